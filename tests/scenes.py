@@ -29,6 +29,21 @@ def pool(upper: Sequence[float], room: Sequence[float], spacing: float = 0.05, v
     return Scene(**{**own, **tables})
 
 
+def bodies(
+    dimension: int, fluid: Sequence[dict[str, Any]], container: dict[str, Any] | None = None, spacing: float = 0.05,
+    viscosity: float = 0.0, **tables: Any,
+) -> Scene:  # fmt: skip
+    """Bodies of water, if nothing else is said, in a container if there is one, with tables that replace its own."""
+    own = {
+        "dimension": dimension,
+        "discretisation": {"spacing": spacing},
+        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": viscosity}],
+        "fluid": [{"phase": "water", **body} for body in fluid],
+        "solver": {"kind": "pcisph", "time_step": 1e-4},
+    }
+    return Scene(**own | ({} if container is None else {"container": container}) | tables)
+
+
 def pool_text(
     upper: Sequence[float],
     room: Sequence[float],

@@ -17,6 +17,7 @@ from cortado.discretise.walls import RestLattice
 from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.fluid_particles import period
 from cortado.scene.tables import rotation_matrix
+from scenes import bodies, box
 
 SPACING = 0.05
 DISC = {"shape": "sphere", "centre": [0.31, -0.2], "radius": 0.5}
@@ -32,14 +33,8 @@ PIPE = {**TANK, "periodic": [True, False, False]}
 
 
 def scene_of(dimension: int, fluid, container=None, kernel="cubic_spline", support=2.0) -> Scene:
-    return Scene(
-        dimension=dimension,
-        discretisation={"spacing": SPACING, "kernel": kernel, "support": support},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.1}],
-        fluid=[{"phase": "water"} | body for body in fluid],
-        solver={"kind": "pcisph", "time_step": 5e-4},
-        **({} if container is None else {"container": container}),
-    )
+    cut = {"spacing": SPACING, "kernel": kernel, "support": support}
+    return bodies(dimension, fluid, container, viscosity=0.1, discretisation=cut)
 
 
 def densities(scene: Scene, found: DiscreteScene) -> np.ndarray:
@@ -122,10 +117,9 @@ def test_the_first_frame_of_a_drop_is_round(case):
 
 def test_fluid_in_a_round_cup_stays_at_its_height():
     """It sank by a tenth when it was filled with whole cells."""
-    height = 0.4
-    simulation = cortado.Simulation(scene_of(3, [CYLINDER | {"height": height}], CUP))
+    simulation = cortado.Simulation(scene_of(3, [CYLINDER | {"height": 0.4}], CUP))
     last = simulation.run(200, record_every=200).positions[-1]
-    assert last[:, 1].mean() == pytest.approx(0.5 * height, rel=0.01)
+    assert last[:, 1].mean() == pytest.approx(0.2, rel=0.01)
 
 
 def test_a_free_drop_does_not_move():
@@ -226,14 +220,18 @@ TRIANGLE = {"shape": "polygon", "corners": [[0.0, 0.0], [0.6, 0.0], [0.3, 0.7]]}
 
 
 def scene(fluid: dict, dimension: int, **more) -> Scene:
-    return Scene(
-        dimension=dimension,
-        discretisation={"spacing": SPACING},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
-        fluid=[{**fluid, "phase": "water"}],
-        solver={"kind": "projection", "time_step": 0.001},
-        **more,
-    )
+    solver = {"kind": "projection", "time_step": 0.001}
+    return bodies(dimension, [fluid], viscosity=0.001, solver=solver, **more)
+
+
+def filled(table: Scene, size: float, tolerance: float, middle: list[float]) -> np.ndarray:
+    """(n, d) particles of one body, of which there is as much as its size says, at the rest density, about a middle."""
+    found = discretise(table)
+    x = found.fluid.positions
+    assert len(x) * SPACING**table.dimension == pytest.approx(size, rel=tolerance)
+    assert densities(table, found).max() < 1.005
+    np.testing.assert_allclose(x.mean(axis=0), middle, atol=0.1 * SPACING)
+    return x
 
 
 def torus(folder) -> dict:
@@ -241,17 +239,9 @@ def torus(folder) -> dict:
     return {"shape": "mesh", "file": str(folder / "torus.stl")}
 
 
-def centred(found: DiscreteScene, middle: list[float], tolerance: float) -> None:
-    np.testing.assert_allclose(found.fluid.positions.mean(axis=0), middle, atol=tolerance)
-
-
 def test_a_polygon_is_filled_and_turned():
     table = scene({**TRIANGLE, "position": [1.0, 0.5], "rotation": 0.4}, 2)
-    found = discretise(table)
-    x = found.fluid.positions
-    assert len(x) * SPACING**2 == pytest.approx(0.21, rel=0.03)
-    assert densities(table, found).max() < 1.005
-    centred(found, [1.0, 0.5], 0.1 * SPACING)
+    x = filled(table, 0.21, 0.03, [1.0, 0.5])
     assert table.fluid[0].distance(x, SPACING).max() < 0.0
     upright = np.array([[np.cos(0.4), np.sin(0.4)], [-np.sin(0.4), np.cos(0.4)]]) @ (x - [1.0, 0.5]).T
     assert -0.7 / 3.0 < upright[1].min() < -0.7 / 3.0 + 0.5 * SPACING  # its lowest side was turned with it
@@ -259,20 +249,15 @@ def test_a_polygon_is_filled_and_turned():
 
 def test_a_mesh_is_filled_and_its_hole_is_not(tmp_path):
     table = scene({**torus(tmp_path), "rotation": [np.pi / 2.0, 0.0, 0.0], "position": [0.0, 0.6, 0.1]}, 3)
-    found = discretise(table)
-    x = found.fluid.positions
-    assert len(x) * SPACING**3 == pytest.approx(2.0 * np.pi**2 * MAJOR * MINOR**2, rel=0.03)
-    assert densities(table, found).max() < 1.005
-    centred(found, [0.0, 0.6, 0.1], 0.1 * SPACING)
+    x = filled(table, 2.0 * np.pi**2 * MAJOR * MINOR**2, 0.03, [0.0, 0.6, 0.1])
     away = np.hypot(np.hypot(x[:, 0], x[:, 2] - 0.1) - MAJOR, x[:, 1] - 0.6)  # its axis is along y now
     assert away.max() < MINOR + 0.1 * SPACING  # as of a ball, whose particles are up to 0.09 spacings outside
 
 
 def test_what_is_along_the_lattice_is_as_a_box_to_the_bit(tmp_path):
-    box = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.3, 0.4, 0.2]}
     trimesh.creation.box(bounds=[[0.0, 0.0, 0.0], [300.0, 400.0, 200.0]]).export(tmp_path / "box.ply")
     mesh = {"shape": "mesh", "file": str(tmp_path / "box.ply"), "scale": 0.001}
-    as_box, as_mesh = (discretise(scene(fluid, 3)).fluid.positions for fluid in (box, mesh))
+    as_box, as_mesh = (discretise(scene(one, 3)).fluid.positions for one in (box([0.0] * 3, [0.3, 0.4, 0.2]), mesh))
     np.testing.assert_allclose(as_mesh, as_box, atol=1e-12)
 
 
@@ -286,13 +271,8 @@ def test_what_is_along_the_lattice_is_as_a_box_to_the_bit(tmp_path):
 )
 def test_a_box_and_a_cylinder_are_turned_about_their_middle(fluid, rotation, middle, half, volume):
     """Turned back, all particles are within the shape; the can is as wide as it is high."""
-    dimension = len(middle)
-    table = scene({**fluid, "rotation": rotation}, dimension)
-    found = discretise(table)
-    x = found.fluid.positions
-    assert len(x) * SPACING**dimension == pytest.approx(volume, rel=0.05)
-    assert densities(table, found).max() < 1.005
-    centred(found, middle, 0.1 * SPACING)
+    table = scene({**fluid, "rotation": rotation}, len(middle))
+    x = filled(table, volume, 0.05, middle)
     back = (x - middle) @ rotation_matrix(np.atleast_1d(rotation))
     assert (np.abs(back).max(axis=0) < np.array(half) + 0.1 * SPACING).all()
     assert (np.abs(x - middle).max(axis=0) > np.array(half) + 0.1 * SPACING).any()  # as it is, it is not
@@ -331,11 +311,7 @@ def test_a_polygon_fills_a_tank_of_its_shape_and_stays():
         ({**TRIANGLE, "corners": [[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]]}, 2, "sides that do not cross"),
         ({**TRIANGLE, "corners": [[0.0, 0.0], [0.02, 0.0], [0.0, 0.02]]}, 2, "too thin to hold a particle"),
         (TRIANGLE, 3, "fluid[0].shape"),
-        (
-            {**BAR, "rotation": [0.1, 0.2, 0.3]},
-            2,
-            "rotation is [0.1, 0.2, 0.3], but must be one number in 2-D",
-        ),
+        ({**BAR, "rotation": [0.1, 0.2, 0.3]}, 2, "is [0.1, 0.2, 0.3], but must be one number in 2-D"),
         ({**CAN, "rotation": 0.1}, 3, "fluid[0].rotation is [0.1], but must be a list of 3 components in 3-D"),
         ({"shape": "mesh", "file": "no.stl"}, 2, "fluid[0].shape"),
         ({"shape": "mesh", "file": "no.stl"}, 3, "fluid[0].file cannot be used: "),
@@ -349,19 +325,13 @@ def test_a_bad_one_is_a_sentence(fluid, dimension, sentence):
 
 def test_bad_meshes_have_the_sentences_of_solids(tmp_path):
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
-    names = {"hole": mesh.faces[1:], "inverted": mesh.faces[:, ::-1]}
-    sentences = {"hole": "is not closed", "inverted": "point inwards"}
-    for name, faces in names.items():
-        trimesh.Trimesh(mesh.vertices, faces, process=False).export(tmp_path / f"{name}.stl")
-        with pytest.raises(SceneError, match=sentences[name]):
+    for name, vertices, faces, words in [
+        ("hole", mesh.vertices, mesh.faces[1:], "is not closed"),
+        ("inverted", mesh.vertices, mesh.faces[:, ::-1], "point inwards"),
+        ("millimetres", 1000.0 * mesh.vertices, mesh.faces, r"it looks like millimetres: give it scale = 0.001"),
+    ]:
+        trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / f"{name}.stl")
+        with pytest.raises(SceneError, match=words):
             scene({"shape": "mesh", "file": str(tmp_path / f"{name}.stl")}, 3)
-    mesh.apply_scale(1000.0)
-    mesh.export(tmp_path / "millimetres.stl")
-    with pytest.raises(SceneError, match=r"it looks like millimetres: give it scale = 0.001"):
-        scene({"shape": "mesh", "file": str(tmp_path / "millimetres.stl")}, 3)
-
-
-def test_a_mesh_that_reaches_out_of_the_container_is_a_sentence(tmp_path):
-    box = {"shape": "box", "lower": [-0.2, -0.2, -0.2], "upper": [0.2, 0.2, 0.2]}
     with pytest.raises(SceneError, match=r"fluid\[0\] is partly outside, for example at"):
-        scene(torus(tmp_path), 3, container=box)
+        scene(torus(tmp_path), 3, container=box([-0.2] * 3, [0.2] * 3))

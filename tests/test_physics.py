@@ -5,7 +5,6 @@ import pytest
 
 from benchmarks.bench.scene import dam_break
 from cortado import CortadoWarning, DivergedError, Problem, Scene, Simulation, losses
-from cortado.device import launching
 from scenes import plane, scene, splash
 
 FREE = {"container": {"shape": "none"}}
@@ -65,9 +64,7 @@ def test_same_bits_twice(precision):
 
 def test_rest_density_alone_does_not_matter_without_viscosity():
     """Masses, pressures and walls all scale with it."""
-    made = splash(**{}).model_dump()
-    made["forces"]["viscosity"] = "none"
-    simulation = Simulation(scene(forces=made["forces"]), precision="float64")
+    simulation = Simulation(scene(forces={**splash().forces.model_dump(), "viscosity": "none"}), precision="float64")
     problem = Problem(simulation, 60, losses.FinalPositions(simulation.positions))
     _, gradient = problem.value_and_gradient({"rest_density": 1000.0, "time_step": 0.0021})
     assert abs(1000.0 * gradient["rest_density"]) < 1e-9 * abs(0.0021 * gradient["time_step"])
@@ -107,17 +104,14 @@ def test_lists_that_become_too_short_in_the_midst_of_a_run_grow_and_nothing_chan
 
 
 def test_the_greatest_density_error_can_be_bounded_too():
-    loose = Simulation(splash(minimum_iterations=2, maximum_iterations=60, density_tolerance=0.01))
-    loose_rollout = loose.rollout(150)
-    loose_rollout.forward(keep=False)
-    limits = {"density_tolerance": 0.01, "maximum_density_tolerance": 0.01}
-    tight = Simulation(splash(minimum_iterations=2, maximum_iterations=60, **limits))
-    tight_rollout = tight.rollout(150)
-    tight_rollout.forward(keep=False)
-    assert loose_rollout.diagnostics["greatest_density_errors"].max() > 0.02
-    assert tight_rollout.diagnostics["converged"].all()
-    assert tight_rollout.diagnostics["greatest_density_errors"].max() <= 0.01
-    assert tight_rollout.diagnostics["iterations"].max() > loose_rollout.diagnostics["iterations"].max()
+    limits = {"minimum_iterations": 2, "maximum_iterations": 60, "density_tolerance": 0.01}
+    loose, tight = (
+        Simulation(splash(**limits, **more)).run(150, record_every=150).diagnostics
+        for more in ({}, {"maximum_density_tolerance": 0.01})
+    )
+    assert loose["greatest_density_errors"].max() > 0.02 and tight["converged"].all()
+    assert tight["greatest_density_errors"].max() <= 0.01
+    assert tight["iterations"].max() > loose["iterations"].max()
 
 
 def test_many_iterations_converge_with_a_wide_support():
@@ -154,24 +148,3 @@ def test_frames_and_records():
     np.testing.assert_array_equal(trajectory.steps, [0, 4, 8, 10])
     assert trajectory.positions.shape == (4, 125, 3)
     np.testing.assert_array_equal(trajectory.iterations, np.full(10, 5))
-
-
-def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
-    def once(cores, parts):
-        monkeypatch.setattr(launching, "LEAST_PART", 125 // parts)
-        monkeypatch.setattr(launching, "LEAST_SHARED_PART", 125 // parts if parts > cores else 125)
-        monkeypatch.setattr(launching, "usable_cores", lambda: cores)
-        simulation = Simulation(splash(minimum_iterations=2, maximum_iterations=20), precision="float64")
-        assert simulation.solver.launch.parts == parts
-        assert simulation.solver.launch.capturable == (parts == 1)
-        simulation.solver.resize(8)
-        problem = Problem(simulation, 40, losses.FinalPositions(np.zeros_like(simulation.positions)))
-        point = {"gravity": np.array([0.5, -9.81, 0.2]), "initial_positions": simulation.positions, "viscosity": 0.05}
-        loss, gradient = problem.value_and_gradient(point)
-        tangent = problem.tangent(point, {"gravity": np.ones(3)})
-        return [np.array(loss), np.array(tangent), problem.iterations(), *gradient.values()]
-
-    wanted = once(1, 1)
-    for cores, parts in ((2, 2), (2, 8), (5, 5)):
-        for found, exact in zip(once(cores, parts), wanted, strict=True):
-            assert found.tobytes() == exact.tobytes()

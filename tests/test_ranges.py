@@ -12,61 +12,43 @@ import cortado
 from cortado import Problem, Simulation, forces, gradients
 from cortado.device import launching
 from cortado.device.launching import KernelLauncher
-from scenes import MIXING, jet, plane_of_three, scene, splash, two_layers
+from scenes import MIXING, box, jet, plane_of_three, scene, splash, two_layers
 
 ROOT = Path(cortado.__file__).parent
 APART = "study/one_kernel_loops.py"
 """Kernels of a study of Warp's tape, which is never cut."""
 BINGHAM = {"kind": "bingham", "yield_stress": 10.0, "regularisation": 0.5}
+FALL = {"gravity": [0.0, -9.81, 0.0]}
+STRESS = {"gravity": [1.0, -9.81, 0.0], "viscosity": "stress"}
+TENSE = {
+    "forces": FALL | {"surface_tension": 0.5},
+    "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 2.0}],
+}
+NO_SLIP = box([0.0] * 3, [0.4, 0.6, 0.25], slip="no")
+PROJECTION = {"kind": "projection", "time_step": 0.0021}
+BALL = {"name": "ball", "shape": "sphere", "centre": [0.1] * 3, "radius": 0.06, "velocity": [0.5, 0.0, 0.0]}
+ALONG = {"motion": "path", "slip": "no"}
 CASES = {
     "one phase, iterations by tolerance": lambda: splash(minimum_iterations=2, maximum_iterations=20),
-    "no viscosity, free space": lambda: scene(
-        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "none"}, container={"shape": "none"}
-    ),
-    "pairwise, no slip, diffusion of two phases": lambda: two_layers(
-        container={"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"},
-    ),
+    "no viscosity, free space": lambda: scene(forces=FALL | {"viscosity": "none"}, container={"shape": "none"}),
+    "pairwise, no slip, diffusion of two phases": lambda: two_layers(container=NO_SLIP),
     "diffusion of three phases, a constant mobility": plane_of_three,
     "diffusion of three phases, miscible": lambda: plane_of_three(mixture={**MIXING, "free_energy": "miscible"}),
     "a nozzle": jet,
-    "surface tension": lambda: scene(
-        forces={"gravity": [0.0, -9.81, 0.0], "surface_tension": 0.5},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 2.0}],
-    ),
-    "surface tension by curvature": lambda: scene(
-        solver={"kind": "projection", "time_step": 0.0021},
-        forces={"gravity": [0.0, -9.81, 0.0], "surface_tension": 0.5},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 2.0}],
-    ),
+    "surface tension": lambda: scene(**TENSE),
+    "surface tension by curvature": lambda: scene(solver=PROJECTION, **TENSE),
     "implicit viscosity with a law, no slip": lambda: scene(
-        forces={"gravity": [1.0, -9.81, 0.0], "viscosity": "stress", "viscous_solve": "implicit"},
+        forces=STRESS | {"viscous_solve": "implicit"},
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 20.0, "rheology": BINGHAM}],
-        container={"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"},
+        container=NO_SLIP,
     ),
     "forces of one's own": splash,
-    "the projection": lambda: two_layers(solver={"kind": "projection", "time_step": 0.0021}),
-    "velocities that follow": lambda: two_layers(
-        solver={"kind": "projection", "time_step": 0.0021, "velocities_follow": True}
-    ),
-    "a solid that moves": lambda: scene(solid=[BALL], solver={"kind": "projection", "time_step": 0.0021}),
-    "a solid that moves, PCISPH, stress": lambda: scene(
-        forces={"gravity": [1.0, -9.81, 0.0], "viscosity": "stress"}, solid=[BALL]
-    ),
-    "a solid that is free": lambda: scene(
-        solid=[{**FLOAT, "motion": "free", "density": 500.0, "velocity": [0.5, 0.0, 0.0]}],
-        solver={"kind": "projection", "time_step": 0.0021},
-    ),
+    "the projection": lambda: two_layers(solver=PROJECTION),
+    "velocities that follow": lambda: two_layers(solver=PROJECTION | {"velocities_follow": True}),
+    "a solid that moves": lambda: scene(solid=[BALL | ALONG], solver=PROJECTION),
+    "a solid that moves, PCISPH, stress": lambda: scene(forces=STRESS, solid=[BALL | ALONG]),
+    "a solid that is free": lambda: scene(solid=[BALL | {"motion": "free", "density": 500.0}], solver=PROJECTION),
 }
-BALL = {
-    "name": "ball",
-    "shape": "sphere",
-    "centre": [0.1, 0.1, 0.1],
-    "radius": 0.06,
-    "motion": "path",
-    "velocity": [0.5, 0.0, 0.0],
-    "slip": "no",
-}
-FLOAT = {"name": "float", "shape": "sphere", "centre": [0.1, 0.1, 0.1], "radius": 0.06}
 
 
 def swirl(x, v, t, rate):
@@ -131,6 +113,7 @@ def results(name) -> dict[str, bytes]:
         point["mass_fractions"] = 0.8 * c + 0.2 * random.dirichlet(np.ones(c.shape[1]), len(c))
     directions = {name: random.standard_normal(np.shape(value)) for name, value in point.items()}
     found = {"value": problem.value(point), "tangent": problem.tangent(point, directions)}
+    found["iterations"] = problem.iterations()
     for label, estimator in ESTIMATORS.items():
         is_pcisph = simulation.scene.solver.kind == "pcisph"
         is_free = any(solid.motion == "free" for solid in simulation.scene.solid)
@@ -151,7 +134,7 @@ def set_parts(monkeypatch, cores, parts, particles):
     monkeypatch.setattr(launching, "LEAST_SHARED_PART", particles // parts if parts > cores else particles)
     monkeypatch.setattr(launching, "usable_cores", lambda: cores)
     launcher = KernelLauncher(particles, launching.wp.get_device("cpu"), record_tape=False)
-    assert launcher.parts == parts
+    assert launcher.parts == parts and launcher.capturable == (parts == 1)
 
 
 @cache

@@ -13,39 +13,29 @@ import reference as twins
 from benchmarks.bench.run import bench_reference
 from cortado import DivergedError, InputError, Problem, Simulation, losses, reference
 from cortado.reference import Digits, Terms
-from scenes import plane, scatter, scene, splash, two_layers
+from scenes import box, plane, scatter, scene, splash, two_layers
 
-WALLS = {"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"}
+C2, C4 = ({"spacing": 0.05, "support": h, "kernel": f"wendland_{c}"} for c, h in (("c2", 2.6), ("c4", 3.0)))
+C4_NARROW = {**C4, "support": 2.6}
+NO_SLIP = box([0.0] * 3, [0.4, 0.6, 0.25], slip="no")
+FALL = {"gravity": [0.0, -9.81, 0.0]}
 PAIRWISE = {"gravity": [0.0, -9.81], "viscosity": "pairwise"}
+STRESS = {"gravity": [0.0, -9.81], "viscosity": "stress"}
+PERIOD = box([0.0, 0.0], [0.4, 0.8], periodic=[True, False])
 SCENES = {
     "splash": splash(),
     "tolerance": splash(minimum_iterations=2, maximum_iterations=40, density_tolerance=0.001),
-    "wendland_c2": scene(discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"}),
-    "pairwise, no slip": scene(
-        discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c4"}, container=WALLS
-    ),
-    "stress, no slip": scene(
-        discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"},
-        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "stress"},
-        container=WALLS,
-    ),
-    "stress, free slip": scene(forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "stress"}),
-    "stress, plane, no slip": plane(
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8], "slip": "no"},
-        forces={"gravity": [0.0, -9.81], "viscosity": "stress"},
-    ),
-    "stress, periodic": plane(
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False], "slip": "no"},
-        forces={"gravity": [1.0, -9.81], "viscosity": "stress"},
-    ),
+    "wendland_c2": scene(discretisation=C2),
+    "pairwise, no slip": scene(discretisation=C4_NARROW, container=NO_SLIP),
+    "stress, no slip": scene(discretisation=C2, forces=FALL | {"viscosity": "stress"}, container=NO_SLIP),
+    "stress, free slip": scene(forces=FALL | {"viscosity": "stress"}),
+    "stress, plane, no slip": plane(container=box([0.0, 0.0], [0.7, 0.8], slip="no"), forces=STRESS),
+    "stress, periodic": plane(container=PERIOD | {"slip": "no"}, forces=STRESS | {"gravity": [1.0, -9.81]}),
     "plane": plane(forces=PAIRWISE),
-    "periodic": plane(
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
-        forces={"gravity": [1.0, -9.81], "viscosity": "pairwise"},
-    ),
+    "periodic": plane(container=PERIOD, forces=PAIRWISE | {"gravity": [1.0, -9.81]}),
     "free space": scene(container={"shape": "none"}),
-    "without pressure": scene(forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise", "pressure": False}),
-    "without viscosity": plane(forces={"gravity": [0.0, -9.81], "viscosity": "none"}),
+    "without pressure": scene(forces=FALL | {"viscosity": "pairwise", "pressure": False}),
+    "without viscosity": plane(forces=PAIRWISE | {"viscosity": "none"}),
 }
 scenes = pytest.mark.parametrize("made", SCENES.values(), ids=SCENES)
 TERMS = [Terms(), *(Terms(**{name: False}) for name in ("viscosity", "pressure", "hessian", "density"))]
@@ -58,21 +48,15 @@ def point_and_direction(simulation, steps, seed=0, off_lattice=0.001):
     """
     random, shape = np.random.default_rng(seed), simulation.positions.shape
 
-    def noise(*shape):
-        return random.standard_normal(shape)
-
+    noise, size = random.standard_normal, np.sqrt(shape[0])
     point = {
         "gravity": np.tile(simulation.scene.forces.gravity, (steps, 1)),
-        "initial_positions": simulation.positions + off_lattice * noise(*shape),
-        "initial_velocities": simulation.velocities + 0.01 * noise(*shape),
+        "initial_positions": simulation.positions + off_lattice * noise(shape),
+        "initial_velocities": simulation.velocities + 0.01 * noise(shape),
         "viscosity": np.array(0.05),
     }
-    directions = {
-        "gravity": noise(steps, shape[1]) / np.sqrt(steps),
-        "initial_positions": 0.05 * noise(*shape) / np.sqrt(shape[0]),
-        "initial_velocities": 0.1 * noise(*shape) / np.sqrt(shape[0]),
-        "viscosity": np.array(0.05),
-    }
+    directions = {"gravity": noise((steps, shape[1])) / np.sqrt(steps), "initial_positions": 0.05 * noise(shape) / size}
+    directions |= {"initial_velocities": 0.1 * noise(shape) / size, "viscosity": np.array(0.05)}
     if simulation.scene.forces.viscosity == "stress":
         scatter(point["initial_positions"], simulation.scene.discretisation.spacing)
     if simulation.scene.forces.viscosity == "none":
@@ -88,6 +72,19 @@ def distance(found, wanted):
     """Relative, of vectors; `Digits` are subtracted digit by digit."""
     size = np.linalg.norm(np.asarray(wanted))
     return np.linalg.norm(found - wanted) / (size if size > 0.0 else 1.0)
+
+
+def gradients_agree(simulation, point, steps, tolerance):
+    """The loss and the gradient of the reference engine are those of the Warp engine, whose problem is returned."""
+    loss = losses.FinalPositions(target_of(simulation))
+    problem = Problem(Simulation(simulation.scene, precision="float64"), steps, loss)
+    value, wanted = problem.value_and_gradient(point)
+    found = simulation.gradient(point, steps, reference.FinalPositions(loss.target))
+    assert found.value == pytest.approx(value, rel=0.01 * tolerance)
+    for name, gradient in wanted.items():
+        away = np.linalg.norm(found.parameters[name].high - gradient)
+        assert away <= tolerance * max(np.linalg.norm(gradient), 1e-6), name
+    return problem
 
 
 # ---- against the Warp engine ---------------------------------------------------------------------------------------
@@ -108,18 +105,11 @@ def test_derivatives_are_those_of_the_warp_engine(made):
     steps = 100 if made is SCENES["splash"] else 40
     simulation = reference.Simulation(made)
     point, directions = point_and_direction(simulation, steps)
-    target = target_of(simulation)
-    problem = Problem(Simulation(made, precision="float64"), steps, losses.FinalPositions(target))
-    loss, wanted = problem.value_and_gradient(point)
-    found = simulation.gradient(point, steps, reference.FinalPositions(target))
-    assert found.value == pytest.approx(loss, rel=1e-9)
-    for name, gradient in wanted.items():
-        assert distance(found.parameters[name].high, gradient) < 1e-8, name
+    problem = gradients_agree(simulation, point, steps, 1e-8)
     tangent = simulation.tangent(point, directions, steps)
-    bar, _ = reference.FinalPositions(target).adjoint(tangent.positions[-1], tangent.velocities[-1])
-    assert (bar * tangent.position_tangents.high[-1]).sum() == pytest.approx(
-        problem.tangent(point, directions), rel=1e-8
-    )
+    bar, _ = reference.FinalPositions(problem.loss.target).adjoint(tangent.positions[-1], tangent.velocities[-1])
+    forward = (bar * tangent.position_tangents.high[-1]).sum()
+    assert forward == pytest.approx(problem.tangent(point, directions), rel=1e-8)
 
 
 def test_float32_is_as_near_to_float64_as_the_warp_engine_is():
@@ -137,10 +127,8 @@ def test_float32_is_as_near_to_float64_as_the_warp_engine_is():
         _, warp = problem.value_and_gradient(point)
         for name, gradient in wanted.parameters.items():
             errors[name].append([distance(g, gradient.high) for g in (found.parameters[name].high, warp[name])])
-        last = wanted.history.positions.high[-1]
-        errors["positions"].append(
-            [distance(x, last) for x in (found.history.positions.high[-1], problem.end(point).positions)]
-        )
+        ends = found.history.positions.high[-1], problem.end(point).positions
+        errors["positions"].append([distance(x, wanted.history.positions.high[-1]) for x in ends])
     for name, pairs in errors.items():
         own, other = np.median(pairs, axis=0)
         assert 0.0 < own < max(5.0 * other, 1e-5), name
@@ -182,9 +170,8 @@ def test_methods_agree_in_float128(quadruple, method):
 
 def test_the_tangent_is_the_limit_of_differences_in_float128(quadruple):
     simulation, point, directions, exact = quadruple
-    found = simulation.tangent(
-        point, directions, 200, method="finite_difference", difference=1e-12, record_every=50
-    ).position_tangents
+    differences = {"method": "finite_difference", "difference": 1e-12, "record_every": 50}
+    found = simulation.tangent(point, directions, 200, **differences).position_tangents
     for frame in (1, 2, 4):
         assert distance(found[frame], exact.position_tangents[frame]) < 1e-12
 
@@ -205,8 +192,7 @@ def test_precisions_agree(precision):
 def test_the_adjoint_is_the_transpose_of_the_tangent(made, terms):
     simulation = reference.Simulation(made)
     point, directions = point_and_direction(simulation, 30)
-    target = target_of(simulation)
-    loss = reference.FinalPositions(target)
+    loss = reference.FinalPositions(target_of(simulation))
     back = simulation.gradient(point, 30, loss, terms=terms)
     forth = simulation.tangent(point, directions, 30, terms=terms)
     bar, _ = loss.adjoint(forth.positions[-1], forth.velocities[-1])
@@ -221,9 +207,8 @@ def test_terms_make_a_difference():
     point, directions = point_and_direction(simulation, 60)
     found = [simulation.tangent(point, directions, 60, terms=terms).position_norms[-1] for terms in TERMS]
     assert len(set(np.round(found, 6))) == len(TERMS)
-    free = simulation.tangent(
-        point, {"gravity": directions["gravity"]}, 60, terms=Terms(pressure=False, viscosity=False)
-    )
+    neither = Terms(pressure=False, viscosity=False)
+    free = simulation.tangent(point, {"gravity": directions["gravity"]}, 60, terms=neither)
     falling = np.array([[60 - n for n in range(60)]]) @ directions["gravity"] * 0.0021**2
     np.testing.assert_allclose(free.position_tangents.high[-1], np.broadcast_to(falling, (125, 3)), rtol=1e-12)
 
@@ -342,9 +327,13 @@ def test_an_observer_may_stop_a_run():
 
 
 def stirred(motion, **changes):
-    """The splash with a block below it that moves."""
-    block = {"name": "block", "shape": "box", "lower": [0.25, 0.0, 0.05], "upper": [0.4, 0.1, 0.2], "motion": motion}
-    return scene(solid=[{**block, **changes}], solver={"kind": "projection", "time_step": 0.001})
+    """A simulation of the splash with a block below it that moves."""
+    block = box([0.25, 0.0, 0.05], [0.4, 0.1, 0.2], name="block", motion=motion, **changes)
+    return reference.Simulation(scene(solid=[block], solver={"kind": "projection", "time_step": 0.001}))
+
+
+def as_printed(name):
+    return reference.Simulation(SCENES[name]).tangent({}, {}, 5, method="as_printed")
 
 
 @pytest.mark.parametrize(
@@ -367,26 +356,11 @@ def stirred(motion, **changes):
         (lambda s: reference.Simulation(splash(), threads=0), "threads is 0"),
         (lambda s: reference.Simulation(3), "must be a cortado.Scene or the path of a scene file"),
         (lambda s: reference.Simulation(two_layers()), "several phases or an emitter"),
-        (
-            lambda s: reference.Simulation(stirred("path", velocity=[0.1, 0.0, 0.0])),
-            r"solid\[0\], which moves, but must",
-        ),
-        (
-            lambda s: reference.Simulation(stirred("fixed", surface_velocity=[0.1, 0.0, 0.0])),
-            r"solid\[0\], which moves",
-        ),
-        (
-            lambda s: reference.Simulation(stirred("free", density=500.0)),
-            r"solid\[0\], which moves, but must have",
-        ),
-        (
-            lambda s: reference.Simulation(SCENES["stress, no slip"]).tangent({}, {}, 5, method="as_printed"),
-            "must not be used with the stress viscosity",
-        ),
-        (
-            lambda s: reference.Simulation(SCENES["stress, periodic"]).tangent({}, {}, 5, method="as_printed"),
-            "must not be used with the stress viscosity",
-        ),
+        (lambda s: stirred("path", velocity=[0.1, 0.0, 0.0]), r"solid\[0\], which moves, but must"),
+        (lambda s: stirred("fixed", surface_velocity=[0.1, 0.0, 0.0]), r"solid\[0\], which moves"),
+        (lambda s: stirred("free", density=500.0), r"solid\[0\], which moves, but must have"),
+        (lambda s: as_printed("stress, no slip"), "must not be used with the stress viscosity"),
+        (lambda s: as_printed("stress, periodic"), "must not be used with the stress viscosity"),
     ],
 )
 def test_a_mistake_gives_a_sentence(call, sentence):
@@ -395,12 +369,12 @@ def test_a_mistake_gives_a_sentence(call, sentence):
 
 
 def test_a_lost_particle_is_named():
-    wild = {"initial_velocities": np.full((125, 3), 1e12)}
-    with pytest.raises(DivergedError, match="particle 0 was lost; speed limits the time step to about"):
-        reference.Simulation(splash()).run(5, wild)
-    down = {"initial_velocities": np.tile([0.0, -200.0, 0.0], (125, 1))}
-    with pytest.raises(DivergedError, match=r"diverged in step 1: particle 0 \(and 49 more\) left the container"):
-        reference.Simulation(splash()).run(5, down)
+    for velocity, words in [
+        ([1e12, 1e12, 1e12], "particle 0 was lost; speed limits the time step to about"),
+        ([0.0, -200.0, 0.0], r"diverged in step 1: particle 0 \(and 49 more\) left the container"),
+    ]:
+        with pytest.raises(DivergedError, match=words):
+            reference.Simulation(splash()).run(5, {"initial_velocities": np.tile(velocity, (125, 1))})
 
 
 def test_where_it_is_not_installed_there_is_one_sentence():

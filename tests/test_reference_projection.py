@@ -6,28 +6,21 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from cortado import InputError, Problem, Simulation, losses, reference
+from cortado import InputError, Simulation, reference
 from cortado.reference import Terms
 from cortado.scene.discrete_scene import discretise, mirrors_of
 from cortado.solvers.projection.lattice import coarse_grid
 from reference_projection import Projection
-from scenes import plane, scene
+from scenes import box, plane, scene
 from test_projection import C2, CASES, HURLED, PERIODIC, SOLVER, begun, thrown
-from test_reference import distance, target_of
+from test_reference import C4, distance, gradients_agree, target_of
 
 CUBIC = {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"}
-C4 = {"spacing": 0.05, "support": 3.0, "kernel": "wendland_c4"}
-NO_SLIP = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8], "slip": "no"}
 SCENES = {
     "plane": plane(solver=SOLVER),
     "space": scene(solver=SOLVER),
-    "periodic": plane(
-        solver=SOLVER,
-        container=PERIODIC,
-        discretisation=C2,
-        forces={"gravity": [1.0, -9.81]},
-    ),
-    "stress, no slip": plane(solver=SOLVER, container=NO_SLIP, discretisation=C2),
+    "periodic": plane(solver=SOLVER, container=PERIODIC, discretisation=C2, forces={"gravity": [1.0, -9.81]}),
+    "stress, no slip": plane(solver=SOLVER, container=box([0.0, 0.0], [0.7, 0.8], slip="no"), discretisation=C2),
     "wendland_c4": plane(solver={**SOLVER, "iterations": 7, "repairs": 1}, discretisation=C4),
     "free space": plane(solver=SOLVER, container={"shape": "none"}, forces={"gravity": [0.0, 0.0]}),
 }
@@ -94,15 +87,9 @@ def test_it_is_the_projection_of_the_warp_engine(made):
     np.testing.assert_allclose(found.velocities.high[-1], wanted.velocities[-1], rtol=0.0, atol=1e-10)
     np.testing.assert_allclose(found.density_errors, wanted.density_errors, rtol=0.0, atol=1e-13)
     assert np.array_equal(found.iterations, wanted.iterations) and (wanted.density_errors > 0.0).any()
-    target = target_of(simulation)
-    problem = Problem(warp, steps, losses.FinalPositions(target))
-    loss, bars = problem.value_and_gradient(point)
-    mine = simulation.gradient(point, steps, reference.FinalPositions(target))
-    assert mine.value == pytest.approx(loss, rel=1e-12)
-    for name, bar in bars.items():
-        assert distance(mine.parameters[name].high, bar) < 1e-10, name
+    problem = gradients_agree(simulation, point, steps, 1e-10)
     tangent = simulation.tangent(point, directions, steps)
-    bar, _ = reference.FinalPositions(target).adjoint(tangent.positions[-1], tangent.velocities[-1])
+    bar, _ = reference.FinalPositions(problem.loss.target).adjoint(tangent.positions[-1], tangent.velocities[-1])
     forward = (bar * tangent.position_tangents.high[-1]).sum()
     size = np.linalg.norm(bar) * tangent.position_norms[-1]
     assert abs(forward - problem.tangent(point, directions)) < 1e-10 * size
@@ -117,11 +104,7 @@ def test_fluid_that_is_hurled_at_walls_is_that_of_the_warp_engine(case):
     point |= begun(case, simulation)
     wanted, found = warp.run(steps, point), simulation.run(steps, point)
     np.testing.assert_allclose(found.positions.high, wanted.positions, rtol=0.0, atol=1e-12)
-    target = target_of(simulation)
-    _, bars = Problem(warp, steps, losses.FinalPositions(target)).value_and_gradient(point)
-    mine = simulation.gradient(point, steps, reference.FinalPositions(target))
-    for name, bar in bars.items():
-        assert distance(mine.parameters[name].high, bar) < 1e-10, name
+    gradients_agree(simulation, point, steps, 1e-10)
     analytic, dual = (simulation.tangent(point, directions, steps, method) for method in ("analytic", "dual"))
     assert distance(dual.position_tangents[-1], analytic.position_tangents[-1]) < 1e-12
 
@@ -129,16 +112,9 @@ def test_fluid_that_is_hurled_at_walls_is_that_of_the_warp_engine(case):
 @pytest.mark.parametrize("name", ["plane", "free space"])
 def test_on_corners_of_the_clamp_it_takes_the_mean_slope_too(name):
     """The lattice as a scene has it, moving as a whole: there is no divergence, and so the clamp is on its corner."""
-    made = SCENES[name]
-    simulation, steps = reference.Simulation(made), 2
+    simulation, steps = reference.Simulation(SCENES[name]), 2
     point, directions = point_and_direction(simulation, steps, at_rest=True)
-    target = target_of(simulation)
-    _, bars = Problem(Simulation(made, precision="float64"), steps, losses.FinalPositions(target)).value_and_gradient(
-        point
-    )
-    mine = simulation.gradient(point, steps, reference.FinalPositions(target))
-    for name, bar in bars.items():
-        assert np.linalg.norm(mine.parameters[name].high - bar) < 1e-9 * max(np.linalg.norm(bar), 1e-6), name
+    gradients_agree(simulation, point, steps, 1e-9)
     analytic, dual = (simulation.tangent(point, directions, steps, method) for method in ("analytic", "dual"))
     assert distance(dual.velocity_tangents[-1], analytic.velocity_tangents[-1]) < 1e-12
 
@@ -162,31 +138,18 @@ def test_methods_agree_and_the_adjoint_is_the_transpose(made):
 
 
 @pytest.mark.parametrize("name", ["plane", "space"])
-def test_differences_confirm_derivatives_far_below_round_off_of_float64(name):
-    """In float64 the best step of central differences leaves an error of about 1e-9."""
+def test_derivatives_are_right_far_below_round_off_of_float64(name):
+    """In which the best step of central differences leaves an error of about 1e-9; the adjoint is the transpose."""
     if "float128" not in reference.precisions():
         pytest.skip("the compiler has no float128")
     simulation, steps = reference.Simulation(SCENES[name], "float128"), 6
     point, directions = point_and_direction(simulation, steps)
     exact = simulation.tangent(point, directions, steps, record_every=steps)
-    for method in ("dual", "complex_step"):
-        other = simulation.tangent(point, directions, steps, method=method, record_every=steps)
-        assert distance(other.position_tangents[-1], exact.position_tangents[-1]) < 1e-28
-        assert distance(other.velocity_tangents[-1], exact.velocity_tangents[-1]) < 1e-28
-    found = simulation.tangent(
-        point, directions, steps, method="finite_difference", difference=1e-12, record_every=steps
-    )
-    assert distance(found.position_tangents[-1], exact.position_tangents[-1]) < 1e-18
-    assert distance(found.velocity_tangents[-1], exact.velocity_tangents[-1]) < 1e-18
-
-
-@pytest.mark.parametrize("name", ["plane", "space"])
-def test_the_adjoint_is_the_transpose_far_below_round_off_of_float64(name):
-    if "float128" not in reference.precisions():
-        pytest.skip("the compiler has no float128")
-    simulation, steps = reference.Simulation(SCENES[name], "float128"), 6
-    point, directions = point_and_direction(simulation, steps)
-    exact = simulation.tangent(point, directions, steps, record_every=steps)
+    methods = {"dual": (1e-28, {}), "complex_step": (1e-28, {}), "finite_difference": (1e-18, {"difference": 1e-12})}
+    for method, (most, options) in methods.items():
+        other = simulation.tangent(point, directions, steps, method=method, record_every=steps, **options)
+        assert distance(other.position_tangents[-1], exact.position_tangents[-1]) < most
+        assert distance(other.velocity_tangents[-1], exact.velocity_tangents[-1]) < most
     bar = np.random.default_rng(2).standard_normal(simulation.positions.shape)
     back = simulation.gradient(point, steps, Along(bar))
     forward = product(bar, exact.position_tangents[-1])
@@ -235,23 +198,25 @@ def test_without_pressure_nothing_is_projected():
     assert found.iterations.tolist() == [0] * 10
 
 
+LAW = "{kind='power_law', flow_index=0.6}"
+
+
+def at(simulation):
+    return reference.FinalPositions(simulation.positions)
+
+
+def other(simulation, change):
+    return reference.Simulation(simulation.scene.replaced(change))
+
+
 @pytest.mark.parametrize(
     "call, sentence",
     [
         (lambda s: s.tangent({}, {}, 5, method="as_printed"), "must not be used with the projection"),
         (lambda s: s.tangent({}, {}, 5, terms=Terms(hessian=False)), "must not with the projection"),
-        (
-            lambda s: s.gradient({}, 5, reference.FinalPositions(s.positions), terms=Terms(pressure=False)),
-            "must not with the projection",
-        ),
-        (
-            lambda s: reference.Simulation(s.scene.replaced("forces.viscous_solve='implicit'")),
-            'must have viscous_solve = "explicit"',
-        ),
-        (
-            lambda s: reference.Simulation(s.scene.replaced("phase[0].rheology={kind='power_law', flow_index=0.6}")),
-            r"scene has phase\[0\].rheology, but must leave it out",
-        ),
+        (lambda s: s.gradient({}, 5, at(s), terms=Terms(pressure=False)), "must not with the projection"),
+        (lambda s: other(s, "forces.viscous_solve='implicit'"), 'must have viscous_solve = "explicit"'),
+        (lambda s: other(s, f"phase[0].rheology={LAW}"), r"scene has phase\[0\].rheology, but must leave it out"),
     ],
 )
 def test_a_mistake_gives_a_sentence(call, sentence):

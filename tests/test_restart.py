@@ -34,9 +34,11 @@ def test_a_restart_has_the_bits_of_a_run_that_did_not_stop(name, precision, tmp_
     simulation = Simulation(MAKERS[name](), precision=precision)
     controls = controls_of(simulation)
     whole = simulation.run(FIRST + REST, controls)
-    first = simulation.run(FIRST, {key: table[:FIRST] for key, table in controls.items()}, record_every=5)
+    earlier, later = (
+        {key: table[rows] for key, table in controls.items()} for rows in (slice(FIRST), slice(FIRST, None))
+    )
+    first = simulation.run(FIRST, earlier, record_every=5)
     first.save(tmp_path / "first.vtkhdf")
-    later = {key: table[FIRST:] for key, table in controls.items()}
     for state in (first.last_state, Trajectory.load(tmp_path / "first.vtkhdf").last_state):
         rest = simulation.run(REST, later, state=state)
         assert rest.steps.tolist() == list(range(FIRST, FIRST + REST + 1))
@@ -49,40 +51,37 @@ def test_a_restart_has_the_bits_of_a_run_that_did_not_stop(name, precision, tmp_
             assert (found is None) == (wanted is None)
             assert found is None or found.tobytes() == wanted[FIRST:].tobytes(), field
         assert rest.density_errors.tobytes() == whole.density_errors[FIRST:].tobytes()
-        again = simulation.run(FIRST, {key: table[:FIRST] for key, table in controls.items()})
+        again = simulation.run(FIRST, earlier)
         assert again.positions.tobytes() == whole.positions[: FIRST + 1].tobytes()  # nothing of the restart stays
-
-
-FRACTIONS = "state mass_fractions of particle 0 are"
 
 
 def test_states_that_do_not_fit_are_refused():
     simulation = Simulation(pour(), precision="float64")
     state = simulation.run(3).last_state
 
+    x, n, wrong = state["positions"], simulation.particles, "state mass_fractions of particle 0 are"
+
     def other(**fields):
         return replace(state, fields={**state.fields, **fields})
 
     emitterless = Simulation(two_layers()).run(1).last_state
-    for arguments, what in [
-        ({"state": other(positions=state["positions"][:-1])}, "state positions has shape"),
+    for given, controls, what in [
+        (other(positions=x[:-1]), {}, "state positions has shape"),
         (
-            {"state": other(positions=state["positions"] + [0.0, 0.0, 5.0])},
-            "state positions has particle 0 at .* m, outside the container of this scene",
+            other(positions=x + [0.0, 0.0, 5.0]),
+            {},
+            "positions has particle 0 at .* m, outside the container of this",
         ),
-        (
-            {"state": other(reference_density=np.zeros(simulation.particles))},
-            "state reference_density must be greater than 0",
-        ),
-        ({"state": other(mass_fractions=np.full((simulation.particles, 2), [2.0, -1.0]))}, FRACTIONS + " 2, -1"),
-        ({"state": other(mass_fractions=np.full((simulation.particles, 2), [0.9, 0.2]))}, FRACTIONS + " 0.9, 0.2"),
-        ({"state": other(emitted=np.array([np.nan]))}, "state emitted has a value that is not finite"),
-        ({"state": emitterless}, "state has positions, .*, but must have positions, .*, outlet, emitted in this scene"),
-        ({"state": simulation.initial}, "must be a RestartState"),
-        ({"state": state, "controls": {"initial_velocities": state["velocities"]}}, "must be left out with a state"),
+        (other(reference_density=np.zeros(n)), {}, "state reference_density must be greater than 0"),
+        (other(mass_fractions=np.full((n, 2), [2.0, -1.0])), {}, f"{wrong} 2, -1"),
+        (other(mass_fractions=np.full((n, 2), [0.9, 0.2])), {}, f"{wrong} 0.9, 0.2"),
+        (other(emitted=np.array([np.nan])), {}, "state emitted has a value that is not finite"),
+        (emitterless, {}, "state has positions, .*, but must have positions, .*, outlet, emitted in this scene"),
+        (simulation.initial, {}, "must be a RestartState"),
+        (state, {"initial_velocities": state["velocities"]}, "must be left out with a state"),
     ]:
         with pytest.raises(InputError, match=what):
-            simulation.run(3, **arguments)
+            simulation.run(3, controls, state=given)
 
 
 def test_an_emitter_goes_on_with_another_flow():
@@ -115,18 +114,11 @@ def test_a_run_goes_on_from_a_frame_on_the_way():
 
 def spread_out(factor):
     """A plane of as many particles, with a spacing so many times as large."""
-    scene = plane()
-    box = scene.fluid[0].model_copy(update={"upper": tuple(factor * x for x in scene.fluid[0].upper)})
-    wall = scene.container.model_copy(update={"upper": tuple(3.0 * x for x in scene.container.upper)})
-    cut = {"spacing": factor * scene.discretisation.spacing}
-    return Scene(
-        **{
-            **scene.model_dump(exclude_none=True),
-            "fluid": [box.model_dump()],
-            "container": wall.model_dump(exclude_none=True),
-            "discretisation": {**scene.discretisation.model_dump(), **cut},
-        }
-    )
+    tables = plane().model_dump(exclude_none=True)
+    (fluid,), cut = tables["fluid"], tables["discretisation"]
+    fluid["upper"] = [factor * x for x in fluid["upper"]]
+    tables["container"]["upper"] = [3.0 * x for x in tables["container"]["upper"]]
+    return Scene(**{**tables, "discretisation": {**cut, "spacing": factor * cut["spacing"]}})
 
 
 def refused(simulation, state, controls=None):
@@ -152,10 +144,7 @@ def test_a_state_of_another_spacing_is_refused(factor, known):
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        (
-            "phase.0.rest_density=900",
-            "a rest density of 900 kg/m3, but must be of one with a rest density of 1000 kg/m3",
-        ),
+        ("phase.0.rest_density=900", "density of 900 kg/m3, but must be of one with a rest density of 1000 kg/m3"),
         ('discretisation.kernel="wendland_c2"', "the kernel wendland_c2"),
         ("discretisation.support=2.5", "a support of 2.5 spacings"),
         ("container.periodic=[true,false]", "periods of"),
@@ -216,8 +205,7 @@ def test_particles_of_a_state_that_cannot_be_are_refused():
 )
 def test_a_clock_that_cannot_be_is_refused(clock, words):
     simulation = Simulation(plane())
-    state = replace(simulation.run(2).last_state, clock=clock)
-    sentence = refused(simulation, state)
+    sentence = refused(simulation, replace(simulation.run(2).last_state, clock=clock))
     assert sentence.startswith("state clock") and words in sentence
 
 
@@ -349,9 +337,8 @@ def test_a_run_begins_at_the_end_of_another(cortado_command, place):
     code, _, err = cortado_command("run", "scene.toml", "--out", "rest", "--steps", 4, "--state", place)
     assert (code, err) == (0, "")
     whole, rest = (Trajectory.load(f"{run}/trajectory.vtkhdf") for run in ("whole", "rest"))
-    np.testing.assert_array_equal(rest.positions, whole.positions[6:])
-    np.testing.assert_array_equal(rest.times, whole.times[6:])
-    np.testing.assert_array_equal(rest.steps, whole.steps[6:])
+    for name in ("positions", "times", "steps"):
+        np.testing.assert_array_equal(getattr(rest, name), getattr(whole, name)[6:])
     again = ["--out", "rest", "--steps", 4, "--resume", "--state"]
     assert cortado_command("run", "scene.toml", *again, place)[0] == 0
     code, _, err = cortado_command("run", "scene.toml", *again, "whole")
@@ -359,20 +346,17 @@ def test_a_run_begins_at_the_end_of_another(cortado_command, place):
 
 
 def test_frames_come_at_a_rate(cortado_command):
-    code, _, _ = cortado_command("run", "scene.toml", "--time", 0.2, "--fps", 50, "--out", "dam")
-    times = Trajectory.load("dam/trajectory.vtkhdf").times
-    assert code == 0 and len(times) == 11
-    assert ((times - np.arange(11) / 50 >= -1e-9) & (times - np.arange(11) / 50 < 0.004)).all()
-    assert json.loads(Path("dam/environment.json").read_text())["settings"]["fps"] == 50
-
-
-def test_a_rate_is_kept_and_counts_from_where_a_run_begins(cortado_command):
-    cortado_command("run", "scene.toml", "--steps", 5, "--fps", 29.97, "--out", "first")
-    code, _, _ = cortado_command("run", "scene.toml", "--time", 0.1, "--fps", 50, "--out", "rest", "--state", "first")
-    first, rest = (Trajectory.load(f"{run}/trajectory.vtkhdf") for run in ("first", "rest"))
-    assert code == 0 and first.marks == Marks(0.0, 29.97) and rest.marks == Marks(first.times[-1], 50.0)
-    late = rest.times - rest.marks.at(np.arange(6))
-    assert (late >= -1e-9).all() and (late < 0.004).all()
+    """It is kept, and counts from where a run begins."""
+    run = ("run", "scene.toml", "--out")
+    cortado_command(*run, "first", "--steps", 5, "--fps", 29.97)
+    for more in ([], ["--state", "first"]):
+        code, _, _ = cortado_command(*run, "rest", "--time", 0.2, "--fps", 50, "--overwrite", *more)
+        first, rest = (Trajectory.load(f"{name}/trajectory.vtkhdf") for name in ("first", "rest"))
+        assert code == 0 and len(rest.times) == 11 and first.marks == Marks(0.0, 29.97)
+        assert rest.marks == Marks(first.times[-1] if more else 0.0, 50.0)
+        late = rest.times - rest.marks.at(np.arange(11))
+        assert (late >= -1e-9).all() and (late < 0.004).all()
+    assert json.loads(Path("rest/environment.json").read_text())["settings"]["fps"] == 50
 
 
 @pytest.mark.parametrize(
@@ -396,10 +380,9 @@ def test_wrong_arguments_are_sentences(cortado_command, options, words):
 
 def test_another_run_is_not_gone_on_with(cortado_command):
     cortado_command("run", "scene.toml", "--out", "dam", "--steps", 3)
-    code, _, err = cortado_command("run", "scene.toml", "--out", "dam", "--steps", 4, "--resume")
-    assert code == 2 and "steps" in err
-    code, _, err = cortado_command("run", "scene.toml", "--out", "dam", "--steps", 3)
-    assert code == 2 and "--resume" in err
+    for options, word in (([4, "--resume"], "steps"), ([3], "--resume")):
+        code, _, err = cortado_command("run", "scene.toml", "--out", "dam", "--steps", *options)
+        assert code == 2 and word in err
 
 
 def test_the_middle_of_a_run_has_no_backward_pass():

@@ -13,6 +13,7 @@ from cortado.errors import InputError, unwarned
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.fluid_particles import fluid_particles, period
 from cortado.scene.stability import stability_limits
+from scenes import bodies, box
 from test_packing import densities
 
 SPACING = 0.05
@@ -20,15 +21,7 @@ SPACING = 0.05
 
 def scene_of(dimension: int, fluid, container=None, spacing: float = SPACING) -> Scene:
     phases = [{"name": name, "rest_density": 1000, "viscosity": 0.0} for name in ("oil", "water")]
-    fluids = [{"phase": "water"} | body for body in fluid]
-    data = {"dimension": dimension, "discretisation": {"spacing": spacing}, "phase": phases, "fluid": fluids}
-    if container is not None:
-        data["container"] = container
-    return Scene(**data, solver={"kind": "pcisph", "time_step": 1e-4})
-
-
-def box(lower, upper, **more) -> dict:
-    return {"shape": "box", "lower": lower, "upper": upper, **more}
+    return bodies(dimension, fluid, container, spacing, phase=phases)
 
 
 def nearest(points: np.ndarray) -> float:
@@ -282,10 +275,9 @@ def test_a_first_lattice_can_be_jittered(tmp_path):
     """Particles of bodies alone, not points of a file or those in a nozzle; the same in every run."""
     points = tmp_path / "points.npy"
     np.save(points, [[0.9, 0.1], [0.9, 0.3]])
-    bodies = [box([0.0, 0.0], [0.5, 0.5]), {"shape": "points", "file": str(points)}]
-    even = scene_of(2, bodies).replaced(
-        'emitter={phase="oil", outlet=[0.7, 1.0], radius=0.1, length=0.2, flow_rate=0.01}'
-    )
+    nozzle = 'emitter={phase="oil", outlet=[0.7, 1.0], radius=0.1, length=0.2, flow_rate=0.01}'
+    fluid = [box([0.0, 0.0], [0.5, 0.5]), {"shape": "points", "file": str(points)}]
+    even = scene_of(2, fluid).replaced(nozzle)
     stirred = even.replaced("discretisation.jitter=0.2")
     moves = discretise(stirred).fluid.positions - discretise(even).fluid.positions
     assert np.abs(moves[:100]).max() <= 0.2 * SPACING and np.abs(moves[:100]).std() > 0.05 * SPACING
@@ -296,38 +288,21 @@ def test_a_first_lattice_can_be_jittered(tmp_path):
         even.replaced("discretisation.jitter=0.4")
 
 
-def boxes_of_fluid(dimension, *boxes, lower=0.0, upper=2.0):
+def boxes_of_fluid(dimension, *corners):
     """Boxes of fluid, each from a lower to an upper corner."""
-    fluid = [{"shape": "box", "lower": low, "upper": high, "phase": "water"} for low, high in boxes]
-    return Scene(
-        name="boxes",
-        dimension=dimension,
-        discretisation={"spacing": SPACING},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.01}],
-        fluid=fluid,
-        container={"shape": "box", "lower": [lower] * dimension, "upper": [upper] * dimension},
-        solver={"kind": "pcisph", "time_step": 0.001},
-    )
+    return scene_of(dimension, [box(*pair) for pair in corners], box([0.0] * dimension, [2.0] * dimension))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("offset", np.arange(5) / 5.0 + 0.1)
 def test_a_box_within_another_is_refused(dimension, offset):
-    """At any place of its particles between those of the other, and in either order."""
+    """At any place of its particles between those of the other, and in either order; and one that is half in it."""
     low = 0.4 + offset * SPACING
     large, small = ([0.0] * dimension, [1.0] * dimension), ([low] * dimension, [low + 0.1] * dimension)
-    for boxes in ((large, small), (small, large)):
+    half = [0.6 + offset * SPACING] * dimension, [1.1 + offset * SPACING] * dimension
+    for pair in ((large, small), (small, large), (large, half)):
         with pytest.raises(SceneError, match=r"fluid\[1\] is overlapping fluid\[0\] at"):
-            boxes_of_fluid(dimension, *boxes)
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_a_box_half_in_another_is_refused(dimension):
-    half = 0.5 * SPACING
-    with pytest.raises(SceneError, match="overlapping"):
-        boxes_of_fluid(
-            dimension, ([0.0] * dimension, [0.5] * dimension), ([0.3 + half] * dimension, [0.8 + half] * dimension)
-        )
+            boxes_of_fluid(dimension, *pair)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -335,33 +310,23 @@ def test_a_box_half_in_another_is_refused(dimension):
 def test_a_box_may_stand_in_a_corner_of_others(dimension, gap):
     """Nearer than a lattice by some of a spacing, or further away; the floor and the walls are boxes of fluid."""
     side, at = 0.5, 0.5 + gap * SPACING
-    floor = ([0.0] * dimension, [1.0, side, 1.0][:dimension])
-    wall = ([0.0, side, 0.0][:dimension], [side, 1.0, 1.0][:dimension])
-    boxes = [floor, wall]
+    boxes = [
+        ([0.0] * dimension, [1.0, side, 1.0][:dimension]),
+        ([0.0, side, 0.0][:dimension], [side, 1.0, 1.0][:dimension]),
+    ]
     if dimension == 3:
         boxes.append(([side, side, 0.0], [1.0, 1.0, side]))
     boxes_of_fluid(dimension, *boxes, ([at] * dimension, [at + 0.3] * dimension))
 
 
-WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.0}
-
-
-def spinning_bodies(dimension, *fluid, **more):
+def spinning_bodies(dimension, *fluid):
     forces = {"gravity": [0.0] * dimension, "viscosity": "none"}
-    tables = {
-        "solver": {"kind": "pcisph", "time_step": 0.001},
-        "discretisation": {"spacing": 0.1},
-        "phase": [WATER],
-        "forces": forces,
-        "container": {"shape": "none"},
-    }
-    return Scene(dimension=dimension, fluid=[{"phase": "water", **one} for one in fluid], **tables, **more)
+    return bodies(dimension, fluid, spacing=0.1, forces=forces, solver={"kind": "pcisph", "time_step": 0.001})
 
 
 def test_a_rectangle_spins_counterclockwise_besides_its_velocity():
-    box = {"shape": "box", "lower": [1.0, 0.0], "upper": [2.0, 0.6], "velocity": [0.3, 0.0], "angular_velocity": 2.0}
-    rest = {"shape": "box", "lower": [3.0, 0.0], "upper": [3.4, 0.4]}
-    simulation = Simulation(spinning_bodies(2, box, rest), precision="float64")
+    turning = box([1.0, 0.0], [2.0, 0.6], velocity=[0.3, 0.0], angular_velocity=2.0)
+    simulation = Simulation(spinning_bodies(2, turning, box([3.0, 0.0], [3.4, 0.4])), precision="float64")
     arms = simulation.positions[:60] - [1.5, 0.3]
     wanted = np.stack([0.3 - 2.0 * arms[:, 1], 2.0 * arms[:, 0]], axis=1)
     np.testing.assert_allclose(simulation.velocities[:60], wanted, atol=1e-12)
@@ -380,15 +345,10 @@ def test_a_sphere_spins_where_its_particles_were_packed(axis):
 
 
 def test_the_time_step_knows_how_fast_the_fastest_particle_is():
-    box = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}
-    still, spinning = (stability_limits(spinning_bodies(2, {**box, "angular_velocity": w})) for w in (0.0, 50.0))
-    greatest = np.linalg.norm(
-        Simulation(spinning_bodies(2, {**box, "angular_velocity": 50.0})).velocities, axis=1
-    ).max()
-    assert spinning["speed"] < still["speed"]
-    assert (
-        spinning_bodies(2, {**box, "angular_velocity": 50.0}).fluid[0].greatest_speed(0.1) >= (1.0 - 1e-12) * greatest
-    )
+    still, spinning = (spinning_bodies(2, box([0.0, 0.0], [1.0, 1.0], angular_velocity=w)) for w in (0.0, 50.0))
+    assert stability_limits(spinning)["speed"] < stability_limits(still)["speed"]
+    greatest = np.linalg.norm(Simulation(spinning).velocities, axis=1).max()
+    assert spinning.fluid[0].greatest_speed(0.1) >= (1.0 - 1e-12) * greatest
 
 
 @pytest.mark.parametrize(
@@ -396,6 +356,5 @@ def test_the_time_step_knows_how_fast_the_fastest_particle_is():
     [(2, [1.0, 0.0, 0.0], "one number in 2-D"), (3, 1.0, "a list of 3 components"), (2, "fast", "angular_velocity")],
 )
 def test_wrong_spins_are_sentences(dimension, spin, words):
-    lower, upper = [0.0] * dimension, [1.0] * dimension
     with pytest.raises(SceneError, match=words):
-        spinning_bodies(dimension, {"shape": "box", "lower": lower, "upper": upper, "angular_velocity": spin})
+        spinning_bodies(dimension, box([0.0] * dimension, [1.0] * dimension, angular_velocity=spin))

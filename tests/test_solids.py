@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 
 from cortado import CortadoWarning, DivergedError, InputError, Problem, SceneError, Simulation
-from cortado.discretise.calibration import rest_volume
-from cortado.discretise.shapes import pairs_within
-from cortado.discretise.smoothing import smoothing_kernel
 from cortado.losses import CentreOfMass
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.solids import BoxSolid, CapsuleSolid, CupSolid, CylinderSolid, PolygonSolid, SphereSolid, solids_of
 from finite_differences import both_modes, central_difference
 from held_water import cup_turned, meshes, stirred
 from scenes import box, pool
+from test_packing import densities
 
 AT = {"name": "a", "base": [0.1, 0.2, 0.3], "radius": 0.4}
 SOLIDS = {
@@ -127,17 +125,6 @@ def full(table, **tables):
     """A tank full of fluid around, or in, a solid."""
     block = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "phase": "water"}
     return scene([table], fluid=[block], **tables)
-
-
-def densities(one, discrete):
-    """(n,) those of first particles, over that of the lattice."""
-    kernel, support = smoothing_kernel(one.discretisation.kernel), one.discretisation.support_radius
-    x, walls, d = discrete.fluid.positions, discrete.walls, one.dimension
-    i, _, apart = pairs_within(x, x, support)
-    k, b, from_walls = pairs_within(x, walls.positions, support)
-    sums = np.bincount(i, kernel.weight(apart, d, support), len(x))
-    sums += np.bincount(k, walls.weights[b] * kernel.weight(from_walls, d, support), len(x))
-    return rest_volume(kernel, one.discretisation.spacing, support, d) * sums
 
 
 TURNED_TANK = {"shape": "box", "lower": [0.2, 0.2], "upper": [0.8, 0.8], "rotation": 0.4, "side": "inside"}

@@ -53,16 +53,14 @@ for _ in range(60):
 def example(dimension: int, dtype: type = np.float64) -> Trajectory:
     generator = np.random.default_rng(7)
     positions, velocities = generator.normal(size=(2, 4, 6, dimension)).astype(dtype)
+    diagnostics = {"iterations": [5, 4, 3, 9, 2], "density_errors": [0.1, 0.02, 0.03, 0.2, 0.01]}
+    diagnostics["converged"] = [True, True, True, False, True]
     return Trajectory(
         times=np.array([0.0, 0.1, 0.2, 0.25]),
         steps=np.array([0, 2, 4, 5]),
         positions=positions,
         velocities=velocities,
-        diagnostics={
-            "iterations": np.array([5, 4, 3, 9, 2]),
-            "density_errors": np.array([0.1, 0.02, 0.03, 0.2, 0.01]),
-            "converged": np.array([True, True, True, False, True]),
-        },
+        diagnostics={name: np.array(values) for name, values in diagnostics.items()},
         others={"emitted": np.array([[0.0], [0.1], [0.2], [0.3]])},
         constants={"reference_density": np.full(6, 1000.0)},
     )
@@ -125,25 +123,19 @@ def test_vtk_sees_every_frame(tmp_path, dimension):
 
 
 def test_file_can_be_read_while_it_grows(tmp_path):
-    rows = np.ones((5, 2))
-    with TrajectoryWriter(
-        tmp_path / "a.vtkhdf",
-        times=np.arange(9),
-        particles=5,
-        dimension=2,
-        precision="float64",
-        scalars=["pressure", "density"],
-    ) as writer:
-        assert not (tmp_path / "a.vtkhdf").exists()
+    rows, file = np.ones((5, 2)), tmp_path / "a.vtkhdf"
+    options = {"particles": 5, "dimension": 2, "precision": "float64", "scalars": ["pressure", "density"]}
+    with TrajectoryWriter(file, times=np.arange(9), **options) as writer:
+        assert not file.exists()
         for k in range(3):
             writer.append(k * rows, rows, density=1000.0 + np.arange(5) + k, pressure=np.full(5, k))
-            arrays = read(tmp_path / "a.vtkhdf")
+            arrays = read(file)
             assert arrays["times"].tolist() == list(range(k + 1)) == arrays["steps"].tolist()
             assert arrays["positions"].shape == (k + 1, 5, 2)
             np.testing.assert_array_equal(arrays["positions"][k], k * rows)
             np.testing.assert_array_equal(arrays["density"][k], 1000.0 + np.arange(5) + k)
             np.testing.assert_array_equal(arrays["pressure"][k], np.full(5, k))
-            times, frames = frames_seen_by_vtk(tmp_path / "a.vtkhdf")
+            times, frames = frames_seen_by_vtk(file)
             assert times == list(range(9))
             assert [vertices for *_, vertices in frames] == [5] * (k + 1) + [0] * (8 - k)
 
@@ -195,13 +187,9 @@ def test_missing_foreign_and_damaged_files_are_sentences(tmp_path):
         file["x"] = 1.0
     text.write_text("not a trajectory")
     cut.write_bytes(good.read_bytes()[:3000])
-    for path, words in {
-        tmp_path / "absent": "no trajectory file",
-        tmp_path: "no trajectory file",
-        foreign: "not a trajectory that Cortado wrote",
-        text: "cannot be read",
-        cut: "cannot be read",
-    }.items():
+    said = {tmp_path / "absent": "no trajectory file", tmp_path: "no trajectory file"}
+    said |= {foreign: "not a trajectory that Cortado wrote", text: "cannot be read", cut: "cannot be read"}
+    for path, words in said.items():
         with pytest.raises(InputError, match=words):
             Trajectory.load(path)
 
@@ -284,29 +272,29 @@ def test_a_disk_that_fills_up_leaves_the_frames_before(tmp_path, monkeypatch):
 
 
 def test_writer_refuses_what_was_not_announced(tmp_path):
-    rows = np.zeros((3, 2))
-    with pytest.raises(InputError, match="cannot be written"):
-        TrajectoryWriter(tmp_path / "no" / "a", times=[0.0], particles=3, dimension=2)
-    with pytest.raises(InputError, match="at least 1 frame"):
-        TrajectoryWriter(tmp_path / "a", times=[], particles=3, dimension=2)
-    sizes = {"particles": 3, "dimension": 2, "steps": 1, "diagnostics": {"iterations": int}}
-    with TrajectoryWriter(tmp_path / "a", times=[0.0], others={"outlet": np.zeros((1, 2))}, **sizes) as writer:
-        with pytest.raises(InputError, match=r"positions of shape \(3, 2\)"):
-            writer.append(np.zeros((3, 3)), rows, others={"outlet": np.zeros((1, 2))})
-        with pytest.raises(InputError, match="pressure"):
-            writer.append(rows, rows, pressure=np.zeros(3))
-        with pytest.raises(InputError, match=r"the other fields \['outlet'\], found \[\]"):
-            writer.append(rows, rows)
-        with pytest.raises(InputError, match=r"outlet of shape \(1, 2\), found \(2,\)"):
-            writer.append(rows, rows, others={"outlet": np.zeros(2)})
-        writer.append(rows, rows, others={"outlet": np.zeros((1, 2))})
+    rows, outlet = np.zeros((3, 2)), {"outlet": np.zeros((1, 2))}
+    sizes = {"particles": 3, "dimension": 2}
+    for place, times, words in [("no/a", [0.0], "cannot be written"), ("a", [], "at least 1 frame")]:
+        with pytest.raises(InputError, match=words):
+            TrajectoryWriter(tmp_path / place, times=times, **sizes)
+    counted = {"steps": 1, "diagnostics": {"iterations": int}}
+    with TrajectoryWriter(tmp_path / "a", times=[0.0], others=outlet, **sizes, **counted) as writer:
+        for positions, more, words in [
+            (np.zeros((3, 3)), {"others": outlet}, r"positions of shape \(3, 2\)"),
+            (rows, {"pressure": np.zeros(3)}, "pressure"),
+            (rows, {}, r"the other fields \['outlet'\], found \[\]"),
+            (rows, {"others": {"outlet": np.zeros(2)}}, r"outlet of shape \(1, 2\), found \(2,\)"),
+        ]:
+            with pytest.raises(InputError, match=words):
+                writer.append(positions, rows, **more)
+        writer.append(rows, rows, others=outlet)
         with pytest.raises(InputError, match="1 frames, and one more"):
             writer.append(rows, rows)
         with pytest.raises(InputError, match="1 steps, and 2 came"):
             writer.append_steps(iterations=[5, 5])
         with pytest.raises(InputError, match=r"the diagnostics \['iterations'\], found \['density_errors'\]"):
             writer.append_steps(density_errors=[0.1])
-    with TrajectoryWriter(tmp_path / "b", times=[0.0], particles=3, dimension=2):
+    with TrajectoryWriter(tmp_path / "b", times=[0.0], **sizes):
         pass
     assert os.listdir(tmp_path) == ["a"]
 

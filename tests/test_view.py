@@ -1,6 +1,8 @@
 """``cortado view``, without a browser: what its page is given."""
 
+import sys
 import urllib.request
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +23,7 @@ from remembering_force import Memory, U
 viser = pytest.importorskip("viser")
 PORT = 18310
 NOZZLE = """
-[emitter]
-phase = "water"
-outlet = [0.3, 0.55]
-radius = 0.05
-length = 0.2
-flow_rate = 0.05
+emitter = {phase = "water", outlet = [0.3, 0.55], radius = 0.05, length = 0.2, flow_rate = 0.05}
 """
 
 
@@ -37,11 +34,18 @@ def scene(tmp_path, monkeypatch) -> Path:
     return tmp_path / "scene.toml"
 
 
+@contextmanager
+def window(place, port, precision="float32"):
+    """Of a file or a folder; it is closed afterwards."""
+    shown = opened(place, [], "cpu", precision, port)
+    with closing(shown.window):
+        yield shown
+
+
 @pytest.fixture
 def live(scene):
-    shown = opened(scene, [], "cpu", "float32", PORT)
-    yield shown
-    shown.window.close()
+    with window(scene, PORT) as shown:
+        yield shown
 
 
 def points(shown) -> np.ndarray:
@@ -83,15 +87,12 @@ def test_what_cannot_be_computed_is_said_and_the_window_goes_on(live):
 
 
 def test_a_nozzle_follows_its_sliders(scene):
-    scene.write_text(TINY_SCENE + NOZZLE)
-    shown = opened(scene, [], "cpu", "float32", PORT + 2)
-    try:
+    scene.write_text(NOZZLE + TINY_SCENE)
+    with window(scene, PORT + 2) as shown:
         shown.tick()
         shown.nozzle[0].value = 0.4
         shown.tick()
         np.testing.assert_allclose(np.ravel(shown._state["outlet"])[:2], [0.4, 0.55], atol=1e-6)
-    finally:
-        shown.window.close()
 
 
 def coloured(shown, name: str) -> np.ndarray:
@@ -160,13 +161,10 @@ def test_arrows_point_where_the_loss_pulls(live):
 
 def test_what_a_solver_does_not_know_is_said_in_a_sentence(scene, live, monkeypatch):
     scene.write_text(TINY_SCENE + "[forces]\npressure = false\n")
-    shown = opened(scene, [], "cpu", "float32", PORT + 3)
-    try:
+    with window(scene, PORT + 3) as shown:
         own = coloured(shown, "phase")
         np.testing.assert_array_equal(coloured(shown, "pressure"), own)
         assert "without a pressure" in shown.window.legend.content
-    finally:
-        shown.window.close()
     monkeypatch.setattr(view_window, "ParticleSolver", int)  # a solver of another kind
     own = coloured(live, "phase")
     np.testing.assert_array_equal(coloured(live, "density"), own)
@@ -176,9 +174,8 @@ def test_what_a_solver_does_not_know_is_said_in_a_sentence(scene, live, monkeypa
 @pytest.fixture
 def task(scene):
     scene.write_text(GOOD_TASK)
-    shown = opened(scene, [], "cpu", "float32", PORT + 4)
-    yield shown
-    shown.window.close()
+    with window(scene, PORT + 4) as shown:
+        yield shown
 
 
 def test_a_task_goes_on_one_step_of_its_search_at_a_time(task):
@@ -223,8 +220,7 @@ def test_a_step_that_fails_says_why(task, monkeypatch):
 
 def test_a_run_is_played_and_gone_through(scene):
     main(["run", "scene.toml", "--steps", "4", "--out", "a", "--no-pictures"])
-    shown = opened(Path("a"), [], "cpu", None, PORT + 1)
-    try:
+    with window(Path("a"), PORT + 1, None) as shown:
         trajectory = Trajectory.load("a/trajectory.vtkhdf")
         shown.show(3)
         np.testing.assert_allclose(points(shown)[:, :2], trajectory.positions[3], atol=1e-6)
@@ -234,43 +230,41 @@ def test_a_run_is_played_and_gone_through(scene):
         shown._former -= 1.0
         shown.tick()
         assert shown.slider.value > 0
-    finally:
-        shown.window.close()
 
 
 def test_the_field_of_a_part_colours_particles(scene):
     simulation = cortado.Simulation("scene.toml", forces=[Memory()])
-    for shown in (
-        LiveView(simulation, PORT + 2),
-        RecordedView(simulation.scene, simulation.run(3), lambda: simulation, PORT + 3),
-    ):
-        try:
+    recorded = RecordedView(simulation.scene, simulation.run(3), lambda: simulation, PORT + 3)
+    for shown in (LiveView(simulation, PORT + 2), recorded):
+        with closing(shown.window):
             for _ in range(3):
                 shown.tick()
-            if isinstance(shown, RecordedView):
+            if shown is recorded:
                 shown.show(3)
             assert len(np.unique(coloured(shown, "phase"), axis=0)) == 1
             assert len(np.unique(coloured(shown, U.name), axis=0)) > 1
             assert U.name in shown.window.legend.content
-        finally:
-            shown.window.close()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [(["a", "--set", "solver.time_step=1"], "--set is given"), (["b"], "no run in"), (["c.toml"], "c.toml")],
-)
-def test_what_cannot_be_shown_is_said_in_a_sentence(scene, arguments, sentence, capsys):
-    main(["run", "scene.toml", "--steps", "1", "--out", "a", "--no-pictures"])
+CANNOT = [
+    (["a", "--set", "solver.time_step=1"], "--set is given"),
+    (["b"], "no run in"),
+    (["c.toml"], "c.toml"),
+    (["absent"], "absent does not exist, but"),
+    (["."], "There is no run in "),
+]
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), CANNOT)
+def test_what_cannot_be_shown_is_said_in_a_sentence(scene, arguments, sentence, cortado_command):
+    assert cortado_command("run", "scene.toml", "--steps", 1, "--out", "a", "--no-pictures")[0] == 0
     Path("b").mkdir()
-    with pytest.raises(SystemExit) as end:
-        main(["view", *arguments])
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert end.value.code == 2 and sentence in error
+    code, out, error = cortado_command("view", *arguments)
+    assert (code, out) == (2, "") and sentence in error and len(error.splitlines()) == 1
 
 
 def test_without_viser_a_sentence_says_what_to_install(scene, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "viser", None)
+    monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(cortado.InputError, match=r"pip install viser"):
         opened(scene, [], "cpu", "float32", PORT)
 
@@ -305,15 +299,14 @@ def test_solids_are_seen_where_they_are(scene, dimension):
     rod = ROD.replace("0.1, 0.1]", "0.1]").replace("0.5, 0.2]", "0.5]").replace("[0.2, 0.3, 0.4]", "0.4")
     gravity = "\n[forces]\ngravity = [0.0, 0.0, -9.81]\n"
     scene.write_text(TINY_SCENE + rod if dimension == 2 else IN_SPACE + gravity + ROD)
-    shown = opened(scene, [], "cpu", "float32", PORT + 5)
-    try:
-        window, made = shown.window, shown.simulation.scene
-        (frame,) = window._solids
-        nodes = window.server.scene._handle_from_node_name
+    with window(scene, PORT + 5) as shown:
+        seen, made = shown.window, shown.simulation.scene
+        (frame,) = seen._solids
+        nodes = seen.server.scene._handle_from_node_name
         w, x, y, z = frame.wxyz
         turn = Rotation.from_quat([x, y, z, w]).as_matrix()
         lines = np.array(nodes["/solid_0/edges"].points) @ turn.T + frame.position
-        np.testing.assert_allclose(lines, window._space(solid_outline(made)), atol=1e-6)
+        np.testing.assert_allclose(lines, seen._space(solid_outline(made)), atol=1e-6)
         assert ("/solid_0/faces" in nodes) == (dimension == 3)
         if dimension == 3:
             mesh = nodes["/solid_0/faces"]
@@ -321,14 +314,6 @@ def test_solids_are_seen_where_they_are(scene, dimension):
             found = np.unique(np.round(lines.reshape(-1, 3), 5), axis=0)
             np.testing.assert_allclose(np.unique(np.round(places, 5), axis=0), found, atol=2e-5)
             assert tuple(mesh.color) == tuple(to_srgb(np.array([[[0.7, 0.3, 0.05]]]))[0, 0])
-        window.place_solids(made.model_copy(update={"solid": (made.solid[0].model_copy(update=MOVED[dimension]),)}))
-        np.testing.assert_allclose(frame.position, window._space(np.array(MOVED[dimension]["position"])), atol=1e-6)
+        seen.place_solids(made.model_copy(update={"solid": (made.solid[0].model_copy(update=MOVED[dimension]),)}))
+        np.testing.assert_allclose(frame.position, seen._space(np.array(MOVED[dimension]["position"])), atol=1e-6)
         assert np.abs(frame.wxyz - [w, x, y, z]).max() > 0.05
-    finally:
-        shown.window.close()
-
-
-@pytest.mark.parametrize("path, words", [("absent", "absent does not exist, but"), (".", "There is no run in ")])
-def test_neither_a_run_nor_a_scene(scene, cortado_command, path, words):
-    code, out, err = cortado_command("view", path)
-    assert (code, out) == (2, "") and words in err and len(err.splitlines()) == 1

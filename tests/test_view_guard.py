@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing, contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -29,26 +29,22 @@ exceptions = pytest.importorskip("websockets.exceptions")
 PORT = 18510
 PATIENCE = 5.0
 """[s] that a message has to arrive."""
-CAMERA = {
-    "type": "ViewerCameraMessage",
-    "wxyz": [1, 0.0, 0.0, 0.0],
-    "position": [0.0, 0.0, 1.0],
-    "fov": 1.3,
-    "near": 0.01,
-    "far": 1000,
-    "image_height": 800,
-    "image_width": 1000,
-    "look_at": [0.0, 0.0, 0.0],
-    "up_direction": [0.0, 1.0, 0.0],
-}
+CAMERA = {"type": "ViewerCameraMessage", "wxyz": [1, 0.0, 0.0, 0.0], "position": [0.0, 0.0, 1.0], "fov": 1.3}
+CAMERA |= {"look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 1.0, 0.0], "near": 0.01, "far": 1000}
+CAMERA |= {"image_height": 800, "image_width": 1000}
 """As viser's page sends it."""
 
 
 @pytest.fixture
-def live(tmp_path, monkeypatch) -> Iterator[Any]:
+def file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
-    shown = opened(tmp_path / "scene.toml", [], "cpu", "float32", PORT)
+    return tmp_path / "scene.toml"
+
+
+@pytest.fixture
+def live(file) -> Iterator[Any]:
+    shown = opened(file, [], "cpu", "float32", PORT)
     yield shown
     shown.window.close()
 
@@ -80,8 +76,18 @@ def joined(port: int, path: str, host: str = "127.0.0.1", **options: Any) -> Any
     )
 
 
-def say(page: Any, message: Any) -> None:
-    page.send(msgspec.msgpack.encode(message))
+def say(page: Any, *messages: Any) -> None:
+    for message in messages:
+        page.send(msgspec.msgpack.encode(message))
+
+
+@contextmanager
+def heard(shown: Any, **options: Any) -> Iterator[Any]:
+    """A page of a window that it knows of."""
+    with joined(*place(shown), **options) as page:
+        say(page, CAMERA)
+        until(shown.window.server.get_clients)
+        yield page
 
 
 def update(handle: Any, **updates: Any) -> dict[str, Any]:
@@ -108,13 +114,12 @@ def test_the_address_shows_the_page(live):
 
 def test_two_windows_have_two_tokens(live, tmp_path):
     other = opened(tmp_path / "scene.toml", [], "cpu", "float32", PORT)
-    try:
+    with closing(other.window):
         (port, path), (its_port, its_path) = place(live), place(other)
         assert its_port != port and its_path != path and answer(its_port, path)[0] == 403
-    finally:
-        other.window.close()
 
 
+EVIL = "evil.example:{port}"
 STRANGERS = {
     "no token": ("/", ()),
     "no path": ("/index.html", ()),
@@ -132,11 +137,8 @@ STRANGERS = {
     "origin that begins like its own": ("{token}/", (("Origin", "http://127.0.0.1:{port}.evil.example"),)),
     "origin by another name": ("{token}/", (("Origin", "http://localhost:{port}"),)),
     "two origins": ("{token}/", (("Origin", "http://127.0.0.1:{port}"), ("Origin", "http://evil.example"))),
-    "foreign name": ("{token}/", (("Host", "evil.example:{port}"),)),
-    "foreign name and origin": (
-        "{token}/",
-        (("Host", "evil.example:{port}"), ("Origin", "http://evil.example:{port}")),
-    ),
+    "foreign name": ("{token}/", (("Host", EVIL),)),
+    "foreign name and origin": ("{token}/", (("Host", EVIL), ("Origin", "http://" + EVIL))),
     "name without port": ("{token}/", (("Host", "127.0.0.1"),)),
     "two names": ("{token}/", (("Host", "127.0.0.1:{port}"), ("Host", "evil.example"))),
 }
@@ -166,10 +168,8 @@ def test_its_own_page_and_programs_with_the_token_are_heard(live, origin):
     port, path = place(live)
     with joined(port, path.rstrip("/"), origin=origin and origin.format(port=port)) as page:
         assert isinstance(page.recv(PATIENCE), bytes)
-        say(page, CAMERA)
-        until(live.window.server.get_clients)
-        say(page, update(live.running, value=False))
-        until(lambda: not live.running.value)
+        say(page, CAMERA, update(live.running, value=False))
+        until(lambda: live.window.server.get_clients() and not live.running.value)
 
 
 NAN, HUGE = math.nan, math.inf
@@ -204,56 +204,47 @@ def test_values_that_no_control_has_are_left_aside(live, attack):
     name, updates = HOSTILE[attack]
     control = {"colour": live.window.colour, "gravity": live.gravity[1], "running": live.running}[name]
     state = control._impl
-    before = (state.value, state.is_button, list(state.update_cb), control.label, control.disabled)
-    port, path = place(live)
-    with joined(port, path) as page:
-        say(page, CAMERA)
-        until(live.window.server.get_clients)
-        say(page, update(control, **updates))
-        say(page, update(live.gravity[0], value=3.0))  # is heard after it
+
+    def now() -> tuple[Any, ...]:
+        return state.value, state.is_button, list(state.update_cb), control.label, control.disabled
+
+    before = now()
+    with heard(live) as page:
+        say(page, update(control, **updates), update(live.gravity[0], value=3.0))  # is heard after it
         until(lambda: live.gravity[0].value == 3.0)
-    after = (state.value, state.is_button, list(state.update_cb), control.label, control.disabled)
-    assert after == before
+    assert now() == before
     live.tick()
     goes_on(live)
 
 
+packed = msgspec.msgpack.encode
+UPDATE = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 1}}
+UPLOAD = dict.fromkeys(("source_component_uuid", "transfer_uuid", "filename", "mime_type"), "a")
 NO_MESSAGES = {
     "no message": b"\x00\x01",
     "nothing": b"",
     "text": "{}",
-    "number": msgspec.msgpack.encode(1),
-    "no type": msgspec.msgpack.encode({"uuid": "a"}),
-    "unknown type": msgspec.msgpack.encode({"type": "Evil"}),
-    "type of a type": msgspec.msgpack.encode({"type": ["GuiUpdateMessage"]}),
-    "no such control": msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 1}}),
-    "no name": msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": [], "updates": {"value": 1}}),
-    "no updates": msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": 1}),
+    "number": packed(1),
+    "no type": packed({"uuid": "a"}),
+    "unknown type": packed({"type": "Evil"}),
+    "type of a type": packed({"type": ["GuiUpdateMessage"]}),
+    "no such control": packed(UPDATE),
+    "no name": packed({**UPDATE, "uuid": []}),
+    "no updates": packed({**UPDATE, "updates": 1}),
     "deep": 100_000 * b"\x91" + b"\x01",
     "long": b"\xc4" + 40_000_000 * b"\x00",
-    "camera without a place": msgspec.msgpack.encode({"type": "ViewerCameraMessage"}),
-    "camera of texts": msgspec.msgpack.encode({**CAMERA, "position": ["a", "b", "c"]}),
-    "camera in the plane": msgspec.msgpack.encode({**CAMERA, "position": [1.0]}),
-    "camera nowhere": msgspec.msgpack.encode({**CAMERA, "image_height": NAN}),
-    "camera with more": msgspec.msgpack.encode({**CAMERA, "evil": 1}),
-    "an upload": msgspec.msgpack.encode(
-        {
-            "type": "FileTransferStartUpload",
-            "source_component_uuid": "a",
-            "transfer_uuid": "b",
-            "filename": "c",
-            "mime_type": "d",
-            "part_count": 1,
-            "size_bytes": 1,
-        }
-    ),
+    "camera without a place": packed({"type": "ViewerCameraMessage"}),
+    "camera of texts": packed({**CAMERA, "position": ["a", "b", "c"]}),
+    "camera in the plane": packed({**CAMERA, "position": [1.0]}),
+    "camera nowhere": packed({**CAMERA, "image_height": NAN}),
+    "camera with more": packed({**CAMERA, "evil": 1}),
+    "an upload": packed({"type": "FileTransferStartUpload", **UPLOAD, "part_count": 1, "size_bytes": 1}),
 }
 
 
 @pytest.mark.parametrize("attack", NO_MESSAGES)
 def test_what_is_no_message_is_left_aside(live, attack, capfd):
-    port, path = place(live)
-    with joined(port, path) as page:
+    with joined(*place(live)) as page:
         try:
             page.send(NO_MESSAGES[attack])
             say(page, CAMERA)
@@ -266,14 +257,10 @@ def test_what_is_no_message_is_left_aside(live, attack, capfd):
 
 def goes_on(live: Any) -> None:
     """A window does what another page says, and its next picture is right."""
-    port, path = place(live)
-    with joined(port, path) as page:
-        say(page, CAMERA)
-        say(page, update(live.running, value=False))
-        say(page, update(live.running, value=True))
+    with joined(*place(live)) as page:
+        say(page, CAMERA, update(live.running, value=False), update(live.running, value=True))
         say(page, update(live.window.colour, value="phase"))
-        say(page, update(live.gravity[0], value=0))  # the page writes whole numbers so
-        say(page, update(live.gravity[1], value=9.81))
+        say(page, update(live.gravity[0], value=0), update(live.gravity[1], value=9.81))  # as the page writes them
         until(lambda: live.gravity[1].value == 9.81 and live.window.colour.value == "phase")
     before = live._state
     live.tick()
@@ -283,10 +270,7 @@ def goes_on(live: Any) -> None:
 
 
 def test_a_slider_goes_to_both_its_ends(live):
-    port, path = place(live)
-    with joined(port, path) as page:
-        say(page, CAMERA)
-        until(live.window.server.get_clients)
+    with heard(live) as page:
         for slider in live.gravity:
             for end in (slider.max, slider.min):
                 shown = round(end, slider.precision)  # as the page writes it
@@ -296,29 +280,21 @@ def test_a_slider_goes_to_both_its_ends(live):
                 assert live.running.value
 
 
-def test_what_is_disabled_is_not_moved(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.toml").write_text(GOOD_TASK)
-    shown = opened(tmp_path / "scene.toml", [], "cpu", "float32", PORT)
-    try:
+def test_what_is_disabled_is_not_moved(file):
+    file.write_text(GOOD_TASK)
+    shown = opened(file, [], "cpu", "float32", PORT)
+    with closing(shown.window):
         shown.played.playing.value = False
         shown.button.disabled = True
-        with joined(*place(shown)) as page:
-            say(page, CAMERA)
-            until(shown.window.server.get_clients)
-            for value in (1.5, 99, -1, True):
-                say(page, update(shown.played.slider, value=value))
-            say(page, update(shown.button, value=True))
-            say(page, update(shown.played.slider, value=2))
+        with heard(shown) as page:
+            say(page, *(update(shown.played.slider, value=value) for value in (1.5, 99, -1, True)))
+            say(page, update(shown.button, value=True), update(shown.played.slider, value=2))
             until(lambda: shown.played.slider.value == 2)
             shown.tick()
             assert shown.taken == 0
             shown.button.disabled = False
-            say(page, update(shown.button, value=False))
-            say(page, update(shown.button, value=True))
+            say(page, update(shown.button, value=False), update(shown.button, value=True))
             until(lambda: shown._wished)
-    finally:
-        shown.window.close()
 
 
 def test_nothing_is_shared(live, monkeypatch):
@@ -326,27 +302,19 @@ def test_nothing_is_shared(live, monkeypatch):
     for name in ("request_share_url", "disconnect_share_url"):
         monkeypatch.setattr(live.window.server, name, lambda name=name: asked.append(name))
     with joined(*place(live)) as page:
-        say(page, CAMERA)
-        say(page, {"type": "ShareUrlRequest"})
-        say(page, {"type": "ShareUrlDisconnect"})
+        say(page, CAMERA, {"type": "ShareUrlRequest"}, {"type": "ShareUrlDisconnect"})
         say(page, update(live.gravity[0], value=3.0))
         until(lambda: live.gravity[0].value == 3.0)
     time.sleep(0.2)
     assert asked == []
-    themes = [one for one in sent(live) if type(one).__name__ == "ThemeConfigurationMessage"]
+    sent = live.window.server._websock_server._broadcast_buffer.message_from_id.values()
+    themes = [one for one in sent if type(one).__name__ == "ThemeConfigurationMessage"]
     assert [theme.show_share_button for theme in themes] == [False]
 
 
-def sent(shown: Any) -> list[Any]:
-    """What every page of a window is told."""
-    return list(shown.window.server._websock_server._broadcast_buffer.message_from_id.values())
-
-
 @pytest.mark.parametrize("reads", [True, False], ids=["reads", "reads nothing"])
-def test_it_ends_within_a_second_while_pages_are_connected(tmp_path, monkeypatch, reads):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.toml").write_text(TINY_SCENE)
-    shown = opened(tmp_path / "scene.toml", [], "cpu", "float32", PORT)
+def test_it_ends_within_a_second_while_pages_are_connected(file, reads):
+    shown = opened(file, [], "cpu", "float32", PORT)
     pages = [joined(*place(shown), max_queue=None if reads else 1) for _ in range(2)]  # 1: it stops at the second
     for page in pages:
         say(page, CAMERA)
@@ -362,9 +330,8 @@ def test_it_ends_within_a_second_while_pages_are_connected(tmp_path, monkeypatch
         socket.create_connection(("127.0.0.1", PORT), timeout=1.0)
 
 
-def test_ctrl_c_ends_the_command_while_a_page_is_connected(tmp_path):
-    (tmp_path / "scene.toml").write_text(TINY_SCENE)
-    words = [sys.executable, "-m", "cortado", "view", str(tmp_path / "scene.toml"), "--port", str(PORT)]
+def test_ctrl_c_ends_the_command_while_a_page_is_connected(file):
+    words = [sys.executable, "-m", "cortado", "view", str(file), "--port", str(PORT)]
     pipe = subprocess.PIPE
     with (
         subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, preexec_fn=listen) as command,
@@ -383,12 +350,11 @@ def test_ctrl_c_ends_the_command_while_a_page_is_connected(tmp_path):
         assert (command.returncode, out, err) == (0, "", "")
 
 
-def test_a_viser_that_cannot_be_guarded_is_not_started(tmp_path, monkeypatch):
+def test_a_viser_that_cannot_be_guarded_is_not_started(file, monkeypatch):
     """The canary of where the guard takes hold: `websockets.asyncio.server.serve`, which viser calls by this name."""
     import websockets.asyncio.server as own
 
     serve = own.serve
-    (tmp_path / "scene.toml").write_text(TINY_SCENE)
 
     class Elsewhere:
         asyncio = type("asyncio", (), {"server": type("server", (), {"serve": staticmethod(serve)})})
@@ -398,7 +364,7 @@ def test_a_viser_that_cannot_be_guarded_is_not_started(tmp_path, monkeypatch):
 
     monkeypatch.setattr("viser.infra._infra.websockets", Elsewhere())
     with pytest.raises(cortado.InputError, match=r"viser .* cannot be guarded"):
-        opened(tmp_path / "scene.toml", [], "cpu", "float32", PORT)
+        opened(file, [], "cpu", "float32", PORT)
     assert own.serve is serve
     with pytest.raises(OSError):
         socket.create_connection(("127.0.0.1", PORT), timeout=1.0)

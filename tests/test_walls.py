@@ -15,6 +15,8 @@ from cortado.discretise.walls import SHALLOW, RestLattice, box_walls, short_box,
 from cortado.pictures.shown_solids import solid_outline
 from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.shape_tables import BoxContainer, Container
+from scenes import bodies
+from scenes import box as corners
 from test_packing import densities as packed_densities
 from test_solids import volume_and_middle, winding
 
@@ -105,18 +107,10 @@ def test_layers_lie_behind_the_surface_in_order(name, dimension, support):
 
 def filled(container: dict[str, Any], kernel: str, support: float, solid: Any = (), **fluid: Any) -> DiscreteScene:
     """A container full of water, around solids."""
-    dimension = len(container.get("lower", container.get("base")))
     body = {key: value for key, value in container.items() if key not in ("periodic", "lid")}
-    scene = Scene(
-        dimension=dimension,
-        discretisation={"spacing": SPACING, "support": support, "kernel": kernel},
-        phase=[{"name": "water", "rest_density": 1000, "viscosity": 0.0}],
-        fluid=[{**body, "phase": "water", **fluid}],
-        container=container,
-        solid=list(solid),
-        solver={"kind": "pcisph", "time_step": 1e-4},
-    )
-    return discretise(scene)
+    cut = {"spacing": SPACING, "support": support, "kernel": kernel}
+    dimension = len(container.get("lower", container.get("base")))
+    return discretise(bodies(dimension, [{**body, **fluid}], container, discretisation=cut, solid=list(solid)))
 
 
 def densities(discrete: DiscreteScene) -> np.ndarray:
@@ -129,14 +123,13 @@ def densities(discrete: DiscreteScene) -> np.ndarray:
         tree = cKDTree(np.concatenate([points + image for image in images]))
         repeated = np.tile(weights, len(images))
         for i, near in enumerate(tree.query_ball_point(fluid, support)):
-            found[i] += repeated[near] @ kernel.weight(
-                np.linalg.norm(tree.data[near] - fluid[i], axis=1), dimension, support
-            )
+            apart = np.linalg.norm(tree.data[near] - fluid[i], axis=1)
+            found[i] += repeated[near] @ kernel.weight(apart, dimension, support)
     return discrete.lattice.volume * found / (1.0 - SLACK)
 
 
 def box(upper: list[float], **more: Any) -> dict[str, Any]:
-    return {"shape": "box", "lower": [0.0] * len(upper), "upper": [SPACING * x for x in upper], **more}
+    return corners([0.0] * len(upper), [SPACING * x for x in upper], **more)
 
 
 KINDS = pytest.mark.parametrize(
@@ -266,17 +259,8 @@ UNIT = np.array([-1.0, 2.0]) / np.sqrt(5.0)
 
 def scene(solids: list, fluid: tuple = ([0.0, 0.0], [1.0, 0.6]), container: dict | None = BOX, **more) -> Scene:
     """By default all of a tank below 0.6 m is full of water, but for what is solid."""
-    dimension = len(fluid[0])
-    return Scene(
-        dimension=dimension,
-        discretisation={"spacing": SPACING},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
-        fluid=[{"shape": "box", "lower": fluid[0], "upper": fluid[1], "phase": "water"}],
-        solid=solids,
-        solver={"kind": "projection", "time_step": 0.001},
-        **({} if container is None else {"container": container}),
-        **more,
-    )
+    solver = {"kind": "projection", "time_step": 0.001}
+    return bodies(len(fluid[0]), [corners(*fluid)], container, viscosity=1e-3, solid=solids, solver=solver, **more)
 
 
 def energies(run, gravity=9.81):
@@ -378,13 +362,10 @@ def test_a_plane_in_front_of_all_of_the_fluid_is_said():
         discretise(scene([SLOPE | {"position": [0.5, 2.0]}]))
 
 
-def test_pictures_have_a_plane_as_far_as_the_container_goes():
-    lines = solid_outline(scene([SLOPE]))
+def test_a_plane_is_in_pictures_as_far_as_the_container_goes_and_in_json():
+    table = scene([SLOPE])
+    lines = solid_outline(table)
     assert lines.min() == pytest.approx(0.0, abs=1e-12) and lines.max() == pytest.approx(1.0)
     assert np.abs((lines - SLOPE["position"]) @ UNIT).min() < 1e-12
-
-
-def test_a_scene_with_a_plane_is_the_same_out_of_its_json():
-    table = scene([SLOPE])
     again = Scene.from_json(table.to_json())
     np.testing.assert_array_equal(discretise(again).walls.positions, discretise(table).walls.positions)

@@ -103,18 +103,20 @@ LOOPS = {
 """Of each kernel: what its sum s begins as, what stands in the loop over neighbours, and what stands after it."""
 
 
-def loop_kernel(name: str) -> Any:
-    begin, body, after = LOOPS[name]
-    text = f"""def {name}(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = {begin}
-    for k in range({8 if name == "static_loop" else "count[i]"}):
-        {body.lstrip()}
-    {after}
-"""
+def kernel_of(name: str, arguments: str, body: str) -> Any:
+    text = f"def {name}({arguments}):\n    i = wp.tid()\n{body}\n"
     known = dict(globals())
     exec(text, known)
     return wp.Kernel(known[name], source=text)
+
+
+def loop_kernel(name: str) -> Any:
+    begin, body, after = LOOPS[name]
+    text = f"""    s = {begin}
+    for k in range({8 if name == "static_loop" else "count[i]"}):
+        {body.lstrip()}
+    {after}"""
+    return kernel_of(name, "x: reals, t: reals, near: lists, count: integers, out: reals", text)
 
 
 @wp.func
@@ -149,53 +151,21 @@ def function_returns_square(x: reals, t: reals, near: lists, count: integers, ou
 # ---- arrays on the tape
 
 
-@wp.kernel
-def copy_to(a: reals, b: reals):
-    i = wp.tid()
-    b[i] = a[i]
-
-
-@wp.kernel
-def multiply_in_place(a: reals, b: reals):
-    i = wp.tid()
-    b[i] *= a[i]
-
-
-@wp.kernel
-def square_in_place(b: reals):
-    i = wp.tid()
-    b[i] = b[i] * b[i]
-
-
-@wp.kernel
-def square_to(a: reals, b: reals):
-    i = wp.tid()
-    b[i] = a[i] * a[i]
-
-
-@wp.kernel
-def add_square_to(a: reals, b: reals):
-    i = wp.tid()
-    b[i] += a[i] * a[i]
-
-
-@wp.kernel
-def length_to(a: reals, b: reals):
-    i = wp.tid()
-    b[i] = wp.length(wp.vec3d(a[i], a[i], a[i]))
-
-
-@wp.kernel
-def guarded_root_where(a: reals, b: reals):
-    i = wp.tid()
-    b[i] = wp.where(a[i] > real(0.0), wp.sqrt(a[i]), real(0.0))
-
-
-@wp.kernel
-def guarded_root_if(a: reals, b: reals):
-    i = wp.tid()
-    if a[i] > real(0.0):
-        b[i] = wp.sqrt(a[i])
+ARRAYS = {
+    "copy_to": "b[i] = a[i]",
+    "multiply_in_place": "b[i] *= a[i]",
+    "square_in_place": "b[i] = b[i] * b[i]",
+    "square_to": "b[i] = a[i] * a[i]",
+    "add_square_to": "b[i] += a[i] * a[i]",
+    "length_to": "b[i] = wp.length(wp.vec3d(a[i], a[i], a[i]))",
+    "guarded_root_where": "b[i] = wp.where(a[i] > real(0.0), wp.sqrt(a[i]), real(0.0))",
+    "guarded_root_if": "if a[i] > real(0.0):\n        b[i] = wp.sqrt(a[i])",
+}
+"""What each kernel writes to b, of a or in place."""
+KERNELS = {
+    name: kernel_of(name, "b: reals" if name == "square_in_place" else "a: reals, b: reals", f"    {body}")
+    for name, body in ARRAYS.items()
+}
 
 
 # ---- the harness
@@ -205,8 +175,8 @@ def array(values: Any, grad: bool = True) -> Any:
     return wp.array(np.asarray(values, dtype=np.float64), dtype=wp.float64, device="cpu", requires_grad=grad)
 
 
-def launch(kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-    wp.launch(kernel, outputs[0].shape[0], inputs=inputs, outputs=outputs, device="cpu")
+def launch(kernel: Any, inputs: list[Any], output: Any) -> None:
+    wp.launch(kernel, output.shape[0], inputs=inputs, outputs=[output], device="cpu")
 
 
 Program = Callable[[Any, Any], Any]
@@ -222,7 +192,7 @@ def neighbour_program(name: str) -> Program:
 
     def program(x: Any, t: Any) -> Any:
         out = array(np.zeros(N))
-        launch(kernel, [x, t, near, count], [out])
+        launch(kernel, [x, t, near, count], out)
         return out
 
     return program
@@ -281,105 +251,84 @@ class Row:
         )
 
 
-def loops(right: bool, what: str, *names: str) -> list[Row]:
-    return [Row(name, neighbour_program(name), what, right) for name in names]
+def loops(right: bool, what: str, names: str) -> list[Row]:
+    return [Row(name, neighbour_program(name), what, right) for name in names.split()]
 
 
-def in_place_product(x: Any, t: Any) -> Any:
-    out = array(np.zeros(N))
-    launch(copy_to, [x], [out])
-    launch(multiply_in_place, [t], [out])
-    return out
+def launched(*steps: Any) -> Program:
+    """Launches of kernels by name: "kernel source target", of the arrays x, t, out, scratch ones, which are zero at
+    first, and "plain" without a gradient; or what is done to the output in between."""
+
+    def program(x: Any, t: Any) -> Any:
+        arrays = {"x": x, "t": t, "out": array(np.zeros(N))}
+        for step in steps:
+            if callable(step):
+                step(arrays["out"])
+                continue
+            kernel, *sources, target = step.split()
+            arrays.setdefault(target, array(np.zeros(N), grad=target != "plain"))
+            launch(KERNELS[kernel], [arrays[source] for source in sources], arrays[target])
+        return arrays["out"]
+
+    return program
 
 
-def in_place_square(x: Any, t: Any) -> Any:
-    out = array(np.zeros(N))
-    launch(copy_to, [x], [out])
-    launch(square_in_place, [], [out])
-    return out
-
-
-def scratch_reused(x: Any, t: Any) -> Any:
-    scratch, out = array(np.zeros(N)), array(np.zeros(N))
-    launch(copy_to, [x], [scratch])
-    launch(add_square_to, [scratch], [out])
-    launch(copy_to, [t], [scratch])
-    launch(add_square_to, [scratch], [out])
-    return out
-
-
-def scratch_of_its_own(x: Any, t: Any) -> Any:
-    out = array(np.zeros(N))
-    for source in (x, t):
-        scratch = array(np.zeros(N))
-        launch(copy_to, [source], [scratch])
-        launch(add_square_to, [scratch], [out])
-    return out
-
-
-def zeroed_between_launches(x: Any, t: Any) -> Any:
-    out = array(np.zeros(N))
-    launch(add_square_to, [x], [out])
-    out.zero_()
-    launch(add_square_to, [t], [out])
-    return out
-
-
-def filled_between_launches(x: Any, t: Any) -> Any:
-    out = array(np.zeros(N))
-    launch(add_square_to, [x], [out])
-    out.fill_(1.0)
-    launch(add_square_to, [t], [out])
-    return out
-
-
-def intermediate_without_gradient(x: Any, t: Any) -> Any:
-    between, out = array(np.zeros(N), grad=False), array(np.zeros(N))
-    launch(square_to, [x], [between])
-    launch(square_to, [between], [out])
-    return out
+SQUARES = ("add_square_to x out", "add_square_to t out")
+WITHOUT_GRADIENT = launched("square_to x plain", "square_to plain out")
 
 
 ROWS = [
-    *loops(True, "s += W, then out = s or constant * s", "raw_sum", "constant_times_sum"),
+    *loops(True, "s += W, then out = s or constant * s", "raw_sum constant_times_sum"),
     *loops(
         True,
         "vector sum; if inside the loop; continue before any accumulation",
-        "vector_sum",
-        "if_in_loop",
-        "continue_before_sum",
+        "vector_sum if_in_loop continue_before_sum",
     ),
     *loops(True, "a wp.func returns the raw sum, the kernel uses it non-linearly", "function_returns_raw_sum"),
     *loops(
         False,
         "s * s, pow(s, 7), max(s - c, 0), f / s after the loop",
-        "square_after_loop",
-        "power_after_loop",
-        "clamp_after_loop",
-        "quotient_after_loop",
+        "square_after_loop power_after_loop clamp_after_loop quotient_after_loop",
     ),
     *loops(False, "t * s after the loop with t read before it", "factor_times_sum"),
     *loops(False, "sum and non-linear use in the same wp.func", "function_returns_square"),
-    *loops(False, "a second loop uses the first one's sum; if s > c after the loop", "second_loop", "if_after_loop"),
+    *loops(False, "a second loop uses the first one's sum; if s > c after the loop", "second_loop if_after_loop"),
     *loops(
         False,
         "continue after an accumulation; break after a counter; s = s * s + W; fixed-point iteration",
-        "continue_after_sum",
-        "break_after_counter",
-        "recurrence",
-        "fixed_point",
+        "continue_after_sum break_after_counter recurrence fixed_point",
     ),
-    *loops(True, "s = s + W on a scalar or a whole vector", "plain_assignment", "vector_plain_assignment"),
+    *loops(True, "s = s + W on a scalar or a whole vector", "plain_assignment vector_plain_assignment"),
     *loops(False, "v[0] = v[0] + W on a local vector", "component_assignment"),
     *loops(True, "v[0] += W on a local vector", "component_increment"),
     *loops(True, "static loops, non-linear use included", "static_loop"),
-    Row("in_place_product", in_place_product, "y[i] *= a[i] in place", False),
-    Row("in_place_square", in_place_square, "y[i] = y[i] * y[i] in place", False),
-    Row("scratch_reused", scratch_reused, "a scratch array that a later launch overwrites", False),
-    Row("scratch_of_its_own", scratch_of_its_own, "a scratch array for each launch", True),
-    Row("zeroed_between_launches", zeroed_between_launches, "array.zero_() between launches", False),
-    Row("filled_between_launches", filled_between_launches, "array.fill_() between launches", False),
-    Row("intermediate_without_gradient", intermediate_without_gradient, "intermediate without requires_grad", False),
+    Row("in_place_product", launched("copy_to x out", "multiply_in_place t out"), "y[i] *= a[i] in place", False),
+    Row("in_place_square", launched("copy_to x out", "square_in_place out"), "y[i] = y[i] * y[i] in place", False),
+    Row(
+        "scratch_reused",
+        launched("copy_to x a", "add_square_to a out", "copy_to t a", "add_square_to a out"),
+        "a scratch array that a later launch overwrites",
+        False,
+    ),
+    Row(
+        "scratch_of_its_own",
+        launched("copy_to x a", "add_square_to a out", "copy_to t b", "add_square_to b out"),
+        "a scratch array for each launch",
+        True,
+    ),
+    Row(
+        "zeroed_between_launches",
+        launched(SQUARES[0], lambda out: out.zero_(), SQUARES[1]),
+        "array.zero_() between launches",
+        False,
+    ),
+    Row(
+        "filled_between_launches",
+        launched(SQUARES[0], lambda out: out.fill_(1.0), SQUARES[1]),
+        "array.fill_() between launches",
+        False,
+    ),
+    Row("intermediate_without_gradient", WITHOUT_GRADIENT, "intermediate without requires_grad", False),
 ]
 
 
@@ -395,24 +344,25 @@ def test_factor_before_the_loop_has_gradient_zero():
 
 
 def test_intermediate_without_gradient_is_silently_zero():
-    gradient = tape_gradient(intermediate_without_gradient)[0]
+    gradient = tape_gradient(WITHOUT_GRADIENT)[0]
     np.testing.assert_array_equal(gradient, 0.0, "an intermediate without requires_grad gave the gradient 0 in Warp")
 
 
-def derivative_at(kernel: Any, value: float) -> float:
+def derivative_at(kernel: str, value: float) -> float:
     a, b = array([value]), array([0.0])
     with wp.Tape() as tape:
-        launch(kernel, [a], [b])
+        launch(KERNELS[kernel], [a], b)
     tape.backward(grads={b: array([1.0], grad=False)})
     return float(a.grad.numpy()[0])
 
 
 def test_length_has_derivative_zero_at_zero():
-    assert derivative_at(length_to, 2.0) == pytest.approx(3**0.5)
-    assert derivative_at(length_to, 0.0) == 0.0, "wp.length(0) had the adjoint 0 in Warp"
+    assert derivative_at("length_to", 2.0) == pytest.approx(3**0.5)
+    assert derivative_at("length_to", 0.0) == 0.0, "wp.length(0) had the adjoint 0 in Warp"
 
 
 def test_guarded_root_needs_an_if():
-    assert derivative_at(guarded_root_where, 4.0) == derivative_at(guarded_root_if, 4.0) == 0.25
-    assert np.isnan(derivative_at(guarded_root_where, 0.0)), "wp.where(x > 0, sqrt(x), 0) had the derivative NaN at 0"
-    assert derivative_at(guarded_root_if, 0.0) == 0.0, "if x > 0: sqrt(x) had the derivative 0 at 0"
+    where, branch = "guarded_root_where", "guarded_root_if"
+    assert derivative_at(where, 4.0) == derivative_at(branch, 4.0) == 0.25
+    assert np.isnan(derivative_at(where, 0.0)), "wp.where(x > 0, sqrt(x), 0) had the derivative NaN at 0"
+    assert derivative_at(branch, 0.0) == 0.0, "if x > 0: sqrt(x) had the derivative 0 at 0"
