@@ -58,64 +58,34 @@ TOLERANCE = {"float64": 1e-12, "float32": 1e-4}
 processors without fused multiplications, with which small scenes differ by 1e-13 and 3e-5; so do functions of NumPy."""
 FLOOR = 1e-2
 """The norm of a gradient counts as this part of the greatest one of its row at least: some are mostly round-off."""
-GROWING = {
-    "baffles",
-    "beach",
-    "drop",
-    "drop_large",
-    "ink",
-    "jug",
-    "match_image",
-    "materials",
-    "new drop",
-    "new pillar",
-    "new pour",
-    "new raft",
-    "new rayleigh_taylor",
-    "new shaken",
-    "new stirred",
-    "pour",
-    "rotor",
-}
+GROWING = {"baffles", "beach", "drop", "drop_large", "ink", "jug", "match_image", "materials", "pour", "rotor"}
+GROWING |= {f"new {name}" for name in ("drop", "pillar", "pour", "raft", "rayleigh_taylor", "shaken", "stirred")}
 """Scenes in which a last bit of NumPy's grows beyond that, as splashes do: they have their numbers on one machine."""
 MODULES = ("errors", "environments", "jax", "torch")
 """Public ones besides those among the names of `cortado`."""
 SPACINGS = {
-    "baffles": 0.03,
-    "beach": 0.07,
-    "dam_break": 0.08,
-    "dam_break_large": 0.1,
-    "drop": 0.012,
-    "drop_large": 0.012,
-    "fountain": 0.015,
-    "honey": 0.0045,
-    "ink": 0.04,
-    "jug": 0.004,
-    "latte_art": 0.005,
-    "latte_art_heart": 0.0045,
-    "latte_art_large": 0.0045,
-    "latte_art_small": 0.005,
-    "match_image": 0.02,
-    "match_image_fractions": 0.04,
-    "materials": 0.02,
-    "new drop": 0.012,
-    "new honey": 0.005,
-    "new pillar": 0.08,
-    "new pour": 0.0055,
-    "new raft": 0.08,
-    "new rayleigh_taylor": 0.04,
-    "new shaken": 0.025,
-    "new stirred": 0.007,
-    "pour": 0.005,
-    "recover_gravity": 0.1,
-    "ring": 0.0065,
-    "rotor": 0.01,
-    "shaken": 0.025,
-    "shear": 0.04,
-    "splash_8000": 0.125,
-    "surface_tension": 0.0025,
-    "turned_cup": 0.007,
-    "two_dams": 0.1,
+    name: spacing
+    for spacing, names in {
+        0.0025: ["surface_tension"],
+        0.004: ["jug"],
+        0.0045: ["honey", "latte_art_heart", "latte_art_large"],
+        0.005: ["latte_art", "latte_art_small", "new honey", "pour"],
+        0.0055: ["new pour"],
+        0.0065: ["ring"],
+        0.007: ["new stirred", "turned_cup"],
+        0.01: ["rotor"],
+        0.012: ["drop", "drop_large", "new drop"],
+        0.015: ["fountain"],
+        0.02: ["match_image", "materials"],
+        0.025: ["new shaken", "shaken"],
+        0.03: ["baffles"],
+        0.04: ["ink", "match_image_fractions", "new rayleigh_taylor", "shear"],
+        0.07: ["beach"],
+        0.08: ["dam_break", "new pillar", "new raft"],
+        0.1: ["dam_break_large", "recover_gravity", "two_dams"],
+        0.125: ["splash_8000"],
+    }.items()
+    for name in names
 }
 """[m]"""
 Make = Callable[[], Scene]

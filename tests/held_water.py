@@ -14,27 +14,17 @@ from scenes import box
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.001}
 GRAVITY = 9.81
-MESHES = (
-    "torus",
-    "cup with a handle",
-    "bodies that overlap",
-    "box as a tank",
-    "200,000 triangles",
-    "a sheet one spacing thick",
-    "a torus that crosses itself",
-)
+MESHES = ("torus", "cup with a handle", "bodies that overlap", "box as a tank", "200,000 triangles")
+MESHES += ("a sheet one spacing thick", "a torus that crosses itself")
 
 
 def simulated(
     dimension: int, spacing: float, step: float, steps: int, every: int, precision: str = "float32", **tables: Any
 ) -> Any:
     """The trajectory of a scene of water; a particle that enters a solid or leaves the container ends the run."""
-    scene = Scene(
-        dimension=dimension,
-        phase=[WATER],
-        solver={"kind": "projection", "time_step": step},
-        **{"discretisation": {"spacing": spacing}, **tables},
-    )
+    own = {"phase": [WATER], "discretisation": {"spacing": spacing}}
+    own["solver"] = {"kind": "projection", "time_step": step}
+    scene = Scene(dimension=dimension, **{**own, **tables})
     return Simulation(scene, precision=precision).run(steps, record_every=every)
 
 
@@ -56,17 +46,12 @@ def stirred(across: int, steps: int, thickness: float = 0.08) -> dict[str, float
     spacings."""
     spacing, half = 1.0 / across, np.array([0.25, 0.5 * thickness])
     middle = np.array([0.5, 0.45])
-    paddle = box(
-        list(middle - half),
-        list(middle + half),
-        name="paddle",
-        motion="path",
-        angular_velocity=float(1.0 / np.linalg.norm(half)),
-    )
+    paddle = box(list(middle - half), list(middle + half), name="paddle", motion="path")
+    paddle["angular_velocity"] = float(1.0 / np.linalg.norm(half))
     run = simulated(
         *(2, spacing, 0.045 * spacing, steps, 20),
-        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "phase": "water"}],
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.5]},
+        fluid=[box([0.0, 0.0], [1.0, 1.0], phase="water")],
+        container=box([0.0, 0.0], [1.0, 1.5]),
         solid=[paddle],
     )
     outside = float(np.maximum(-run.positions, run.positions - [1.0, 1.5]).max())
@@ -85,22 +70,14 @@ def cup_turned(across: int, steps: int) -> dict[str, float]:
     step = 0.03 * spacing
     time = step * steps
     base = np.array([0.0, 1.0])
-    cup = {
-        "name": "cup",
-        "shape": "cup",
-        "base": list(base),
-        "radius": radius,
-        "height": height,
-        "thickness": thickness,
-        "motion": "path",
-        "times": [0.0, 0.45 * time, 0.55 * time, time],
-        "rotations": [0.0, np.pi, np.pi, 0.0],
-    }
+    cup = {"name": "cup", "shape": "cup", "base": list(base), "radius": radius, "height": height, "motion": "path"}
+    cup |= {"thickness": thickness, "times": [0.0, 0.45 * time, 0.55 * time, time]}
+    cup["rotations"] = [0.0, np.pi, np.pi, 0.0]
     bottom = base[1] + thickness
     run = simulated(
         *(2, spacing, step, steps, 4),
-        fluid=[{"shape": "box", "lower": [-radius, bottom], "upper": [radius, bottom + 0.8], "phase": "water"}],
-        container={"shape": "box", "lower": [-4.0, -0.6], "upper": [4.0, 4.0]},
+        fluid=[box([-radius, bottom], [radius, bottom + 0.8], phase="water")],
+        container=box([-4.0, -0.6], [4.0, 4.0]),
         solid=[cup],
     )
     middle = float(run.solids["cup"].positions[0][1] - base[1])
@@ -160,11 +137,11 @@ def _meshes(bottom: bool) -> dict[str, tuple[trimesh.Trimesh, dict[str, Any]]]:
     for mesh in (torus, fine, cup, spindle):
         mesh.apply_transform(upright)
     tank = trimesh.creation.box(bounds=[[0.0, 0.0, 0.0], [0.6, 0.5, 0.4]])
-    container = {"shape": "box", "lower": [-0.35, 0.0, -0.35], "upper": [0.35, 0.8, 0.35]}
-    block = {"shape": "box", "lower": [-0.35, 0.3, -0.35], "upper": [0.35, 0.5, 0.35], "phase": "water"}
+    container = box([-0.35, 0.0, -0.35], [0.35, 0.8, 0.35])
+    block = box([-0.35, 0.3, -0.35], [0.35, 0.5, 0.35], phase="water")
     around = {"fluid": [block], "container": container, "mesh": {"position": [0.0, 0.25, 0.0]}}
     poured = {"shape": "cylinder", "base": [0.0, 0.1, 0.0], "radius": 0.22, "height": 0.3, "phase": "water"}
-    in_tank = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.3, 0.4, 0.4], "phase": "water"}
+    in_tank = box([0.0, 0.0, 0.0], [0.3, 0.4, 0.4], phase="water")
     return {
         "torus": (torus, dict(around)),
         "200,000 triangles": (fine, dict(around)),

@@ -19,16 +19,17 @@ from cortado.pictures.run_pictures import gradient_check
 from cortado.problem import ProblemForwardPass
 from cortado.render.scene_renderer import scene_renderer
 from cortado.sph.free_energy import FREE_ENERGIES
-from scenes import jet, plane, plane_of_three, pour, scene, splash, two_layers
+from scenes import box, jet, plane, plane_of_three, pour, scene, splash, two_layers
 
 SPLINES = {name: {"spacing": 0.05, "support": 2.6, "kernel": name} for name in ("wendland_c2", "wendland_c4")}
+BY_TOLERANCE = {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 2, "maximum_iterations": 30}
+BY_TOLERANCE |= {"density_tolerance": 0.001}
+PAIRWISE = {"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise"}
 RIGHT = {
     "3-D, cubic spline, splash": splash,
     "3-D, Wendland C2": lambda: scene(discretisation=SPLINES["wendland_c2"]),
     "3-D, Wendland C4, pairwise, no slip": lambda: scene(
-        discretisation=SPLINES["wendland_c4"],
-        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise"},
-        container={"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"},
+        discretisation=SPLINES["wendland_c4"], forces=PAIRWISE, container=box([0.0] * 3, [0.4, 0.6, 0.25], slip="no")
     ),
     "3-D, without walls": lambda: scene(container={"shape": "none"}),
     "3-D, without pressure": lambda: scene(forces={"gravity": [0.0, -9.81, 0.0], "pressure": False}),
@@ -36,18 +37,10 @@ RIGHT = {
     "3-D, two fluids from a nozzle": pour,
     "2-D": plane,
     "2-D, Wendland C2, iterations by tolerance": lambda: plane(
-        discretisation=SPLINES["wendland_c2"],
-        solver={
-            "kind": "pcisph",
-            "time_step": 0.002,
-            "minimum_iterations": 2,
-            "maximum_iterations": 30,
-            "density_tolerance": 0.001,
-        },
+        discretisation=SPLINES["wendland_c2"], solver=BY_TOLERANCE
     ),
     "2-D, periodic, pairwise": lambda: plane(
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
-        forces={"gravity": [1.0, -9.81], "viscosity": "pairwise"},
+        container=box([0.0, 0.0], [0.4, 0.8], periodic=[True, False]), forces={**PAIRWISE, "gravity": [1.0, -9.81]}
     ),
     "2-D, three fluids that mix": plane_of_three,
     "2-D, nozzle": jet,
@@ -176,16 +169,17 @@ def picture(simulation):
     return losses.Image(renderer, np.random.default_rng(1).random(renderer.shape))
 
 
+def two_frames(made):
+    return losses.Frames({3: losses.FinalPositions(0.9 * made.positions), 8: Spread()})
+
+
 SMALL_PICTURE = {"view": "top", "resolution": [12, 10]}
 IN_SINGLE = {
     "3-D": (splash, lambda simulation: losses.FinalPositions(simulation.positions)),
     "2-D, centre of mass": (plane, lambda simulation: losses.CentreOfMass([0.3, 0.1])),
     "3-D, two fluids, a picture": (lambda: two_layers(render=SMALL_PICTURE), picture),
     "2-D, three fluids, a loss of one's own": (plane_of_three, lambda simulation: Spread()),
-    "2-D, nozzle, two frames": (
-        jet,
-        lambda made: losses.Frames({3: losses.FinalPositions(0.9 * made.positions), 8: Spread()}),
-    ),
+    "2-D, nozzle, two frames": (jet, two_frames),
     "3-D, a function of Warp arrays": (scene, lambda simulation: recorded),
 }
 
@@ -277,10 +271,6 @@ def test_without_steps_nothing_is_claimed():
     assert found.right and found.alignment is None and found.consistency.sample_steps.tolist() == [0]
 
 
-def test_it_is_part_of_the_public_face():
-    assert cortado.certify is certify
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -359,38 +349,28 @@ def comparison(adjoint=1.0, tangents=(0.5, 1.0), differences=((0.5, 1.0),) * 3, 
     )
 
 
-@pytest.mark.parametrize(
-    "right",
-    [
-        comparison(),
-        comparison(adjoint=1.0 + 1e-10),
-        comparison(tangents=(0.5, 7.0), adjoint=7.0, differences=((0.5, 2.0), (0.5, -1.0), (0.5, 0.3))),
-        comparison(adjoint=1e-16, tangents=(0.0, -1e-16), differences=((0.0, 3e-13), (0.0, 2e-12), (0.0, 1e-11))),
-        comparison(differences=((0.5, 1.1), (0.5, 1.001), (0.5, 1.0001))),
-        comparison(differences=((0.5, 1.0001), (0.5, 1.0001), (0.5, 1.0))),  # beside a kink
-        comparison(differences=((0.5, 1.01),) * 3, sides=0.02),  # on it
-    ],
-)
-def test_what_is_right(right):
-    assert right.right
+OFF = ((0.5, 2.0), (0.5, -1.0), (0.5, 0.3))
+"""Differences that agree with nothing."""
+JUDGED = [
+    (True, {}),
+    (True, {"adjoint": 1.0 + 1e-10}),
+    (True, {"tangents": (0.5, 7.0), "adjoint": 7.0, "differences": OFF}),
+    (True, {"adjoint": 1e-16, "tangents": (0.0, -1e-16), "differences": ((0.0, 3e-13), (0.0, 2e-12), (0.0, 1e-11))}),
+    (True, {"differences": ((0.5, 1.1), (0.5, 1.001), (0.5, 1.0001))}),
+    (True, {"differences": ((0.5, 1.0001), (0.5, 1.0001), (0.5, 1.0))}),  # beside a kink
+    (True, {"differences": ((0.5, 1.01),) * 3, "sides": 0.02}),  # on it
+    (False, {"differences": ((0.5, 1.01),) * 3, "sides": 0.005}),
+    *((False, {"adjoint": adjoint}) for adjoint in (np.nan, -1.0, 0.0, 1.0 + 1e-6)),
+    (False, {"adjoint": 1.00001, "tangents": (0.5, 1.00001)}),
+    (False, {"differences": ((0.5, 1.0001), (0.5, 1.0001), (0.5, 1.0002))}),
+    (False, {"tangents": (0.6, 7.0), "adjoint": 7.0, "differences": OFF}),
+    (False, {"tangents": (0.5, np.nan)}),
+]
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        comparison(differences=((0.5, 1.01),) * 3, sides=0.005),
-        comparison(adjoint=np.nan),
-        comparison(adjoint=-1.0),
-        comparison(adjoint=0.0),
-        comparison(adjoint=1.0 + 1e-6),
-        comparison(adjoint=1.00001, tangents=(0.5, 1.00001)),
-        comparison(differences=((0.5, 1.0001), (0.5, 1.0001), (0.5, 1.0002))),
-        comparison(tangents=(0.6, 7.0), adjoint=7.0, differences=((0.5, 2.0), (0.5, -1.0), (0.5, 0.3))),
-        comparison(tangents=(0.5, np.nan)),
-    ],
-)
-def test_what_is_wrong(wrong):
-    assert not wrong.right
+@pytest.mark.parametrize(("right", "found"), JUDGED)
+def test_what_is_right_and_what_is_wrong(right, found):
+    assert comparison(**found).right == right
 
 
 def horizon(exact, difference, strain=(0.1, 0.2, 0.4)):
@@ -398,22 +378,11 @@ def horizon(exact, difference, strain=(0.1, 0.2, 0.4)):
     return Horizon("gravity", np.array([10, 20, 30]), exact, difference, strain)
 
 
-@pytest.mark.parametrize(
-    ("exact", "step"),
-    [
-        ((1.0, 2.1, 3.0), 30),
-        ((1.0, 2.0, 9.0), 20),
-        ((1.0, 9.0, 3.0), 10),
-        ((9.0, 9.0, 3.0), 0),
-        ((1.0, 2.0, np.nan), 20),
-    ],
-)
-def test_the_measured_horizon(exact, step):
-    found = horizon(exact, (1.0, 2.0, 3.0))
-    assert found.measured == step and found.lasts == (step == 30)
-
-
-def test_the_predicted_horizon():
+def test_the_measured_and_the_predicted_horizon():
+    ways = {30: (1.0, 2.1, 3.0), 20: (1.0, 2.0, 9.0), 10: (1.0, 9.0, 3.0), 0: (9.0, 9.0, 3.0)}
+    for step, exact in (*ways.items(), (20, (1.0, 2.0, np.nan))):
+        found = horizon(exact, (1.0, 2.0, 3.0))
+        assert found.measured == step and found.lasts == (step == 30)
     same = (1.0, 1.0, 1.0)
     assert horizon(same, same).predicted == 30
     assert horizon(same, same, strain=(0.1, 0.1, 0.2)).predicted is None
@@ -423,11 +392,8 @@ def test_the_advice():
     far = horizon((1.0, 9.0, 9.0), (1.0, 1.0, 1.0))
     found = replace(long(), horizons=(far,))
     judged = [Judged("Exact()", 0.99, 9.0), Judged("AdjointViscosity()", 0.8, 1.0)]
-    for (cosine, size), wanted in {
-        (0.9, 1.0): "EnsembleMean(spread)",
-        (0.9, 3.0): "AdjointViscosity()",
-        (0.7, 1.0): "AdjointViscosity()",
-    }.items():
+    advised = ((0.9, 1.0, "EnsembleMean(spread)"), (0.9, 3.0, "AdjointViscosity()"), (0.7, 1.0, "AdjointViscosity()"))
+    for cosine, size, wanted in advised:
         both = (*judged, Judged("EnsembleMean(spread)", cosine, size))
         assert replace(found, alignment=Alignment(0.1, both)).estimator == wanted
     lost = (judged[0], Judged("AdjointViscosity()", 0.1, 1.0), Judged("EnsembleMean(spread)", 0.2, 1.0))

@@ -77,63 +77,40 @@ def a_pair(positions, velocities=None):
     return positions, np.zeros((N, 2)) if velocities is None else velocities
 
 
+ONES = np.ones((N, 2))
+LOST = np.diag([1.0, np.nan, 1.0, 1.0, 1.0])[:, :2]
+WARPED = r"is a Warp array of vec3d of shape \(6,\) on cpu, but must be .* \(5,\)"
+OF_END = r"takes the arguments '\(end\)', but .* is an object with value\(end\) and adjoint\(end\)\.$"
+BAD_ADJOINTS = {
+    "an adjoint that is not finite": (
+        a_pair(LOST),
+        r"positions has a value in row 1 .* must be made of numbers\.$",
+    ),
+    "one of a quantity": ({"velocities": np.full((N, 2), np.inf)}, "of velocities has a value in row 0"),
+    "no adjoint": (None, "is a NoneType"),
+    "one array": (ONES, "is a ndarray"),
+    "one array in a tuple": ((ONES,), "is a tuple of 1"),
+    "a wrong shape": (a_pair(np.ones((N, 3))), r"of positions has shape \(5, 3\), but must be \(5, 2\)"),
+    "complex numbers": (a_pair(ONES, ONES.astype(complex)), "of velocities is made of complex numbers"),
+    "a mask": (a_pair(np.ma.masked_equal(0.0 * ONES, 0.0)), "of positions is partly masked"),
+    "another number of particles": (state(N + 1), f"of positions {WARPED}"),
+    "another precision": (state(precision=FLOAT32), "of vec3f"),
+    "NumPy arrays in a state": (
+        State(END.state.fields, {**state().named(), "velocities": np.zeros((N, 3))}),
+        "of velocities is a ndarray",
+    ),
+    "colours": (SnapshotAdjoint(state(), np.ones(3)), "of colours has shape"),
+    "no state": (SnapshotAdjoint(None, np.ones((2, 3))), "a NoneType as its"),
+}
 MISTAKES = {
     "no value": (lambda: as_loss(Given(None)).value(END), "the loss's value is None"),
     "an array as value": (lambda: as_loss(Given(np.ones(3))).value(END), r"shape \(3,\), but must be one number"),
     "a complex value": (lambda: as_loss(Given(1j)).value(END), "the loss's value is 1j"),
-    "an adjoint that is not finite": (
-        lambda: adjoint_of(a_pair(np.diag([1.0, np.nan, 1.0, 1.0, 1.0])[:, :2])),
-        r"adjoint of positions has a value in row 1 that is not finite, but must be made of numbers\.$",
-    ),
-    "one of a quantity": (
-        lambda: adjoint_of({"velocities": np.full((N, 2), np.inf)}),
-        "of velocities has a value in row 0",
-    ),
-    "no adjoint": (lambda: adjoint_of(None), "is a NoneType"),
-    "one array": (lambda: adjoint_of(np.ones((N, 2))), "is a ndarray"),
-    "one array in a tuple": (
-        lambda: adjoint_of((np.ones((N, 2)),)),
-        "is a tuple of 1",
-    ),
-    "a wrong shape": (
-        lambda: adjoint_of(a_pair(np.ones((N, 3)))),
-        r"of positions has shape \(5, 3\), but must be \(5, 2\)",
-    ),
-    "complex numbers": (
-        lambda: adjoint_of(a_pair(np.ones((N, 2)), np.ones((N, 2), complex))),
-        "of velocities is made of complex numbers",
-    ),
-    "a mask": (
-        lambda: adjoint_of(a_pair(np.ma.masked_equal(np.zeros((N, 2)), 0.0))),
-        "of positions is partly masked",
-    ),
-    "another number of particles": (
-        lambda: adjoint_of(state(N + 1)),
-        r"of positions is a Warp array of vec3d of shape \(6,\) on cpu, but must be .* \(5,\)",
-    ),
-    "another precision": (
-        lambda: adjoint_of(state(precision=FLOAT32)),
-        "of vec3f",
-    ),
-    "NumPy arrays in a state": (
-        lambda: adjoint_of(State(END.state.fields, {**state().named(), "velocities": np.zeros((N, 3))})),
-        "of velocities is a ndarray",
-    ),
-    "colours": (
-        lambda: adjoint_of(SnapshotAdjoint(state(), np.ones(3))),
-        "of colours has shape",
-    ),
-    "no state": (
-        lambda: adjoint_of(SnapshotAdjoint(None, np.ones((2, 3)))),
-        "a NoneType as its",
-    ),
+    **{name: (partial(adjoint_of, given), words) for name, (given, words) in BAD_ADJOINTS.items()},
     "a class": (lambda: as_loss(FinalPositions), "loss is the class FinalPositions"),
     "an array": (lambda: as_loss(np.zeros((N, 2))), "loss is a ndarray"),
     "too few arguments": (lambda: as_loss(lambda x, v: None), r"takes the arguments '\(x, v\)', but must take 3"),
-    "a function of the end": (
-        lambda: as_loss(lambda end: 0.0),
-        r"takes the arguments '\(end\)', but .* is an object with value\(end\) and adjoint\(end\)\.$",
-    ),
+    "a function of the end": (lambda: as_loss(lambda end: 0.0), OF_END),
     "too many arguments": (lambda: as_loss(lambda x, v, c, loss: None), "must take 3: positions, velocities"),
     "a function that is recorded": (lambda: Recorded(lambda x, v: None), r"arguments '\(x, v\)', but must take 3: pos"),
     "an adjoint without an argument": (lambda: as_loss(Narrow()), "the loss's adjoint takes the arguments"),

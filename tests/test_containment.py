@@ -1,6 +1,7 @@
 """Walls hold the fluid, and the fluid keeps its density, at every step of a violent flow; where they fail, the run ends
 in a sentence."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -61,19 +62,13 @@ def energies(scene: Scene, trajectory: Trajectory) -> np.ndarray:
     return 0.5 * (v**2).sum(axis=2).mean(axis=1) - (x @ gravity).mean(axis=1) + lowest
 
 
+@pytest.mark.parametrize(
+    ("kernel", "steps"), [("cubic_spline", 1000), ("wendland_c2", 300), ("wendland_c4", 300)], ids=SUPPORTS
+)
 @pytest.mark.parametrize("make", [box, cup])
-def test_walls_hold_a_dam_break(make):
-    """1,000 particles, 1,000 steps."""
-    _check(make(), 1000)
-
-
-@pytest.mark.parametrize("kernel", ["wendland_c2", "wendland_c4"])
-@pytest.mark.parametrize("make", [box, cup])
-def test_walls_hold_a_dam_break_with_other_kernels(make, kernel):
-    _check(make(kernel=kernel), 300)
-
-
-def _check(scene: Scene, steps: int) -> None:
+def test_walls_hold_a_dam_break(make, kernel, steps):
+    """1,000 particles."""
+    scene = make(kernel=kernel)
     trajectory = Simulation(scene, precision="float32").run(steps)
     travelled = np.linalg.norm(trajectory.positions[-1] - trajectory.positions[0], axis=1)
     assert travelled.max() > 3.0 * scene.discretisation.spacing  # it did move
@@ -275,19 +270,14 @@ def points(tmp_path, apart):
     )
 
 
-def test_points_that_are_packed_are_refused(tmp_path):
+def test_points_fit_the_spacing_or_are_warned_of_or_refused(tmp_path):
     wanted = r"have 1.56 times the rest density .*spacing is 0.05 m, and these points would fit one of 0.04 m"
     with pytest.raises(InputError, match=wanted):
         Simulation(points(tmp_path, 0.04))
-
-
-@pytest.mark.parametrize(("apart", "words"), [(0.0485, "fly apart: .* fit one of 0.0485"), (0.1, "hardly touch each")])
-def test_points_for_another_spacing_are_warned_of(tmp_path, apart, words):
-    with pytest.warns(CortadoWarning, match=words):
-        Simulation(points(tmp_path, apart))
-
-
-@pytest.mark.filterwarnings("error::cortado.CortadoWarning")
-def test_points_that_fit_are_taken(tmp_path):
-    Simulation(points(tmp_path, 0.05))
-    Simulation(points(tmp_path, 0.051))
+    for apart, words in ((0.0485, "fly apart: .* fit one of 0.0485"), (0.1, "hardly touch each")):
+        with pytest.warns(CortadoWarning, match=words):
+            Simulation(points(tmp_path, apart))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CortadoWarning)
+        Simulation(points(tmp_path, 0.05))
+        Simulation(points(tmp_path, 0.051))

@@ -17,7 +17,7 @@ from cortado.sph.surface_tension import CurvatureTension, SurfaceTension
 from finite_differences import both_modes, central_difference, directional
 from oscillating_drops import C2, C4, CUBIC
 from reference_terms import Curvature
-from scenes import plane
+from scenes import box, plane
 
 PROJECTION = {"kind": "projection", "time_step": 0.002}
 PCISPH = {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3}
@@ -27,19 +27,13 @@ def loose(points, precision="float64", discretisation=C2, pressure=True, tension
     """A simulation of particles a spacing of 0.1 apart, and a point that puts them at ``points`` [spacings]."""
     x = 0.1 * np.asarray(points, dtype=np.float64)
     n, d = x.shape
-    scene = Scene(
-        **{
-            "dimension": d,
-            "discretisation": {"spacing": 0.1, **discretisation},
-            "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 20.0}],
-            "fluid": [
-                {"shape": "box", "lower": [0.0] * d, "upper": [0.1 * n] + [0.1] * (d - 1), "phase": "water"},
-            ],
-            "forces": {"gravity": [0.0] * d, "surface_tension": tension, "pressure": pressure},
-            "solver": PROJECTION,
-            **tables,
-        }
-    )
+    own = {
+        "discretisation": {"spacing": 0.1, **discretisation},
+        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 20.0}],
+        "fluid": [box([0.0] * d, [0.1 * n] + [0.1] * (d - 1), phase="water")],
+        "forces": {"gravity": [0.0] * d, "surface_tension": tension, "pressure": pressure},
+    }
+    scene = Scene(dimension=d, **{**own, "solver": PROJECTION, **tables})
     simulation = Simulation(scene, precision=precision)
     assert len(simulation.positions) == n
     return simulation, {"initial_positions": x, "surface_tension": np.array(tension)}
@@ -73,9 +67,8 @@ FEW = {
 
 def problem_of(points, steps=2, **options):
     simulation, point = loose(points, **options)
-    target = point["initial_positions"] + 0.05 * np.sin(np.arange(point["initial_positions"].size)).reshape(
-        point["initial_positions"].shape
-    )
+    x = point["initial_positions"]
+    target = x + 0.05 * np.sin(np.arange(x.size)).reshape(x.shape)
     return Problem(simulation, steps, losses.FinalPositions(target)), point
 
 
@@ -84,10 +77,8 @@ def problem_of(points, steps=2, **options):
 def test_few_particles_have_a_force_and_derivatives(name):
     """That are finite, the same in both directions, and those of differences, on one side and on the other."""
     problem, point = problem_of(FEW[name], pressure=False)
-    ways = {
-        "initial_positions": 0.1 * np.random.default_rng(1).standard_normal(point["initial_positions"].shape),
-        "surface_tension": np.array(0.1),
-    }
+    moved = 0.1 * np.random.default_rng(1).standard_normal(point["initial_positions"].shape)
+    ways = {"initial_positions": moved, "surface_tension": np.array(0.1)}
     value, gradient = problem.value_and_gradient(point)
     tangent = problem.tangent(point, ways)
     assert np.isfinite(value) and all(np.isfinite(each).all() for each in gradient.values())
@@ -122,7 +113,7 @@ def test_one_particle_a_pair_and_two_lines_feel_nothing():
         assert np.abs(run.velocities[-1]).max() < 1e-12, name
 
 
-WALLS = {"shape": "box", "lower": [-0.05, -0.05], "upper": [4.2, 1.2]}
+WALLS = box([-0.05, -0.05], [4.2, 1.2])
 PIECES = {
     "plane": (stirred(grid(6, 6)), C2, {}),
     "plane, at walls": (stirred(grid(6, 6)), C4, {"container": WALLS}),
@@ -201,39 +192,25 @@ def test_the_constants_do_not_depend_on_the_spacing_and_hardly_on_the_kernel():
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
-def test_the_solver_says_which_form_a_scene_has():
+def test_the_solver_says_which_form_a_scene_has_and_its_steps_may_be_longer_by_curvature():
+    limits = []
     for solver, wanted in ((PROJECTION, CurvatureTension), (PCISPH, SurfaceTension)):
-        for discretisation in (C2, CUBIC):
+        for discretisation in (CUBIC, C2):
             forces = {"gravity": [0.0, -9.81], "surface_tension": 3.0}
-            made = Simulation(plane(solver=solver, discretisation={"spacing": 0.05, **discretisation}, forces=forces))
-            found = [type(force) for force in made.solver.forces]
+            made = plane(solver=solver, discretisation={"spacing": 0.05, **discretisation}, forces=forces)
+            found = [type(force) for force in Simulation(made).solver.forces]
             assert [kind for kind in found if kind in (SurfaceTension, CurvatureTension)] == [wanted]
+        limits.append(stability_limits(made)["surface tension"])
+    assert limits[0] == pytest.approx(2.5 * limits[1])
 
 
-def test_steps_may_be_longer_by_curvature_in_a_projection():
-    limits = [
-        stability_limits(
-            plane(
-                solver=solver,
-                discretisation={"spacing": 0.05, **C2},
-                forces={"gravity": [0.0, -9.81], "surface_tension": 3.0},
-            )
-        )
-        for solver in (PCISPH, PROJECTION)
-    ]
-    assert limits[1]["surface tension"] == pytest.approx(2.5 * limits[0]["surface tension"])
-
-
-def test_a_fluid_with_hardly_any_viscosity_is_warned_of():
+def test_a_fluid_with_hardly_any_viscosity_and_a_narrow_support_are_warned_of():
     for viscosity, warned in ((0.1, True), (2.0, False)):
         water = [{"name": "water", "rest_density": 1000.0, "viscosity": viscosity}]
         with warnings.catch_warnings(record=True) as found:
             warnings.simplefilter("always")
             loose(grid(8, 8), phase=water)
         assert any("viscosity of phase 'water'" in str(one.message) for one in found) == warned
-
-
-def test_a_narrow_support_is_warned_of():
     with pytest.warns(CortadoWarning, match="support is 2, but surface tension needs at least 2.5"):
         loose(grid(8, 8), discretisation=CUBIC)
 

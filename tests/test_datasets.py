@@ -94,10 +94,8 @@ def test_tangents_are_the_derivatives_along_their_directions():
         kinds = {"initial_positions": "position", "initial_velocities": "velocity"}
         along = {name: found[f"tangent/{kind}_direction"][which] for name, kind in kinds.items()}
         for h in (1e-6, 1e-7):
-            ends = [
-                made.run(6, {name: start[name] + s * h * along[name] for name in start}, record_every=2)
-                for s in (1, -1)
-            ]
+            moved = ({name: start[name] + s * h * along[name] for name in start} for s in (1, -1))
+            ends = [made.run(6, one, record_every=2) for one in moved]
             for own, field in (("position", "positions"), ("velocity", "velocities")):
                 differences = (getattr(ends[0], field) - getattr(ends[1], field)) / (2.0 * h)
                 off = np.abs(differences - found[f"tangent/{own}"][which]).max()
@@ -185,9 +183,8 @@ def quick(monkeypatch):
         rows = np.full((4, 300, 2), float(sample.number))
         moments = [9, [1.0, 2.0], [3.0, 4.0]]
         ends = {"lower": [0.0, 0.0], "upper": [1.0, 1.0], "particles": 300}
-        return datasets.OneRun(
-            {"position": rows, "particle_type": np.zeros(300)}, {"vel": moments, "acc": moments, **ends}
-        )
+        arrays = {"position": rows, "particle_type": np.zeros(300)}
+        return datasets.OneRun(arrays, {"vel": moments, "acc": moments, **ends})
 
     made.asked = []
     monkeypatch.setattr(command, "one_run", made)
@@ -196,18 +193,15 @@ def quick(monkeypatch):
     return made
 
 
-def test_a_run_that_diverges_is_left_out_and_said(file, cortado_command, quick):
+def test_runs_that_fail_are_left_out_and_said(file, cortado_command, quick):
     quick.others[1] = DivergedError(3, 7, "take a smaller time step")
     code, out, err = cortado_command("dataset", file, "--runs", 5, "--out", "data")
     assert code == 0 and "2 to train, 1 to validate, 1 to test" in out
     assert "1 of 5 runs failed and are left out. The first is run 1: The simulation diverged in step 3" in err
     train = arrays_of("data/train.h5")
     assert [train[f"0000{k}/position"][0, 0, 0] for k in range(2)] == [0.0, 2.0]
-
-
-def test_where_no_run_is_left_to_train_it_says_why(file, cortado_command, quick):
     quick.others |= dict.fromkeys(range(3), InputError("no fluid fits."))
-    code, _, err = cortado_command("dataset", file, "--runs", 5, "--out", "data")
+    code, _, err = cortado_command("dataset", file, "--runs", 5, "--out", "none")
     assert code == 1 and "No run of those for train could be computed. The first: no fluid fits." in err
 
 
@@ -224,9 +218,7 @@ def test_what_was_killed_goes_on(file, cortado_command, quick):
 
 
 @pytest.mark.parametrize(("size", "there"), [(15_000, 0), (50_000, 5), (None, 5)])
-def test_a_full_disk_is_a_sentence_and_keeps_what_is_there(
-    size, there, file, tmp_path, cortado_command, quick, monkeypatch
-):
+def test_a_full_disk_is_a_sentence_and_keeps_what_is_there(size, there, file, cortado_command, quick, monkeypatch):
     """Full at the first run, in the midst of the file of all of them, and before it."""
     with monkeypatch.context() as patch, largest_file(size) if size else nullcontext():
         if not size:
@@ -239,32 +231,29 @@ def test_a_full_disk_is_a_sentence_and_keeps_what_is_there(
     assert len(quick.asked) == 5 - there and not Path("data/runs").exists()
 
 
+def varied(key, lower, upper, more=("dataset.logarithmic=[]",)):
+    return [word for one in (f'dataset.vary={{"{key}"=[{lower},{upper}]}}', *more) for word in ("--set", one)]
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (("--out", "data.h5"), "--out is data.h5, but must be a folder"),
         (("--runs", 2), "--runs is 2, but must be from 3 to 100,000: one to train and one to validate"),
         (("--set", "dataset.write_every=4"), "dataset.write_every is 4, but must be a divisor of steps, which is 6"),
-        (
-            ("--set", 'dataset.vary={"solver.time_step"=[0.001,0.002]}', "--set", "dataset.logarithmic=[]"),
-            "vary has solver.time_step, which must be the same",
-        ),
-        (
-            ("--set", 'dataset.vary={"picture.film_speed"=[0.1,0.2]}', "--set", "dataset.logarithmic=[]"),
-            "vary has picture.film_speed, which changes nothing that is computed",
-        ),
+        (varied("solver.time_step", 0.001, 0.002), "vary has solver.time_step, which must be the same"),
+        (varied("picture.film_speed", 0.1, 0.2), "vary has picture.film_speed, which changes nothing that is computed"),
         (("--set", "problem.steps=3"), "problem.steps is given, but must be left out"),
-        (("--set", 'dataset.vary={"phase.oil.viscosity"=[0.1,0.2]}', "--set", "dataset.logarithmic=[]"), "oil"),
-        (
-            ("--set", 'dataset.vary={"phase.0.viscosity"=[0.2,0.1]}'),
-            "dataset.vary.'phase.0.viscosity' is [0.2, 0.1], but must",
-        ),
+        (varied("phase.oil.viscosity", 0.1, 0.2), "oil"),
+        (varied("phase.0.viscosity", 0.2, 0.1, ()), "dataset.vary.'phase.0.viscosity' is [0.2, 0.1], but must"),
         (("--set", "solver.time_step=auto"), "a data set"),
     ],
 )
 def test_wrong_calls_are_sentences(file, change, words, cortado_command, quick):
-    code, _, err = cortado_command("dataset", file, *change)
-    assert code == 2 and words in err and err.count("\n") == 1
+    Path("plain.toml").write_text(SCENE)
+    for arguments, said in (((file, *change), words), (("plain.toml",), "plain.toml: dataset is missing, but must be")):
+        code, _, err = cortado_command("dataset", *arguments)
+        assert code == 2 and said in err and err.count("\n") == 1
     assert not quick.asked
 
 
@@ -282,12 +271,6 @@ def test_a_folder_of_something_else_is_kept(file, tmp_path, cortado_command, qui
     (tmp_path / "mine" / "notes.txt").touch()
     code, _, err = cortado_command("dataset", file, "--out", "mine")
     assert code == 2 and "holds notes.txt, but no data set" in err
-
-
-def test_a_scene_without_the_table_says_so(file, tmp_path, cortado_command):
-    (tmp_path / "plain.toml").write_text(SCENE)
-    code, _, err = cortado_command("dataset", "plain.toml")
-    assert code == 2 and "plain.toml: dataset is missing, but must be a table" in err
 
 
 @pytest.mark.parametrize(

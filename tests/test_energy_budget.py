@@ -10,7 +10,7 @@ from cortado import Problem, Simulation
 from cortado.particles.neighbourhood import neighbourhood_type
 from cortado.particles.state import to_device
 from reference_projection import Projection
-from scenes import OIL, plane, plane_of_three, scene, two_layers
+from scenes import OIL, box, plane, plane_of_three, scene, two_layers
 from still_fluids import still_water
 from test_moving_solids import ROTOR
 from test_quantities import Weighted, cubic_spline
@@ -26,10 +26,8 @@ class Step:
     solver's order if nothing else is said."""
 
     def __init__(self, make, kernel, precision):
-        made = make(
-            discretisation={"spacing": 0.05, "support": SUPPORTS[kernel], "kernel": kernel},
-            forces={"gravity": make().forces.gravity, "viscosity": "none"},
-        )
+        cut = {"spacing": 0.05, "support": SUPPORTS[kernel], "kernel": kernel}
+        made = make(discretisation=cut, forces={"gravity": make().forces.gravity, "viscosity": "none"})
         self.simulation, random = Simulation(made, precision=precision), np.random.default_rng(0)
         shape = self.simulation.positions.shape
         self.point = {
@@ -134,11 +132,8 @@ def test_so_it_is_in_the_reference_engine(make, kernel):
 PROJECTION = {"kind": "projection", "time_step": 0.002}
 C2 = {"discretisation": {"spacing": 0.05, "kernel": "wendland_c2", "support": 2.6}}
 BOTH = [scene().phase[0].model_dump(), OIL]
-HALVES = [
-    {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.2], "phase": "water"},
-    {"shape": "box", "lower": [0.0, 0.2], "upper": [0.4, 0.4], "phase": "oil"},
-]
-ROOM = {"container": {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.6, 0.6, 0.6]}}
+HALVES = [box([0.0, 0.0], [0.4, 0.2], phase="water"), box([0.0, 0.2], [0.4, 0.4], phase="oil")]
+ROOM = {"container": box([0.0, 0.0, 0.0], [0.6, 0.6, 0.6])}
 FLOWS = {
     "plane": lambda **own: plane(solver=PROJECTION, **own),
     "plane, Wendland": lambda **own: plane(solver=PROJECTION, **own, **C2),
@@ -167,8 +162,8 @@ def test_pressures_are_sums_over_all_pairs_and_walls(name):
     """In NumPy, from the pressures' impulses and L of the solver, also beside a box that sticks out into the fluid, and
     with images."""
     d = FLOWS[name]().dimension
-    box = {"name": "box", "shape": "box", "lower": [0.1] * d, "upper": [0.2] * d}
-    simulation = Simulation(FLOWS[name](solid=[box]), precision="float64")
+    own = box([0.1] * d, [0.2] * d, name="box")
+    simulation = Simulation(FLOWS[name](solid=[own]), precision="float64")
     turning = {"initial_velocities": np.random.default_rng(1).normal(size=simulation.velocities.shape)}
     first, second = (simulation.run(steps, turning).last_state for steps in (6, 7))
     found, solver = simulation.quantity("pressure", first), simulation.solver

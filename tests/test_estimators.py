@@ -21,11 +21,11 @@ from cortado import (
 from cortado.gradients import AdjointEstimator, Estimate, Filtered
 from cortado.gradients.reverse_mode import EddyViscosity
 from reference import complex_step
-from scenes import jet, plane, plane_of_three, pour, scene, splash
+from scenes import box, jet, plane, plane_of_three, pour, scene, splash
 from twins import twin
 
 DROPS = [
-    {"shape": "box", "lower": lower, "upper": upper, "phase": "water"}
+    box(lower, upper, phase="water")
     for lower, upper in (([0.0, 0.0], [0.4, 0.2]), ([0.5, 0.5], [0.55, 0.55]), ([0.2, 0.6], [0.3, 0.65]))
 ]
 """A pool, a particle and a pair of particles."""
@@ -33,7 +33,7 @@ MAKERS = {
     "3-D": scene,
     "2-D": plane,
     "periodic": lambda: plane(
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
+        container=box([0.0, 0.0], [0.4, 0.8], periodic=[True, False]),
         forces={"gravity": [1.0, -9.81], "viscosity": "pairwise"},
     ),
     "three phases": plane_of_three,
@@ -252,7 +252,7 @@ def separations(x, kind):
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("coefficient", [2.0, 30.0, 1000.0])
 def test_a_viscosity_equals_the_twins(kind, coefficient, precision):
-    """With a great coefficient the strengths of all that strains are the greatest."""
+    """With a great coefficient the strengths of all that strains are the greatest. It keeps sums and does not grow."""
     simulation = simulation_of(kind, precision)
     point = point_of(simulation)
     before, after, strengths = filtered(simulation, coefficient)
@@ -265,18 +265,11 @@ def test_a_viscosity_equals_the_twins(kind, coefficient, precision):
     for a, found in pairs_of(before, after):
         np.testing.assert_allclose(found, matrix @ a, rtol=0, atol=10 * small)
         assert np.abs(found - a).max() > 0.005
-    for name in set(before) - {"positions", "velocities"}:
-        np.testing.assert_allclose(after[name], before[name], rtol=1e-15 if precision == "float64" else 1e-6)
-
-
-@kinds
-@pytest.mark.parametrize("coefficient", [2.0, 1000.0])
-def test_a_viscosity_keeps_sums_and_does_not_grow(kind, coefficient):
-    before, after, _ = filtered(simulation_of(kind), coefficient)
-    for a, found in pairs_of(before, after):
-        np.testing.assert_allclose(found.sum(axis=0), a.sum(axis=0), rtol=1e-13)
+        np.testing.assert_allclose(found.sum(axis=0), a.sum(axis=0), rtol=1e-13 if precision == "float64" else 1e-4)
         assert (np.linalg.norm(found, axis=0) < np.linalg.norm(a, axis=0)).all()
         assert kind != "drops" or (found[-3] == a[-3]).all()  # a particle alone
+    for name in set(before) - {"positions", "velocities"}:
+        np.testing.assert_allclose(after[name], before[name], rtol=1e-15 if precision == "float64" else 1e-6)
 
 
 def test_a_viscosity_is_linear_in_the_adjoint():
@@ -371,9 +364,7 @@ def chaotic():
 
 def test_a_viscosity_keeps_the_adjoint_of_a_long_run_from_growing(chaotic):
     point = {"gravity": np.array([0.5, -9.81, 0.0])}
-    (_, exact), (_, found) = (
-        chaotic.value_and_gradient(point, one) for one in (gradients.Exact(), gradients.AdjointViscosity())
-    )
+    exact, found = (chaotic.value_and_gradient(point, one)[1] for one in (None, gradients.AdjointViscosity()))
     assert np.linalg.norm(exact["gravity"]) > 30 * np.linalg.norm(found["gravity"])
     smoothed = chaotic.estimate(point, gradients.RandomizedSmoothing(0.1, samples=8))
     a, b = (one["gravity"][:2] for one in (found, smoothed.gradient))  # along z, by symmetry, there is noise alone
@@ -546,13 +537,9 @@ def test_intervals_of_a_mean_of_gradients_contain_it_as_often_as_they_say(sample
 def test_intervals_of_guided_differences_know_that_directions_are_noisy():
     """The loss has no noise here, but the surrogate, by which the gradient is turned."""
     stub = Stub(quadratic)
-
-    def found(seed):
-        return gradients.Guided(0.1, parts=1, seed=seed, position_noise=0.0, surrogate=NoisySlopes(seed)).estimate(
-            stub, POINT
-        )
-
-    estimates = [found(seed) for seed in range(300)]
+    settings = {"parts": 1, "position_noise": 0.0}
+    guided = (gradients.Guided(0.1, seed=seed, surrogate=NoisySlopes(seed), **settings) for seed in range(300))
+    estimates = [one.estimate(stub, POINT) for one in guided]
     mean = np.mean([one.gradient["gravity"] for one in estimates], axis=0)
     ends = [[end["gravity"] for end in one.interval()] for one in estimates]
     assert 0.9 <= np.mean([(lower <= mean) & (mean <= upper) for lower, upper in ends]) <= 0.99
@@ -561,7 +548,7 @@ def test_intervals_of_guided_differences_know_that_directions_are_noisy():
 
 def test_guided_differences_of_nothing_are_nothing():
     stub = Stub(lambda values: 7.0)
-    flat = gradients.Guided(0.1, surrogate=Flat()).estimate(stub, POINT)
+    flat = gradients.Guided(0.1, surrogate=Slopes(lambda g, mu: 0.0 * g, lambda g, mu: 0.0)).estimate(stub, POINT)
     assert not flat.gradient["gravity"].any() and not flat.standard_error["gravity"].any()
     assert all(not end["gravity"].any() for end in flat.interval())
 
@@ -701,9 +688,8 @@ def test_a_member_with_a_parameter_out_of_its_range_is_left_out_too():
     pairs = [abs(float(0.2 * drawn.offset()[0])) for _ in range(10)]
     kept = [u for u in pairs if u <= 0.18]
     assert 7 < len(kept) < 10
-    with pytest.warns(
-        CortadoWarning, match=r"runs of the ensemble cannot be run, by which \d of 10 antithetic pairs are"
-    ):
+    said = r"runs of the ensemble cannot be run, by which \d of 10 antithetic pairs are"
+    with pytest.warns(CortadoWarning, match=said):
         found = mean.estimate(problem, {"viscosity": 0.18})
     assert found.left_out == 2 * (10 - len(kept))
     slopes = [problem.value_and_gradient({"viscosity": 0.18 + s * u})[1]["viscosity"] for u in kept for s in (1, -1)]
@@ -727,13 +713,6 @@ def test_an_ensemble_that_is_too_large_is_refused_before_anything_is_run(make, m
     with pytest.raises(InputError, match=r"^This needs about .* of memory, most of it for .* samples.*; take fewer"):
         make(0.5, samples=100_000).estimate(stub, POINT)
     assert not stub.calls
-
-
-class Flat:
-    """In place of an estimator: no gradient at all."""
-
-    def estimate(self, problem, parameters, observe=None):
-        return gradients.Estimate(7.0, {name: np.zeros_like(value) for name, value in parameters.items()})
 
 
 AVERAGES = [gradients.RandomizedSmoothing(1e-3), gradients.EnsembleMean(1e-3), gradients.Guided(1e-3)]
@@ -903,6 +882,11 @@ def test_an_estimate_comes_in_float64():
 
 # ---- mistakes -------------------------------------------------------------------------------------------------------
 
+
+def estimated(estimator, **parameters):
+    return lambda problem: problem.estimate(parameters, estimator)
+
+
 MISTAKES = {
     "order 0": lambda p: gradients.AdjointViscosity(order=0),
     "order in words": lambda p: gradients.AdjointViscosity(order="two"),
@@ -914,9 +898,7 @@ MISTAKES = {
     "no position noise": lambda p: gradients.RandomizedSmoothing(position_noise=None),
     "endless position noise": lambda p: gradients.EnsembleMean(position_noise=np.inf),
     "negative seed": lambda p: gradients.RandomizedSmoothing(seed=-1),
-    "a sample out of range": lambda p: p.estimate(
-        {"viscosity": 0.1}, gradients.EnsembleMean(1.0, estimator=gradients.Exact())
-    ),
+    "a sample out of range": estimated(gradients.EnsembleMean(1.0, estimator=gradients.Exact()), viscosity=0.1),
     "spread in words": lambda p: p.estimate({"viscosity": 0.1}, gradients.EnsembleMean("wide")),
     "coefficient NaN": lambda p: gradients.AdjointViscosity(float("nan")),
     "coefficient in words": lambda p: gradients.AdjointViscosity("strong"),
@@ -931,9 +913,7 @@ MISTAKES = {
     "nothing to average": lambda p: p.estimate({}, gradients.EnsembleMean()),
     "nothing to guide": lambda p: p.estimate({}, gradients.Guided()),
     "a spread that is round-off": lambda p: p.estimate({"viscosity": 1.0}, gradients.Guided(1e-17)),
-    "a number of one's own averaged": lambda p: p.estimate(
-        {"viscosity": 1.0}, gradients.EnsembleMean(estimator=Returning(3.0))
-    ),
+    "a number of one's own averaged": estimated(gradients.EnsembleMean(estimator=Returning(3.0)), viscosity=1.0),
     "a number of one's own at many points": lambda p: evaluate(p, [{"viscosity": 1.0}], Returning(3.0)),
     "an average of one": lambda p: gradients.EnsembleMean(samples=1),
     "an average over no spread": lambda p: p.estimate({"viscosity": 1.0}, gradients.EnsembleMean(0.0)),
@@ -944,9 +924,7 @@ MISTAKES = {
     "position noise below 0": lambda p: gradients.RandomizedSmoothing(position_noise=-0.1),
     "spread 0": lambda p: p.estimate({"viscosity": 1.0}, gradients.RandomizedSmoothing(0.0)),
     "spread without a name": lambda p: p.estimate({"viscosity": 1.0}, gradients.RandomizedSmoothing({"gravity": 1.0})),
-    "too many numbers": lambda p: p.estimate(
-        {"initial_positions": p.simulation.positions}, gradients.RandomizedSmoothing()
-    ),
+    "too many numbers": estimated(gradients.RandomizedSmoothing(), initial_positions=np.zeros((125, 3))),
     "masses of others": lambda p: Problem(p.simulation, 1, losses.CentreOfMass([0.0] * 3, np.ones(7))).value({}),
     "no masses": lambda p: losses.CentreOfMass([0.0] * 3, np.zeros(7)),
     "target's shape": lambda p: Problem(p.simulation, 1, losses.CentreOfMass([0.0] * 2)).value({}),
@@ -955,9 +933,7 @@ MISTAKES = {
     "settings that may change": lambda p: p.estimate({"viscosity": 0.1}, Changing()),
     "a tuple": lambda p: p.estimate({"viscosity": 0.1}, Returning((1.0, {}))),
     "no gradient": lambda p: p.estimate({"viscosity": 0.1}, Returning(Estimate(1.0, {}))),
-    "a gradient of another shape": lambda p: p.estimate(
-        {"viscosity": 0.1}, Returning(Estimate(1.0, {"viscosity": [1.0]}))
-    ),
+    "a gradient of another shape": estimated(Returning(Estimate(1.0, {"viscosity": [1.0]})), viscosity=0.1),
     "a gradient in words": lambda p: p.estimate({"viscosity": 0.1}, Returning(Estimate(1.0, {"viscosity": "small"}))),
 }
 

@@ -17,70 +17,53 @@ from cortado.optimisation.inverse.tables import FitTables, TaskTables
 from cortado.pictures.image_files import write_picture
 from every_key import key_at, keys_of, numbers, places, put, same
 
-SCENE, TASK, SHORT = "scene.toml", "task.toml", ("--steps", "3")
-NOWHERE = "cuda:99"
+SCENE, TASK = "scene.toml", "task.toml"
 COMMANDS = {
-    "new": (("dam.toml",), {"template": ["drop"], "dimension": ["3"]}),
-    "examples": ((), {"copy": ["first_gradient"], "to": ["there"]}),
+    "new": ("dam.toml", "template drop, dimension 3"),
+    "examples": ("", "copy first_gradient, to there"),
     "describe": (
-        (SCENE, "--json", "--set", "picture.film_frames=0"),
-        {
-            **{"steps": ["7"], "time": ["0.1"], "record-every": ["3"], "fps": ["9"], "picture": ["a.png"]},
-            **{"set": ["solver.time_step=0.001"], "device": [NOWHERE], "precision": ["float64"]},
-        },
+        "scene.toml --json --set picture.film_frames=0",
+        "steps 7, time 0.1, record-every 3, fps 9, picture a.png, set solver.time_step=0.001, device cuda:99, "
+        "precision float64",
     ),
     "run": (
-        (SCENE, "--out", "out", "--no-pictures"),
-        {
-            **{"steps": ["3"], "time": ["0.01"], "set": ["solver.time_step=0.001"], "device": [NOWHERE]},
-            **{"precision": ["float64"], "record-every": ["2"], "fps": ["100"], "state": ["run"], "resume": []},
-            **{"record": ["density"], "out": ["other"]},
-        },
+        "scene.toml --out out --no-pictures",
+        "steps 3, time 0.01, set solver.time_step=0.001, device cuda:99, precision float64, record-every 2, fps 100, "
+        "state run, resume, record density, out other",
     ),
-    "compare": (("run", "finer"), {"json": []}),
+    "compare": ("run finer", "json"),
     "optimise": (
-        (TASK, "--no-pictures"),
-        {
-            **{"out": ["other"], "set": ["optimise.iterations=3"], "device": [NOWHERE], "precision": ["float64"]},
-            **{"resume": [], "scheduler": ["tcp://127.0.0.1:1"], "workers": ["2"]},
-        },
+        "task.toml --no-pictures",
+        "out other, set optimise.iterations=3, device cuda:99, precision float64, resume, workers 2, "
+        "scheduler tcp://127.0.0.1:1",
     ),
     "picture": (
-        ("run",),
-        {
-            **{"frame": ["0"], "film": ["--out", "film.webp"], "lines": ["90"], "camera": ["orbit"]},
-            **{"colour": ["speed"], "out": ["b.png"], "set": ["picture.width=100"], "device": [NOWHERE]},
-        },
+        "run",
+        "frame 0, film --out film.webp, lines 90, camera orbit, colour speed, out b.png, set picture.width=100, "
+        "device cuda:99",
     ),
-    "export": (
-        ("run", "--to", "vtp"),
-        {"to": ["ply"], "out": ["there"], "every": ["2"], "set": ["picture.colour=speed"]},
-    ),
-    "convergence": (("run", "finer", "finest"), {"quantity": ["absent.py:f"], "json": []}),
+    "export": ("run --to vtp", "to ply, out there, every 2, set picture.colour=speed"),
+    "convergence": ("run finer finest", "quantity absent.py:f, json"),
     "dataset": (
-        (TASK, "--runs", "3"),
-        {
-            **{"runs": ["4"], "out": ["other"], "set": ["dataset.seed=4"], "device": [NOWHERE]},
-            **{"precision": ["float64"]},
-        },
+        "task.toml --runs 3",
+        "runs 4, out other, set dataset.seed=4, device cuda:99, precision float64",
     ),
     "sweep": (
-        (SCENE, "--set", "solver.time_step=0.001,0.002", *SHORT, "--no-pictures"),
-        {
-            **{"set": ["phase.0.viscosity=0.1,0.2"], "zip": ["phase.0.viscosity=0.1,0.2"], "steps": ["4"]},
-            **{"time": ["0.1"], "out": ["other"], "device": [NOWHERE], "precision": ["float64"]},
-            **{"record-every": ["2"], "fps": ["100"]},
-        },
+        "scene.toml --set solver.time_step=0.001,0.002 --steps 3 --no-pictures",
+        "set phase.0.viscosity=0.1,0.2, zip phase.0.viscosity=0.1,0.2, steps 4, time 0.1, out other, device cuda:99, "
+        "precision float64, record-every 2, fps 100",
     ),
     "gradients check": (
-        (SCENE, *SHORT, "--json"),
-        {
-            **{"steps": ["2"], "parameters": ["viscosity"], "loss": ["centre-of-mass"], "perturbation": ["0.1"]},
-            **{"out": ["there"], "set": ["solver.time_step=0.001"], "device": [NOWHERE], "seed": ["1"]},
-        },
+        "scene.toml --steps 3 --json",
+        "steps 2, parameters viscosity, loss centre-of-mass, perturbation 0.1, out there, "
+        "set solver.time_step=0.001, device cuda:99, seed 1",
     ),
 }
-"""The arguments of each command, and values of its options."""
+"""The arguments of each command, and its options with values."""
+OPTIONS = {
+    command: {option.split()[0]: option.split()[1:] for option in options.split(", ")}
+    for command, (_, options) in COMMANDS.items()
+}
 ASIDE = {
     "help": "words",
     "quiet": "what it keeps back are lines of progress: tests/test_cli.py",
@@ -96,7 +79,9 @@ ASIDE = {
     "dataset workers": "the same comes out: tests/test_datasets.py",
     "gradients check json": "given here",
 }
-CASES = [(command, option) for command, (_, options) in COMMANDS.items() for option in options]
+KNOWN: dict[str, Any] = {}
+"""What commands do without a further option."""
+CASES = [(command, option) for command, options in OPTIONS.items() for option in options]
 
 
 @pytest.fixture
@@ -133,38 +118,33 @@ def content(path):
     return numbers(path)
 
 
-@pytest.fixture(scope="module")
-def known():
-    return {}
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_option_is_forgotten(command, cortado_command):
     shown = set(re.findall(r"^│ (?:-h, )?--([a-z-]+)", cortado_command(*command.split(), "--help")[1], re.MULTILINE))
     aside = {name.removeprefix(f"{command} ") for name in ASIDE}
-    missing = shown - aside - set(COMMANDS[command][1])
+    missing = shown - aside - set(OPTIONS[command])
     assert shown and not missing, f"give {missing} above"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_given_twice_has_the_same_effects(command, effects):
     """Or all options would act."""
-    arguments, _ = COMMANDS[command]
+    arguments = COMMANDS[command][0].split()
     found = effects(command, *arguments)
     assert found[0] in (0, 1), found
     assert same(effects(command, *arguments), found)
 
 
 @pytest.mark.parametrize("command, option", CASES, ids=[f"{command}-{option}" for command, option in CASES])
-def test_an_option_given_alone_acts_or_is_refused(command, option, effects, known):
-    arguments, options = COMMANDS[command]
-    if command not in known:
-        known[command] = effects(command, *arguments)
-    found = effects(command, *arguments, f"--{option}", *options[option])
+def test_an_option_given_alone_acts_or_is_refused(command, option, effects):
+    arguments = COMMANDS[command][0].split()
+    if command not in KNOWN:
+        KNOWN[command] = effects(command, *arguments)
+    found = effects(command, *arguments, f"--{option}", *OPTIONS[command][option])
     if found[0] == 2:
         assert_one_sentence(found[1][-1])
     else:
-        assert not same(found, known[command])
+        assert not same(found, KNOWN[command])
 
 
 SENSOR = {"name": "gauge", "kind": "wave_gauge", "position": [0.2, 0.0], "radius": 0.2}
@@ -298,18 +278,13 @@ def outcome(cortado_command, unrendered, measured, tmp_path_factory):
     return ended
 
 
-@pytest.fixture(scope="module")
-def outcomes():
-    return {}
-
-
 @pytest.mark.parametrize("base, path", KEYS, ids=[f"{base}-{'.'.join(map(str, path))}" for base, path in KEYS])
-def test_a_key_of_a_task_changed_alone_acts_or_is_refused(base, path, outcome, outcomes):
-    if base not in outcomes:
-        outcomes[base] = outcome(base, BASES[base])
-        assert outcomes[base][0] in (0, 1), outcomes[base][1]
+def test_a_key_of_a_task_changed_alone_acts_or_is_refused(base, path, outcome):
+    if base not in KNOWN:
+        KNOWN[base] = outcome(base, BASES[base])
+        assert KNOWN[base][0] in (0, 1), KNOWN[base][1]
     tables = json.loads(json.dumps(BASES[base]))
     put(tables, path, tables_of(base))
     found = outcome(base, tables)
     print(found[:2])
-    assert found[0] == 2 or not same(found, outcomes[base])
+    assert found[0] == 2 or not same(found, KNOWN[base])

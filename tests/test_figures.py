@@ -69,13 +69,8 @@ def test_nearer_particles_hide_farther_ones(tmp_path):
 def test_particles_side_by_side_share_their_scale(tmp_path, dimension):
     points = block(dimension)
     corners = (np.full(dimension, -0.1), np.full(dimension, 0.8))
-    path = plots.particles(
-        [points, points + 0.1],
-        ["before", "after"],
-        tmp_path / "a.png",
-        container=corners,
-        dimension=dimension,
-    )
+    options = {"container": corners, "dimension": dimension}
+    path = plots.particles([points, points + 0.1], ["before", "after"], tmp_path / "a.png", **options)
     ink = pixels(path).sum(axis=-1) < 450
     left, right = ink[:, : ink.shape[1] // 2], ink[:, ink.shape[1] // 2 :]
     assert 0.8 < left.sum() / right.sum() < 1.25
@@ -129,13 +124,10 @@ def test_images_are_shown_in_srgb(tmp_path, count):
     assert np.all(rows[across:] > rows[0] + 100)
 
 
-def test_images_without_titles_are_a_sentence(tmp_path):
+def test_images_without_titles_and_unwritable_pictures_are_sentences(tmp_path):
     for shown, titles in (([], []), ([np.zeros((2, 2, 3))], [])):
         with pytest.raises(InputError, match="titles"):
             plots.images(shown, titles, tmp_path / "a.png")
-
-
-def test_unwritable_picture_is_a_sentence(tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         plots.loss_curve([1.0], tmp_path / "absent" / "loss.png")
 

@@ -18,7 +18,7 @@ from cortado.optimisation.fitting.fit import with_error
 from cortado.optimisation.fitting.least_squares import Coordinates, whitened
 from cortado.optimisation.fitting.observations import Frames
 from cortado.sensors import PressureProbe, WallForce, WaveGauge
-from scenes import plane
+from scenes import box, plane
 
 STEPS, TIME_STEP = 12, 0.005
 TRUE = 2.0
@@ -88,9 +88,8 @@ def test_of_one_number_per_frame_it_is_the_textbook_formula():
     J, y = random.standard_normal((30, 1, 3)), random.standard_normal((30, 1))
     _, r, inverse = linear_fit(J, y)
     score = score_covariance(J, r, inverse, 30.0)
-    assert inverse @ score.B @ inverse == pytest.approx(
-        inverse * (r**2).sum() / 27.0 * (1.0 + 2.0 / 30.0), rel=0.03, abs=2e-4
-    )
+    wanted = inverse * (r**2).sum() / 27.0 * (1.0 + 2.0 / 30.0)
+    assert inverse @ score.B @ inverse == pytest.approx(wanted, rel=0.03, abs=2e-4)
     assert score.degrees_of_freedom(inverse, np.eye(3)[0]) == pytest.approx(27.0, rel=0.02)
 
 
@@ -120,9 +119,8 @@ def test_products_are_what_they_say():
 
 
 def test_coordinates_leave_fixed_numbers_alone():
-    own = Coordinates.of(
-        {"viscosity": [1.0, 2.0], "gravity": [0.5, -9.0]}, ["viscosity"], {"viscosity": (1.0, [1.0, 9.0])}
-    )
+    start = {"viscosity": [1.0, 2.0], "gravity": [0.5, -9.0]}
+    own = Coordinates.of(start, ["viscosity"], {"viscosity": (1.0, [1.0, 9.0])})
     assert own.labels == ["viscosity[1]", "gravity[0]", "gravity[1]"]
     u = own.start + [0.1, 0.0, 1.0]
     assert own.values(u)["viscosity"] == pytest.approx([1.0, 2.0 * np.exp(0.1)])
@@ -175,9 +173,8 @@ def assert_slopes(experiment, at, directions, h):
     """The derivatives along directions are those of differences over a step, and are given with what is predicted."""
     predicted, slopes = experiment.linearised(at, directions)
     for k, direction in enumerate(directions):
-        ends = [
-            experiment.predicted({n: v + way * h * direction.get(n, 0.0) for n, v in at.items()}) for way in (1.0, -1.0)
-        ]
+        moved = ({n: v + way * h * direction.get(n, 0.0) for n, v in at.items()} for way in (1.0, -1.0))
+        ends = [experiment.predicted(one) for one in moved]
         for name, slope in slopes.items():
             difference = (ends[0][name] - ends[1][name]) / (2.0 * h)
             assert np.linalg.norm(difference - slope[..., k]) <= 1e-5 * np.linalg.norm(slope[..., k]), (name, direction)
@@ -187,12 +184,8 @@ def assert_slopes(experiment, at, directions, h):
 def test_the_jacobian_is_the_limit_of_differences(experiment):
     at = {"viscosity": np.array(TRUE), "gravity": np.array([0.3, -9.0]), **experiment.start}
     at["camera.translation"] = np.array([1e-3, 2e-3, 0.0])  # else pixels look exactly along the faces between cells
-    directions = [
-        {"viscosity": np.array(1.0)},
-        {"gravity": np.array([1.0, 0.5])},
-        {"camera.width": np.array(0.1)},
-        {"camera.translation": np.array([0.01, 0.02, 0.0])},
-    ]
+    along = {"viscosity": 1.0, "gravity": [1.0, 0.5], "camera.width": 0.1, "camera.translation": [0.01, 0.02, 0.0]}
+    directions = [{name: np.array(value)} for name, value in along.items()]
     assert_slopes(experiment, at, directions, 1e-4)
 
 
@@ -200,12 +193,9 @@ def test_viscosity_acts_as_in_a_run_with_the_value_that_is_tried():
     """A viscosity of 200 Pa s asks for implicit viscosity, one of 0.2 Pa s does not, whatever the scene has."""
     times = TIME_STEP * np.arange(1.0, 5.0)
     height = measured.SensorSeries(WaveGauge([0.1, 0.0], radius=0.08), times, np.ones((4, 1)), 2)
-    thick, thin = (
-        measured.Experiment(
-            cortado.Simulation(SCENE.replaced(f"phase.0.viscosity={own}"), precision="float64"), {"gauge": height}
-        )
-        for own in (200.0, 0.2)
-    )
+    scenes = (SCENE.replaced(f"phase.0.viscosity={own}") for own in (200.0, 0.2))
+    simulations = (cortado.Simulation(one, precision="float64") for one in scenes)
+    thick, thin = (measured.Experiment(one, {"gauge": height}) for one in simulations)
     for tried in (0.2, 200.0):
         both = [one.predicted({"viscosity": tried})["gauge"] for one in (thick, thin)]
         assert np.array_equal(*both)
@@ -321,14 +311,20 @@ def test_a_fit_in_float32_is_that_in_float64(shaken):
     assert both[0].converged
 
 
-def test_a_notebook_shows_numbers_with_bars_and_doubts(shaken):
-    found = cortado.fit(
-        with_shake(shaken, 0, 1e-5), {"viscosity": 1.5, "gravity": [0.0, -9.0]}, {"gravity": ([0.0, -9.0],) * 2}
-    )
-    page = found._repr_html_()
+@pytest.fixture(scope="module")
+def wrong(shaken):
+    """A fit whose gravity is too small."""
+    start, held = {"viscosity": 1.5, "gravity": [0.0, -9.0]}, {"gravity": ([0.0, -9.0],) * 2}
+    return cortado.fit(with_shake(shaken, 0, 1e-5), start, held)
+
+
+def test_a_wrong_model_is_doubted_and_a_notebook_shows_numbers_with_bars_and_doubts(shaken, wrong):
+    page = wrong._repr_html_()
     assert "Pa s" in page and "±" in page and "data:image/png;base64," in page
-    assert escape(found.doubts[0]) in page and page.count("<tr>") == 2
-    assert repr(found).startswith("Fit(viscosity ") and "±" in repr(found)
+    assert escape(wrong.doubts[0]) in page and page.count("<tr>") == 2
+    assert repr(wrong).startswith("Fit(viscosity ") and "±" in repr(wrong)
+    assert wrong.doubts and "model is" in wrong.doubts[0]
+    assert not cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5}).doubts
 
 
 def test_two_experiments_tell_more_than_one(shaken):
@@ -358,15 +354,6 @@ def test_the_posterior_is_that_of_the_bars(shaken):
         pickle.loads(pickle.dumps(found)).log_posterior(found.u)
 
 
-def test_a_wrong_model_is_doubted(shaken):
-    """Its gravity is too small."""
-    found = cortado.fit(
-        with_shake(shaken, 0, 1e-5), {"viscosity": 1.5, "gravity": [0.0, -9.0]}, {"gravity": ([0.0, -9.0],) * 2}
-    )
-    assert found.doubts and "model is" in found.doubts[0]
-    assert not cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5}).doubts
-
-
 @pytest.fixture(scope="module")
 def weighed(simulation):
     """A scale below the container, with times enough for trends."""
@@ -390,9 +377,8 @@ def test_a_trend_in_a_single_series_is_doubted(weighed):
     drift = 0.04 * np.abs(weighed.observations["scale"].measured).max() * np.linspace(-1.0, 1.0, 20)[:, None]
     doubts = cortado.fit(with_noise(weighed, 0.01, wrong=drift), {"viscosity": 1.5}, starts=1).doubts
     assert any("The residuals of scale have a trend, from " in one for one in doubts)
-    assert not any(
-        "trend" in one for one in cortado.fit(with_noise(weighed, 0.01), {"viscosity": 1.5}, starts=1).doubts
-    )
+    doubts = cortado.fit(with_noise(weighed, 0.01), {"viscosity": 1.5}, starts=1).doubts
+    assert not any("trend" in one for one in doubts)
 
 
 def test_a_clock_that_is_late_is_doubted_where_it_is_not_searched(clocked, simulation):
@@ -452,29 +438,32 @@ def test_what_cannot_be_told_is_said(simulation, shaken):
 TIMES = [0.0, 0.01, 0.02, 0.03]
 
 
+def series(values, columns=("force_y",), *noise, times=TIMES):
+    return lambda _: measured.SensorSeries(WallForce(), times, values, 2, list(columns), *noise)
+
+
+def tracks(positions, places=((0.1, 0.1),), times=TIMES, **options):
+    return lambda simulation: measured.Tracks(simulation, places, times, positions, **options)
+
+
+def video(frames, **options):
+    return lambda simulation: measured.Video(simulation.renderer(resolution=(8, 8)), TIMES, frames, **options)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (
-            lambda s: measured.SensorSeries(WallForce(), TIMES[:3], np.zeros((3, 1)), 2, ["force_y"]),
-            "at least 4 rising",
-        ),
-        (lambda s: measured.SensorSeries(WallForce(), TIMES, np.zeros((4, 1)), 2, ["up"]), "one of force_x"),
-        (lambda s: measured.SensorSeries(WallForce(), TIMES, np.zeros((4, 2)), 2, ["force_x", "torque"]), "one unit"),
-        (lambda s: measured.SensorSeries(WallForce(), TIMES, np.full((4, 1), np.nan), 2, ["force_y"]), "not for all"),
-        (lambda s: measured.SensorSeries(WallForce(), TIMES, np.zeros((4, 1)), 2, ["force_y"], 0.0), "greater than 0"),
-        (lambda s: measured.Tracks(s, [[9.0, 9.0]], TIMES, np.zeros((4, 1, 2))), "must be within"),
-        (lambda s: measured.Tracks(s, [[0.1, 0.1]], TIMES, np.zeros((4, 2, 2))), "positions has shape"),
-        (lambda s: measured.Video(s.renderer(resolution=(8, 8)), TIMES, np.zeros((4, 8, 9, 3))), "frames has shape"),
-        (
-            lambda s: measured.Video(s.renderer(resolution=(8, 8)), TIMES, np.zeros((4, 8, 8, 3)), calibrate=["up"]),
-            "calib",
-        ),
-        (lambda s: measured.Tracks(s, [[0.1, 0.1]], TIMES, np.zeros((4, 1, 2)), calibrate=["rotation"]), "of start"),
-        (
-            lambda s: measured.Tracks(s, [[0.1, 0.1]], TIMES[::-1], np.zeros((4, 1, 2))),
-            "times has 0.02 s after 0.03 s, but must rise",
-        ),
+        (series(np.zeros((3, 1)), times=TIMES[:3]), "at least 4 rising"),
+        (series(np.zeros((4, 1)), ["up"]), "one of force_x"),
+        (series(np.zeros((4, 2)), ["force_x", "torque"]), "one unit"),
+        (series(np.full((4, 1), np.nan)), "not for all"),
+        (series(np.zeros((4, 1)), ["force_y"], 0.0), "greater than 0"),
+        (tracks(np.zeros((4, 1, 2)), [[9.0, 9.0]]), "must be within"),
+        (tracks(np.zeros((4, 2, 2))), "positions has shape"),
+        (tracks(np.zeros((4, 1, 2)), calibrate=["rotation"]), "of start"),
+        (tracks(np.zeros((4, 1, 2)), times=TIMES[::-1]), "times has 0.02 s after 0.03 s, but must rise"),
+        (video(np.zeros((4, 8, 9, 3))), "frames has shape"),
+        (video(np.zeros((4, 8, 8, 3)), calibrate=["up"]), "calib"),
         (lambda s: measured.Experiment(s, {}), "observations is empty"),
         (lambda s: cortado.fit([], {"viscosity": 1.0}), "experiments is empty"),
         (lambda s: cortado.fit("experiment", {"viscosity": 1.0}), "must be a cortado.measured.Experiment, or a list"),
@@ -515,11 +504,8 @@ def test_a_background_that_stays_tells_how_large_the_noise_is():
 
 
 def test_a_tracer_at_the_edge_of_a_period_swims_with_the_fluid_on_both_sides():
-    made = plane(
-        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.4], "phase": "water"}],
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8], "periodic": [True, False]},
-    )
-    channel = cortado.Simulation(made)
+    room = box([0.0, 0.0], [0.7, 0.8], periodic=[True, False])
+    channel = cortado.Simulation(plane(fluid=[box([0.0, 0.0], [0.7, 0.4], phase="water")], container=room))
     for edge in (0.0, 0.7, -1.4):
         tracks = measured.Tracks(channel, [[edge, 0.2]], TIMES, np.zeros((4, 1, 2)))
         moved = channel.positions + 0.1 * np.outer(channel.positions[:, 0] > 0.35, [1.0, 0.0])

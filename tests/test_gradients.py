@@ -6,16 +6,11 @@ import warp as wp
 
 from cortado import Problem, Simulation, gradients, losses
 from finite_differences import both_modes, central_difference, decades, distance, plateau
-from scenes import plane, scene, splash
+from scenes import box, plane, scene, splash
 
 SCALES = {
-    "gravity": 1.0,
-    "gravity over time": 1.0,
-    "initial_positions": 0.05,
-    "initial_velocities": 0.1,
-    "viscosity": 0.05,
-    "rest_density": 100.0,
-    "time_step": 1e-4,
+    **{"gravity": 1.0, "gravity over time": 1.0, "initial_positions": 0.05, "initial_velocities": 0.1},
+    **{"viscosity": 0.05, "rest_density": 100.0, "time_step": 1e-4},
 }
 """Size of a direction of each parameter."""
 
@@ -76,13 +71,10 @@ SHAPES = {
     "wendland_c4, no slip": scene(
         discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c4"},
         forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise"},
-        container={"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"},
+        container=box([0.0] * 3, [0.4, 0.6, 0.25], slip="no"),
     ),
     "plane": plane(),
-    "periodic": plane(
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
-        forces={"gravity": [1.0, -9.81]},
-    ),
+    "periodic": plane(container=box([0.0, 0.0], [0.4, 0.8], periodic=[True, False]), forces={"gravity": [1.0, -9.81]}),
     "free space": scene(container={"shape": "none"}),
     "without pressure": scene(forces={"gravity": [0.0, -9.81, 0.0], "pressure": False}),
     "iterations by tolerance": splash(**ITERATIONS["tolerance"]),
@@ -104,10 +96,7 @@ def test_gather_adjoint_equals_warps_tape(made):
 
 @pytest.mark.parametrize("made", SHAPES.values(), ids=SHAPES)
 def test_all_parameters_at_once(made):
-    """One reverse sweep against one forward sweep, along a direction in all parameters together.
-
-    The lattice is disturbed: its symmetry puts many particles near the kink of the pressure's clamp at once.
-    """
+    """The lattice is disturbed: its symmetry puts many particles near the kink of the pressure's clamp at once."""
     problem = problem_of(made, 40)
     point, directions = {}, {}
     for what in SCALES:
@@ -144,9 +133,8 @@ def add_square(x: wp.array(dtype=wp.vec3d), count: wp.float64, loss: wp.array(dt
 
 
 def mean_square(positions, velocities, loss):
-    wp.launch(
-        add_square, len(positions), inputs=[positions, float(len(positions))], outputs=[loss], device=positions.device
-    )
+    count = len(positions)
+    wp.launch(add_square, count, inputs=[positions, float(count)], outputs=[loss], device=positions.device)
 
 
 POINT, ALONG = {"x": np.array(1.0), "y": np.array(5.0)}, {"x": np.array(1.0)}
@@ -157,19 +145,13 @@ def cube(values):
     return float(values["x"] ** 3)
 
 
-def test_a_right_derivative_is_on_a_plateau():
+def test_a_right_derivative_is_on_a_plateau_of_neighbours_and_a_chance_agreement_is_none():
     assert central_difference(cube, POINT, ALONG, 0.1) == pytest.approx(3.01, rel=1e-13)
     assert distance(cube, POINT, ALONG, 3.0, decades(1.0, 6.0)) < 1e-9
-
-
-def test_a_chance_agreement_is_none():
     wrong, steps = 3.0 + 1e-4, decades(1.0, 6.0)
     nearest = min(abs(central_difference(cube, POINT, ALONG, h) - wrong) for h in steps)
     assert nearest < 1e-12  # at h = 0.01
     assert distance(cube, POINT, ALONG, wrong, steps, enough=1e-6) > 1e-5
-
-
-def test_a_plateau_is_of_neighbours():
     assert plateau([1.0, 0.1, 5.0, 0.2, 0.3, 0.1, 9.0]) == 0.3
     with pytest.raises(AssertionError):
         plateau([0.1, 0.1])

@@ -56,14 +56,8 @@ except KeyboardInterrupt as stop:
 
 def stopped(number: int, *arguments: str, **environment: str) -> tuple[int, str]:
     """Exit code and what a Python process says that gets a signal when it says 'here'."""
-    process = subprocess.Popen(
-        [sys.executable, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env={**os.environ, **environment},
-        text=True,
-        preexec_fn=listen,
-    )
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "preexec_fn": listen}
+    process = subprocess.Popen([sys.executable, *arguments], env={**os.environ, **environment}, **options)
     assert process.stdout is not None and process.stdout.readline() == "here\n"
     process.send_signal(number)
     out, _ = process.communicate(timeout=30)
@@ -96,9 +90,8 @@ def test_workers_that_begin_are_interrupted_in_one_sentence(number):
     """Ctrl-C goes to all processes of a terminal, also to those that are still being imported; a second one too."""
     sent = "killpg(0, signal.SIGINT)" if number == signal.SIGINT else "kill(os.getpid(), signal.SIGTERM)"
     program = [sys.executable, "-c", WORKERS.replace("NUMBER", sent)]
-    done = subprocess.run(
-        program, capture_output=True, text=True, timeout=120, start_new_session=True, preexec_fn=listen
-    )
+    options = {"start_new_session": True, "preexec_fn": listen, "timeout": 120}
+    done = subprocess.run(program, capture_output=True, text=True, **options)
     assert (done.returncode, done.stdout, done.stderr) == (128 + number, "Interrupted.\n", "")
 
 
@@ -119,6 +112,7 @@ def test_a_signal_that_is_ignored_stays_so():
 
 
 MISTAKE = ("run", "absent.toml")
+UNWRITTEN = "The result cannot be written to the standard output: "
 SENTENCE = "absent.toml: the scene cannot be read: No such file or directory.\n"
 
 
@@ -155,18 +149,8 @@ def in_shell(line: str, *arguments: str, **environment: str) -> tuple[int, str]:
         ('"$@" 2>/dev/full', MISTAKE, 2, ""),
         ('"$@" 2> >(exec 0<&-; sleep 1)', MISTAKE, 2, ""),
         ('"$@" | true; exit ${PIPESTATUS[0]}', ["run", "--help"], 141, ""),
-        (
-            '"$@" >/dev/full',
-            ["--help"],
-            1,
-            "The result cannot be written to the standard output: No space left on device.\n",
-        ),
-        (
-            '"$@" >&-',
-            ["schema"],
-            1,
-            "The result cannot be written to the standard output: Bad file descriptor.\n",
-        ),
+        ('"$@" >/dev/full', ["--help"], 1, f"{UNWRITTEN}No space left on device.\n"),
+        ('"$@" >&-', ["schema"], 1, f"{UNWRITTEN}Bad file descriptor.\n"),
     ],
     ids=["whole", "no stderr", "no streams", "full stderr", "broken stderr", "broken stdout", "full stdout", "none"],
 )

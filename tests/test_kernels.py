@@ -162,18 +162,8 @@ def cloud(name: str, seed: int = 7) -> Cloud:
     return Cloud(x, s, search, dimension)
 
 
-VECTORS = (
-    "x",
-    "v",
-    "acceleration",
-    "acceleration_in",
-    "gravity",
-    "x_star",
-    "x_free",
-    "v_free",
-    "outlet_in",
-    "nozzle_path",
-)
+VECTORS = {"x", "v", "acceleration", "acceleration_in", "gravity", "x_star"}
+VECTORS |= {"x_free", "v_free", "outlet_in", "nozzle_path"}
 
 
 class Operation:
@@ -216,15 +206,6 @@ class Operation:
         random = np.random.default_rng(seed)
         forward = self.forward(self.start)
         return {name: random.standard_normal(forward[name].shape) for name in self.outputs}
-
-    def forward(self, values: Values) -> Values:
-        raise NotImplementedError
-
-    def tangent(self, values: Values, dots: Values) -> Values:
-        raise NotImplementedError
-
-    def adjoint(self, values: Values, bars: Values) -> Values:
-        raise NotImplementedError
 
 
 def dotted(dots: Values) -> Values:
@@ -344,13 +325,8 @@ class Stress(Viscosity):
     def __init__(self, cloud):
         super().__init__(cloud)
         self.kernels = stress_kernels(DISCRETISATION, cloud.dimension, newtonian_law(), self.sticks)
-        self.given = {
-            "s": self.s,
-            "control": 1.3,
-            "least": 0.05,
-            "theta": np.zeros((1, 1)),
-            "theta_dot": np.zeros((1, 1)),
-        }
+        none = np.zeros((1, 1))
+        self.given = {"s": self.s, "control": 1.3, "least": 0.05, "theta": none, "theta_dot": none}
         self.room = {name: np.zeros((N, 3, 3)) for name in "MAT"} | {name: np.zeros(N) for name in ("R", "eta")}
 
     def known(self, values):
@@ -367,19 +343,13 @@ class Stress(Viscosity):
         known = {**self.known(values), **dotted(dots), **{f"{name}_dot": value for name, value in self.room.items()}}
         known |= launch(self.kernels.moments.tangent, **known)
         known |= launch(self.kernels.stress.tangent, **known, A_u_dot=known["A_dot"])
-        return {
-            "acceleration": launch(self.kernels.force.tangent, **known, acceleration_dot=np.zeros((N, 3)))[
-                "acceleration_dot"
-            ]
-        }
+        found = launch(self.kernels.force.tangent, **known, acceleration_dot=np.zeros((N, 3)))
+        return {"acceleration": found["acceleration_dot"]}
 
     def adjoint(self, values, bars):
         known = {**self.known(values), **{f"{name}_bar": value for name, value in self.room.items()}}
-        known |= {
-            "acceleration_bar": bars["acceleration"],
-            "theta_bar": np.zeros((N, 1)),
-            "A_u_bar": np.zeros((N, 3, 3)),
-        }
+        known |= {"theta_bar": np.zeros((N, 1)), "A_u_bar": np.zeros((N, 3, 3))}
+        known["acceleration_bar"] = bars["acceleration"]
         known |= zeros("x_bar", "v_bar", "m_bar", "mu_bar")
         of_stress, of_particles = self.kernels.force.adjoint
         known |= launch(of_stress, **known)
@@ -387,10 +357,8 @@ class Stress(Viscosity):
         known["A_bar"] = known["A_bar"] + known["A_u_bar"]
         for kernel in self.kernels.moments.adjoint, of_particles:
             known |= launch(kernel, **known)
-        return {
-            **{name: known[f"{name}_bar"] for name in ("x", "v", "m", "mu")},
-            "acceleration_in": bars["acceleration"],
-        }
+        found = {name: known[f"{name}_bar"] for name in ("x", "v", "m", "mu")}
+        return {**found, "acceleration_in": bars["acceleration"]}
 
 
 class StressWithoutSlip(Stress):
@@ -476,16 +444,9 @@ class Iterations(Operation):
         first = launch(Kernels.integration.predict, **{**values, **out})
         states, pressures, cs = [first], [values["p_in"]], []
         for _ in range(self.iterations):
-            given = {**values, "x_star": states[-1]["x_star"], "p_in": pressures[-1]}
-            found = launch(
-                Kernels.pressure.forward,
-                s=self.s,
-                stiffness=self.stiffness,
-                **given,
-                p_out=np.zeros(N),
-                c=np.zeros(N),
-                error=wp.zeros(N, dtype=wp.vec2d, device=CPU),
-            )
+            given = {**values, "x_star": states[-1]["x_star"], "p_in": pressures[-1], "stiffness": self.stiffness}
+            given |= {"p_out": np.zeros(N), "c": np.zeros(N), "error": wp.zeros(N, dtype=wp.vec2d, device=CPU)}
+            found = launch(Kernels.pressure.forward, s=self.s, **given)
             pressures.append(found["p_out"])
             cs.append(found["c"])
             states.append(launch(Kernels.force.forward, s=self.s, **values, c=cs[-1], **out))
@@ -518,26 +479,10 @@ class Iterations(Operation):
 
     def adjoint(self, values, bars):
         states, pressures, cs = self.record(values)
-        bar = launch(
-            Kernels.begin_adjoint,
-            order=self.order,
-            **values,
-            v_star=states[-1]["v_star"],
-            x_scene_bar=bars["x_new"],
-            v_scene_bar=bars["v_new"],
-            **zeros(
-                "time_step_bar",
-                "x_bar",
-                "v_bar",
-                "n_bar",
-                "m_bar",
-                "rho_0_bar",
-                "mu_bar",
-                "scaled_bar",
-                "y_bar",
-                "p_bar",
-            ),
-        )
+        names = ("time_step", "x", "v", "n", "m", "rho_0", "mu", "scaled", "y", "p")
+        given = {**values, "x_scene_bar": bars["x_new"], "v_scene_bar": bars["v_new"], "v_star": states[-1]["v_star"]}
+        given |= zeros(*(f"{name}_bar" for name in names))
+        bar = launch(Kernels.begin_adjoint, order=self.order, **given)
         bar = {name: value for name, value in bar.items() if name.endswith("_bar")}
         bar["p_bar"] = bars["p_new"]
         for k in reversed(range(self.iterations)):
@@ -590,15 +535,11 @@ class Blend(Operation):
     def adjoint(self, values, bars):
         given = {**values, **self.materials(values), "order": self.order, "c_scene_bar": bars["c_new"]}
         given |= {f"{name}_bar": bars[name] for name in ("rho_0", "mu")} | {"c_bar": np.zeros((N, 3))}
-        sums = {
-            name: np.stack([values] * 3, axis=1) for name, values in zeros("rest_density_bar", "viscosity_bar").items()
-        }
+        empty = zeros("rest_density_bar", "viscosity_bar")
+        sums = {name: np.stack([values] * 3, axis=1) for name, values in empty.items()}
         found = launch(self.kernels.blend.adjoint, **given, **sums)
-        return {
-            "c": found["c_bar"],
-            "rest_density": found["rest_density_bar"].sum(axis=0),
-            "viscosity": found["viscosity_bar"].sum(axis=0),
-        }
+        totals = {name: found[f"{name}_bar"].sum(axis=0) for name in ("rest_density", "viscosity")}
+        return {"c": found["c_bar"], **totals}
 
 
 class Potential(Operation):
@@ -674,52 +615,22 @@ class Substep(Potential):
         }
 
 
-class SubstepOfMiscible(Substep):
-    variant = "2, miscible, constant"
-
-
-class SubstepOfThree(Substep):
-    variant = "3, double well, constant"
-
-
-class SubstepOfThreeMiscible(Substep):
-    variant = "3, miscible, degenerate"
-
-
-class SubstepOfFour(Substep):
-    variant = "4, double well, degenerate"
-
-
-class TwoIterations(Iterations):
-    iterations = 2
-
-
-class FiveIterations(Iterations):
-    iterations = 5
-
-
-ADJOINT = [
-    Density,
-    WallYield,
-    DensityRatio,
-    Pairwise,
-    PairwiseWithFriction,
-    Stress,
-    StressWithoutSlip,
-    GravityTable,
-    Iterations,
-    TwoIterations,
-    FiveIterations,
-    WithoutViscosity,
-    Blend,
-    Substep,
-    SubstepOfMiscible,
-    SubstepOfThree,
-    SubstepOfThreeMiscible,
-    SubstepOfFour,
+SUBSTEPS = [Substep] + [
+    type(name, (Substep,), {"variant": variant})
+    for name, variant in {
+        "SubstepOfMiscible": "2, miscible, constant",
+        "SubstepOfThree": "3, double well, constant",
+        "SubstepOfThreeMiscible": "3, miscible, degenerate",
+        "SubstepOfFour": "4, double well, degenerate",
+    }.items()
 ]
+TwoIterations, FiveIterations = (
+    type(name, (Iterations,), {"iterations": count}) for name, count in (("TwoIterations", 2), ("FiveIterations", 5))
+)
+VISCOUS = [Pairwise, PairwiseWithFriction, Stress, StressWithoutSlip, WithoutViscosity]
+STEPS = [Density, WallYield, DensityRatio, GravityTable, Iterations, TwoIterations, FiveIterations, Blend]
+ADJOINT = [*STEPS, *VISCOUS, *SUBSTEPS]
 TANGENT = [*ADJOINT, Pressure, PressureForce, Potential, Flux]
-
 clouds = pytest.mark.parametrize("where", ["3-D", "2-D", "periodic"])
 
 
@@ -763,13 +674,12 @@ def test_tangent_is_the_limit_of_central_differences(operation, name, where):
 def check_differences(op: Operation, directions: Values, tangent: Values) -> None:
     for output in op.outputs:
         size = norm(tangent, [output])
-        found = [
-            np.linalg.norm(
-                central_difference(lambda values, k=output: op.forward(values)[k], op.start, directions, h)
-                - tangent[output]
-            )
-            for h in decades(3.5, 6.5)
-        ]
+
+        def off(h, output=output):
+            found = central_difference(lambda values: op.forward(values)[output], op.start, directions, h)
+            return np.linalg.norm(found - tangent[output])
+
+        found = [off(h) for h in decades(3.5, 6.5)]
         assert plateau(found) < 1e-7 * size or max(found) == size == 0.0, f"{output}: {plateau(found) / size:.1e}"
 
 

@@ -2,6 +2,7 @@
 
 import gc
 import pickle
+from types import SimpleNamespace
 
 import pytest
 import warp as wp
@@ -48,17 +49,12 @@ def test_what_is_given_comes_before_groups_and_groups_in_their_order():
 @pytest.mark.parametrize("missing", NAMES)
 def test_a_missing_argument_is_named(missing):
     given = {name: 0 for name in NAMES if name != missing}
-    with pytest.raises(
-        TypeError, match=f"argument '{missing}' of kernel .*predict.* is missing; it has particles, time"
-    ):
+    told = f"argument '{missing}' of kernel .*predict.* is missing; it has particles, time"
+    with pytest.raises(TypeError, match=told):
         bound(PREDICT, (), given, Bundles())
-
-
-def test_what_is_known_is_said_where_an_argument_is_missing():
     groups = dict.fromkeys(("particles", "time_step", "x", "v", "xstar"), 0), {"x": 1, "acceleration": 2}
-    with pytest.raises(
-        TypeError, match=r"'x_star' of .* is missing; .*; known are v_star, particles, time_step, x, v, xstar, acc"
-    ):
+    told = r"'x_star' of .* is missing; .*; known are v_star, particles, time_step, x, v, xstar, acc"
+    with pytest.raises(TypeError, match=told):
         bound(PREDICT, groups, {"v_star": 0}, Bundles())
 
 
@@ -95,10 +91,8 @@ def count_neighbours(s: neighbourhood_type(FLOAT64), found: wp.array(dtype=wp.in
 def test_a_sum_over_neighbours_begins_where_its_range_begins():
     """Else a range of particles would overwrite another, from some thousands of particles on, without a word."""
     solver = Simulation(plane(), precision="float64").solver
-    context, found = (
-        solver.context(solver.new_parameters(1)),
-        wp.zeros(solver.layout.particles, dtype=wp.int32, device=CPU),
-    )
+    context = solver.context(solver.new_parameters(1))
+    found = wp.zeros(solver.layout.particles, dtype=wp.int32, device=CPU)
     with pytest.raises(TypeError, match=r"count_neighbours takes the neighbourhood s, .* i = s\.first \+ wp\.tid\(\)"):
         context.launch(count_neighbours, found=found)
 
@@ -166,24 +160,14 @@ def test_launches_together_are_one_to_a_watcher():
     assert done == [first, second] * 2 and first.numpy() == 12 and second.numpy() == 6
 
 
-class Device:
-    """As much of a device as counts."""
-
-    def __init__(self, is_cpu):
-        self.is_cpu = is_cpu
-
-
 def test_few_particles_get_many_lanes_and_a_cpu_has_one():
+    gpu, cpu = (SimpleNamespace(is_cpu=is_cpu) for is_cpu in (False, True))
     sizes = [1, *(most for most, _ in BY_SIZE), *(most + 1 for most, _ in BY_SIZE), 10**7]
-    found = [lanes_for(size, Device(is_cpu=False)) for size in sorted(sizes)]
+    found = [lanes_for(size, gpu) for size in sorted(sizes)]
     assert found == sorted(found, reverse=True) and found[-1] == 1
     assert all(32 % lanes == 0 for lanes in found)
-    assert {lanes_for(size, Device(is_cpu=True)) for size in sizes} == {1}
-
-
-def test_lanes_that_are_asked_for_are_had_on_a_gpu_alone():
-    assert lanes_for(100, Device(is_cpu=False), 2) == 2
-    assert lanes_for(100, Device(is_cpu=True), 2) == 1
+    assert {lanes_for(size, cpu) for size in sizes} == {1}
+    assert lanes_for(100, gpu, 2) == 2 and lanes_for(100, cpu, 2) == 1
 
 
 @pytest.mark.parametrize("lanes", [3, 0, 32, "four", 1.5, True])
@@ -220,12 +204,7 @@ def kernels_of(discretisation):
         *(kernels for mixture in mixtures for kernels in (mixture.potential, mixture.flux)),
     ]
     kernels = [kernel for family in families for kernel in (family.forward, family.tangent, family.adjoint)]
-    alone = [
-        fill_kernel(discretisation),
-        filters.crowd,
-        filters.strength,
-        filters.viscosity,
-    ]
+    alone = [fill_kernel(discretisation), filters.crowd, filters.strength, filters.viscosity]
     alone += [viscous.force.forward, viscous.force.tangent, *viscous.force.adjoint]
     return [*alone, *kernels, curved.mean.forward, curved.mean.tangent, curved.mean.adjoint[1]]
 
