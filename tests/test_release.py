@@ -8,6 +8,7 @@ import sys
 import tarfile
 import tomllib
 import zipfile
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -86,43 +87,44 @@ def test_an_unknown_task_is_told(arguments):
     assert (done.returncode, done.stdout) == (2, "") and "one of: setup, test, test-all, demo, lint" in done.stderr
 
 
-@pytest.mark.parametrize("newer", ["pyproject.toml", "reference/pyproject.toml", "reference/cpp/CMakeLists.txt"])
-def test_what_changed_is_installed_again(tmp_path, monkeypatch, newer):
+@pytest.fixture
+def installs(tmp_path, monkeypatch):
+    """A folder in the place of the repository, the commands that are run in it, and what they end with."""
     (tmp_path / "reference/cpp").mkdir(parents=True)
-    for name in ("pyproject.toml", "reference/pyproject.toml", "reference/cpp/CMakeLists.txt"):
+    for name in INSTALLED:
         (tmp_path / name).touch()
-    ready, ran = tmp_path / "ready", []
+    ran, failing = [], []
     monkeypatch.setattr(tasks, "ROOT", tmp_path)
-    monkeypatch.setattr(tasks, "STAMPS", {"test": ready, "pictures": tmp_path / "demo"})
+    monkeypatch.setattr(tasks, "STAMPS", {"test": tmp_path / "ready", "pictures": tmp_path / "demo"})
     monkeypatch.setattr(tasks, "BIN", tmp_path)
-    monkeypatch.setattr(tasks, "run", lambda command, quiet=False: ran.append(command) or 0)
+    monkeypatch.setattr(tasks, "run", lambda command, quiet=False: ran.append(command) or int(command in failing))
+    return tmp_path, ran, failing
+
+
+INSTALLED = ["pyproject.toml", "reference/pyproject.toml", "reference/cpp/CMakeLists.txt"]
+
+
+@pytest.mark.parametrize("newer", INSTALLED)
+def test_what_changed_is_installed_again(installs, newer):
+    folder, ran, _ = installs
     tasks.set_up("test")
     tasks.set_up("test")
-    assert set(ran) == {(*tasks.INSTALL, ".[test]"), tasks.ENGINE} and len(ran) == 2 and ready.exists()
-    later = ready.stat().st_mtime + 10
-    os.utime(tmp_path / newer, (later, later))
+    assert set(ran) == {(*tasks.INSTALL, ".[test]"), tasks.ENGINE} and len(ran) == 2 and (folder / "ready").exists()
+    later = (folder / "ready").stat().st_mtime + 10
+    os.utime(folder / newer, (later, later))
     tasks.set_up("test")
     assert len(ran) == 4
 
 
 @pytest.mark.parametrize("required", ["", "1"])
-def test_without_a_compiler_all_but_the_engine_is_installed(tmp_path, monkeypatch, capsys, required):
-    (tmp_path / "pyproject.toml").touch()
-    (tmp_path / "reference").mkdir()
-    (tmp_path / "reference/pyproject.toml").touch()
-    ready = tmp_path / "ready"
-    monkeypatch.setattr(tasks, "ROOT", tmp_path)
-    monkeypatch.setattr(tasks, "STAMPS", {"test": ready})
-    monkeypatch.setattr(tasks, "BIN", tmp_path)
+def test_without_a_compiler_all_but_the_engine_is_installed(installs, monkeypatch, capsys, required):
+    folder, _, failing = installs
+    failing.append(tasks.ENGINE)
     monkeypatch.setenv("CORTADO_REQUIRE_ENGINE", required)
-    monkeypatch.setattr(tasks, "run", lambda command, quiet=False: int(command == tasks.ENGINE))
-    if required:
-        with pytest.raises(SystemExit):
-            tasks.set_up("test")
-    else:
+    with pytest.raises(SystemExit) if required else nullcontext():
         tasks.set_up("test")
-        assert "Installed without the reference engine" in capsys.readouterr().err
-    assert ready.exists() != bool(required)
+    assert required or "Installed without the reference engine" in capsys.readouterr().err
+    assert (folder / "ready").exists() != bool(required)
 
 
 ENGINE_FOLDER = ROOT / "reference"
@@ -131,10 +133,8 @@ needs_cmake = pytest.mark.skipif(shutil.which("cmake") is None, reason="CMake is
 
 def build(backend: str, hook: str, source: Path, out: Path, **environment: str) -> subprocess.CompletedProcess:
     """Call a hook of a build backend, as pip does."""
-    code = f"from {backend} import {hook}; {hook}({str(out)!r})"
-    return subprocess.run(
-        [sys.executable, "-c", code], cwd=source, env={**os.environ, **environment}, capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", f"from {backend} import {hook}; {hook}({str(out)!r})"]
+    return subprocess.run(command, cwd=source, env={**os.environ, **environment}, capture_output=True, text=True)
 
 
 def test_the_wheel_is_pure_python_and_holds_all_that_is_read(tmp_path):

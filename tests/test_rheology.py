@@ -10,11 +10,11 @@ import pytest
 import warp as wp
 
 import cortado
-from cortado import InputError, Problem, SceneError, Simulation, losses
+from cortado import InputError, SceneError, Simulation
 from cortado.errors import OutOfRangeError
 from cortado.forces import OverTime, Rheology
 from cortado.sph.viscosity_law import LAWS, bingham, carreau, herschel_bulkley, power_law
-from scenes import HONEY, plane
+from scenes import HONEY, aimed, bodies, box, plane
 
 ROOT = Path(__file__).parents[1]
 KINDS = {
@@ -24,8 +24,8 @@ KINDS = {
     "herschel_bulkley": {"yield_stress": 3.0, "flow_index": 0.7, "regularisation": 0.3, "least_shear_rate": 0.1},
 }
 STEPS = 8
-FLUID = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.25, 0.3], "velocity": [0.5, 0.2], "phase": "honey"}
-ROOM = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 0.5], "slip": "no"}
+FLUID = box([0.0, 0.0], [0.25, 0.3], velocity=[0.5, 0.2], phase="honey")
+ROOM = box([0.0, 0.0], [0.5, 0.5], slip="no")
 
 
 def thick(rheology=None, solve="automatic", **changes):
@@ -36,9 +36,7 @@ def thick(rheology=None, solve="automatic", **changes):
 
 
 def problem(made, precision="float64", **options):
-    simulation = Simulation(made, precision=precision, **options)
-    target = simulation.positions + 0.02 * np.sin(7.0 * simulation.positions)
-    return Problem(simulation, STEPS, losses.FinalPositions(target))
+    return aimed(Simulation(made, precision=precision, **options), STEPS)
 
 
 @pytest.mark.parametrize("shear_rate", [1e-6, 0.03, 2.0, 500.0])
@@ -120,28 +118,28 @@ def test_a_law_of_one_s_own_in_two_phases_has_the_viscosity_of_each():
     np.testing.assert_allclose(law.run(STEPS).positions[-1], plain.run(STEPS).positions[-1], rtol=0.0, atol=1e-12)
 
 
+LAW = {"kind": "bingham", "yield_stress": 1.0}
+
+
 @pytest.mark.parametrize(
-    ("rheology", "words"),
+    ("rheology", "changes", "words"),
     [
-        ({"kind": "jelly"}, "phase[0].rheology"),
-        ({"kind": "bingham"}, "yield_stress"),
-        ({"kind": "bingham", "yield_stress": -1.0}, "yield_stress"),
-        ({"kind": "carreau", "relaxation_time": 0.1, "flow_index": 0.0}, "flow_index"),
-        ({"kind": "carreau", "relaxation_time": 0.1, "flow_index": 0.5, "yield_stress": 1.0}, "yield_stress"),
+        ({"kind": "jelly"}, {}, r"phase\[0\].rheology"),
+        ({"kind": "bingham"}, {}, "yield_stress"),
+        ({"kind": "bingham", "yield_stress": -1.0}, {}, "yield_stress"),
+        ({"kind": "carreau", "relaxation_time": 0.1, "flow_index": 0.0}, {}, "flow_index"),
+        ({"kind": "carreau", "relaxation_time": 0.1, "flow_index": 0.5, "yield_stress": 1.0}, {}, "yield_stress"),
+        (None, {"phase": [{**HONEY, "rheology": LAW}, {**HONEY, "name": "syrup"}]}, "several phases"),
+        (LAW, {"forces": {"gravity": [0.0, -9.81], "viscosity": "none"}}, "is 'none', but must be \"stress\""),
     ],
 )
-def test_what_is_no_law_is_a_sentence(rheology, words):
-    with pytest.raises(SceneError) as caught:
-        thick(rheology)
-    assert words in str(caught.value) and "\n" not in str(caught.value)
+def test_what_is_no_law_is_a_sentence(rheology, changes, words):
+    with pytest.raises(SceneError, match=words) as caught:
+        thick(rheology, **changes)
+    assert "\n" not in str(caught.value)
 
 
-def test_where_there_can_be_no_law_it_is_a_sentence():
-    law = {"kind": "bingham", "yield_stress": 1.0}
-    with pytest.raises(SceneError, match="several phases"):
-        thick(phase=[{**HONEY, "rheology": law}, {**HONEY, "name": "syrup"}])
-    with pytest.raises(SceneError, match="viscosity is 'none', but must be \"stress\""):
-        thick(law, forces={"gravity": [0.0, -9.81], "viscosity": "none"})
+def test_a_law_of_one_s_own_needs_a_stress_and_its_arguments():
     made = thick(forces={"gravity": [0.0, 0.0], "viscosity": "pairwise"})
     with pytest.raises(InputError, match="viscosity is 'pairwise', but must be 'stress'"):
         Simulation(made, forces=[Rheology(cross, time=1.0, index=1.0)])
@@ -157,11 +155,12 @@ def test_a_film_that_does_not_yield_creeps_as_slowly_as_is_said(kind):
     index = {"flow_index": 0.6} if kind == "herschel_bulkley" else {}
     phase = {"rest_density": 1000.0, "viscosity": 0.01, "rheology": {"kind": kind, "yield_stress": 150.0, **index}}
     with pytest.warns(cortado.CortadoWarning, match=r"below 150 Pa, it creeps, at up to 0.0025 m/s: its depth, 0.1 m"):
-        made = plane(
-            discretisation={"spacing": spacing},
+        made = bodies(
+            2,
+            [box([0.0, 0.0], [8 * spacing, depth], phase="mud")],
+            box([0.0, 0.0], [8 * spacing, 1.5 * depth], **sides),
+            spacing,
             phase=[{"name": "mud", **phase}],
-            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [8 * spacing, depth], "phase": "mud"}],
-            container={"shape": "box", "lower": [0.0, 0.0], "upper": [8 * spacing, 1.5 * depth], **sides},
             forces={"gravity": [9.81 * slope / size, -9.81 / size], "viscosity": "stress"},
             solver={"kind": "pcisph", "time_step": 0.002},
         )
@@ -179,9 +178,8 @@ def test_a_film_that_does_not_yield_creeps_as_slowly_as_is_said(kind):
 @pytest.mark.parametrize("named", [None, {"kind": "bingham", **KINDS["bingham"]}])
 def test_two_laws_are_one_too_many(named):
     laws = [Rheology(cross, time=0.4, index=0.8), Rheology(cross, "other", time=0.1, index=0.5)]
-    with pytest.raises(
-        InputError, match=r"^Rheology\(.*\) and Rheology\(.*\) both take the place of .* viscosity, but"
-    ):
+    words = r"^Rheology\(.*\) and Rheology\(.*\) both take the place of .* viscosity, but"
+    with pytest.raises(InputError, match=words):
         Simulation(thick(named), forces=laws[: 2 if named is None else 1])
 
 
@@ -225,10 +223,7 @@ BENT = {"swirl": [0.1, 0.2], "slope": OverTime([0.0, 1.0], [0.0, 0.0])}
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        (
-            {"beyond.slope": 1e-4},
-            r"beyond returns -\d.* Pa s at a shear rate of 1\.\d*e\+04 1/s, for the viscosity of h",
-        ),
+        ({"beyond.slope": 1e-4}, r"beyond returns -\d.* at a shear rate of 1\.\d*e\+04 1/s, for the viscosity of h"),
         ({"viscosity": 1e-9, "beyond.slope": 1e-9}, r"beyond returns -\d.* for the viscosity of honey, 1e-09 Pa s"),
         ({"swirled.swirl": [-2.0, 0.0]}, "swirled returns -0.5 Pa s"),
         ({"swirled.slope": np.array([0.0] * 4 + [1e3] * 4)}, r"swirled returns -\d"),
@@ -253,10 +248,9 @@ def test_a_search_refuses_a_law_that_is_none_and_goes_on():
 
 
 def test_a_law_that_a_scene_names_is_tried_too():
-    with pytest.raises(
-        InputError, match=r"power_law returns inf Pa s at a shear rate of .* for the viscosity of honey"
-    ):
-        Simulation(thick(phase=[{**HONEY, "viscosity": 1e28, "rheology": {"kind": "power_law", "flow_index": 3.0}}]))
+    phase = {**HONEY, "viscosity": 1e28, "rheology": {"kind": "power_law", "flow_index": 3.0}}
+    with pytest.raises(InputError, match=r"power_law returns inf Pa s at a shear rate of .* the viscosity of honey"):
+        Simulation(thick(phase=[phase]))
 
 
 def turned(viscosity, shear_rate):
@@ -268,9 +262,7 @@ def test_the_law_of_the_page_runs_as_printed(tmp_path, monkeypatch):
     page = (ROOT / "docs/viscosity.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```(?:py|python)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     assert len(blocks) == 2
-    program = tmp_path / "page.py"
-    program.write_text(
-        "\n".join([blocks[0].partition("carreau = ")[0], blocks[1], "thinning.run(3)"]), encoding="utf-8"
-    )
+    program, parts = tmp_path / "page.py", [blocks[0].partition("carreau = ")[0], blocks[1], "thinning.run(3)"]
+    program.write_text("\n".join(parts), encoding="utf-8")
     monkeypatch.chdir(ROOT)
     runpy.run_path(str(program))

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -69,12 +70,16 @@ def test_a_folder_with_a_run_is_refused_unless_overwritten(tmp_path):
     (folder.figures / "holiday.png").write_text("mine")
     (folder.figures / "loss.png").write_text("")
     (folder.checkpoint / "1").mkdir(parents=True)
-    (folder.checkpoint / "replay.log").write_text("")
-    (folder.checkpoint / "1" / "replay.log").write_text("")
+    for place in (folder.checkpoint, folder.checkpoint / "1"):
+        (place / "replay.log").write_text("")
     with pytest.raises(InputError, match=r"--out, or replace it with --overwrite, or .* --resume\.$"):
         new_run(folder.path)
     with pytest.raises(InputError, match=r"--overwrite\.$"):
         new_run(folder.path, kind="optimise")
+    new_run(tmp_path / "b", kind="optimise")
+    for kind, words in (("optimise", "--resume"), ("run", r"--overwrite\.$")):
+        with pytest.raises(InputError, match=words):
+            new_run(tmp_path / "b", kind=kind)
     assert folder.read_metrics() == [{"step": 1}]
     new_run(folder.path, overwrite=True)
     assert folder.read_metrics() == [] and not folder.checkpoint.exists()
@@ -83,20 +88,15 @@ def test_a_folder_with_a_run_is_refused_unless_overwritten(tmp_path):
     assert (folder.path / "notes.txt").read_text() == "mine"
 
 
-def test_resume_is_advised_where_it_can_be_done(tmp_path):
-    new_run(tmp_path / "a", kind="optimise")
-    with pytest.raises(InputError, match="--resume"):
-        new_run(tmp_path / "a", kind="optimise")
-    with pytest.raises(InputError, match=r"--overwrite\.$"):
-        new_run(tmp_path / "a")
-
-
 def test_files_of_somebody_else_are_never_overwritten(tmp_path):
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "holiday.png").write_text("")
     with pytest.raises(InputError, match="no run of Cortado"):
         new_run(tmp_path, overwrite=True)
     assert os.listdir(tmp_path / "figures") == ["holiday.png"]
+    for place in ("holiday.png", "holiday.png/below"):
+        with pytest.raises(InputError, match="cannot be written"):
+            new_run(tmp_path / "figures" / place)
 
 
 def test_a_folder_of_several_runs_or_of_the_user_is_refused(tmp_path, monkeypatch):
@@ -166,10 +166,8 @@ def test_a_damaged_folder_is_a_sentence(tmp_path, name, damage):
 
 
 def test_a_refused_resume_names_the_setting(tmp_path):
-    settings = {
-        "problem": {"steps": 20, "target": {"gravity": np.array([0.0, -9.5])}},
-        "extinction_schedule": (0.5, 1.0),
-    }
+    target = {"gravity": np.array([0.0, -9.5])}
+    settings = {"problem": {"steps": 20, "target": target}, "extinction_schedule": (0.5, 1.0)}
     folder = new_run(tmp_path / "a", kind="optimise", settings=settings)
     RunFolder.resume(folder.path, SCENE, COMMAND, kind="optimise", settings=settings)
     settings["problem"]["target"] = {"gravity": np.array([0.0, -9.8])}
@@ -188,7 +186,6 @@ class Killed(BaseException):
 def test_a_kill_while_a_folder_is_made_leaves_one_to_overwrite_or_resume(tmp_path, monkeypatch, overwrite):
     """Killed at every file that is written, made or removed."""
     events = [(Path, "unlink"), (Path, "mkdir"), (Path, "rmdir"), (cortado.runs.run_folder, "write_atomically")]
-    finished = False
     for moment in range(200):
         path = tmp_path / str(moment)
         if overwrite:
@@ -199,11 +196,9 @@ def test_a_kill_while_a_folder_is_made_leaves_one_to_overwrite_or_resume(tmp_pat
         with monkeypatch.context() as patch:
             for owner, name in events:
                 patch.setattr(owner, name, killing(getattr(owner, name), left))
-            try:
+            with suppress(Killed):
                 new_run(path, overwrite=overwrite)
-                finished = True
-            except Killed:
-                pass
+        finished = next(left, None) is not None
         if (path / "environment.json").exists():
             assert RunFolder.resume(path, SCENE, COMMAND).figures.is_dir() and (path / "scene.json").exists()
         else:
@@ -231,13 +226,6 @@ def test_what_killed_processes_left_unfinished_is_removed(tmp_path):
         (RunFolder.create if options else RunFolder.resume)(folder.path, SCENE, COMMAND, **options)
         assert sorted(os.listdir(folder.path)) == ["environment.json", "figures", "scene.json"]
         assert os.listdir(folder.figures) == []
-
-
-def test_unwritable_places_are_sentences(tmp_path):
-    (tmp_path / "file").write_text("")
-    for place in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(InputError, match="cannot be written"):
-            new_run(place)
 
 
 def test_report_is_one_self_contained_escaped_page(tmp_path):
@@ -353,12 +341,7 @@ def huge(path):
 
 def another(make):
     """Something else in the place of a file."""
-
-    def replace(path):
-        path.unlink()
-        make(path)
-
-    return replace
+    return lambda path: (path.unlink(), make(path))
 
 
 NO_SCENES = {

@@ -10,7 +10,6 @@ import warp as wp
 
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
-from cortado.cli import main
 from cortado.device.launching import BandLauncher, launch
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import corners
@@ -30,6 +29,7 @@ from cortado.pictures.tracing.wetting import particles_of, wetting
 from cortado.runs.frames import Pace, pace_of
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.appearance import Picture
+from scenes import bodies, box
 
 SMALL = {"width": 96, "height": 64}
 FILLED = np.array([[0.05, 0.05, 0.05], [0.25, 0.25, 0.25]])
@@ -38,25 +38,14 @@ RED, BLUE = (0.8, 0.1, 0.05), (0.05, 0.1, 0.8)
 
 def scene_of(dimension=3, fluids=1, picture=None, **tables):
     """A box with a box of fluid in it, or two of two fluids side by side; 27 particles each in 3-D."""
-    names = ["one", "two"][:fluids]
-    phases = [
-        {"name": name, "rest_density": 1000.0, "viscosity": 0.05, "colour": colour}
-        for name, colour in zip(names, (BLUE, RED), strict=False)
-    ]
-    bodies = [
-        {"lower": [0.3 * k, 0.0, 0.0][:dimension], "upper": [0.3 * (k + 1), 0.3, 0.3][:dimension], "phase": name}
-        for k, name in enumerate(names)
-    ]
-    given = {
-        "dimension": dimension,
-        "discretisation": {"spacing": 0.1},
-        "phase": phases,
-        "fluid": [{"shape": "box", **body} for body in bodies],
-        "container": {"shape": "box", "lower": [0.0] * dimension, "upper": [0.6, 0.5, 0.4][:dimension]},
-        "solver": {"kind": "pcisph", "time_step": 0.002},
-        "picture": {**SMALL, **(picture or {})},
-    }
-    return cortado.Scene(**{**given, **tables})
+    phases, fluid, water = [], [], {"rest_density": 1000.0, "viscosity": 0.05}
+    for k, (name, colour) in enumerate((("one", BLUE), ("two", RED))[:fluids]):
+        phases.append({"name": name, "colour": colour, **water})
+        ends = [0.3 * k, 0.0, 0.0][:dimension], [0.3 * (k + 1), 0.3, 0.3][:dimension]
+        fluid.append(box(*ends, phase=name))
+    container, solver = box([0.0] * dimension, [0.6, 0.5, 0.4][:dimension]), {"kind": "pcisph", "time_step": 0.002}
+    given = {"phase": phases, "solver": solver, "picture": {**SMALL, **(picture or {})}, "container": container}
+    return bodies(dimension, tables.pop("fluid", fluid), spacing=0.1, **{**given, **tables})
 
 
 def first_state(scene):
@@ -72,6 +61,10 @@ def drawn(scene, positions=None, colours=None):
     return painter(scene, x).image(x, c)
 
 
+def is_blue(image):
+    return image[..., 2] > 1.3 * image[..., 0]
+
+
 @pytest.mark.parametrize("surface", ["liquid", "spheres"])
 @pytest.mark.parametrize("shape", ["box", "cylinder", "none"])
 def test_27_particles_are_seen(surface, shape):
@@ -80,22 +73,27 @@ def test_27_particles_are_seen(surface, shape):
     scene = scene_of(picture={"surface": surface}, **containers[shape])
     image = drawn(scene)
     assert image.shape == (64, 96, 3) and image.min() >= 0.0 and image.max() <= 1.0
-    blue = (image[..., 2] > 1.3 * image[..., 0]).mean()
-    assert 0.01 < blue < 0.65
+    assert 0.01 < is_blue(image).mean() < 0.65
 
 
 @pytest.mark.parametrize("surface", ["liquid", "spheres"])
 def test_a_scene_without_fluid_is_empty(surface):
     scene = scene_of(picture={"surface": surface})
     image = painter(scene, FILLED).image(np.zeros((0, 3)), np.zeros((0, 3)))
-    assert not (image[..., 2] > 1.3 * image[..., 0]).any() and 0.02 < image.std() < 0.2
+    assert not is_blue(image).any() and 0.02 < image.std() < 0.2
 
 
 def test_what_is_above_is_above_and_what_is_right_is_right():
     """The fluid, in the left lower part of its box, is there in the picture too."""
-    image = drawn(scene_of())
-    rows, columns = np.nonzero(image[..., 2] > 1.3 * image[..., 0])
+    rows, columns = np.nonzero(is_blue(drawn(scene_of())))
     assert rows.mean() > 36 and columns.mean() < 46
+
+
+def test_the_camera_goes_where_the_scene_says():
+    scene = scene_of(picture={"camera": [0.3, 0.2, 3.0], "look_at": [0.3, 0.2, 0.2]})
+    stage = Stage.of(scene, FILLED)
+    np.testing.assert_allclose(stage.placed(np.array([[0.3, 0.2, 3.0], [0.3, 0.2, 0.2]])), [stage.eye, stage.look_at])
+    assert np.nonzero(is_blue(drawn(scene)))[1].max() < 52  # the fluid is on the left of x = 0.3
 
 
 def test_two_fluids_have_their_colours():
@@ -106,8 +104,7 @@ def test_two_fluids_have_their_colours():
 
 def test_fluid_that_left_a_periodic_plane_is_seen_where_it_comes_back():
     """Up to the edges, and beside what is at the other edge."""
-    box = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.3], "periodic": [True, False]}
-    scene = scene_of(2, fluids=2, container=box)
+    scene = scene_of(2, fluids=2, container=box([0.0, 0.0], [0.6, 0.3], periodic=[True, False]))
     x, colours = first_state(scene)
     moved = drawn(scene, x + [1.5, 0.0])  # by two and a half periods: the fluids have changed places
     np.testing.assert_allclose(moved, drawn(scene, x, colours[::-1]), atol=1e-9)
@@ -120,9 +117,8 @@ def test_the_plane_shows_pure_colours_and_mixtures():
     for colour in (BLUE, RED):
         wanted = to_srgb(np.array(colour).reshape(1, 1, 3))[0, 0]
         assert min(np.abs(np.subtract(pixel, wanted, dtype=int)).max() for pixel in seen) <= 2
-    half = np.full_like(colours, 0.0) + 0.5 * np.add(BLUE, RED)
-    mixed = drawn(scene, x, half)[170, 150]
-    assert mixed == pytest.approx(0.5 * np.add(BLUE, RED), abs=0.02)
+    half = 0.5 * np.add(BLUE, RED)
+    assert drawn(scene, x, 0.0 * colours + half)[170, 150] == pytest.approx(half, abs=0.02)
 
 
 def test_a_drop_in_the_plane_is_as_large_as_a_spacing():
@@ -158,17 +154,13 @@ GRAVITIES = ([0.0, -9.81, 0.0], [0.0, 0.0, -9.81], [9.81, 0.0, 0.0], [0.0, 0.0, 
 def test_the_camera_sees_the_whole_container_and_comes_near(gravity, size):
     scene = scene_of(forces={"gravity": gravity}, picture={"width": size[0], "height": size[1]})
     stage = Stage.of(scene, FILLED)
-    box = stage.placed(corners(*scene.container.extent()))
+    away = stage.placed(corners(*scene.container.extent())) - stage.eye
     forward = stage.look_at - stage.eye
     forward /= np.linalg.norm(forward)
     right, up = screen_axes(forward)
-    half = np.tan(0.5 * np.radians(stage.picture.field_of_view))
-    depth = (box - stage.eye) @ forward
-    across = (box - stage.eye) @ right / depth / half
-    upwards = (box - stage.eye) @ up / depth / half * size[0] / size[1]
-    assert depth.min() > 0.0
-    widest = max(np.abs(across).max(), np.abs(upwards).max())
-    assert 0.8 < widest < 1.0
+    depth = np.tan(0.5 * np.radians(stage.picture.field_of_view)) * (away @ forward)
+    across, upwards = away @ right / depth, away @ up / depth * size[0] / size[1]
+    assert depth.min() > 0.0 and 0.8 < max(np.abs(across).max(), np.abs(upwards).max()) < 1.0
 
 
 @pytest.mark.parametrize("gravity", GRAVITIES)
@@ -178,15 +170,6 @@ def test_up_is_against_gravity(gravity):
     assert np.linalg.det(frame) == pytest.approx(1.0)
     wanted = -np.array(gravity) / 9.81 if any(gravity) else (0.0, 1.0, 0.0)
     np.testing.assert_allclose(frame[1], wanted)
-
-
-def test_the_camera_goes_where_the_scene_says():
-    scene = scene_of(picture={"camera": [0.3, 0.2, 3.0], "look_at": [0.3, 0.2, 0.2]})
-    stage = Stage.of(scene, FILLED)
-    np.testing.assert_allclose(stage.placed(np.array([[0.3, 0.2, 3.0], [0.3, 0.2, 0.2]])), [stage.eye, stage.look_at])
-    image = drawn(scene)
-    _, columns = np.nonzero(image[..., 2] > 1.3 * image[..., 0])
-    assert columns.max() < 52  # the fluid is on the left of x = 0.3
 
 
 CPU = BandLauncher(wp.get_device("cpu"))
@@ -253,11 +236,8 @@ def test_contrast_is_found_between_neighbours_alone():
     image = np.random.default_rng(3).random((5, 7, 3)).astype(np.float32)
     image[:2, :4] = 0.5
     across, down = (np.abs(np.diff(image, axis=axis)).max(axis=2) > 0.8 for axis in (1, 0))
-    wanted = np.zeros((5, 7), dtype=bool)
-    wanted[:, 1:] |= across
-    wanted[:, :-1] |= across
-    wanted[1:] |= down
-    wanted[:-1] |= down
+    wanted = np.pad(across, ((0, 0), (1, 0))) | np.pad(across, ((0, 0), (0, 1)))
+    wanted |= np.pad(down, ((1, 0), (0, 0))) | np.pad(down, ((0, 1), (0, 0)))
     found = wp.zeros(35, dtype=wp.int32, device="cpu")
     pixels = wp.array(image.reshape(-1, 3), dtype=wp.vec3, device="cpu")
     launch(find_contrast, 35, "cpu", first=0, columns=7, image=pixels, contrast=0.8, found=found)
@@ -278,8 +258,8 @@ def test_light_has_no_edge_where_reflection_within_water_becomes_total():
     scene = scene_of(
         picture={"width": 64, "height": 400, "field_of_view": 2.0, **looks},
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.05, "material": "water"}],
-        fluid=[{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.6, 0.5, 0.8], "phase": "water"}],
-        container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.6, 0.8, 0.8]},
+        fluid=[box([0.0] * 3, [0.6, 0.5, 0.8])],
+        container=box([0.0] * 3, [0.6, 0.8, 0.8]),
     )
     column = drawn(scene)[:, 32]
     assert np.abs(np.diff(column[180:220], axis=0)).max() < 0.05
@@ -297,10 +277,8 @@ def test_a_page_shows_its_panels_side_by_side():
 def test_a_lattice_in_a_round_cup_reaches_its_glass():
     cup = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.5}
     for radius in (0.5, 0.437, 0.4):
-        scene = scene_of(
-            fluid=[{**cup, "radius": radius, "height": 0.4, "phase": "one"}],
-            container={**cup, "radius": radius, "height": 0.8},
-        )
+        fluid, container = ({**cup, "radius": radius, "height": height} for height in (0.4, 0.8))
+        scene = scene_of(fluid=[{**fluid, "phase": "one"}], container=container)
         positions, colours = first_state(scene)
         off = scenery(Stage.of(scene, positions), State(positions, colours), CPU).surface.mesh.points.numpy()
         level = off[np.abs(off[:, 1] + 0.2) < 0.1]  # halfway up the fluid
@@ -430,9 +408,7 @@ def test_a_film_has_as_many_frames_as_are_asked_for_and_says_what_is_left_out():
 def test_a_package_that_is_missing_is_named(monkeypatch):
     assert lacking(scene_of()) is None
     monkeypatch.setattr(shading_film, "find_spec", lambda name: None)
-    advice = r"pip install av\."
-    with pytest.raises(AssertionError, match="Shaded pictures need PyAV, which is not installed: " + advice):
-        raise AssertionError(lacking(scene_of()))
+    assert "Shaded pictures need PyAV, which is not installed: pip install av." in lacking(scene_of())
     assert lacking(scene_of(picture={"film_frames": 0})) is None
 
 
@@ -458,22 +434,17 @@ def test_words_and_panels():
     np.testing.assert_allclose(page[[20, 20, 60, 60], [30, 90, 30, 90], 0], [0.8 / 3, 1.6 / 3, 0.8, 1.0])
 
 
-UNUSED = (*(("discretisation", "jitter"), ("solver", "courant"), ("solver", "greatest_time_step")),)
-"""Keys that change nothing in a scene that does not use them."""
-
-
 def test_pictures_change_neither_results_nor_whether_a_search_goes_on(tmp_path):
     plain, other = scene_of(), scene_of(picture={"width": 128, "floor": False})
-    prints = [
-        cortado.Problem(cortado.Simulation(scene), steps=2, loss=FinalPositions(np.zeros((27, 3)))).fingerprint
-        for scene in (plain, other)
-    ]
-    assert prints[0] == prints[1]
+    loss = FinalPositions(np.zeros((27, 3)))
+    problems = (cortado.Problem(cortado.Simulation(scene), 2, loss) for scene in (plain, other))
+    assert len({problem.fingerprint for problem in problems}) == 1
     folder = RunFolder.create(tmp_path / "run", plain.to_json(), [], kind="optimise")
     folder.require(other.to_json(), "optimise")
     aside = ("picture", "sensor", "force", "solid")
     former = {name: table for name, table in json.loads(plain.to_json()).items() if name not in aside}
-    for table, key in (*UNUSED, ("container", "material"), ("container", "colour")):
+    unused = [("discretisation", "jitter"), ("solver", "courant"), ("solver", "greatest_time_step")]
+    for table, key in (*unused, ("container", "material"), ("container", "colour")):
         del former[table][key]
     for phase in former["phase"]:
         del phase["material"]
@@ -507,49 +478,45 @@ def test_a_simulation_draws_its_frames():
         simulation.picture(trajectory[-1], height=1)
 
 
-PICTURE = """
-[picture]
-width = 96
-height = 64
-"""
+PICTURE = "\n[picture]\nwidth = 96\nheight = 64\n"
 
 
-def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
+def test_commands_write_pictures_and_films(tmp_path, monkeypatch, cortado_command):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(TINY_SCENE + PICTURE)
     (tmp_path / "task.toml").write_text(GOOD_TASK + PICTURE)
-    main(["run", "scene.toml", "--steps", "3", "--out", "a"])
+
+    def well(*words):
+        code, out, error = cortado_command(*words)
+        assert code == 0, error
+        return out
+
+    well("run", "scene.toml", "--steps", "3", "--out", "a")
     written = {path.name for path in (tmp_path / "a" / "figures").iterdir()}
     assert {"first.png", "last.png", "film.mp4"} <= written
     assert (tmp_path / "a" / "report.html").read_text().count("data:video/mp4") == 1
-    main(["picture", "a", "--frame", "1", "--set", "picture.width=128", "--out", "one.png"])
+    well("picture", "a", "--frame", "1", "--set", "picture.width=128", "--out", "one.png")
     assert cortado.pictures.read_picture("one.png").shape == (64, 128, 3)
-    main(["picture", "a", "--film", "--lines", "64", "--colour", "speed"])
-    assert (
-        "film.mp4: 4 frames, 0.9 s, at 0.0095 x, with 4.5 frames a second, as no more were recorded: --fps 16667 "
-        in capsys.readouterr().out
-    )
-    main(["optimise", "task.toml", "--out", "b"])
-    assert capsys.readouterr().out.splitlines()[-1].endswith("; open figures/found.mp4, or report.html.")
+    out = well("picture", "a", "--film", "--lines", "64", "--colour", "speed")
+    told = "film.mp4: 4 frames, 0.9 s, at 0.0095 x, with 4.5 frames a second, as no more were recorded: --fps 16667 "
+    assert told in out
+    out = well("optimise", "task.toml", "--out", "b")
+    assert out.splitlines()[-1].endswith("; open figures/found.mp4, or report.html.")
     written = {path.name for path in (tmp_path / "b" / "figures").iterdir()}
     assert {"found.png", "search.png", "found.mp4", "search.mp4"} <= written
     assert cortado.pictures.read_picture(tmp_path / "b" / "figures" / "found.png").shape == (64, 3 * 48, 3)
-    main(["run", "scene.toml", "--steps", "1", "--out", "c", "--no-pictures"])
+    well("run", "scene.toml", "--steps", "1", "--out", "c", "--no-pictures")
     assert not (tmp_path / "c" / "figures" / "film.mp4").exists()
-    for arguments, sentence in (
-        (["--frame", "9"], "--frame is 9, but the run has 4 frames"),
-        (["--camera", "fly"], "picture.camera_path.kind is 'fly'"),
-        (
-            ["--camera", "follow:raft"],
-            "picture.camera_path is a table, but must be left out, as the scene has 2 dimensions",
-        ),
-        (["--colour", "heat"], "picture.colour is 'heat'"),
-        (["--set", "solver.time_step=1"], "must begin with picture."),
-        (["--film", "--set", "picture.film_frames=0"], "--film is given, but picture.film_frames is 0"),
-    ):
-        with pytest.raises(SystemExit) as end:
-            main(["picture", "a", *arguments])
-        assert end.value.code == 2 and sentence in capsys.readouterr().err
+    for arguments, sentence in {
+        "--frame 9": "--frame is 9, but the run has 4 frames",
+        "--camera fly": "picture.camera_path.kind is 'fly'",
+        "--camera follow:raft": "camera_path is a table, but must be left out, as the scene has 2 dimensions",
+        "--colour heat": "picture.colour is 'heat'",
+        "--set solver.time_step=1": "must begin with picture.",
+        "--film --set picture.film_frames=0": "--film is given, but picture.film_frames is 0",
+    }.items():
+        code, _, error = cortado_command("picture", "a", *arguments.split())
+        assert code == 2 and sentence in error
 
 
 def test_defaults_are_large_enough_to_share():

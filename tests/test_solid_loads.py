@@ -9,13 +9,13 @@ from cortado.losses import Series
 from cortado.sensors import SolidLoad, WallForce
 from test_free_bodies import RAFT
 from test_moving_solids import ROTOR, plane, space
-from test_solid_parameters import PCISPH, SCENES, STEPS, Weighted, body, check, pasty, point_of, problem_of
+from test_quantities import Weighted
+from test_solid_parameters import PCISPH, PROJECTION, SCENES, STEPS, body, check, pasty, point_of, problem_of
 
 POST = {"name": "post", "shape": "sphere", "centre": [0.5, 0.2], "radius": 0.07, "slip": "no"}
 TANK = {"name": "tank", "shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.6], "side": "inside", "slip": "no"}
 IN_TANK = {"fluid": [body("water", upper=(0.7, 0.4))], "container": {"shape": "none"}}
 """All walls are those of solids."""
-PROJECTION = {"kind": "projection", "time_step": 0.001}
 KINDS = {
     "projection": {"solver": PROJECTION},
     "projection, implicit": {"solver": PROJECTION, "forces": {"viscous_solve": "implicit"}},

@@ -15,44 +15,22 @@ from cortado.losses.distances import SensorMatch
 from cortado.pictures.exported import Exported
 from cortado.runs.solid_motion import posed
 from cortado.sensors import PressureProbe, WallForce
-from finite_differences import decades, distance
+from finite_differences import both_modes, decades, distance
+from scenes import box
 from test_moving_solids import PADDLE, ROTOR, WATER, plane, space
+from test_quantities import Weighted
 
-PASTE = {
-    "name": "paste",
-    "rest_density": 1000.0,
-    "viscosity": 4.0,
-    "rheology": {"kind": "bingham", "yield_stress": 8.0, "regularisation": 0.5},
-}
+PASTE = {"name": "paste", "rest_density": 1000.0, "viscosity": 4.0}
+PASTE["rheology"] = {"kind": "bingham", "yield_stress": 8.0, "regularisation": 0.5}
 OIL = {"name": "oil", "rest_density": 800.0, "viscosity": 3.0}
-BALL = {
-    "name": "ball",
-    "shape": "sphere",
-    "centre": [0.45, 0.3],
-    "radius": 0.06,
-    "motion": "path",
-    "velocity": [-0.3, 0.2],
-    "slip": "free",
-}
-PCISPH = {"kind": "pcisph", "time_step": 0.001}
+BALL = {"name": "ball", "shape": "sphere", "centre": [0.45, 0.3], "radius": 0.06}
+BALL |= {"motion": "path", "velocity": [-0.3, 0.2], "slip": "free"}
+PCISPH, PROJECTION = ({"kind": kind, "time_step": 0.001} for kind in ("pcisph", "projection"))
 STEPS = 5
 
 
-class Weighted:
-    """The sum of weights times the squares of a quantity's values."""
-
-    def __init__(self, name, weights):
-        self.name, self.weights = name, weights
-
-    def value(self, end):
-        return float((self.weights * end[self.name] ** 2).sum())
-
-    def adjoint(self, end):
-        return {self.name: 2.0 * self.weights * end[self.name]}
-
-
 def body(phase, lower=(0.0, 0.0), upper=(0.6, 0.4)):
-    return {"shape": "box", "lower": list(lower), "upper": list(upper), "phase": phase}
+    return box(list(lower), list(upper), phase=phase)
 
 
 def pasty(solver, **forces):
@@ -60,8 +38,12 @@ def pasty(solver, **forces):
 
 
 def periodic():
-    container = {"shape": "box", "lower": [0, 0], "upper": [0.6, 1], "periodic": [True, False], "slip": "no"}
+    container = box([0, 0], [0.6, 1], periodic=[True, False], slip="no")
     return plane({**ROTOR, "lower": [0.48, 0.15], "upper": [0.68, 0.25]}, container=container)
+
+
+BOTH = {"phase": [WATER, OIL], "fluid": [body("water", upper=(0.6, 0.2)), body("oil", lower=(0.0, 0.2))]}
+SPOUT = {"phase": "water", "outlet": [0.8, 0.5], "radius": 0.08, "length": 0.2, "flow_rate": 0.2}
 
 
 SCENES = {
@@ -69,29 +51,18 @@ SCENES = {
     "pcisph": lambda: plane(ROTOR, solver=PCISPH),
     "space": space,
     "space, pcisph": lambda: space(solver=PCISPH, forces={"viscosity": "stress"}),
-    "paste": lambda: pasty({"kind": "projection", "time_step": 0.001}),
-    "paste, implicit": lambda: pasty({"kind": "projection", "time_step": 0.001}, viscous_solve="implicit"),
+    "paste": lambda: pasty(PROJECTION),
+    "paste, implicit": lambda: pasty(PROJECTION, viscous_solve="implicit"),
     "paste, implicit, pcisph": lambda: pasty(PCISPH, viscous_solve="implicit"),
     "pairwise": lambda: plane(ROTOR, solver=PCISPH, forces={"viscosity": "pairwise"}),
-    "two phases": lambda: plane(
-        ROTOR, phase=[WATER, OIL], fluid=[body("water", upper=(0.6, 0.2)), body("oil", lower=(0.0, 0.2))]
-    ),
-    "belt": lambda: plane(
-        {**ROTOR, "surface_velocity": [0.7, 0.0]}, container={"shape": "box", "lower": [0, 0], "upper": [1, 1]}
-    ),
+    "two phases": lambda: plane(ROTOR, **BOTH),
+    "belt": lambda: plane({**ROTOR, "surface_velocity": [0.7, 0.0]}, container=box([0, 0], [1, 1])),
     "two solids": lambda: plane(ROTOR, BALL),
     "periodic": periodic,
-    "mixture": lambda: plane(
-        ROTOR,
-        phase=[WATER, OIL],
-        fluid=[body("water", upper=(0.6, 0.2)), body("oil", lower=(0.0, 0.2))],
-        mixture={"interface_width": 0.06, "mobility": 1e-3},
-    ),
+    "mixture": lambda: plane(ROTOR, **BOTH, mixture={"interface_width": 0.06, "mobility": 1e-3}),
     "tension": lambda: plane(ROTOR, forces={"surface_tension": 2.0}),
     "tension, pcisph": lambda: plane(ROTOR, solver=PCISPH, forces={"surface_tension": 2.0}),
-    "emitter": lambda: plane(
-        ROTOR, emitter={"phase": "water", "outlet": [0.8, 0.5], "radius": 0.08, "length": 0.2, "flow_rate": 0.2}
-    ),
+    "emitter": lambda: plane(ROTOR, emitter=SPOUT),
 }
 
 
@@ -125,11 +96,7 @@ def problem_of(scene, quantity="speed", precision="float64"):
 
 def check(problem, point, along):
     """One by one reverse and forward mode, to round-off, and all of them together differences."""
-    gradient, forward = problem.value_and_gradient(point)[1], 0.0
-    for name, direction in along.items():
-        found = problem.tangent(point, {name: direction})
-        assert (gradient[name] * direction).sum() == pytest.approx(found, rel=1e-10), name
-        forward += found
+    forward = sum(both_modes(problem, point, {name: direction})[1] for name, direction in along.items())
     assert distance(problem.value, point, along, forward, decades(3.0, 7.0), enough=1e-7) < 1e-6
 
 
@@ -163,10 +130,10 @@ def test_the_time_step_has_a_derivative_where_the_path_is_given():
 @pytest.mark.parametrize("kind", ["projection", "pcisph"])
 def test_a_solid_that_is_told_where_it_begins_is_that_of_a_scene_that_says_so(kind):
     """To round-off, if the fluid is there: its walls do not depend on where it begins or how it is turned."""
-    place, turned, at = [0.46, 0.21], 0.3, {"fluid": [body("water", upper=(0.3, 0.4))]}
-    solver = {"kind": kind, "time_step": 0.001}
-    told = plane({**ROTOR, "position": [0.6, 0.3]}, solver=solver, **at)
-    own = plane({**ROTOR, "position": place, "rotation": turned}, solver=solver, **at)
+    place, turned, solver = [0.46, 0.21], 0.3, {"kind": kind, "time_step": 0.001}
+    at = {"fluid": [body("water", upper=(0.3, 0.4))], "solver": solver}
+    told = plane({**ROTOR, "position": [0.6, 0.3]}, **at)
+    own = plane({**ROTOR, "position": place, "rotation": turned}, **at)
     there = problem_of(own)
     fluid = {"initial_positions": there.simulation.positions}
     given = {**fluid, "rotor.position": place, "rotor.rotation": turned}
@@ -175,13 +142,11 @@ def test_a_solid_that_is_told_where_it_begins_is_that_of_a_scene_that_says_so(ki
     assert abs(found / problem_of(told).value(fluid) - 1.0) > 1e-6
 
 
+DISC = {"shape": "sphere", "centre": [0.5, 0.4], "radius": 0.15}
+
+
 @pytest.mark.parametrize(
-    ("shape", "scale"),
-    [
-        ({"shape": "box", "lower": [0.35, 0.25], "upper": [0.65, 0.55]}, 4.0 / 3.0),
-        ({"shape": "sphere", "centre": [0.5, 0.4], "radius": 0.15}, 0.9),
-    ],
-    ids=["box", "disc"],
+    ("shape", "scale"), [(box([0.35, 0.25], [0.65, 0.55]), 4.0 / 3.0), (DISC, 0.9)], ids=["box", "disc"]
 )
 def test_a_solid_that_is_told_how_large_it_is_has_the_walls_of_one_that_is(shape, scale, tmp_path):
     """Water that is packed about one of that size has nearly the rest density beside it."""
@@ -214,9 +179,8 @@ def test_scenes_of_a_batch_have_the_bits_of_single_ones():
     points = [point_of(scene, seed=seed)[0] for seed in range(2)]
     one, loss = Simulation(scene, precision="float64"), CentreOfMass([0.5, 0.3])
     several = Problem(Simulation(scene, batch=2, precision="float64"), STEPS, loss)
-    values, gradients = several.value_and_gradient(
-        {name: np.stack([point[name] for point in points]) for name in points[0]}
-    )
+    together = {name: np.stack([point[name] for point in points]) for name in points[0]}
+    values, gradients = several.value_and_gradient(together)
     for b, point in enumerate(points):
         value, gradient = Problem(one, STEPS, loss).value_and_gradient(point)
         assert values[b] == value
@@ -238,11 +202,8 @@ def test_a_run_that_goes_on_has_the_bits_and_the_derivatives_of_a_whole_one():
     rest = simulation.run(STEPS - 2, some(point, slice(2, None)), state=first.last_state)
     np.testing.assert_array_equal(rest.positions[-1], whole.positions[-1])
     np.testing.assert_array_equal(rest.solids["rotor"].rotations, whole.solids["rotor"].rotations[2:])
-    check(
-        Problem(simulation, STEPS - 2, CentreOfMass([0.5, 0.3])).beginning_at(first.last_state),
-        some(point, slice(2, None)),
-        some(along, slice(2, None)),
-    )
+    problem = Problem(simulation, STEPS - 2, CentreOfMass([0.5, 0.3])).beginning_at(first.last_state)
+    check(problem, *(some(values, slice(2, None)) for values in (point, along)))
 
 
 def test_in_single_precision_they_are_right_to_its_digits():
@@ -272,11 +233,7 @@ def test_a_certificate_moves_a_path_steadily_and_finds_its_derivatives_right():
         ("rotor.displacement", np.zeros((3, 2)), r"has shape \(3, 2\), but must be \(2,\) or \(5, 2\) in m"),
         ("rotor.turn", np.zeros((STEPS, 1)), r"has shape \(5, 1\), but must be \(\) or \(5,\) in rad"),
         ("rotor.position", [np.nan, 0.0], "has a value that is not finite"),
-        (
-            "ball.position",
-            [0.1, 0.1],
-            r"'ball.position' is unknown, but must be one of .*, rotor.angular_velocity in this scene",
-        ),
+        ("ball.position", [0.1, 0.1], r"is unknown, but must be one of .*, rotor.angular_velocity in this scene"),
         ("rotor.scale", [1.0, 1.1], r"has shape \(2,\), but must be \(\)"),
         ("rotor.scale", 0.0, r"rotor.scale is 0.0, but must be greater than 0"),
         ("rotor.velocity", [0.1], r"has shape \(1,\), but must be \(2,\) in m/s"),
@@ -320,10 +277,7 @@ def test_a_solid_that_jumps_is_warned_of():
     [
         ({"rotor.scale": 1.6}, r"'rotor' is 1\.6 times as large .*, but its walls hold for 0\.6 to 1\.5"),
         ({"rotor.scale": 0.5}, r"'rotor' is 0\.5 times as large .*, but its walls hold for 0\.6 to 1\.5"),
-        (
-            {"ball.scale": 1.4},
-            r"'ball' is 1\.4 times as large .* and reaches 0\.06 m, more than a spacing",
-        ),
+        ({"ball.scale": 1.4}, r"'ball' is 1\.4 times as large .* and reaches 0\.06 m, more than a spacing"),
         ({"floor.scale": 1.1}, r"'floor' is 1\.1 times as large .*, so that it does not fill a period"),
     ],
 )
@@ -361,17 +315,15 @@ def steady_of(scene):
     return point, along
 
 
-PROPELLER = {
-    **{key: PADDLE[key] for key in ("name", "shape", "start", "end", "radius", "rotation", "motion")},
-    "velocity": [0.1, 0.0, 0.2],
-}
+PROPELLER = {key: PADDLE[key] for key in ("name", "shape", "start", "end", "radius", "rotation", "motion")}
+PROPELLER["velocity"] = [0.1, 0.0, 0.2]
 
 
 @pytest.mark.parametrize(
     "scene",
     [
-        *(plane(ROTOR, BALL, solver={"kind": kind, "time_step": 0.001}) for kind in ("projection", "pcisph")),
-        *(space(solid=[PROPELLER], solver={"kind": kind, "time_step": 0.001}) for kind in ("projection", "pcisph")),
+        *(plane(ROTOR, BALL, solver=solver) for solver in (PROJECTION, PCISPH)),
+        *(space(solid=[PROPELLER], solver=solver) for solver in (PROJECTION, PCISPH)),
     ],
     ids=["plane, projection", "plane, pcisph", "space, projection", "space, pcisph"],
 )

@@ -14,6 +14,7 @@ from cortado.pictures.shown_solids import FAR, SolidMesh, shown_solids, solid_ou
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.tracing.solid_surfaces import NODES, REACH, FloorShadow, SolidSurfaces
 from cortado.pictures.tracing.wetting import mirrored
+from scenes import bodies, box
 
 BLUE, ORANGE = (0.05, 0.1, 0.8), (0.7, 0.3, 0.05)
 PILLAR = {"name": "pillar", "shape": "box", "lower": [0.35, 0.0, 0.15], "upper": [0.45, 0.4, 0.25], "colour": ORANGE}
@@ -34,16 +35,14 @@ def scene_of(dimension, *solids, picture=None, **tables):
     d = dimension
     cut = [{k: v[:d] if isinstance(v, list) and k != "rotation" else v for k, v in one.items()} for one in solids]
     given = {
-        "dimension": d,
-        "discretisation": {"spacing": 0.05},
         "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05, "colour": BLUE}],
-        "fluid": [{"shape": "box", "lower": [0.0] * d, "upper": [0.2, 0.3, 0.4][:d], "phase": "water"}],
-        "container": {"shape": "box", "lower": [0.0] * d, "upper": [0.6, 0.5, 0.4][:d]},
+        "container": box([0.0] * d, [0.6, 0.5, 0.4][:d]),
         "solid": cut,
         "solver": {"kind": "pcisph", "time_step": 0.002},
         "picture": {"width": 240, "height": 160, **(picture or {})},
     }
-    return cortado.Scene(**{**given, **tables})
+    fluid = tables.pop("fluid", [box([0.0] * d, [0.2, 0.3, 0.4][:d])])
+    return bodies(d, fluid, **{**given, **tables})
 
 
 def lattice(lower, upper, spacing=0.05):
@@ -122,9 +121,8 @@ def test_a_solid_in_space_has_its_colour_where_it_is():
 def test_a_solid_hides_what_is_behind_it(dimension):
     behind = lattice([0.35, 0.1, 0.0][:dimension], [0.45, 0.3, 0.1][:dimension], 0.04)
     place, positions = (0.4, 0.2, 0.25)[:dimension], np.concatenate([COLUMN[dimension], behind])
-    with_it, without = (
-        scene_of(dimension, *solids, picture=FRONT if dimension == 3 else {}) for solids in ((PILLAR,), ())
-    )
+    picture = FRONT if dimension == 3 else {}
+    with_it, without = scene_of(dimension, PILLAR, picture=picture), scene_of(dimension, picture=picture)
     assert is_blue(seen(without, positions, place)) and is_orange(seen(with_it, positions, place))
 
 
@@ -187,24 +185,20 @@ def test_a_side_in_a_wall_does_not_flicker(flush, shift):
 
 def test_a_solid_is_cut_at_the_walls_of_a_closed_container():
     through = {**PILLAR, "lower": [0.5, 0.1, 0.1], "upper": [0.9, 0.3, 0.3]}
-    scene = scene_of(3, through, picture={"camera": [0.6, 0.2, 3.0], "look_at": [0.6, 0.2, 0.2]})
-    image = is_orange(drawn(scene, COLUMN[3]))
-    row, wall = pixel_of(scene, COLUMN[3], (0.6, 0.2, 0.3))
-    assert image[row, wall - 10 : wall - 2].all() and not image[row, wall + 2 :].any()
-    plane = scene_of(2, through)
-    image = is_orange(drawn(plane, COLUMN[2]))
-    row, wall = pixel_of(plane, COLUMN[2], (0.6, 0.2))
-    assert image[row, wall - 10 : wall - 2].all() and not image[row, wall + 2 :].any()
+    for d, picture in ((3, {"camera": [0.6, 0.2, 3.0], "look_at": [0.6, 0.2, 0.2]}), (2, {})):
+        scene = scene_of(d, through, picture=picture)
+        image = is_orange(drawn(scene, COLUMN[d]))
+        row, wall = pixel_of(scene, COLUMN[d], (0.6, 0.2, 0.3)[:d])
+        assert image[row, wall - 10 : wall - 2].all() and not image[row, wall + 2 :].any()
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_tank_shows_what_is_in_it(dimension):
     """As a container of the same shape does."""
-    tank, box = scene_of(dimension, CAVITY, container={"shape": "none"}), scene_of(dimension)
-    within = (0.1, 0.1, 0.4)[:dimension]
-    for scene in (tank, box):
-        assert is_blue(seen(scene, COLUMN[dimension], within))
-    alike = np.abs(drawn(tank, COLUMN[dimension]) - drawn(box, COLUMN[dimension])).max(axis=2)
+    tank, container = scene_of(dimension, CAVITY, container={"shape": "none"}), scene_of(dimension)
+    for scene in (tank, container):
+        assert is_blue(seen(scene, COLUMN[dimension], (0.1, 0.1, 0.4)[:dimension]))
+    alike = np.abs(drawn(tank, COLUMN[dimension]) - drawn(container, COLUMN[dimension])).max(axis=2)
     assert np.mean(alike > 0.1) < 0.02
 
 
@@ -280,17 +274,15 @@ def test_solids_cast_a_shadow_on_the_floor():
 
 def test_a_solid_lies_in_the_shadow_of_another():
     roof = {**PILLAR, "name": "roof", "lower": [0.0, 0.42, 0.0], "upper": [0.6, 0.48, 0.4]}
-    light = [
-        seen(scene_of(3, *solids, picture=FRONT), COLUMN[3], (0.4, 0.2, 0.25)) for solids in ((PILLAR,), (PILLAR, roof))
-    ]
-    assert light[1][0] < 0.85 * light[0][0] and light[1][0] > 0.1
+    scenes = scene_of(3, PILLAR, picture=FRONT), scene_of(3, PILLAR, roof, picture=FRONT)
+    bright, dark = (seen(scene, COLUMN[3], (0.4, 0.2, 0.25))[0] for scene in scenes)
+    assert 0.1 < dark < 0.85 * bright
 
 
 def test_a_solid_comes_again_with_every_period():
     """One that leaves on the right comes in on the left."""
-    container = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.5], "periodic": [True, False]}
-    scene = scene_of(2, {**PILLAR, "lower": [0.55, 0.1], "upper": [0.65, 0.3]}, container=container, fluid=[
-        {"shape": "box", "lower": [0.1, 0.0], "upper": [0.3, 0.3], "phase": "water"}])  # fmt: skip
+    tables = {"container": box([0.0, 0.0], [0.6, 0.5], periodic=[True, False]), "fluid": [box([0.1, 0.0], [0.3, 0.3])]}
+    scene = scene_of(2, {**PILLAR, "lower": [0.55, 0.1], "upper": [0.65, 0.3]}, **tables)
     water = lattice([0.1, 0.0], [0.3, 0.3])
     for x in (0.03, 0.57):
         assert is_orange(seen(scene, water, (x, 0.2)))
@@ -300,10 +292,8 @@ def test_a_solid_comes_again_with_every_period():
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_solids_are_drawn_in_their_poses_from_one_place(dimension):
     """Of a solid that moves, without a container: where it will be is in the picture from the start."""
-    before, after = (
-        scene_of(dimension, {**PILLAR, **pose}, container={"shape": "none"})
-        for pose in ({}, {"position": [1.5, 0.4, 0.2], "rotation": [0.0, 0.0, 1.2] if dimension == 3 else 1.2})
-    )
+    pose = {"position": [1.5, 0.4, 0.2], "rotation": [0.0, 0.0, 1.2] if dimension == 3 else 1.2}
+    before, after = (scene_of(dimension, PILLAR | own, container={"shape": "none"}) for own in ({}, pose))
     positions = COLUMN[dimension]
     artist, colours = painter(before, positions, poses=[after]), colours_of(before, None, len(positions))
     images = [artist.image(positions, colours, pose) for pose in (None, before, after)]
@@ -316,8 +306,8 @@ def test_solids_are_drawn_in_their_poses_from_one_place(dimension):
 
 @pytest.mark.parametrize("table", SHAPES, ids=lambda table: table["shape"])
 def test_a_mesh_is_closed_smooth_and_fine(table):
-    (shown,) = shown_solids(scene_of(3, table, container={"shape": "none"}, fluid=[
-        {"shape": "box", "lower": [2.0] * 3, "upper": [2.2] * 3, "phase": "water"}]))  # fmt: skip
+    far = {"container": {"shape": "none"}, "fluid": [box([2.0] * 3, [2.2] * 3)]}
+    (shown,) = shown_solids(scene_of(3, table, **far))
     faces = shown.shape.faces(0.02)
     mesh = SolidMesh.of(faces, 0.03)
     a, b, c = mesh.points[mesh.triangles].transpose(1, 0, 2)
@@ -391,12 +381,11 @@ def test_outlines_are_the_edges_and_the_cuts_of_solids():
 
 
 def test_figures_and_views_have_the_lines_of_solids(tmp_path):
-    scene = scene_of(2, PILLAR)
-    paths = [
-        particles([COLUMN[2]], ["now"], tmp_path / name, container=scene.container.extent(), lines=[lines])
-        for name, lines in (("with.png", solid_outline(scene)), ("without.png", solid_outline(scene_of(2))))
-    ]
-    images = [cortado.pictures.read_picture(path) for path in paths]
+    images, views = [], []
+    for scene in (scene_of(2, PILLAR), scene_of(2)):
+        extent, lines = scene.container.extent(), [solid_outline(scene)]
+        path = particles([COLUMN[2]], ["now"], tmp_path / "a.png", container=extent, lines=lines)
+        images.append(cortado.pictures.read_picture(path))
+        views.append(scene_view(scene, {"run": [cortado.Simulation(scene).run(1)[0]]}, [0.0]))
     assert images[0].shape == images[1].shape and 1e-4 < (images[0] != images[1]).any(axis=2).mean() < 0.05
-    views = [scene_view(one, {"run": [cortado.Simulation(one).run(1)[0]]}, [0.0]) for one in (scene, scene_of(2))]
     assert views[0].count("[[") >= views[1].count("[[") and len(views[0]) > len(views[1])
