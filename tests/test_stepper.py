@@ -194,6 +194,30 @@ def test_from_the_second_call_on_nothing_is_allocated_on_the_device(name, monkey
     assert not made
 
 
+@pytest.mark.parametrize("name", ["one fluid", "steps that are chosen", "gravity in every step"])
+def test_runs_of_any_length_share_their_graphs(name, monkeypatch):
+    """On a CPU a graph is captured the second time. A run has the bits of the first one of its simulation."""
+    made = plane(solver={"time_step": "auto"}) if name == "steps that are chosen" else plane()
+    controls = {n: {"gravity": np.linspace([0.5, -9.81], [1.5, -9.0], n)} for n in (3, 11, 21)}
+    given = controls if name == "gravity in every step" else dict.fromkeys(controls)
+    simulation = Simulation(made)
+    wanted = {n: Simulation(made).run(n, given[n]) for n in controls}
+
+    def check(n):
+        found = simulation.run(n, given[n])
+        fields = found.positions, found.velocities, found.times, *found.diagnostics.values()
+        own = wanted[n].positions, wanted[n].velocities, wanted[n].times, *wanted[n].diagnostics.values()
+        assert all(map(np.array_equal, fields, own))
+
+    for n in (21, 3, 11, 21, 3):
+        check(n)
+    captures = []
+    monkeypatch.setattr(wp, "ScopedCapture", lambda *a, **k: captures.append("capture"))
+    for n in (11, 3, 21):
+        check(n)
+    assert not captures
+
+
 class Weighted:
     """A loss of the last state alone, with the same weights in every dimension."""
 

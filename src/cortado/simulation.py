@@ -204,7 +204,16 @@ class Simulation(Stepping):
         when the pressure did not converge; raises `DivergedError` when a particle is
         lost, where a batch warns, and goes on without the scene.
         """
-        return self.collect(self.rollout(steps, controls, state, time), record_every, record, sensors)
+        own, number = self.__dict__, steps_of_run(self, steps, time, {} if controls is None else controls)
+        rollout = own.pop("_idle", None)  # not to be had by a run within this one
+        if rollout is None or rollout.room < number:
+            rollout = Rollout(self.solver, 1 << (number - 1).bit_length())
+        try:
+            rollout.steps = number
+            self._begin(rollout, controls, state, time)
+            return self.collect(rollout, record_every, record, sensors)
+        finally:
+            own["_idle"] = rollout
 
     @in_turn
     def collect(
@@ -262,15 +271,24 @@ class Simulation(Stepping):
         time: float | None = None,
     ) -> Rollout:
         """Return a rollout that is ready to go forward from the scene's first state; see `run` for its arguments."""
-        given = {} if controls is None else controls
-        rollout = Rollout(self.solver, steps_of_run(self, steps, time, given))
-        space = ParameterSpace(self, rollout.steps)
+        rollout = Rollout(self.solver, steps_of_run(self, steps, time, {} if controls is None else controls))
+        self._begin(rollout, controls, state, time)
+        return rollout
+
+    def _begin(
+        self,
+        rollout: Rollout,
+        controls: Mapping[str, Any] | None,
+        state: RestartState | Sequence[RestartState] | None,
+        time: float | None,
+    ) -> None:
+        """Give a rollout its first state and parameters, and its end where that is a time."""
+        space, given = ParameterSpace(self, rollout.steps), {} if controls is None else controls
         values = space.checked(given)
         states = one_for_each(state, self.batch)
         space.check_restarts(states, values)
         space.begin(rollout, values, states=states)
         end_after(rollout, time)
-        return rollout
 
     def quantity(
         self,

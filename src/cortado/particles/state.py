@@ -307,7 +307,12 @@ class Parameters(Arrays):
             if isinstance(last, np.ndarray) and np.array_equal(last, given):
                 continue
             self._written[name] = given
-            if hasattr(array.dtype, "_shape_"):
+            is_vector = hasattr(array.dtype, "_shape_")
+            axis = given.ndim - 1 - is_vector  # of steps, where the parameter has one
+            if array.ndim == 2 and axis >= 0 and 1 < given.shape[axis] < array.shape[1]:
+                room = array.shape[1] - given.shape[axis]
+                given = np.pad(given, [(0, room if k == axis else 0) for k in range(given.ndim)], mode="edge")
+            if is_vector:
                 table = np.zeros((*array.shape, 3))
                 table[..., : given.shape[-1]] = given
                 array.assign(table)

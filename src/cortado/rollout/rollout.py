@@ -32,8 +32,9 @@ Observer = Callable[[int, State], None]
 """A function that a run calls with the number of a state and the state, which later steps overwrite."""
 OBSERVED = "a number of steps", "a state"
 """Descriptions of an observer's two arguments, for error messages."""
-CHUNK = 64
-"""Greatest number of steps between two reads by the host."""
+CHUNK = {"cpu": 8, "cuda": 64}
+"""Greatest number of steps between two reads by the host, by kind of device: to capture one costs as much as four
+launches on a CPU, where a read costs little."""
 FILLED = {"cpu": 32_000, "cuda": 16_000_000}
 """Particles times steps of a chunk, by kind of device, above which a read by the host costs hardly anything."""
 
@@ -80,13 +81,14 @@ class AdjointStep:
 
 
 class Rollout(Staying):
-    """A number of steps of a solver from a first state, which can be repeated and differentiated."""
+    """A number of steps of a solver from a first state, which can be repeated and differentiated. Between evaluations
+    ``steps`` may be set to fewer than it was made with, its ``room``."""
 
     instead = "but the simulation that it is of can"
 
     @WARP
     def __init__(self, solver: Solver, steps: int, memory_budget: int = MEMORY_BUDGET):
-        self.solver, self.steps = solver, steps
+        self.solver, self.steps, self.room = solver, steps, steps
         self._device = solver.device
         require(step_parts(steps, solver.discretisation.precision.bytes), "take fewer steps", self._device)
         self.initial = solver.new_state()
@@ -117,14 +119,14 @@ class Rollout(Staying):
         self._spare: list[StateSeries] = []
         """Those of earlier runs that nobody will come back to, for the next run that keeps states."""
         self._buffer, self._bar = self.initial.following(), self.initial.like()
-        filled = FILLED["cpu" if self._device.is_cpu else "cuda"] // max(solver.layout.all_particles, 1)
-        length = max(min(CHUNK, filled, steps), 1)
+        kind = "cpu" if self._device.is_cpu else "cuda"
+        length = max(min(CHUNK[kind], FILLED[kind] // max(solver.layout.all_particles, 1), steps), 1)
         self._series = StateSeries(self.initial, length)
         self._chunk = [self._series.state(k) for k in range(length)]
         """The states of the last chunk."""
         self._tangent: tuple[Parameters, StepTangent, State] | None = None
         """The last one, with the tangents of the parameters that it was made for, and that of the present state."""
-        self._generation = -1
+        self._generation, self._is_warm = -1, False
         self._forget_stale_graphs()
         self.goes_on = False
         """Whether the first state was given whole, so that it depends on no parameter."""
@@ -151,8 +153,6 @@ class Rollout(Staying):
         """The lock that a thread holds while it uses the solver."""
         return self.solver.turn
 
-    # ---- evaluations ---------------------------------------------------------------------------------------------
-
     def begin_evaluation(self) -> None:
         """Prepare for a new first state and parameters: residuals that return to the present ones save copies."""
         if len(self.pending) > 1:
@@ -163,8 +163,6 @@ class Rollout(Staying):
             self._checkpoints = Checkpoints(self.initial, self._interval)
         self.pending.clear()
         self.progress, self.evaluation = Progress(), next(self._evaluations)
-
-    # ---- forward -------------------------------------------------------------------------------------------------
 
     @in_turn
     def forward(self, observe: Observer | None = None, keep: bool = True) -> State:
@@ -183,7 +181,7 @@ class Rollout(Staying):
         self.solver.reset(step)
         try:
             while step < self.steps and not ended:
-                last = min(step + min(len(self._chunk), self.step_sizes.longest_chunk), self.steps)
+                last = step + self._length(self.steps - step)
                 self._buffer.assign(state)  # which may be one of the states that steps overwrite
                 chunk = self._advance(step, last)
                 while self.solver.make_room() or self.step_sizes.again(step, last):
@@ -217,11 +215,12 @@ class Rollout(Staying):
     def _advance(self, first: int, last: int) -> list[State]:
         """Take steps ``first`` to ``last`` from the buffered state, and return the states after them, which the next
         chunk overwrites."""
-        self.solver.step_number.fill_(first)
-        self.step_sizes.seek(first)
         length = last - first
+        if not self._is_warm and self._device.is_cuda:
+            self._warm_up(first)
+        self._begin_at(first)
         if is_new := length not in self._chunks:
-            self._chunks[length] = CapturedGraph(partial(self._take, length), self.solver.launch)
+            self._chunks[length] = CapturedGraph(partial(self._take, length), self.solver.launch, self._is_warm)
         self._chunks[length]()
         if is_new and (self.solver.step_number.numpy() != last).any():  # then no lost particle would be noticed
             name = type(self.solver).__name__
@@ -229,6 +228,23 @@ class Rollout(Staying):
                 f"solver {name} has not counted its steps, but must: its step is to end with self.end_step."
             )
         return self._chunk[:length]
+
+    def _length(self, left: int) -> int:
+        """Return the number of steps of the next chunk, of those ``left``. A rollout that has room for more steps cuts
+        its end into powers of two, which runs of other lengths can use again."""
+        length = min(len(self._chunk), self.step_sizes.longest_chunk, left)
+        return length if self.steps == self.room or length < left else 1 << (length.bit_length() - 1)
+
+    def _warm_up(self, first: int) -> None:
+        """Take one step by launches, as a capture must not load modules or allocate, and take it back."""
+        self._begin_at(first)
+        self._take(1)
+        is_short = self.solver.make_room()
+        self._forget_stale_graphs()
+        self.solver.reset(first)
+        if is_short:
+            self._warm_up(first)
+        self._is_warm = True
 
     def _take(self, length: int) -> None:
         """Launch ``length`` steps from the buffered state."""
@@ -242,13 +258,11 @@ class Rollout(Staying):
         """Drop captured graphs where this rollout or another has replaced arrays of the solver."""
         if self._generation == self.solver.generation:
             return
-        self._generation = self.solver.generation
+        self._generation, self._is_warm = self.solver.generation, False
         self._chunks: dict[int, CapturedGraph] = {}
         """Graphs by their number of steps."""
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
         self._steps_along: dict[Counts, CapturedGraph] = {}
-
-    # ---- derivatives ---------------------------------------------------------------------------------------------
 
     @in_turn
     def backward(self, derivative: BackwardStep, bars: Mapping[int, State], observe: Observer | None = None) -> State:
@@ -337,9 +351,12 @@ class Rollout(Staying):
 
     def _seek(self, step: int) -> Counts:
         """Prepare the solver to take a step, counted from 0, again, and return its recorded counts."""
+        self._begin_at(step)
+        return self.log.seek(step)
+
+    def _begin_at(self, step: int) -> None:
         self.solver.step_number.fill_(step)
         self.step_sizes.seek(step)
-        return self.log.seek(step)
 
 
 OF_AN_EVALUATION = (
@@ -378,7 +395,7 @@ class Residual:
 
     def put_aside(self) -> None:
         """Copy the first state, parameters and log that another evaluation is about to overwrite."""
-        rollout, log = self.rollout, self.rollout.solver.new_log(self.rollout.steps)
+        rollout, log = self.rollout, self.rollout.solver.new_log(self.rollout.room)
         log.assign(rollout.log)
         first, time_steps, sizes = rollout.initial.copy(), rollout.time_steps.copy(), rollout.step_sizes.recorded()
         written = rollout.parameters.written.items()

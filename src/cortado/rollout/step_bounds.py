@@ -168,7 +168,7 @@ def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, 
     if not isinstance(rollout.step_sizes, ChosenSteps):
         courant = COURANT if scene.solver.courant is None else scene.solver.courant
         length = courant * 0.5 * scene.discretisation.support_radius
-        rollout.step_sizes = ChosenSteps(rollout.solver, rollout.parameters, rollout.steps, length)
+        rollout.step_sizes = ChosenSteps(rollout.solver, rollout.parameters, rollout.room, length)
     least = 1.0 / rollout.solver.layout.precision.greatest
     bounds = np.stack([step_bounds(scene, own, rollout.steps, least) for own in members], axis=1)
     scheduled = Courses(rollout, scene, parameters, members) if any(map(parameters.courses, members)) else None

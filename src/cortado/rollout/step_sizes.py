@@ -271,14 +271,15 @@ class ChosenSteps(StepSizes):
         self._read = RecordedSizes(np.zeros(shape), np.zeros(shape))
         self._scheduled: Scheduled | None = None
         self._compressions = Compressions(solver, steps) if isinstance(solver, ProjectionSteps) else None
-        self._retaken = Retaken()
+        self._steps, self._retaken = steps, Retaken()
         self.end = inf
         self.longest_chunk = StepSizes.longest_chunk
 
     def begin(self, clocks: Sequence[Clock], bounds: NDArray, scheduled: Scheduled | None) -> list[Clock]:
         """Prepare a run with upper bounds (steps, members) [s]; with ``scheduled`` parameters the host reads each step.
         Returns clocks of the first states, which learn the times of later ones."""
-        self._bounds.assign(bounds)
+        self._steps, room = len(bounds), len(self._bounds)
+        self._bounds.assign(np.pad(bounds, ((0, room - len(bounds)), (0, 0)), mode="edge"))
         self._first.assign([clock.time_step for clock in clocks])
         self._times[0].assign([clock.time for clock in clocks])
         self._scheduled, self._retaken, self.end = scheduled, Retaken(), inf
@@ -373,7 +374,7 @@ class ChosenSteps(StepSizes):
             own.assign(np.minimum(sizes, longest)[None])
             sizes[:] = own.numpy()[0]
             self.seek(last)
-        if last < len(self._bounds):
+        if last < self._steps:
             self._scheduled.fill(last, times, sizes)
 
     def of_step(self, step: int) -> NDArray:

@@ -290,8 +290,8 @@ class Stepping:
 
         ``parameters`` are any of those of `Problem` but first values, which ``state`` has; one over time has a row for
         each of these steps. Nothing is recorded on the way. From a `DeviceState` it gives another one. From the
-        second call on with as many steps no array of the device is allocated but those of a `DeviceState`, and no graph
-        is captured. Warns and raises as `Simulation.run` does.
+        second call on with as many steps, on a CPU from the third, no array of the device is allocated but those of a
+        `DeviceState`, and no graph is captured. Warns and raises as `Simulation.run` does.
         """
         return self.stepper(check_steps(steps)).advance(state, parameters)
 
