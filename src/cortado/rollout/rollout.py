@@ -33,8 +33,7 @@ Observer = Callable[[int, State], None]
 OBSERVED = "a number of steps", "a state"
 """Descriptions of an observer's two arguments, for error messages."""
 CHUNK = {"cpu": 8, "cuda": 64}
-"""Greatest number of steps between two reads by the host, by kind of device: to capture one costs as much as four
-launches on a CPU, where a read costs little."""
+"""Greatest number of steps between two reads by the host: on a CPU a capture costs four launches, a read little."""
 FILLED = {"cpu": 32_000, "cuda": 16_000_000}
 """Particles times steps of a chunk, by kind of device, above which a read by the host costs hardly anything."""
 
