@@ -28,19 +28,10 @@ def falling_jet(across, dimension, viscosity=0.0, solver=PROJECTION, device="cpu
         step = min(step, 0.1 * spacing**2 / (viscosity / 1000.0))
     steps = int(np.ceil(time / step))
     opening = np.pi * WIDTH**2 / 4.0 if dimension == 3 else WIDTH
-    jet = {
-        "outlet": [0.0] * dimension,
-        "direction": list(-down),
-        "radius": 0.5 * WIDTH,
-        "length": SPEED * time * 1.05,
-        "flow_rate": opening * SPEED,
-        "phase": "water",
-    }
+    jet = {"outlet": [0.0] * dimension, "direction": list(-down), "radius": 0.5 * WIDTH, "phase": "water"}
+    jet |= {"length": SPEED * time * 1.05, "flow_rate": opening * SPEED}
     simulation = simulated(
-        spacing,
-        dimension,
-        "float32",
-        C2,
+        *(spacing, dimension, "float32", C2),
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": viscosity}],
         fluid=[],
         emitter=jet,

@@ -62,9 +62,8 @@ def fourth_order_difference(
     value: Callable[[Mapping[str, Any]], Any], point: Mapping[str, Any], directions: Mapping[str, Any], h: float
 ) -> Any:
     """The same of fourth order, by Richardson's extrapolation: it bears larger steps, with less round-off."""
-    return (
-        4.0 * central_difference(value, point, directions, h) - central_difference(value, point, directions, 2.0 * h)
-    ) / 3.0
+    near, far = (central_difference(value, point, directions, step) for step in (h, 2.0 * h))
+    return (4.0 * near - far) / 3.0
 
 
 Difference = Callable[[Callable[[Mapping[str, Any]], Any], Mapping[str, Any], Mapping[str, Any], float], Any]

@@ -13,7 +13,8 @@ from cortado.optimisation.layers.functions import Steps
 from cortado.optimisation.layers.layer import PARAMETER, STATE, named
 from cortado.optimisation.layers.layer import on_host as arrays_on_host
 from cortado.particles.state import State
-from scenes import jet, plane, pour, scene, two_layers
+from layered import same_bits
+from scenes import jet, plane, pool, pour, scene, two_layers
 from test_stepper import assert_same_state, last_adjoint, scheduled
 
 CUDA = pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
@@ -83,17 +84,11 @@ def test_steps_and_derivatives_have_the_bits_of_those_on_the_host(name, precisio
     bars, parts = stepper.vjp(residual, last_adjoint(wanted) | {"time": 0.3})
     adjoint = {"positions": vectors(simulation, 2.0 * x + v), "velocities": vectors(simulation, x), "time": 0.3}
     same_bars, same_parts = stepper.vjp(same_residual, adjoint)
-    for one, other in ((bars, on_host(simulation, same_bars)), (parts, same_parts)):
-        assert {n: np.asarray(a).tobytes() for n, a in one.items()} == {
-            n: np.asarray(a).tobytes() for n, a in other.items()
-        }
-    dots = stepper.jvp(residual, {"velocities": x}, {"gravity": np.ones(simulation.dimension)})
-    same_dots = stepper.jvp(
-        same_residual, {"velocities": vectors(simulation, x)}, {"gravity": np.ones(simulation.dimension)}
-    )
-    assert {n: np.asarray(a).tobytes() for n, a in dots.items()} == {
-        n: a.tobytes() for n, a in on_host(simulation, same_dots).items()
-    }
+    for one, other in ((bars, same_bars), (parts, same_parts)):
+        same_bits(one, on_host(simulation, other))
+    pull = {"gravity": np.ones(simulation.dimension)}
+    same_dots = stepper.jvp(same_residual, {"velocities": vectors(simulation, x)}, pull)
+    same_bits(stepper.jvp(residual, {"velocities": x}, pull), on_host(simulation, same_dots))
 
 
 def test_nothing_of_a_state_passes_through_the_host(monkeypatch, device):
@@ -159,37 +154,31 @@ def test_what_does_not_fit_is_a_sentence(device):
     single = np.zeros((n, 3), dtype=np.float32)
     single[:, :2] = simulation.velocities
     single[5] = np.nan
-    for fields, words in [
-        ({"velocities": np.zeros((n, 3))}, r"velocities is a float64 array \(64, 3\) on cpu, but must be a float32"),
-        (
-            {"velocities": np.zeros((n, 2), dtype=np.float32)},
-            r"\(64, 2\) on cpu, but must be a float32 array \(64, 3\)",
-        ),
-        ({"velocities": [[0.0, 0.0]]}, "must be an array that speaks DLPack"),
-        ({"velocities": np.array([["fast"]])}, "velocities cannot be taken: Unsupported"),
-        ({"velocities": given(simulation, single)}, "not finite"),
-        ({"positions": given(simulation, crowded)}, "at one place"),
-        ({"velocities": given(simulation, crowded + np.float32(1.0))}, "velocities has a third component other than 0"),
-        ({"pressure": given(simulation, crowded)}, "'pressure', but must have only positions"),
+    narrow = np.zeros((n, 2), dtype=np.float32)
+    other, several = Simulation(plane(), precision="float64"), Simulation(plane(), batch=2)
+    fields = {
+        r"velocities is a float64 array \(64, 3\) on cpu, but must be a float32": {"velocities": np.zeros((n, 3))},
+        r"\(64, 2\) on cpu, but must be a float32 array \(64, 3\)": {"velocities": narrow},
+        "must be an array that speaks DLPack": {"velocities": [[0.0, 0.0]]},
+        "velocities cannot be taken: Unsupported": {"velocities": np.array([["fast"]])},
+        "not finite": {"velocities": given(simulation, single)},
+        "at one place": {"positions": given(simulation, crowded)},
+        "velocities has a third component other than 0": {"velocities": given(simulation, crowded + np.float32(1.0))},
+        "'pressure', but must have only positions": {"pressure": given(simulation, crowded)},
+    }
+    for use, words in [
+        *((lambda own=own: simulation.on_device(state, own), words) for words, own in fields.items()),
+        (lambda: simulation.vjp(state, {}, {"velocities": narrow}), r"state_bar velocities is .* \(64, 2\) on cpu"),
+        (lambda: other.step(state), "of a simulation with other arrays"),
+        (lambda: several.step(state), "of a simulation with other arrays"),
+        (lambda: Simulation(plane(), device).step(state), "state is of another simulation, but must be of this one"),
+        (lambda: state["pressure"], "has no 'pressure', but has positions"),
+        (lambda: simulation.step(state, {"rest_density": 900.0}), "to be given again"),
+        (lambda: pickle.dumps(state), "can be neither pickled nor copied"),
+        (lambda: simulation.on_host(3), "state is 3, but must be a DeviceState"),
     ]:
         with pytest.raises(InputError, match=words):
-            simulation.on_device(state, fields)
-    with pytest.raises(InputError, match=r"state_bar velocities is a float32 array \(64, 2\) on cpu"):
-        simulation.vjp(state, {}, {"velocities": np.zeros((n, 2), dtype=np.float32)})
-    with pytest.raises(InputError, match="of a simulation with other arrays"):
-        Simulation(plane(), precision="float64").step(state)
-    with pytest.raises(InputError, match="of a simulation with other arrays"):
-        Simulation(plane(), batch=2).step(state)
-    with pytest.raises(InputError, match="state is of another simulation, but must be of this one"):
-        Simulation(plane(), device).step(state)
-    with pytest.raises(InputError, match="has no 'pressure', but has positions"):
-        state["pressure"]
-    with pytest.raises(InputError, match="to be given again"):
-        simulation.step(state, {"rest_density": 900.0})
-    with pytest.raises(InputError, match="can be neither pickled nor copied"):
-        pickle.dumps(state)
-    with pytest.raises(InputError, match="state is 3, but must be a DeviceState"):
-        simulation.on_host(3)
+            use()
     assert repr(state).startswith("DeviceState(positions (64, 3), velocities (64, 3), ")
 
 
@@ -208,15 +197,10 @@ STEPS = 4
 
 def simulation(precision: str = "float64", **changes: Any) -> cortado.Simulation:
     scene: dict[str, Any] = {
-        "name": "rows",
-        "dimension": 2,
-        "discretisation": {"spacing": 0.1},
         "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.5}],
-        "fluid": [{"shape": "box", "lower": [0, 0], "upper": [0.5, 0.5], "phase": "water"}],
-        "container": {"shape": "box", "lower": [0, 0], "upper": [1, 1]},
         "solver": {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 2, "maximum_iterations": 2},
     }
-    return cortado.Simulation(cortado.Scene(**{**scene, **changes}), precision=precision)
+    return Simulation(pool([0.5, 0.5], [1.0, 1.0], 0.1, **{**scene, **changes}), precision=precision)
 
 
 def on_device(values: np.ndarray, precision: str = "float64") -> wp.array:

@@ -127,15 +127,9 @@ def test_links_lead_to_files():
 
 
 def test_paths_in_backticks_are_there():
-    texts = [
-        *DOCUMENTS.values(),
-        *((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "CONTRIBUTING.md")),
-    ]
-    found = {
-        path
-        for text in texts
-        for path in re.findall(r"`((?:src|tests|docs|examples|reference|fuzz|validation)/[^` *]*)`", text)
-    }
+    texts = [*DOCUMENTS.values(), *((ROOT / name).read_text("utf-8") for name in ("README.md", "CONTRIBUTING.md"))]
+    path = r"`((?:src|tests|docs|examples|reference|fuzz|validation)/[^` *]*)`"
+    found = {one for text in texts for one in re.findall(path, text)}
     assert len(found) > 50
     assert not {path for path in found if not (ROOT / path).exists()}
 
@@ -198,12 +192,10 @@ def test_every_page_is_in_one_table_of_contents():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(DOCS).as_posix())
-def test_a_page_has_one_title_links_and_pictures_that_are_there(page):
+def test_a_page_has_one_title_and_pictures_with_words(page):
     text = CODE_OF_A_PAGE.sub("", page.read_text(encoding="utf-8"))
     assert len(re.findall(r"^# .+", text, re.MULTILINE)) == 1
     assert [alt for alt in re.findall(r"!\[(.*?)\]\(", text, re.DOTALL) if len(alt) < 10] == []
-    links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link]
-    assert [link for link in links if not (page.parent / link).exists()] == []
 
 
 @pytest.mark.parametrize("page, file", outer_pages.OUTER.items())
@@ -214,17 +206,10 @@ def test_a_page_from_elsewhere_is_there_and_says_where(page, file):
 
 def test_bars_around_a_number_are_no_relations():
     """Without a form, a bar inside of a formula has room on both sides, and its superscript hangs below it."""
-    left, right = (
-        f'<mo form="{form}" stretchy="false" lspace="0" rspace="0">&#x0007C;</mo>' for form in ("prefix", "postfix")
-    )
+    bar = '<mo form="{}" stretchy="false" lspace="0" rspace="0">&#x0007C;</mo>'
+    left, right, alone = bar.format("prefix"), bar.format("postfix"), '<mo stretchy="false">&#x0007C;</mo>'
     made = mathml.mathml(r"a \lvert c_i - c_j \rvert^2 + P(x | y) \lvert z \rvert", "inline")
-    assert re.findall(r"<mo[^>]*>&#x0007C;</mo>", made) == [
-        left,
-        right,
-        '<mo stretchy="false">&#x0007C;</mo>',
-        left,
-        right,
-    ]
+    assert re.findall(r"<mo[^>]*>&#x0007C;</mo>", made) == [left, right, alone, left, right]
     assert f"<msup>{right}<mn>2</mn></msup>" in made
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from cortado import CortadoWarning, InputError, Problem, Scene, Simulation, gradients, losses
 from finite_differences import both_modes, decades, distance
-from scenes import jet, plane, pour, scene
+from scenes import box, jet, plane, pour, scene
 from twins import nozzle_of
 
 STEPS = 30
@@ -52,14 +52,10 @@ def point_of(problem, over_time=True):
     own = simulation.parameters()
     path = swaying(own["nozzle_path"]) if over_time else own["nozzle_path"] + 0.003
     x = own["initial_positions"]
-    return {
-        "nozzle_path": path,
-        "flow_rate": own["flow_rate"],
-        "time_step": own["time_step"],
-        "gravity": own["gravity"],
-        "initial_positions": x + 0.001 * random.standard_normal(x.shape),
-        "initial_velocities": own["initial_velocities"] + 0.1 * random.standard_normal(x.shape),
-    }
+    own |= {"nozzle_path": path, "initial_positions": x + 0.001 * random.standard_normal(x.shape)}
+    own["initial_velocities"] = own["initial_velocities"] + 0.1 * random.standard_normal(x.shape)
+    names = ("nozzle_path", "flow_rate", "time_step", "gravity", "initial_positions", "initial_velocities")
+    return {name: own[name] for name in names}
 
 
 def direction_of(name, value):
@@ -271,36 +267,26 @@ def test_without_an_emitter_its_parameters_are_a_sentence(value):
     simulation = Simulation(plane(), precision="float64")
     problem = Problem(simulation, 2, losses.FinalPositions(simulation.positions))
     gravity = {"gravity": [0.0, -9.81]}
-    for refused in (
-        lambda: problem.value(value),
-        lambda: problem.tangent(gravity, value),
-        lambda: simulation.run(2, controls=value),
-    ):
+    for use in (problem.value, lambda own: problem.tangent(gravity, own), lambda own: simulation.run(2, controls=own)):
         with pytest.raises(InputError, match=r"must be left out, as the scene has no emitter\."):
-            refused()
+            use(value)
     assert value.keys().isdisjoint(simulation.parameters())
 
 
 def test_a_column_in_a_wall_is_named_where_the_pressure_does_not_converge():
     """Its particles cannot move away from a wall that presses on them."""
     nozzle = {"phase": "water", "outlet": [0.25, 0.3], "radius": 0.03, "flow_rate": 0.06}
-    box = {
-        "name": "jet",
-        "dimension": 2,
-        "discretisation": {"spacing": 0.01},
-        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}],
-        "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 0.4]},
-        "forces": {"gravity": [0.0, -9.81]},
-        "solver": {"kind": "pcisph", "time_step": 0.001},
-    }
+    water = [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}]
+    tables = {"discretisation": {"spacing": 0.01}, "phase": water, "solver": {"kind": "pcisph", "time_step": 0.001}}
+    tables |= {"fluid": [], "container": box([0.0, 0.0], [0.5, 0.4])}
     with pytest.warns(CortadoWarning, match=r"did not converge.*Shorten emitter\.length"):
-        Simulation(Scene(**box, emitter={**nozzle, "length": 0.3})).run(3)
+        Simulation(plane(**tables, emitter={**nozzle, "length": 0.3})).run(3)
     with warnings.catch_warnings():
         warnings.simplefilter("error", CortadoWarning)
-        Simulation(Scene(**box, emitter={**nozzle, "length": 0.1})).run(3)
+        Simulation(plane(**tables, emitter={**nozzle, "length": 0.1})).run(3)
 
 
-def test_a_column_is_jittered_along_its_opening_with_the_projection_alone():
+def test_a_column_is_jittered_along_its_opening_with_the_projection_alone_or_as_it_is_given():
     lattice, projected = (pour(**solver) for solver in ({}, {"solver": {"kind": "projection", "time_step": 0.002}}))
     spacing = lattice.discretisation.spacing
     assert (lattice.emitter.jitter, projected.emitter.jitter) == (0.0, 0.05)
@@ -314,9 +300,6 @@ def test_a_column_is_jittered_along_its_opening_with_the_projection_alone():
     assert (lower <= found.positions + 1e-12).all() and (found.positions <= upper + 1e-12).all()
     assert Scene.from_json(projected.to_json()) == projected
     assert "jitter" in projected.computed_json() and "jitter" not in lattice.computed_json()
-
-
-def test_a_jitter_that_is_given_stays():
     solver = {"kind": "projection", "time_step": 0.002}
     nozzle = pour().emitter.model_dump(exclude={"jitter"})
     assert pour(solver=solver, emitter={**nozzle, "jitter": 0.0}).emitter.jitter == 0.0

@@ -68,11 +68,7 @@ def test_who_follows_a_solid_has_it_in_the_middle():
         (scene, {"camera_path": {"kind": "fly"}}, 'camera_path.kind is .fly., but must be "dolly" or "follow"'),
         (scene, {"camera_path": {"kind": "follow", "solid": "raft"}}, "solid is 'raft', but must be left out"),
         (scene, {"camera_path": Orbit().model_dump() | {"turns": np.nan}}, "turns is nan"),
-        (
-            scene,
-            {"camera_path": KEYS | {"times": [1, 1]}},
-            "at least two times",
-        ),
+        (scene, {"camera_path": KEYS | {"times": [1, 1]}}, "at least two times"),
         (scene, {"camera_path": KEYS | {"cameras": [[0] * 3]}}, "2 places of 3 comp"),
         (plane, {"camera_path": {"kind": "orbit"}}, "camera_path .*left out, as the scene has 2 dimensions"),
         (scene, {"colour": "rho"}, 'picture.colour is \'rho\', but must be "phase" or "density"'),

@@ -106,12 +106,8 @@ def test_the_limit_of_a_process_counts():
 
 
 def test_the_limit_of_a_container_counts(monkeypatch, tmp_path):
-    for name, content in (
-        ("memory.max", "3000"),
-        ("memory.current", "1500"),
-        ("memory.stat", "anon 1\ninactive_file 400"),
-    ):
-        (tmp_path / name).write_text(content)
+    for name, content in {"max": "3000", "current": "1500", "stat": "anon 1\ninactive_file 400"}.items():
+        (tmp_path / f"memory.{name}").write_text(content)
     monkeypatch.setattr(memory, "_CGROUP", tmp_path)
     assert memory.available() == 1900.0
     (tmp_path / "memory.max").write_text("max")

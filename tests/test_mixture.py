@@ -42,15 +42,8 @@ class Everything:
 
 
 SIZES = {
-    "gravity": 1.0,
-    "initial_positions": 0.05,
-    "initial_velocities": 0.1,
-    "mass_fractions": 0.1,
-    "rest_density": 100.0,
-    "viscosity": 0.05,
-    "time_step": 1e-4,
-    "mobility": 0.01,
-    "interface_width": 0.004,
+    **{"gravity": 1.0, "initial_positions": 0.05, "initial_velocities": 0.1, "mass_fractions": 0.1},
+    **{"rest_density": 100.0, "viscosity": 0.05, "time_step": 1e-4, "mobility": 0.01, "interface_width": 0.004},
 }
 """Size of a direction of each parameter."""
 
@@ -244,10 +237,7 @@ def test_free_energies_of_one_name_are_told_from_one_another():
         ({"curvature": -1.0}, "FreeEnergy quartic's curvature is -1.0, but must be at least 0"),
         ({"curvature": "a"}, "FreeEnergy quartic's curvature is 'a', but must be"),
         ({"functions": 3}, "FreeEnergy quartic's functions is 3, but must be a function"),
-        (
-            {"functions": lambda precision: 3},
-            r"takes the arguments '\(precision\)', but must take 2: a precision",
-        ),
+        ({"functions": lambda precision: 3}, r"takes the arguments '\(precision\)', but must take 2: a precision"),
         ({"value": 3}, "FreeEnergy quartic's value is 3, but must be a function"),
         ({"name": 3}, "FreeEnergy has the name 3, but must have a text"),
     ],
