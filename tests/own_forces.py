@@ -13,19 +13,14 @@ from cortado.scene.parameters import Axis, Parameter
 def breeze_kernels(discretisation):
     """a = k sin(t) (wind - v), with its derivatives by hand."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
+    numbers, vectors, times = wp.array(dtype=real), wp.array(dtype=vector), wp.array2d(dtype=real)
+    places = wp.array(dtype=wp.int32)
 
     @wp.kernel(module=discretisation.module(True, "tests_breeze"))
     def forward(
-        particles: int,
-        time: wp.array2d(dtype=real),
-        step: wp.array(dtype=wp.int32),
-        breeze_k: wp.array(dtype=real),
-        breeze_wind: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        acceleration_in: wp.array(dtype=vector),
-        # out
-        acceleration: wp.array(dtype=vector),
-    ):
+        particles: int, time: times, step: places, breeze_k: numbers, breeze_wind: vectors, v: vectors,
+        acceleration_in: vectors, acceleration: vectors,
+    ):  # fmt: skip
         i = wp.tid()
         b = i // particles
         rate = breeze_k[b] * wp.sin(time[b, step[b]])
@@ -33,20 +28,10 @@ def breeze_kernels(discretisation):
 
     @wp.kernel(module=discretisation.tangent_module("tests_breeze"), enable_backward=False)
     def tangent(
-        particles: int,
-        time: wp.array2d(dtype=real),
-        time_dot: wp.array2d(dtype=real),
-        step: wp.array(dtype=wp.int32),
-        breeze_k: wp.array(dtype=real),
-        breeze_k_dot: wp.array(dtype=real),
-        breeze_wind: wp.array(dtype=vector),
-        breeze_wind_dot: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        v_dot: wp.array(dtype=vector),
-        acceleration_in_dot: wp.array(dtype=vector),
-        # out
-        acceleration_dot: wp.array(dtype=vector),
-    ):
+        particles: int, time: times, time_dot: times, step: places, breeze_k: numbers, breeze_k_dot: numbers,
+        breeze_wind: vectors, breeze_wind_dot: vectors, v: vectors, v_dot: vectors, acceleration_in_dot: vectors,
+        acceleration_dot: vectors,
+    ):  # fmt: skip
         i = wp.tid()
         b = i // particles
         t = time[b, step[b]]
@@ -56,19 +41,9 @@ def breeze_kernels(discretisation):
 
     @wp.kernel(module=discretisation.module(False, "tests_breeze"), enable_backward=False)
     def adjoint(
-        particles: int,
-        time: wp.array2d(dtype=real),
-        step: wp.array(dtype=wp.int32),
-        breeze_k: wp.array(dtype=real),
-        breeze_wind: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        acceleration_bar: wp.array(dtype=vector),
-        # in and out
-        v_bar: wp.array(dtype=vector),
-        breeze_k_bar: wp.array(dtype=real),
-        breeze_wind_bar: wp.array(dtype=vector),
-        rate_bar: wp.array(dtype=real),
-    ):
+        particles: int, time: times, step: places, breeze_k: numbers, breeze_wind: vectors, v: vectors,
+        acceleration_bar: vectors, v_bar: vectors, breeze_k_bar: numbers, breeze_wind_bar: vectors, rate_bar: numbers,
+    ):  # fmt: skip
         i = wp.tid()
         b = i // particles
         t = time[b, step[b]]
@@ -79,7 +54,7 @@ def breeze_kernels(discretisation):
         rate_bar[i] = breeze_k[b] * wp.cos(t) * work
 
     @wp.kernel(module=discretisation.module(False, "tests_breeze"), enable_backward=False)
-    def add_time(total: wp.array(dtype=real), step: wp.array(dtype=wp.int32), time_bar: wp.array2d(dtype=real)):
+    def add_time(total: numbers, step: places, time_bar: times):
         b = wp.tid()
         time_bar[b, step[b]] = time_bar[b, step[b]] + total[b]
 
@@ -115,14 +90,8 @@ class Breeze:
 
     @property
     def parameters(self):
-        wind = Parameter(
-            "breeze.wind",
-            "m/s",
-            "wind",
-            Axis.SCALAR,
-            lambda s: [1.0, 0.5, 0.2][: s.scene.dimension],
-            components=lambda dimension, phases: dimension,
-        )
+        named = "breeze.wind", "m/s", "wind", Axis.SCALAR, lambda s: [1.0, 0.5, 0.2][: s.scene.dimension]
+        wind = Parameter(*named, components=lambda dimension, phases: dimension)
         return [Parameter("breeze.k", "1/s", "rate", Axis.SCALAR, lambda s: self.k), wind, TIME]
 
     def force(self, setting):

@@ -26,15 +26,11 @@ MEMORY = "memory"
 def memory_kernels(precision):
     """w <- (w + v) / 2 until w is near v, and then v <- v - rate w, with derivatives of k rounds at once."""
     real, vector, pair = precision.real, precision.vector, precision.pair
+    numbers, vectors, pairs = wp.array(dtype=real), wp.array(dtype=vector), wp.array(dtype=pair)
     module = wp.get_module(f"tests_memory_{precision.name}")
 
     @wp.kernel(module=module)
-    def remember(
-        v: wp.array(dtype=vector),
-        w_in: wp.array(dtype=vector),
-        w_out: wp.array(dtype=vector),
-        error: wp.array(dtype=pair),
-    ):
+    def remember(v: vectors, w_in: vectors, w_out: vectors, error: pairs):
         i = wp.tid()
         w = real(0.5) * (w_in[i] + v[i])
         w_out[i] = w
@@ -42,28 +38,15 @@ def memory_kernels(precision):
         error[i] = pair(gap, gap)
 
     @wp.kernel(module=module)
-    def drag(
-        particles: int,
-        memory_rate: wp.array(dtype=real),
-        v: wp.array(dtype=vector),
-        w: wp.array(dtype=vector),
-        v_out: wp.array(dtype=vector),
-    ):
+    def drag(particles: int, memory_rate: numbers, v: vectors, w: vectors, v_out: vectors):
         i = wp.tid()
         v_out[i] = v[i] - memory_rate[i // particles] * w[i]
 
     @wp.kernel(module=module, enable_backward=False)
     def tangent(
-        particles: int,
-        memory_rate: wp.array(dtype=real),
-        memory_rate_dot: wp.array(dtype=real),
-        left: real,
-        w_end: wp.array(dtype=vector),
-        v_dot: wp.array(dtype=vector),
-        w_dot: wp.array(dtype=vector),
-        v_out_dot: wp.array(dtype=vector),
-        w_out_dot: wp.array(dtype=vector),
-    ):
+        particles: int, memory_rate: numbers, memory_rate_dot: numbers, left: real, w_end: vectors, v_dot: vectors,
+        w_dot: vectors, v_out_dot: vectors, w_out_dot: vectors,
+    ):  # fmt: skip
         i = wp.tid()
         w = left * w_dot[i] + (real(1.0) - left) * v_dot[i]
         w_out_dot[i] = w
@@ -72,16 +55,9 @@ def memory_kernels(precision):
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
-        particles: int,
-        order: wp.array(dtype=wp.int32),
-        memory_rate: wp.array(dtype=real),
-        left: real,
-        w_end: wp.array(dtype=vector),
-        w_out_bar: wp.array(dtype=vector),
-        v_scene_bar: wp.array(dtype=vector),
-        w_bar: wp.array(dtype=vector),
-        memory_rate_bar: wp.array(dtype=real),
-    ):
+        particles: int, order: wp.array(dtype=wp.int32), memory_rate: numbers, left: real, w_end: vectors,
+        w_out_bar: vectors, v_scene_bar: vectors, w_bar: vectors, memory_rate_bar: numbers,
+    ):  # fmt: skip
         i = wp.tid()
         p = order[i]
         memory_rate_bar[i] = memory_rate_bar[i] - wp.dot(w_end[i], v_scene_bar[p])

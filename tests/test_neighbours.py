@@ -26,10 +26,17 @@ CPU = wp.get_device("cpu")
 GUARD = -7
 
 precisions = pytest.mark.parametrize("precision", [FLOAT32, FLOAT64], ids=lambda precision: precision.name)
+dimensions = pytest.mark.parametrize("dimension", [2, 3])
 
 
 def padded(vectors: np.ndarray) -> np.ndarray:
     return np.hstack([vectors, np.zeros((len(vectors), 3 - vectors.shape[1]))])
+
+
+def walls_at(places: np.ndarray) -> WallArrays:
+    """With their numbers as weights, so that sorted walls tell who they were."""
+    names, nowhere = np.arange(len(places), dtype=np.float64), 0.0 * padded(places)
+    return WallArrays(padded(places), names, names, nowhere, nowhere, np.full(len(places), -1))
 
 
 def around(search: NeighbourSearch, period: np.ndarray, precision: Precision) -> Any:
@@ -84,14 +91,7 @@ def lists(
     lower = np.where(period > 0, 0.0, lower)
     grid = Grid.around(lower, upper, period, REACH, most)
     discretisation = kind(CUBIC_SPLINE, precision, lanes, periodic=any(period))
-    names = np.arange(len(walls), dtype=np.float64)  # as weights, so that sorted walls tell who they were
-    search = NeighbourSearch(
-        discretisation,
-        grid,
-        WallArrays(padded(walls), names, names, 0.0 * padded(walls), 0.0 * padded(walls), np.full(len(walls), -1)),
-        Layout(n, 1, precision, device),
-        capacity,
-    )
+    search = NeighbourSearch(discretisation, grid, walls_at(walls), Layout(n, 1, precision, device), capacity)
     memory = wp.full((n, capacity + 8) if device.is_cpu else (capacity + 8, n), GUARD, dtype=wp.int32, device=device)
     search.neighbours = memory[:, :capacity].transpose((1, 0)) if device.is_cpu else memory[:capacity]
     neighbourhood = around(search, period, precision)
@@ -104,8 +104,7 @@ def lists(
     fluid_count, count = search.fluid_count.numpy(), search.count.numpy()
     own = fluid_count - search.filling.numpy()
     wall_names = search.walls["wall_weights"].numpy().astype(int)
-    fluid: list[np.ndarray] = [np.zeros(0)] * n
-    near_walls: list[np.ndarray] = [np.zeros(0)] * n
+    fluid, near_walls = ([np.zeros(0)] * n for _ in range(2))
     for i in range(n):
         fluid[order[i]] = order[rows[i, : own[i]]]
         if capacity == 400:  # else the list may have been cut
@@ -187,15 +186,9 @@ def cloud(n: int, dimension: int, size: Any, seed: int = 0) -> np.ndarray:
 
 
 @precisions
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_free_space(dimension, precision):
-    found = check(cloud(300, dimension, 0.6), precision=precision)
-    assert found.needed > 4
-
-
-@precisions
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_walls(dimension, precision):
+@dimensions
+def test_free_space_and_walls(dimension, precision):
+    assert check(cloud(300, dimension, 0.6), precision=precision).needed > 4
     walls = cloud(150, dimension, 0.7, seed=1) - 0.05
     found = check(cloud(200, dimension, 0.6), walls=walls, precision=precision)
     assert any(len(near) for near in found.walls)
@@ -215,7 +208,7 @@ def test_periods(axes, precision):
 
 @precisions
 @pytest.mark.parametrize("reaches", [1.0, 1.4, 2.0, 2.2, 3.0, 3.5])
-@pytest.mark.parametrize("dimension", [2, 3])
+@dimensions
 def test_short_periods(dimension, reaches, precision):
     """With one, two and three cells along an axis no cell is visited twice, and none is left out."""
     size = np.array([reaches, 3.3, reaches])[:dimension] * REACH
@@ -253,6 +246,7 @@ def test_lost_particles_harm_nobody():
     for i in range(100):
         assert set(before.fluid[i]) == set(after.fluid[i])
     assert all(len(after.fluid[i]) == 0 for i in range(100, 104))
+    assert check(np.array([[0.3, 0.2, 0.1]])).needed == 0  # nor does being alone
 
 
 @precisions
@@ -264,7 +258,7 @@ def test_coincident_particles(precision):
 
 
 @precisions
-@pytest.mark.parametrize("dimension", [2, 3])
+@dimensions
 def test_the_lists_reach_beyond_the_support(dimension, precision):
     """On a lattice with pairs at exactly the support radius those are listed, whatever the round-off."""
     spacing, n = SUPPORT / 2, 6
@@ -276,9 +270,10 @@ def test_the_lists_reach_beyond_the_support(dimension, precision):
         assert set(np.flatnonzero(r[i] < 1.001 * SUPPORT)) - {i} == set(listed)
 
 
-@pytest.mark.parametrize(
-    "distance, listed", [(0.5, True), (1.0, True), (1 + 0.99 * SKIN, True), (1 + 1.01 * SKIN, False)]
-)
+NEARER, FARTHER = 1 + 0.99 * SKIN, 1 + 1.01 * SKIN
+
+
+@pytest.mark.parametrize("distance, listed", [(0.5, True), (1.0, True), (NEARER, True), (FARTHER, False)])
 @precisions
 def test_how_far_the_lists_reach(distance, listed, precision):
     found = check(np.array([[0.2, 0.2], [0.2 + distance * SUPPORT, 0.2]]), precision=precision)
@@ -344,10 +339,6 @@ def test_lanes_list_the_same_as_one_thread(name, kind, short, precision, monkeyp
     check_same(found, wanted)
 
 
-def test_one_particle_alone():
-    assert check(np.array([[0.3, 0.2, 0.1]])).needed == 0
-
-
 @pytest.mark.parametrize("capacity", [4, 12, 24])
 @precisions
 def test_lists_that_are_too_short_say_how_long_they_must_be(capacity, precision):
@@ -362,15 +353,10 @@ def test_lists_that_are_too_short_say_how_long_they_must_be(capacity, precision)
 
 
 def test_room_can_be_made():
-    discretisation = Discretisation(CUBIC_SPLINE, FLOAT64)
-    grid = Grid.around(np.zeros(3), np.ones(3), np.zeros(3), REACH, 1000)
-    nothing = WallArrays(
-        np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=int)
-    )
-    search = NeighbourSearch(discretisation, grid, nothing, Layout(10, 1, FLOAT64, CPU), 4)
+    grid, layout = Grid.around(np.zeros(3), np.ones(3), np.zeros(3), REACH, 1000), Layout(10, 1, FLOAT64, CPU)
+    search = NeighbourSearch(Discretisation(CUBIC_SPLINE, FLOAT64), grid, walls_at(np.zeros((0, 3))), layout, 4)
     search.allocate(9)
-    assert search.capacity == 12  # the next multiple of UNROLL
-    assert search.neighbours.shape == (12, 10)
+    assert search.capacity == 12 and search.neighbours.shape == (12, 10)  # the next multiple of UNROLL
 
 
 @settings(max_examples=100, deadline=None, database=None, derandomize=True)
@@ -384,15 +370,9 @@ def test_room_can_be_made():
     most=st.sampled_from([1, 30, 4096]),
 )
 def test_random_clouds(seed, n, periodic, reaches, walls, single, most):
-    dimension = len(periodic)
-    size = np.array(reaches[:dimension]) * REACH
-    check(
-        cloud(n, dimension, size, seed),
-        period=size * periodic,
-        walls=cloud(walls, dimension, size, seed + 1),
-        precision=FLOAT32 if single else FLOAT64,
-        most=most,
-    )
+    size = np.array(reaches[: len(periodic)]) * REACH
+    particles, wall = (cloud(number, len(size), size, seed + k) for k, number in enumerate((n, walls)))
+    check(particles, period=size * periodic, walls=wall, precision=FLOAT32 if single else FLOAT64, most=most)
 
 
 def test_a_grid_covers_its_region():

@@ -90,50 +90,17 @@ PLANTED = {
 }
 
 NOZZLE = {"phase": "oil", "outlet": [0.16, 0.24], "radius": 0.05, "length": 0.11, "flow_rate": 0.2}
-ROOM = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.3, 0.6], "slip": "no"}
-POOL = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.3, 0.2], "phase": "water"}
+ROOM, POOL = box([0.0, 0.0], [0.3, 0.6], slip="no"), box([0.0, 0.0], [0.3, 0.2], phase="water")
 PHASES = [{"name": "water", "rest_density": 1000.0, "viscosity": 2.0}, {**OIL, "viscosity": 8.0}]
-BALL = {
-    "name": "ball",
-    "shape": "sphere",
-    "centre": [0.15, 0.25],
-    "radius": 0.05,
-    "motion": "path",
-    "velocity": [0.5, -1.0],
-    "angular_velocity": 3.0,
-    "slip": "no",
-}
-PLATE = box(
-    [0.12, 0.02, 0.02],
-    [0.18, 0.12, 0.14],
-    name="plate",
-    rotation=[0.2, -0.3, 0.1],
-    motion="path",
-    velocity=[-0.5, 0.2, 0.1],
-    angular_velocity=[2.0, -1.0, 3.0],
-    surface_velocity=[0.3, -0.2, 0.5],
-    slip="no",
-)
-RAFT = box(
-    [0.2, -0.002],
-    [0.45, 0.18],
-    name="raft",
-    rotation=0.01,
-    motion="free",
-    density=500.0,
-    velocity=[0.1, -0.3],
-    angular_velocity=0.5,
-)
-BUOY = {
-    "name": "buoy",
-    "shape": "sphere",
-    "centre": [0.52, 0.14],
-    "radius": 0.08,
-    "motion": "free",
-    "density": 300.0,
-    "velocity": [-0.3, 0.1],
-    "angular_velocity": -1.0,
-}
+STEADY = {"motion": "path", "slip": "no"}
+BALL = {"name": "ball", "shape": "sphere", "centre": [0.15, 0.25], "radius": 0.05, **STEADY}
+BALL |= {"velocity": [0.5, -1.0], "angular_velocity": 3.0}
+PLATE = box([0.12, 0.02, 0.02], [0.18, 0.12, 0.14], name="plate", rotation=[0.2, -0.3, 0.1], **STEADY)
+PLATE |= {"velocity": [-0.5, 0.2, 0.1], "angular_velocity": [2.0, -1.0, 3.0], "surface_velocity": [0.3, -0.2, 0.5]}
+RAFT = box([0.2, -0.002], [0.45, 0.18], name="raft", rotation=0.01, motion="free", density=500.0)
+RAFT |= {"velocity": [0.1, -0.3], "angular_velocity": 0.5}
+BUOY = {"name": "buoy", "shape": "sphere", "centre": [0.52, 0.14], "radius": 0.08, "motion": "free", "density": 300.0}
+BUOY |= {"velocity": [-0.3, 0.1], "angular_velocity": -1.0}
 ARM = box([0.3, 0.175], [0.36, 0.3], name="arm", motion="path", velocity=[0.0, -0.2])
 """They touch: the raft the floor, the buoy the raft, and the arm, which has a path, the raft."""
 IN_SPACE = {
@@ -142,12 +109,8 @@ IN_SPACE = {
 }
 TURNS = {"raft": {"rotation": [0.01, 0.02, 0.01], "angular_velocity": [1.0, 2.0, -3.0]}}
 TURNS["buoy"] = {"rotation": [0.2, 0.1, -0.3], "angular_velocity": [2.0, -1.0, 1.0]}
-THICK = {
-    "name": "paste",
-    "rest_density": 1000.0,
-    "viscosity": 8.0,
-    "rheology": {"kind": "bingham", "yield_stress": 8.0, "regularisation": 0.5},
-}
+LAW = {"kind": "bingham", "yield_stress": 8.0, "regularisation": 0.5}
+THICK = {"name": "paste", "rest_density": 1000.0, "viscosity": 8.0, "rheology": LAW}
 IMPLICIT = {"gravity": [1.0, -9.81], "viscosity": "stress", "viscous_solve": "implicit"}
 PROJECTION = {"kind": "projection", "time_step": 0.002}
 SOLVER = {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3}
@@ -160,106 +123,87 @@ def small(viscosity: str, **changes):
     return plane(**{**tables, "emitter": NOZZLE, **changes})
 
 
+CAMERA = {"view": "volume", "resolution": [9, 8], "position": [0.7, 0.35, 0.8], "look_at": [0.15, 0.08, 0.15]}
 VOLUME = scene(
     phase=PHASES,
     fluid=[
-        {"shape": "box", "lower": lower, "upper": upper, "phase": name}
-        for name, lower, upper in (
-            ("water", [0.1, 0.0, 0.1], [0.2, 0.05, 0.2]),
-            ("oil", [0.1, 0.05, 0.1], [0.2, 0.15, 0.2]),
-        )
+        box([0.1, 0.0, 0.1], [0.2, 0.05, 0.2], phase="water"),
+        box([0.1, 0.05, 0.1], [0.2, 0.15, 0.2], phase="oil"),
     ],
-    container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.3, 0.3, 0.3]},
+    container=box([0.0] * 3, [0.3] * 3),
     solver=SOLVER,
-    render={
-        "view": "volume",
-        "resolution": [9, 8],
-        "position": [0.7, 0.35, 0.8],
-        "look_at": [0.15, 0.08, 0.15],
-        "field_of_view": 20.0,
-        "extinction": 12.0,
-    },
+    render={**CAMERA, "field_of_view": 20.0, "extinction": 12.0},
 )
 """12 particles that one can look into: samples of a ray are dense and thin ones."""
 
+STRESS = {"gravity": [1.0, -9.81, 0.5], "viscosity": "stress"}
+
+
+def honey(lower, upper):
+    """A body of it, alone."""
+    return {"phase": [HONEY], "fluid": [box(lower, upper, phase="honey")]}
+
+
+def block(phase, **tables):
+    """In a corner of space, whose walls hold it."""
+    walls = box([0.0] * 3, [0.3] * 3, slip="no")
+    fluid = [box([0.0] * 3, [0.1, 0.15, 0.15], phase=phase["name"])]
+    return scene(phase=[phase], fluid=fluid, container=walls, forces=STRESS, solver=SOLVER, **tables)
+
+
+def one(viscosity, phase, **changes):
+    """The small pool of one phase, without a nozzle."""
+    return small(viscosity, phase=[phase], fluid=[{**POOL, "phase": phase["name"]}], emitter=None, **changes)
+
+
+def open_air(**tables):
+    """A square of water in free fall."""
+    return plane(fluid=[box([0.2, 0.25], [0.55, 0.6], phase="water")], solver=PROJECTION, **tables)
+
+
+MISCIBLE = {**MIXING, "free_energy": "miscible", "mobility_form": "constant"}
+SHORT = {"kind": "projection", "time_step": 0.001}
+TURNED = [{**body, **IN_SPACE[body["name"]], **TURNS[body["name"]]} for body in (RAFT, BUOY)]
 SCENES = {
     "pairwise, double well": (small("pairwise", mixture=MIXING), "everything"),
-    "pairwise, miscible": (
-        small("pairwise", mixture={**MIXING, "free_energy": "miscible", "mobility_form": "constant"}),
-        "everything",
-    ),
+    "pairwise, miscible": (small("pairwise", mixture=MISCIBLE), "everything"),
     "stress": (small("stress"), "everything"),
     "projection": (small("stress", solver=PROJECTION), "everything"),
     "velocities that follow": (small("stress", solver={**PROJECTION, "velocities_follow": True}), "positions"),
     "projection in the open": (
-        plane(
-            discretisation={"spacing": 0.05, "support": 2.6},  # second rows are neither full nor at the surface
-            fluid=[{"shape": "box", "lower": [0.2, 0.25], "upper": [0.55, 0.6], "phase": "water"}],
-            solver=PROJECTION,
-        ),
+        open_air(discretisation={"spacing": 0.05, "support": 2.6}),  # second rows are neither full nor at the surface
         "positions",
     ),
-    "a solid that moves": (
-        small(
-            "stress", phase=[HONEY], fluid=[{**POOL, "phase": "honey"}], emitter=None, solver=PROJECTION, solid=[BALL]
-        ),
-        "positions",
-    ),
-    "a solid that moves in space": (
-        scene(
-            phase=[HONEY],
-            fluid=[{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.1, 0.15, 0.15], "phase": "honey"}],
-            container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.3, 0.3, 0.3], "slip": "no"},
-            forces={"gravity": [1.0, -9.81, 0.5], "viscosity": "stress"},
-            solver=SOLVER,
-            solid=[PLATE],
-        ),
-        "positions",
-    ),
+    "a solid that moves": (one("stress", HONEY, solver=PROJECTION, solid=[BALL]), "positions"),
+    "a solid that moves in space": (block(HONEY, solid=[PLATE]), "positions"),
     "free bodies that touch": (
         plane(
-            phase=[HONEY],
-            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.4], "phase": "honey"}],
-            container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
+            **honey([0.0, 0.0], [0.6, 0.4]),
+            container=box([0.0, 0.0], [1.0, 1.0]),
             forces={"gravity": [1.0, -9.81]},
-            solver={"kind": "projection", "time_step": 0.001},
+            solver=SHORT,
             solid=[RAFT, BUOY, ARM],
         ),
         "positions",
     ),
     "free bodies that touch in space": (
         scene(
-            phase=[HONEY],
-            fluid=[{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.35, 0.3, 0.25], "phase": "honey"}],
-            container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.5, 0.6, 0.25]},
+            **honey([0.0] * 3, [0.35, 0.3, 0.25]),
+            container=box([0.0] * 3, [0.5, 0.6, 0.25]),
             forces={"gravity": [1.0, -9.81, 0.5]},
-            solver={"kind": "projection", "time_step": 0.001},
-            solid=[{**one, **IN_SPACE[one["name"]], **TURNS[one["name"]]} for one in (RAFT, BUOY)],
+            solver=SHORT,
+            solid=TURNED,
         ),
         "positions",
     ),
-    "implicit": (
-        small("stress", phase=[THICK], fluid=[{**POOL, "phase": "paste"}], emitter=None, forces=IMPLICIT),
-        "positions",
-    ),
-    "a law in space": (
-        scene(
-            phase=[THICK],
-            fluid=[{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.1, 0.15, 0.15], "phase": "paste"}],
-            container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.3, 0.3, 0.3], "slip": "no"},
-            forces={"gravity": [1.0, -9.81, 0.5], "viscosity": "stress"},
-            solver=SOLVER,
-        ),
-        "positions",
-    ),
-    "one phase": (small("pairwise", phase=[HONEY], fluid=[{**POOL, "phase": "honey"}], emitter=None), "positions"),
+    "implicit": (one("stress", THICK, forces=IMPLICIT), "positions"),
+    "a law in space": (block(THICK), "positions"),
+    "one phase": (one("pairwise", HONEY), "positions"),
     "surface tension": (small("pairwise", forces={"gravity": [1.0, -9.81], "surface_tension": 3.0}), "everything"),
     "surface tension by curvature": (
-        plane(
+        open_air(
             discretisation={"spacing": 0.05, "support": 2.0},  # second rows are a part of the surface, not wholly
-            fluid=[{"shape": "box", "lower": [0.2, 0.25], "upper": [0.55, 0.6], "phase": "water"}],
             forces={"gravity": [0.0, 0.0], "surface_tension": 100.0},
-            solver=PROJECTION,
         ),
         "positions",
     ),

@@ -62,9 +62,6 @@ def evaluation(problem: Problem, point: dict[str, Any]) -> dict[str, bytes]:
     return bits({"loss": loss, **gradient})
 
 
-# ---- operations on neighbours ------------------------------------------------------------------------------------
-
-
 @examples(60)
 @given(
     seed=seeds,
@@ -102,9 +99,6 @@ def test_derivatives_of_operations_on_any_cloud(operation, where, seed):
     backward = test_kernels.inner(op.adjoint(op.start, weights), directions, op.inputs)
     sizes = test_kernels.norm(tangent, op.outputs) * test_kernels.norm(weights, op.outputs)
     assert abs(forward - backward) <= 1e-12 * sizes
-
-
-# ---- cuts of the work --------------------------------------------------------------------------------------------
 
 
 @examples(8)
@@ -152,9 +146,6 @@ def test_any_cut_into_ranges_gives_the_same_bits(name, seed, cores, rounds):
             set_parts(patch, workers, parts, made.particles)
             found.append(evaluation(Problem(Simulation(made.scene, precision="float64"), STEPS, Weighed(made)), point))
     assert found[0] == found[1]
-
-
-# ---- symmetries of space -----------------------------------------------------------------------------------------
 
 
 def turned(vectors: Any, quarters: int) -> np.ndarray:

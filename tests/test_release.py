@@ -55,9 +55,6 @@ def test_what_was_tested_is_pinned():
     assert not any("@" in line or "://" in line for line in lines)
 
 
-# ---- python -m tasks ---------------------------------------------------------------------------------------------
-
-
 def test_make_has_all_tasks():
     makefile = (ROOT / "Makefile").read_text("utf-8")
     (names,) = re.findall(r"^TASKS := (.*)$", makefile, re.MULTILINE)

@@ -500,8 +500,6 @@ def test_numpy_arrays_make_the_same_picture(dimension, precision):
     np.testing.assert_array_equal(made.render(*(value.tolist() for value in given.values())), wanted)
 
 
-# ---- periods -----------------------------------------------------------------------------------------------------
-
 PERIODS = np.array([UPPER[0] - LOWER[0], 0.0, UPPER[2] - LOWER[2]])
 LOOK = {name: view for name, view in VIEWS.items() if name != "within"}
 periodic_views = pytest.mark.parametrize("view", LOOK.values(), ids=LOOK.keys())

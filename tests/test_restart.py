@@ -109,9 +109,6 @@ def test_a_run_goes_on_from_a_frame_on_the_way():
         _ = whole[7:].last_state
 
 
-# ---- what a state belongs to -------------------------------------------------------------------------------------
-
-
 def spread_out(factor):
     """A plane of as many particles, with a spacing so many times as large."""
     tables = plane().model_dump(exclude_none=True)

@@ -158,8 +158,6 @@ def test_the_series_joins_the_formula():
     assert below == pytest.approx(above, rel=1e-11)
 
 
-# ---- problems ----------------------------------------------------------------------------------------------------
-
 STEPS = 12
 
 

@@ -32,9 +32,6 @@ def one_layer(scene: Scene, depth: float) -> np.ndarray:
     return scene.container.walls(scene.dimension, scene.discretisation.spacing, depth)
 
 
-# ---- fluid -------------------------------------------------------------------------------------------------------
-
-
 def test_a_box_is_filled_from_its_lower_corner():
     sample = fluid_particles(scene_of(3, [box([0.1, 0.0, -0.1], [0.35, 0.1, 0.05])]))
     indices = np.array(list(product(range(5), range(2), range(3))))
@@ -134,9 +131,6 @@ def test_another_mass_than_was_asked_for_is_warned_of_once():
         Simulation(full)
 
 
-# ---- seams -------------------------------------------------------------------------------------------------------
-
-
 SEAMS = {
     "halves": ([box([0.0, 0.0], [0.31, 0.5]), box([0.31, 0.0], [1.0, 0.5])], [1.5, 1.0], [0.31, 0.15]),
     "stretched": ([box([0.0, 0.0], [1.184, 0.81]), box([1.184, 0.0], [2.514, 0.81])], [3.0, 1.0], [1.184, 0.4]),
@@ -179,9 +173,6 @@ def test_fluids_that_touch_do_not_overlap():
     fluids = [box([0.0, 0.0], [0.5, 0.5]), box([0.5, 0.0], [1.0, 0.5]), box([0.0, 0.5], [1.0, 1.0])]
     container = box([0.0, 0.0], [1.0, 1.0], periodic=[True, True])
     assert nearest(fluid_particles(scene_of(2, fluids, container)).positions) == pytest.approx(SPACING)
-
-
-# ---- walls -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("cells", [(4, 3), (4, 3, 2)])

@@ -28,9 +28,6 @@ def made(tmp_path):
 FREE_STEPS = TINY_LATTE.replace("knots = 3", "")
 
 
-# ---- targets -----------------------------------------------------------------------------------------------------
-
-
 def test_positions_are_those_of_the_hidden_run(made):
     ready = made(GOOD_TASK, "problem.frames=2")
     assert ready.renderer is None and list(ready.targets) == [2, 5]
@@ -92,9 +89,6 @@ def test_a_distance_is_chosen_by_name(made, name, wanted):
     assert loss.distance == wanted
 
 
-# ---- starts ------------------------------------------------------------------------------------------------------
-
-
 def test_random_places_are_the_same_each_time_and_within_the_container(made):
     first, again = (made(PLANE_PICTURE).start["initial_positions"] for _ in range(2))
     np.testing.assert_array_equal(first, again)
@@ -138,9 +132,6 @@ def test_random_fractions_add_up_to_1(made):
     assert found.shape == (LATTE_PARTICLES, 2) and found.min() > 0.0 and found.std() > 0.1
     np.testing.assert_allclose(found.sum(axis=1), 1.0, rtol=1e-14)
     assert isinstance(ready.search.coordinates["mass_fractions"], Softmax)
-
-
-# ---- coordinates and bounds --------------------------------------------------------------------------------------
 
 
 def test_coordinates_are_those_that_the_task_asks_for(made):

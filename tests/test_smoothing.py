@@ -242,9 +242,6 @@ def test_a_kernel_by_name():
         smoothing_kernel("gauss")
 
 
-# ---- calibration
-
-
 def block(dimension, n=9):
     """(n^d, d) a block of the lattice of the rest spacing, and the index of its middle."""
     points = SPACING * np.array(list(itertools.product(range(n), repeat=dimension)), dtype=np.float64)

@@ -283,9 +283,6 @@ def test_positions_in_a_solid_are_refused():
         simulation.run(1, {"initial_positions": places})
 
 
-# ---- thin walls ----------------------------------------------------------------------------------------------------
-
-
 def wall(thickness):
     """From floor to lid beside the column, so many spacings thick."""
     return {"shape": "box", "lower": [0.4, -0.1], "upper": [0.4 + 0.05 * thickness, 1.1]}

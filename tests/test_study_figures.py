@@ -100,10 +100,8 @@ def no_progress(total):
 
 def test_autograd_and_the_adjoint_agree_with_differences_while_little_has_grown(measured):
     table, _ = measured("figure_3_small")
-    tape, adjoint, difference = (
-        np.stack([table.where(source=name)[axis] for axis in "xyz"])
-        for name in (TAPE, ADJOINT, "finite differences, step 0.1 m/s²")
-    )
+    names = TAPE, ADJOINT, "finite differences, step 0.1 m/s²"
+    tape, adjoint, difference = (np.stack([table.where(source=name)[axis] for axis in "xyz"]) for name in names)
     np.testing.assert_allclose(tape, adjoint, rtol=1e-4, atol=1e-4 * np.abs(adjoint).max())
     assert np.linalg.norm(difference - adjoint) < 0.05 * np.linalg.norm(adjoint)
 
@@ -149,9 +147,6 @@ def test_sizes_of_terms_are_those_of_the_exact_tangent():
     by_pressure = np.diff(exact, axis=0) / fluid.solver.time_step - down["gravity"]
     np.testing.assert_allclose(sizes, np.linalg.norm(by_pressure, axis=(1, 2)), rtol=1e-9, atol=1e-12)
     assert (sizes[:4] > 0.1).all()
-
-
-# ---- files -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("file", sorted(EXPERIMENTS.glob("*.toml")), ids=lambda file: file.stem)
@@ -201,9 +196,6 @@ def test_a_scene_is_changed_in_the_file(tmp_path):
     assert (settings.scene.solver.time_step, settings.steps) == (0.0021, 99)
 
 
-# ---- commands ----------------------------------------------------------------------------------------------------
-
-
 def test_a_figure_is_drawn_again_from_its_numbers(measured, tmp_path, gradients):
     _, done = measured("figure_6")
     out = tmp_path / "again"
@@ -251,13 +243,11 @@ def test_an_experiment_that_fails_does_not_stop_the_study(folder, tmp_path, grad
     assert "Failed: device is 'cuda:99'" in printed and "Analytic, all forces" in printed
 
 
-@pytest.mark.parametrize(("arguments", "words"), [(["."], "no experiments"), ([".", "--only", "a"], "no experiments")])
-def test_a_study_of_nothing_is_refused(tmp_path, monkeypatch, gradients, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    code, out, err = gradients("study", *arguments)
-    assert (code, out) == (2, "") and words in err
-
-
-def test_an_unknown_name_is_refused(folder, gradients):
-    code, _, err = gradients("study", folder, "--only", "figure_9")
-    assert code == 2 and "--only is 'figure_9', but must be one of quick, remote." in err
+def test_a_study_of_nothing_and_an_unknown_name_are_refused(tmp_path, folder, gradients):
+    for arguments, words in [
+        ([tmp_path], "no experiments"),
+        ([tmp_path, "--only", "a"], "no experiments"),
+        ([folder, "--only", "figure_9"], "--only is 'figure_9', but must be one of quick, remote."),
+    ]:
+        code, out, err = gradients("study", *arguments)
+        assert (code, out) == (2, "") and words in err

@@ -19,6 +19,7 @@ from experiments.experiment_files import load_experiment
 from experiments.lyapunov_spectrum import growth_by_segment
 from experiments.results import Results
 from experiments.wrong_adjoints import CLAMP, LINEAR, RIGHT, WALLS, WRONG_ADJOINTS
+from scenes import box
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
@@ -27,29 +28,19 @@ EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
 
 def test_an_estimate_is_a_mean_with_its_standard_error():
+    """Errors of a ratio add up as independent ones."""
     samples = np.random.default_rng(0).normal(3.0, 0.5, size=400)
     found = Estimate.of(samples)
     assert abs(found.value - 3.0) < 4 * found.error
     assert found.error == pytest.approx(0.5 / 20, rel=0.1)
     assert np.isnan(Estimate.of([1.0]).error)
-
-
-@pytest.mark.parametrize(
-    "value, error, text",
-    [
-        (0.04731, 0.00123, "0.0473 ± 0.0012"),
-        (334.2, 29.1, "334 ± 29"),
-        (2.5e-9, 1e-10, "(2.50 ± 0.10)e-9"),
-        (1.5, float("nan"), "1.5"),
-    ],
-)
-def test_an_estimate_shows_the_digits_that_it_knows(value, error, text):
-    assert str(Estimate(value, error)) == text
-
-
-def test_errors_of_a_ratio_add_up_as_independent_ones():
     ratio = Estimate(6.0, 0.3).over(Estimate(2.0, 0.24))
     assert (ratio.value, ratio.error) == pytest.approx((3.0, 3.0 * np.hypot(0.05, 0.12)))
+
+
+def test_an_estimate_shows_the_digits_that_it_knows():
+    texts = {(0.04731, 0.00123): "0.0473 ± 0.0012", (334.2, 29.1): "334 ± 29", (2.5e-9, 1e-10): "(2.50 ± 0.10)e-9"}
+    assert [str(Estimate(*given)) for given in [*texts, (1.5, np.nan)]] == [*texts.values(), "1.5"]
 
 
 def test_a_line_is_found_within_its_error():
@@ -59,15 +50,11 @@ def test_a_line_is_found_within_its_error():
     assert abs(line.offset.value - 2.0) < 4 * line.offset.error < 0.2
 
 
-def test_growth_is_the_rate_of_an_exponential():
+def test_growth_is_the_rate_of_an_exponential_and_what_cannot_be_squared_has_an_infinite_norm():
     steps = np.arange(50)
     assert growth_rate(steps, 3.0 * np.exp(0.05 * steps)) == pytest.approx(0.05)
     assert np.isnan(growth_rate(steps[:2], steps[:2] + 1.0))
-
-
-def test_the_norm_of_what_cannot_be_squared_is_infinite():
-    frames = np.array([[[3.0, 4.0]], [[1e200, 0.0]], [[np.nan, 0.0]]])
-    assert norms(frames).tolist() == [5.0, np.inf, np.inf]
+    assert norms(np.array([[[3.0, 4.0]], [[1e200, 0.0]], [[np.nan, 0.0]]])).tolist() == [5.0, np.inf, np.inf]
 
 
 # ---- Lyapunov exponents ------------------------------------------------------------------------------------------
@@ -133,10 +120,13 @@ def noise(count=150, seed=6):
 
 
 def test_moving_all_alike_is_common_and_in_the_first_mode():
-    x, u = particles(), np.tile([1.0, -2.0, 0.5], (150, 1))
+    """One particle takes part alone."""
+    x, u, alone = particles(), np.tile([1.0, -2.0, 0.5], (150, 1)), np.zeros((150, 3))
     assert spatial_scales.common_share(u) == pytest.approx(1.0)
     assert spatial_scales.shares_of_modes(spatial_scales.box_modes(x, LOWER, UPPER), u)[0] == pytest.approx(1.0)
     assert spatial_scales.participation(u) == pytest.approx(150)
+    alone[17] = 1.0
+    assert spatial_scales.participation(alone) == pytest.approx(1.0)
 
 
 def test_a_sloshing_mode_is_found_where_it_belongs():
@@ -156,15 +146,8 @@ def test_noise_has_what_chance_gives_it():
     modes = spatial_scales.box_modes(x, LOWER, UPPER)
     shares = np.mean([spatial_scales.shares_of_modes(modes, noise(seed=seed)) for seed in range(200)], axis=0)
     assert shares == pytest.approx(np.arange(1, 151) / 150, abs=0.01)
-    assert np.mean([spatial_scales.common_share(noise(seed=seed)) for seed in range(400)]) == pytest.approx(
-        1 / 150, rel=0.15
-    )
-
-
-def test_one_particle_takes_part_alone():
-    u = np.zeros((150, 3))
-    u[17] = 1.0
-    assert spatial_scales.participation(u) == pytest.approx(1.0)
+    common = np.mean([spatial_scales.common_share(noise(seed=seed)) for seed in range(400)])
+    assert common == pytest.approx(1 / 150, rel=0.15)
 
 
 def test_averages_keep_long_waves_and_take_noise_away():
@@ -179,9 +162,8 @@ def test_a_picture_changes_as_its_particles_move():
     x, u = particles(20), noise(20)
 
     def picture(positions):
-        axes = [
-            np.arange(a, b, 0.05) for a, b in zip(x[:, :2].min(axis=0) - 0.15, x[:, :2].max(axis=0) + 0.15, strict=True)
-        ]
+        ends = zip(x[:, :2].min(axis=0) - 0.15, x[:, :2].max(axis=0) + 0.15, strict=True)
+        axes = [np.arange(a, b, 0.05) for a, b in ends]
         pixels = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 1, 2)
         return np.exp(-0.5 * ((pixels - positions[:, :2]) ** 2).sum(axis=2) / 0.05**2).sum(axis=1)
 
@@ -192,21 +174,16 @@ def test_a_picture_changes_as_its_particles_move():
 
 # ---- runs, and whole experiments ---------------------------------------------------------------------------------
 
+FREE = {"minimum_iterations": 3, "maximum_iterations": 3, "density_tolerance": 0.01}
 SCENE = {
     "name": "drop",
     "dimension": 2,
     "discretisation": {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"},
     "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}],
-    "fluid": [{"shape": "box", "lower": [0.0, 0.05], "upper": [0.2, 0.25], "phase": "water"}],
-    "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.35, 0.5]},
+    "fluid": [box([0.0, 0.05], [0.2, 0.25], phase="water")],
+    "container": box([0.0, 0.0], [0.35, 0.5]),
     "forces": {"gravity": [0.0, -9.81], "viscosity": "pairwise", "pressure": True},
-    "solver": {
-        "kind": "pcisph",
-        "time_step": 0.002,
-        "minimum_iterations": 3,
-        "maximum_iterations": 3,
-        "density_tolerance": 0.01,
-    },
+    "solver": {"kind": "pcisph", "time_step": 0.002, **FREE},
 }
 
 
@@ -225,9 +202,7 @@ def test_tasks_side_by_side_keep_their_order():
 
 ADAPTED = {
     "wrong_adjoints": ["start=40"],
-    "wrong_derivation": ["direction=[0.0, 1.0]"],
-    "step_size": ["direction=[0.0, 1.0]"],
-    "round_off": ["direction=[0.0, 1.0]"],
+    **{name: ["direction=[0.0, 1.0]"] for name in ("wrong_derivation", "step_size", "round_off")},
     "lyapunov": ["fall=0.05"],
     "locality": ["direction=[1.0, 0.0]", "long_modes=4"],
 }

@@ -58,9 +58,6 @@ def task_file(tmp_path):
     return path
 
 
-# ---- loading -----------------------------------------------------------------------------------------------------
-
-
 def test_a_task_keeps_what_its_file_says(task_file):
     task = load_task(task_file)
     assert task.scene.name == "tiny" and task.problem.steps == 5
@@ -186,9 +183,6 @@ def test_an_example_is_a_task(path):
     assert task.scene.name and task.start.keys() >= (task.optimise.bounds or {}).keys()
 
 
-# ---- bad tasks ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("old, new, field", [bad[1:] for bad in BAD_TASKS], ids=[bad[0] for bad in BAD_TASKS])
 def test_a_bad_task_is_a_sentence(task_file, old, new, field):
     assert old in GOOD_TASK
@@ -216,9 +210,6 @@ def test_a_word_that_is_no_key_is_told_those_that_are(task_file, text, words):
     task_file.write_text(text)
     with pytest.raises(SceneError, match=words):
         load_task(task_file)
-
-
-# ---- judging -----------------------------------------------------------------------------------------------------
 
 
 def result(parameters, losses):

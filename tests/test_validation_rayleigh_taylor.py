@@ -22,8 +22,6 @@ HEAVY, LIGHT = 1800.0, 1000.0
 FIRST, WINDOW = 0.01, (0.02, 0.1)
 """In wavelengths: the first amplitude, and the amplitudes between which growth is measured."""
 
-# ---- linear theory -----------------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True)
 class Mode:
@@ -134,9 +132,6 @@ def test_theory():
         assert root == pytest.approx(n, rel=1e-6)
         assert 1.0 < deep.closed_form / n < 1.13
     assert Mode(k, 0.2, kinematic=1e-9).growth == pytest.approx(Mode(k, 0.2).inviscid, rel=1e-3)
-
-
-# ---- the simulation ----------------------------------------------------------------------------------------------
 
 
 def displaced(velocity: Callable[[np.ndarray], np.ndarray], points: np.ndarray, time: float) -> np.ndarray:
@@ -254,9 +249,6 @@ def test_early_growth(across, waves, damping):
     growth = rayleigh_taylor(across, waves, damping=damping)
     assert growth.rate == pytest.approx(growth.mode.closed_form, rel=0.25)
     assert abs(growth.error) < 0.12
-
-
-# ---- what the lattice adds ---------------------------------------------------------------------------------------
 
 
 def shear_response(kernel: str, support: float, strain: float = 0.05) -> tuple[float, float]:

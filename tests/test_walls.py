@@ -102,9 +102,6 @@ def test_layers_lie_behind_the_surface_in_order(name, dimension, support):
     assert 0.5 * SPACING < layers.depths[-1] < (support - 0.5) * SPACING
 
 
-# ---- containers --------------------------------------------------------------------------------------------------
-
-
 def filled(container: dict[str, Any], kernel: str, support: float, solid: Any = (), **fluid: Any) -> DiscreteScene:
     """A container full of water, around solids."""
     body = {key: value for key, value in container.items() if key not in ("periodic", "lid")}

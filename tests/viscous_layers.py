@@ -6,6 +6,7 @@ import numpy as np
 
 from cortado import Simulation
 from cortado.discretise.calibration import stress_control
+from scenes import box
 from viscous_flows import DENSITY, NU, VISCOSITY, acceleration, simulation
 
 BAND = 0.05
@@ -21,10 +22,7 @@ def two_layers(across: int, ratio: float, form: str = "stress") -> Simulation:
         {"name": name, "rest_density": DENSITY, "viscosity": mu}
         for name, mu in (("thin", VISCOSITY), ("thick", ratio * VISCOSITY))
     ]
-    layers = [
-        {"shape": "box", "lower": [0.0, low], "upper": [long, low + 0.5], "phase": name}
-        for name, low in (("thin", 0.0), ("thick", 0.5))
-    ]
+    layers = [box([0.0, low], [long, low + 0.5], phase=name) for name, low in (("thin", 0.0), ("thick", 0.5))]
     step = {"kind": "pcisph", "time_step": 0.05 * spacing**2 / (ratio * NU)}
     return simulation([long, 1.0], spacing, form=form, phase=phases, fluid=layers, solver=step)
 
