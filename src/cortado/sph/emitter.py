@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import POSITIONS, VELOCITIES, Entry, Layout, Parameters, State, StateField, to_device
 from cortado.scene.parameters import Axis
@@ -29,13 +28,11 @@ from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tange
 
 @dataclass(frozen=True)
 class EmitterKernels(Kernels):
-    """The kernels of an emitter at the end of a step, in scene order; ``begin`` and ``collect`` work by scene."""
+    """The kernels of an emitter at the end of a step, in scene order."""
 
-    begin: Any
-    """Keeps q_(n-1) of the state before a step, and l at its end, as a step may write over the state that it reads."""
-    begin_tangent: Any
-    collect: Any
-    """Adds the adjoints left by prescribed particles to those of the parameters and of the state before."""
+    begin: Kernels
+    """The motion of the column of fluid in the step, with a thread for each scene. The adjoint takes the sums of the
+    adjoints of prescribed positions and velocities."""
 
 
 @cache
@@ -66,10 +63,12 @@ def nozzle_type(precision: Precision) -> Any:
 
 @cache
 def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
-    """Make the kernels of an emitter for a precision. Of each scene, ``outlet`` (members,) is q_(n-1) [m], ``emitted``
-    (members,) l at the end of the step [m]."""
+    """Make the kernels of an emitter for a precision. Of each scene, (members,), ``outlet`` is q_n [m], ``drift`` the
+    velocity of prescribed particles [m/s], and ``emitted`` l at the end of the step [m]."""
     real, vector, nozzle_of = precision.real, precision.vector, nozzle_type(precision)
-    changes = bundle(outlet=vector, emitted=wp.float64, flow_rate=real, time_step=real)
+    module, derivatives = integration_module(precision, True, taped), integration_module(precision, False)
+    numbers, path = ["nozzle", "particles"], wp.array2d(dtype=vector)
+    typed = TypesByName(real, {vector: "outlet drift x v", wp.float64: "emitted", nozzle_of: "nozzle"})
 
     @wp.func
     def advance(flow_rate: real, area: real, time_step: real) -> wp.float64:
@@ -83,140 +82,92 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
             return real(0.0)
         return real(wp.float64(nozzle.upstream[p - nozzle.first]) - emitted)
 
-    @particle_kernel(integration_module(precision, True, taped), "outlet emitted", numbers=["nozzle"])
+    @particle_kernel(module, "outlet drift emitted", numbers=["nozzle"])
+    @typed
     def begin(
-        nozzle: nozzle_of, flow_rate_i: real, time_step_i: real, outlet_in_i: vector, emitted_in_i: wp.float64
-    ) -> tuple[vector, wp.float64]:
-        return outlet_in_i, emitted_in_i + advance(flow_rate_i, nozzle.area, time_step_i)
+        i: int, nozzle, nozzle_path: path, step_i: wp.int32, flow_rate_i, time_step_i, outlet_in_i, emitted_in_i
+    ) -> tuple[vector, vector, wp.float64]:
+        q = nozzle_path[i, step_i]
+        drift = (q - outlet_in_i) / time_step_i + (flow_rate_i / nozzle.area) * nozzle.direction
+        return q, drift, emitted_in_i + advance(flow_rate_i, nozzle.area, time_step_i)
 
-    @wp.kernel(module=integration_module(precision, True, taped))
-    def prescribe(
-        particles: int,
-        nozzle: nozzle_of,
-        nozzle_path: wp.array2d(dtype=vector),
-        flow_rate: wp.array(dtype=real),
-        time_step: wp.array(dtype=real),
-        step: wp.array(dtype=wp.int32),
-        outlet: wp.array(dtype=vector),
-        emitted: wp.array(dtype=wp.float64),
-        x_free: wp.array(dtype=vector),
-        v_free: wp.array(dtype=vector),
-        # out
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        outlet_out: wp.array(dtype=vector),
-        emitted_out: wp.array(dtype=wp.float64),
-    ):
-        i = wp.tid()
-        b = i // particles
-        p = i - b * particles
-        s = remaining(p, nozzle, emitted[b])
-        q = nozzle_path[b, step[b]]
-        if s > real(0.0):
-            place = q + nozzle.offsets[p - nozzle.first] - s * nozzle.direction
-            x[i] = wp.where(s > nozzle.column, place + nozzle.reserve, place)
-            v[i] = (q - outlet[b]) / time_step[b] + (flow_rate[b] / nozzle.area) * nozzle.direction
-        else:
-            x[i] = x_free[i]
-            v[i] = v_free[i]
-        if p == 0:
-            outlet_out[b] = q
-            emitted_out[b] = emitted[b]
-
-    @particle_kernel(integration_module(precision, False), "outlet_dot emitted_dot", numbers=["nozzle"])
+    @particle_kernel(derivatives, "outlet_dot drift_dot emitted_dot", numbers=["nozzle"])
+    @typed
     def begin_tangent(
-        nozzle: nozzle_of,
-        flow_rate_i: real,
-        flow_rate_dot_i: real,
-        time_step_i: real,
-        time_step_dot_i: real,
-        outlet_in_dot_i: vector,
-        emitted_in_dot_i: wp.float64,
-    ) -> tuple[vector, wp.float64]:
+        i: int,
+        nozzle,
+        nozzle_path_dot: path,
+        step_i: wp.int32,
+        flow_rate_i,
+        flow_rate_dot_i,
+        time_step_i,
+        time_step_dot_i,
+        drift_i,
+        outlet_in_dot_i,
+        emitted_in_dot_i,
+    ) -> tuple[vector, vector, wp.float64]:
+        q_dot, along = nozzle_path_dot[i, step_i], nozzle.direction / nozzle.area
+        turn = drift_i - flow_rate_i * along
+        drift_dot = (q_dot - outlet_in_dot_i - time_step_dot_i * turn) / time_step_i + flow_rate_dot_i * along
         faster = advance(flow_rate_dot_i, nozzle.area, time_step_i)
-        longer = advance(flow_rate_i, nozzle.area, time_step_dot_i)
-        return outlet_in_dot_i, emitted_in_dot_i + faster + longer
+        return q_dot, drift_dot, emitted_in_dot_i + faster + advance(flow_rate_i, nozzle.area, time_step_dot_i)
 
-    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
+    @particle_kernel(derivatives, "outlet_bar emitted_bar +flow_rate_bar +time_step_bar", numbers=["nozzle"])
+    @typed
+    def begin_adjoint(
+        i: int,
+        nozzle,
+        nozzle_path_bar: path,
+        step_i: wp.int32,
+        flow_rate_i,
+        time_step_i,
+        drift_i,
+        x_total_i,
+        v_total_i,
+        outlet_bar_i,
+        emitted_bar_i,
+    ) -> tuple[vector, wp.float64, real, real]:
+        nozzle_path_bar[i, step_i] = nozzle_path_bar[i, step_i] + outlet_bar_i + x_total_i + v_total_i / time_step_i
+        along, whole = nozzle.direction / nozzle.area, emitted_bar_i + wp.float64(wp.dot(nozzle.direction, x_total_i))
+        further, turn = real(whole) / nozzle.area, drift_i - flow_rate_i * along
+        faster, longer = wp.dot(along, v_total_i), -wp.dot(v_total_i, turn) / time_step_i
+        return -v_total_i / time_step_i, whole, further * time_step_i + faster, further * flow_rate_i + longer
+
+    @particle_kernel(module, "x v", numbers=numbers)
+    @typed
+    def prescribe(
+        i: int, member: int, particles: int, nozzle, outlet, drift, emitted, x_free_i, v_free_i
+    ) -> tuple[vector, vector]:
+        p = i - member * particles
+        s, x, v = remaining(p, nozzle, emitted), x_free_i, v_free_i
+        if s > real(0.0):
+            place = outlet + nozzle.offsets[p - nozzle.first] - s * nozzle.direction
+            x = wp.where(s > nozzle.column, place + nozzle.reserve, place)
+            v = drift
+        return x, v
+
+    @particle_kernel(derivatives, "x_dot v_dot", numbers=numbers)
+    @typed
     def prescribe_tangent(
-        particles: int,
-        nozzle: nozzle_of,
-        nozzle_path: wp.array2d(dtype=vector),
-        nozzle_path_dot: wp.array2d(dtype=vector),
-        time_step: wp.array(dtype=real),
-        step: wp.array(dtype=wp.int32),
-        outlet: wp.array(dtype=vector),
-        emitted: wp.array(dtype=wp.float64),
-        dot: changes,
-        # in and out
-        x_dot: wp.array(dtype=vector),
-        v_dot: wp.array(dtype=vector),
-        # out
-        outlet_out_dot: wp.array(dtype=vector),
-        emitted_out_dot: wp.array(dtype=wp.float64),
-    ):
-        i = wp.tid()
-        b = i // particles
-        p = i - b * particles
-        q = nozzle_path[b, step[b]]
-        q_dot = nozzle_path_dot[b, step[b]]
-        if remaining(p, nozzle, emitted[b]) > real(0.0):
-            dt = time_step[b]
-            turn_dot = q_dot - dot.outlet[b] - (q - outlet[b]) * (dot.time_step[b] / dt)
-            x_dot[i] = q_dot + real(dot.emitted[b]) * nozzle.direction
-            v_dot[i] = turn_dot / dt + (dot.flow_rate[b] / nozzle.area) * nozzle.direction
-        if p == 0:
-            outlet_out_dot[b] = q_dot
-            emitted_out_dot[b] = dot.emitted[b]
+        i: int, member: int, particles: int, nozzle, emitted, outlet_dot, drift_dot, emitted_dot, x_dot_i, v_dot_i
+    ) -> tuple[vector, vector]:
+        if remaining(i - member * particles, nozzle, emitted) > real(0.0):
+            return outlet_dot + real(emitted_dot) * nozzle.direction, drift_dot
+        return x_dot_i, v_dot_i
 
-    @particle_kernel(
-        integration_module(precision, False),
-        "x_free_bar v_free_bar x_prescribed_bar v_prescribed_bar",
-        numbers=["nozzle", "particles"],
-    )
+    @particle_kernel(derivatives, "x_free_bar v_free_bar x_prescribed_bar v_prescribed_bar", numbers=numbers)
+    @typed
     def prescribe_adjoint(
-        i: int, member: int, particles: int, nozzle: nozzle_of, emitted: wp.float64, x_bar_i: vector, v_bar_i: vector
+        i: int, member: int, particles: int, nozzle, emitted, x_bar_i, v_bar_i
     ) -> tuple[vector, vector, vector, vector]:
         """Split the adjoints of new positions and velocities into those of free and of prescribed particles."""
-        prescribed = remaining(i - member * particles, nozzle, emitted) > real(0.0)
-        return (
-            wp.where(prescribed, vector(), x_bar_i),
-            wp.where(prescribed, vector(), v_bar_i),
-            wp.where(prescribed, x_bar_i, vector()),
-            wp.where(prescribed, v_bar_i, vector()),
-        )
+        if remaining(i - member * particles, nozzle, emitted) > real(0.0):
+            return vector(), vector(), x_bar_i, v_bar_i
+        return x_bar_i, v_bar_i, vector(), vector()
 
-    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
-    def collect(
-        nozzle: nozzle_of,
-        nozzle_path: wp.array2d(dtype=vector),
-        flow_rate: wp.array(dtype=real),
-        time_step: wp.array(dtype=real),
-        step: wp.array(dtype=wp.int32),
-        outlet: wp.array(dtype=vector),
-        x_total: wp.array(dtype=vector),
-        v_total: wp.array(dtype=vector),
-        # in and out
-        outlet_bar: wp.array(dtype=vector),
-        emitted_bar: wp.array(dtype=wp.float64),
-        nozzle_path_bar: wp.array2d(dtype=vector),
-        flow_rate_bar: wp.array(dtype=real),
-        time_step_bar: wp.array(dtype=real),
-    ):
-        b = wp.tid()
-        n = step[b]
-        dt = time_step[b]
-        x_bar = x_total[b]
-        v_bar = v_total[b]
-        nozzle_path_bar[b, n] = nozzle_path_bar[b, n] + outlet_bar[b] + x_bar + v_bar / dt
-        outlet_bar[b] = -v_bar / dt
-        emitted_bar[b] = emitted_bar[b] + wp.float64(wp.dot(nozzle.direction, x_bar))
-        along = real(emitted_bar[b]) / nozzle.area
-        flow_rate_bar[b] = flow_rate_bar[b] + along * dt + wp.dot(nozzle.direction, v_bar) / nozzle.area
-        turn = wp.dot(v_bar, nozzle_path[b, n] - outlet[b]) / (dt * dt)
-        time_step_bar[b] = time_step_bar[b] + along * flow_rate[b] - turn
-
-    return EmitterKernels(prescribe, prescribe_tangent, prescribe_adjoint, begin, begin_tangent, collect)
+    return EmitterKernels(
+        *(prescribe, prescribe_tangent, prescribe_adjoint), Kernels(begin, begin_tangent, begin_adjoint)
+    )
 
 
 OUTLET = StateField("outlet", "m", Entry.VECTOR, Axis.SCALAR, first="nozzle_path")
@@ -268,21 +219,23 @@ class Emitter(Part):
         constants.column, padding = nozzle.column, (0, 3 - len(nozzle.direction))
         constants.direction = precision.vector(*np.pad(nozzle.direction, padding))
         constants.reserve = precision.vector(*np.pad(nozzle.reserve, padding))
-        self.constants = {"nozzle": constants, **layout.state(self.fields, requires_grad).named()}
+        drift = wp.zeros(layout.members, dtype=precision.vector, device=device, requires_grad=requires_grad)
+        self.constants = {"nozzle": constants, "drift": drift, **layout.state(self.fields, requires_grad).named()}
         """Of the nozzle, and of a step once it has begun, for kernels."""
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Keep the nozzle's fields of the state before the step, which the end of the step needs."""
+        """Compute the motion of the column in the step, from the state before it, which the end may write over."""
         before = {"outlet_in": state["outlet"], "emitted_in": state["emitted"]}
-        step.launch(self.kernels.begin, self.constants, **before, threads=self.layout.members)
+        step.launch(self.kernels.begin.forward, self.constants, **before, threads=self.layout.members)
 
     def target(self, moved: State) -> State:
         return self.free
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
         free = {"x_free": self.free.positions, "v_free": self.free.velocities}
-        new = {"outlet_out": state["outlet"], "emitted_out": state["emitted"]}
-        step.launch(self.kernels.forward, self.constants, **free, x=moved.positions, v=moved.velocities, **new)
+        step.launch(self.kernels.forward, self.constants, **free, x=moved.positions, v=moved.velocities)
+        for field in self.fields:
+            wp.copy(state[field.name], self.constants[field.name])
 
     def new_tangent(self) -> "EmitterTangent":
         return EmitterTangent(self)
@@ -296,16 +249,16 @@ class EmitterTangent(PartTangent):
 
     def __init__(self, emitter: Emitter):
         self._emitter = emitter
-        self._dot = emitter.layout.state(emitter.fields).named("_dot")
+        drift_dot = wp.zeros_like(emitter.constants["drift"], requires_grad=False)
+        self._dot = {"drift_dot": drift_dot, **emitter.layout.state(emitter.fields).named("_dot")}
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         kernels, known = self._emitter.kernels, (self._emitter.constants, self._dot, dot.parameters.named("_dot"))
-        outlet, emitted = state_dot["outlet"], state_dot["emitted"]
-        before = {"outlet_in_dot": outlet, "emitted_in_dot": emitted}
-        step.launch(kernels.begin_tangent, *known, **before, threads=self._emitter.layout.members)
-        new = {"outlet_out_dot": outlet, "emitted_out_dot": emitted}
-        moved = {"x_dot": state_dot.positions, "v_dot": state_dot.velocities}
-        step.launch(kernels.tangent, *known, **moved, **new)
+        before = {f"{field.name}_in_dot": state_dot[field.name] for field in self._emitter.fields}
+        step.launch(kernels.begin.tangent, *known, **before, threads=self._emitter.layout.members)
+        step.launch(kernels.tangent, *known, x_dot=state_dot.positions, v_dot=state_dot.velocities)
+        for field in self._emitter.fields:
+            wp.copy(state_dot[field.name], self._dot[f"{field.name}_dot"])
 
 
 class EmitterAdjoint(PartAdjoint):
@@ -337,5 +290,5 @@ class EmitterAdjoint(PartAdjoint):
         own = {"outlet_bar": state_bar["outlet"], "emitted_bar": state_bar["emitted"]}
         totals = {"x_total": x_total, "v_total": v_total}
         collected = {**own, **totals, "threads": emitter.layout.members}
-        step.launch(emitter.kernels.collect, emitter.constants, bar.named("_bar"), **collected)
+        step.launch(emitter.kernels.begin.adjoint, emitter.constants, bar.named("_bar"), **collected)
         return free
