@@ -19,9 +19,7 @@ ROOT = Path(cortado.__file__).parent
 
 UNNAMED = {
     "sph.integration": {"integration_kernels.collect_masses"},
-    "sph.emitter": {"emitter_kernels.collect"},
     "sph.curvature": {
-        "curvature_functions.normal_back",
         *("curvature_sums.colour_back", "curvature_sums.average_back"),
         *("curvature_sums.bend_back", "curvature_sums.mean_back"),
     },
@@ -59,7 +57,6 @@ SHARED = {
     "render.rays": {"interpolation_functions.trilinear_weight"},
     "solvers.pcisph.steps": {"density_ratio_kernels.excess_derivative"},
     "sph.free_energy": {"_double_well.hessian_product", "_miscible.hessian_product", "_degenerate.gradient"},
-    "sph.curvature": {"curvature_functions.rise"},
     "sph.rotations": {"rotations.further"},
     "particles.moving_walls": {"turn_functions.turning", "turn_functions.leaning"},
     "sph.surface_tension": {"normal_kernels.change", "tension_functions.pull_derivative"},

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.calibration import lattice_offsets, rest_volume
 from cortado.discretise.smoothing import SmoothingKernel
@@ -92,10 +93,9 @@ class CurvatureFunctions:
 
     normal: Any
     """The indicator w and the normal e of q and the spacing."""
-    normal_tangent: Any
-    """The tangents of w and e, by q, the spacing and the tangent of q."""
-    normal_back: Any
-    """The adjoint of q, by q, the spacing and the adjoints of w and e."""
+    normal_work: Any
+    """w w_bar + e . e_bar of q, the spacing, w_bar and e_bar. Its gradient by q is the adjoint of q; with 0 for w_bar
+    it is also the change of e along e_bar, as that is symmetric."""
     curvature: Any
     """The curvature kappa of B and D."""
     outermost: Any
@@ -111,12 +111,6 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Cu
     singular, lone, hollow = wp.constant(real(SINGULAR[dimension])), wp.constant(real(LONE)), wp.constant(real(HOLLOW))
 
     @wp.func
-    def rise(size: real) -> real:
-        """Return the derivative of the surface indicator w with respect to s |q|."""
-        t = wp.clamp((size - faint) / (clear - faint), real(0.0), real(1.0))
-        return real(6.0) * t * (real(1.0) - t) / (clear - faint)
-
-    @wp.func
     def normal(q: vector, spacing: real):
         """Return the surface indicator w and the unit normal e of a particle; e is 0 where w is 0."""
         size, w, e = wp.length(q), real(0.0), vector()
@@ -125,22 +119,10 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Cu
             e = q / size
         return w, e
 
-    @wp.func
-    def normal_tangent(q: vector, spacing: real, q_dot: vector):
-        size, w_dot, e_dot = wp.length(q), real(0.0), vector()
-        if size * spacing > faint:
-            along = wp.dot(q, q_dot) / size
-            w_dot = rise(size * spacing) * spacing * along
-            e_dot = (q_dot - (along / size) * q) / size
-        return w_dot, e_dot
-
-    @wp.func
-    def normal_back(q: vector, spacing: real, w_bar: real, e_bar: vector) -> vector:
-        size, q_bar = wp.length(q), vector()
-        if size * spacing > faint:
-            along = rise(size * spacing) * spacing * w_bar - wp.dot(q, e_bar) / (size * size)
-            q_bar = (e_bar + along * q) / size
-        return q_bar
+    @wp.func(module=module)
+    def normal_work(q: vector, spacing: real, w_bar: real, e_bar: vector) -> real:
+        w, e = normal(q, spacing)
+        return w * w_bar + wp.dot(e, e_bar)
 
     @wp.func(module=module)
     def curvature(B: matrix, D: matrix) -> real:
@@ -163,7 +145,7 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Cu
         divisor = real(1.0) - real(2.0) * hollow + rest * rest / (real(4.0) * hollow) + wp.max(more + hollow, real(0.0))
         return mean / divisor
 
-    return CurvatureFunctions(normal, normal_tangent, normal_back, curvature, outermost)
+    return CurvatureFunctions(normal, normal_work, curvature, outermost)
 
 
 @dataclass(frozen=True)
@@ -171,26 +153,14 @@ class CurvatureSums:
     """Warp functions of the curvature's sums over the fluid; symmetric matrices are diagonals and entries yz, xz,
     xy."""
 
-    colour: Any
-    """g and z, without W(0)."""
-    colour_tangent: Any
-    colour_back: Any
-    """The adjoint of x by those of g and z."""
-    average: Any
-    """V sum W_ij g_j"""
-    average_tangent: Any
-    average_back: Any
-    """From the adjoint r of the average: V sum W_ij r_j, and the adjoint of x."""
-    bend: Any
-    """B and the symmetric part of D."""
-    bend_tangent: Any
-    bend_back: Any
-    """From symmetric adjoints of B and D to those of e, w and x."""
-    mean: Any
-    """V sum W_ij c_j and V sum W_ij w_j"""
-    mean_tangent: Any
-    mean_back: Any
-    """From adjoints a and b of both sums: V sum W_ij a_j, V sum W_ij b_j, and the adjoint of x."""
+    colour: Kernels
+    """g and z, without W(0); from their adjoints that of x."""
+    average: Kernels
+    """V sum W_ij g_j; from the adjoint r of the average V sum W_ij r_j, and the adjoint of x."""
+    bend: Kernels
+    """B and the symmetric part of D; from symmetric adjoints of both to those of e, w and x."""
+    mean: Kernels
+    """V sum W_ij c_j and V sum W_ij w_j; from their adjoints a and b V sum W_ij a_j, V sum W_ij b_j, and that of x."""
 
 
 @cache
@@ -294,8 +264,8 @@ def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
         return W * a_j, W * b_j, (s.volume * both) * gradient(x_ij, s)
 
     return CurvatureSums(
-        *(colour, colour_tangent, colour_back),
-        *(average, average_tangent, average_back),
-        *(bend, bend_tangent, bend_back),
-        *(mean, mean_tangent, mean_back),
+        Kernels(colour, colour_tangent, colour_back),
+        Kernels(average, average_tangent, average_back),
+        Kernels(bend, bend_tangent, bend_back),
+        Kernels(mean, mean_tangent, mean_back),
     )

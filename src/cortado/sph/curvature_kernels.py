@@ -68,11 +68,11 @@ def curvature_kernels(discretisation: Discretisation, dimension: int) -> Curvatu
     own = curvature_functions(precision, dimension, module)
     normal_of, curvature_of, outermost = own.normal, own.curvature, own.outermost
 
-    @particle_kernel(module, "g z", [over(sums.colour, "g others")])
+    @particle_kernel(module, "g z", [over(sums.colour.forward, "g others")])
     def colour(i: int, g: vector, others: real, s: neighbourhood) -> tuple[vector, real]:
         return g, others + real(1 - s.filling[i]) * s.self_weight * s.volume
 
-    @particle_kernel(module, "q w e", [over(sums.average, "others")], numbers=["spacing"])
+    @particle_kernel(module, "q w e", [over(sums.average.forward, "others")], numbers=["spacing"])
     def normal(
         i: int, others: vector, spacing: real, g_i: vector, z_i: real, s: neighbourhood
     ) -> tuple[vector, real, vector]:
@@ -80,7 +80,7 @@ def curvature_kernels(discretisation: Discretisation, dimension: int) -> Curvatu
         w, e = normal_of(q, spacing)
         return q, w, e
 
-    @particle_kernel(module, "B D c", [over(sums.bend, "diagonal others turned mixed")])
+    @particle_kernel(module, "B D c", [over(sums.bend.forward, "diagonal others turned mixed")])
     def bend(diagonal: vector, others: vector, turned: vector, mixed: vector, w_i: real) -> tuple[matrix, matrix, real]:
         B, D = whole(diagonal, others), even(turned, mixed)
         return B, D, w_i * curvature_of(B, D)
@@ -88,7 +88,7 @@ def curvature_kernels(discretisation: Discretisation, dimension: int) -> Curvatu
     @particle_kernel(
         module,
         "a b acceleration:acceleration_in",
-        [over(sums.mean, "others_a others_b")],
+        [over(sums.mean.forward, "others_a others_b")],
         numbers=["depth", "per_width"],
     )
     def mean(
@@ -123,18 +123,19 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
     even = moment_functions(precision, dimension).change
     module = discretisation.tangent_module(topic)
     own = curvature_functions(precision, dimension, module)
-    normal_of, curvature_of, outermost = own.normal_tangent, own.curvature, own.outermost
+    normal_work, curvature_of, outermost = own.normal_work, own.curvature, own.outermost
 
-    @particle_kernel(module, "q_dot w_dot e_dot", [over(sums.average_tangent, "others")], numbers=["spacing"])
+    @particle_kernel(module, "q_dot w_dot e_dot", [over(sums.average.tangent, "others")], numbers=["spacing"])
     def normal_tangent(
         i: int, others: vector, spacing: real, g_dot_i: vector, z_i: real, z_dot_i: real, q_i: vector, s: neighbourhood
     ) -> tuple[vector, real, vector]:
         own_part = (real(1 - s.filling[i]) * s.self_weight * s.volume) * g_dot_i
         q_dot = (others + own_part - z_dot_i * q_i) / z_i
-        w_dot, e_dot = normal_of(q_i, spacing, q_dot)
-        return q_dot, w_dot, e_dot
+        w_by_q, _spacing, _w, _e = wp.grad(normal_work)(q_i, spacing, real(1.0), vector())
+        e_dot, _spacing, _w, _e = wp.grad(normal_work)(q_i, spacing, real(0.0), q_dot)
+        return q_dot, wp.dot(w_by_q, q_dot), e_dot
 
-    @particle_kernel(module, "c_dot", [over(sums.bend_tangent, "diagonal others turned mixed")])
+    @particle_kernel(module, "c_dot", [over(sums.bend.tangent, "diagonal others turned mixed")])
     def bend_tangent(
         diagonal: vector,
         others: vector,
@@ -152,7 +153,7 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
     @particle_kernel(
         module,
         "acceleration_dot:acceleration_in_dot",
-        [over(sums.mean_tangent, "others_a others_b")],
+        [over(sums.mean.tangent, "others_a others_b")],
         numbers=["depth", "per_width"],
     )
     def mean_tangent(
@@ -185,7 +186,7 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
         return along * q_i + (strength * k * w_i) * q_dot_i
 
     return (
-        sum_kernel("colour_tangent", module, "g_dot z_dot", sums.colour_tangent),
+        sum_kernel("colour_tangent", module, "g_dot z_dot", sums.colour.tangent),
         normal_tangent,
         bend_tangent,
         mean_tangent,
@@ -200,7 +201,7 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
     neighbourhood, sums = neighbourhood_type(precision), curvature_sums(discretisation)
     module = discretisation.module(False, topic)
     own = curvature_functions(precision, dimension, module)
-    normal_back, curvature_of, outermost = own.normal_back, own.curvature, own.outermost
+    normal_work, curvature_of, outermost = own.normal_work, own.curvature, own.outermost
 
     typed = TypesByName(real, {vector: "q acceleration x e", matrix: "B D", neighbourhood: "s"})
 
@@ -223,7 +224,7 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
         )
 
     @particle_kernel(
-        module, "+x_bar +w_bar B_bar D_bar", [over(sums.mean_back, "c_part w_part x_part", a="a_bar", b="b_bar")]
+        module, "+x_bar +w_bar B_bar D_bar", [over(sums.mean.adjoint, "c_part w_part x_part", a="a_bar", b="b_bar")]
     )
     @typed
     def mean_adjoint(
@@ -237,16 +238,17 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
         w_bar = w_part + self_weight * b_bar_i + curvature_of(B_i, D_i) * c_bar
         return x_part, w_bar, half * (by_B + wp.transpose(by_B)), half * (by_D + wp.transpose(by_D))
 
-    @particle_kernel(module, "+x_bar r z_bar", [over(sums.bend_back, "e_bar w_part x_part")], numbers=["spacing"])
+    @particle_kernel(module, "+x_bar r z_bar", [over(sums.bend.adjoint, "e_bar w_part x_part")], numbers=["spacing"])
     @typed
     def bend_adjoint(e_bar, w_part, x_part, spacing, q_i, z_i, w_bar_i, q_bar_i) -> tuple[vector, vector, real]:
         """Turn the adjoints of B, D, w and q into those of z and of V sum W_ij g_j, which is r."""
-        r = (q_bar_i + normal_back(q_i, spacing, w_bar_i + w_part, e_bar)) / z_i
+        by_q, _spacing, _w, _e = wp.grad(normal_work)(q_i, spacing, w_bar_i + w_part, e_bar)
+        r = (q_bar_i + by_q) / z_i
         return x_part, r, -wp.dot(q_i, r)
 
-    @particle_kernel(module, "g_bar +x_bar", [over(sums.average_back, "g_part x_part")])
+    @particle_kernel(module, "g_bar +x_bar", [over(sums.average.adjoint, "g_part x_part")])
     def normal_adjoint(i: int, g_part: vector, x_part: vector, r_i: vector, s: neighbourhood) -> tuple[vector, vector]:
         return g_part + (real(1 - s.filling[i]) * s.self_weight * s.volume) * r_i, x_part
 
-    colour_adjoint = sum_kernel("colour_adjoint", module, "+x_bar", sums.colour_back)
+    colour_adjoint = sum_kernel("colour_adjoint", module, "+x_bar", sums.colour.adjoint)
     return colour_adjoint, normal_adjoint, bend_adjoint, (force_adjoint, mean_adjoint)

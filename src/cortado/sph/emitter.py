@@ -161,9 +161,9 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         i: int, member: int, particles: int, nozzle, emitted, x_bar_i, v_bar_i
     ) -> tuple[vector, vector, vector, vector]:
         """Split the adjoints of new positions and velocities into those of free and of prescribed particles."""
-        if remaining(i - member * particles, nozzle, emitted) > real(0.0):
-            return vector(), vector(), x_bar_i, v_bar_i
-        return x_bar_i, v_bar_i, vector(), vector()
+        led, no = remaining(i - member * particles, nozzle, emitted) > real(0.0), vector()
+        x_free_bar, v_free_bar = wp.where(led, no, x_bar_i), wp.where(led, no, v_bar_i)
+        return x_free_bar, v_free_bar, wp.where(led, x_bar_i, no), wp.where(led, v_bar_i, no)
 
     return EmitterKernels(
         *(prescribe, prescribe_tangent, prescribe_adjoint), Kernels(begin, begin_tangent, begin_adjoint)
