@@ -11,7 +11,7 @@ from cortado.gradients import ImplicitPressure, Tape
 from cortado.losses import CentreOfMass, SolidPose
 from cortado.runs.solid_motion import posed
 from cortado.scene.solids import AnySolid
-from cortado.solvers.contact_kernels import STIFFNESS
+from cortado.solvers.contacts import STIFFNESS
 from finite_differences import central_difference
 from floating_bodies import disc_in_a_round_tank, floating_box
 from reference_projection import Projection

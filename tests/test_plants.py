@@ -57,7 +57,7 @@ SHARED = {
     "render.rays": {"interpolation_functions.trilinear_weight"},
     "solvers.pcisph.steps": {"density_ratio_kernels.excess_derivative"},
     "sph.free_energy": {"_double_well.hessian_product", "_miscible.hessian_product", "_degenerate.gradient"},
-    "sph.rotations": {"rotations.further"},
+    "sph.moving_solids": {"rotations.further"},
     "particles.moving_walls": {"turn_functions.turning", "turn_functions.leaning"},
     "sph.surface_tension": {"normal_kernels.change", "tension_functions.pull_derivative"},
     "sph.viscosity": {"viscosity_kernels.pair_viscosity_derivative"},

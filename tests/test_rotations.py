@@ -13,7 +13,7 @@ from cortado.device.precision import FLOAT64
 from cortado.optimisation.transforms import TimeInterpolation, Transformed
 from cortado.scene.parameter_values import SMALL as SMALL_TILT
 from cortado.scene.parameter_values import Tilt
-from cortado.sph.rotations import SMALL, rotations
+from cortado.sph.moving_solids import SMALL, rotations
 from finite_differences import both_modes, decades, distance, plateau
 from scenes import plane, scene, splash
 

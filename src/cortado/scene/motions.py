@@ -370,7 +370,7 @@ def _angles(w: NDArray[Any], dimension: int) -> NDArray[np.float64]:
 
 
 def _jacobian(w: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the matrix J of `cortado.sph.rotations` for a rotation vector."""
+    """Return the matrix J of `cortado.sph.moving_solids` for a rotation vector."""
     size, cross = float(np.linalg.norm(w)), np.cross(np.eye(3), w)
     if size < 1e-4:
         return np.asarray(np.eye(3) + 0.5 * cross + cross @ cross / 6.0)

@@ -10,8 +10,7 @@ from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.particles.state import Layout, zeros
 from cortado.scene.motions import density_name
-from cortado.solvers.projection.body_kernels import body_kernels
-from cortado.solvers.projection.body_motion import motion_kernels
+from cortado.solvers.projection.body_kernels import body_kernels, motion_kernels
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
