@@ -75,11 +75,11 @@ class TypesByName:
         def spread(x_ij, x_dot_ij, v_ij, m_i, m_j, s) -> vector: ...
 
     A parameter without a type has that of the longest of these names with which its words begin, as those of x_dot_ij
-    begin with x. One that begins with none of them is a number."""
+    begin with x. One that begins with none of them has the usual type, which is that of numbers as a rule."""
 
-    def __init__(self, real: Any, names: Mapping[Any, str] | None = None):
-        """Take the type of numbers, and words that are names of each other type."""
-        self._real = real
+    def __init__(self, usual: Any, names: Mapping[Any, str] | None = None):
+        """Take the usual type, and words that are names of each other type."""
+        self._usual = usual
         self._types = {name: kind for kind, words in (names or {}).items() for name in words.split()}
 
     def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -101,7 +101,7 @@ class TypesByName:
     def _of(self, name: str) -> Any:
         while name and name not in self._types:
             name = name.rpartition("_")[0]
-        return self._types.get(name, self._real)
+        return self._types.get(name, self._usual)
 
 
 @dataclass(frozen=True)

@@ -25,23 +25,17 @@ class OrderKernels:
 def order_kernels(dtype: Any, module: Any) -> OrderKernels:
     """Make the kernels that sort and unsort entries of a Warp type, in a Warp module."""
 
+    typed = TypesByName(dtype, {wp.int32: "order"})
+
     @wp.kernel(module=module)
-    def sort(
-        order: wp.array(dtype=wp.int32),
-        a_scene: wp.array(dtype=dtype),
-        # out
-        a: wp.array(dtype=dtype),
-    ):
+    @typed.arrays
+    def sort(order, a_scene, a):
         i = wp.tid()
         a[i] = a_scene[order[i]]
 
     @wp.kernel(module=module)
-    def unsort(
-        order: wp.array(dtype=wp.int32),
-        a: wp.array(dtype=dtype),
-        # out
-        a_scene: wp.array(dtype=dtype),
-    ):
+    @typed.arrays
+    def unsort(order, a, a_scene):
         i = wp.tid()
         a_scene[order[i]] = a[i]
 

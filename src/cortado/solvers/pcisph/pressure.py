@@ -45,24 +45,12 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     LANES = discretisation.lanes
     lane = lane_functions(discretisation.precision, LANES).lane
 
+    names = {neighbourhood: "s", wp.int32: "rounds", vector: "x v scaled", pair_of: "error"}
+    typed = TypesByName(real, {**names, values: "at", changes: "dot"})
+
     @wp.kernel(module=discretisation.module(True, "pcisph"))
-    def pressure(
-        s: neighbourhood,
-        k: int,
-        rounds: wp.array(dtype=wp.int32),
-        stiffness: real,
-        time_step: wp.array(dtype=real),
-        n: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        rho_0: wp.array(dtype=real),
-        y: wp.array(dtype=real),
-        x_star: wp.array(dtype=vector),
-        p_in: wp.array(dtype=real),
-        # out
-        p_out: wp.array(dtype=real),
-        c: wp.array(dtype=real),
-        error: wp.array(dtype=pair_of),
-    ):
+    @typed.arrays
+    def pressure(s, k: int, rounds, stiffness: real, time_step, n, m, rho_0, y, x_star, p_in, p_out, c, error):
         """Write p_out = max(p_in + delta y (m n* - rho_0), 0), with n* of positions ``x_star``, and c = p_out / n^2;
         ``error`` gets the compression (rho* - rho_0)+ / rho_0 twice, for a sum and a maximum."""
         i = s.first + wp.tid() // LANES
@@ -88,20 +76,9 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         error[i] = pair_of(compression, compression)
 
     @wp.kernel(module=discretisation.tangent_module("pcisph"), enable_backward=False)
+    @typed.arrays
     def pressure_tangent(
-        s: neighbourhood,
-        k: int,
-        rounds: wp.array(dtype=wp.int32),
-        stiffness: real,
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        at: values,
-        x_star: wp.array(dtype=vector),
-        x_star_dot: wp.array(dtype=vector),
-        dot: changes,
-        # out
-        p_out_dot: wp.array(dtype=real),
-        c_dot: wp.array(dtype=real),
+        s, k: int, rounds, stiffness: real, time_step, time_step_dot, at, x_star, x_star_dot, dot, p_out_dot, c_dot
     ):
         i = s.first + wp.tid() // LANES
         member = i // s.particles
@@ -123,22 +100,9 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         c_dot[i] = (p_dot_i - real(2.0) * p_i / n_i * dot.n[i]) / (n_i * n_i)
 
     @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
+    @typed.arrays
     def pressure_adjoint(
-        s: neighbourhood,
-        k: int,
-        rounds: wp.array(dtype=wp.int32),
-        time_step: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        v: wp.array(dtype=vector),
-        x_star: wp.array(dtype=vector),
-        v_star: wp.array(dtype=vector),
-        r: wp.array(dtype=real),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        v_bar: wp.array(dtype=vector),
-        time_step_bar: wp.array(dtype=real),
-        # out
-        scaled_bar: wp.array(dtype=vector),
+        s, k: int, rounds, time_step, m, v, x_star, v_star, r, x_bar, v_bar, time_step_bar, scaled_bar
     ):
         """Add to adjoints of positions, velocities and time step the part by r, the adjoint of n*."""
         i = s.first + wp.tid() // LANES

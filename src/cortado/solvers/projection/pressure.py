@@ -130,26 +130,19 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     }
     seen = bundle(**own)
     bars = bundle(x=vector, n=real, time_step=real, **own)
-    iterate = bundle(u=vector, A=matrix, d=real, y=real, k=real)
+    iterate, shared = bundle(u=vector, A=matrix, d=real, y=real, k=real), bundle(coarse=real, **own)
+    moving, moved = bundle(u=vector, y=real, k=real, **own), bundle(A_dot=matrix, k_out_dot=real, y_out_dot=real)
     clamp, LANES = clamp_functions(precision), discretisation.lanes
     wanted, wanted_tangent, parts = clamp.wanted, clamp.wanted_tangent, clamp.parts
     lane = lane_functions(precision, LANES).lane
 
+    names = {seen: "of", bars: "bar", six: "S T", neighbourhood: "s", vector: "x g u", matrix: "A", iterate: "at"}
+    typed = TypesByName(real, names)
+
     @wp.kernel(module=module)
+    @typed.arrays
     def update(
-        s: neighbourhood,
-        omega: real,
-        beta: real,
-        time_step: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        of: bundle(coarse=real, **own),
-        at: iterate,
-        # out
-        k_out: wp.array(dtype=real),
-        y_out: wp.array(dtype=real),
-        T: wp.array(dtype=six),
-        error: wp.array(dtype=pair_of),
+        s, omega: real, beta: real, time_step, x, n, of: shared, at, k_out, y_out, T, error: wp.array(dtype=pair_of)
     ):
         """Take a pressure iteration. ``error``: the square of the unwanted divergence times the time step, weighted
         with c, and c, which is 1 inside and beside walls and 0 at free surfaces. A and the divergence are written to
@@ -184,21 +177,9 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         error[i] = pair_of(of.coarse[i] * (dt * left) * (dt * left), of.coarse[i])
 
     @wp.kernel(module=tangent_module, enable_backward=False)
+    @typed.arrays
     def update_tangent(
-        s: neighbourhood,
-        omega: real,
-        beta: real,
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        n_dot: wp.array(dtype=real),
-        of: seen,
-        at: iterate,
-        dot: bundle(u=vector, y=real, k=real, **own),
-        # out
-        out: bundle(A_dot=matrix, k_out_dot=real, y_out_dot=real),
+        s, omega: real, beta: real, time_step, time_step_dot, x, x_dot, n, n_dot, of, at, dot: moving, out: moved
     ):
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient_tangent(i, x, x_dot, at.u, dot.u, s)
@@ -223,8 +204,6 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         found += fall * (dot.weights[i][0] * down + of.weights[i][0] * change)
         out.y_out_dot[i] = found + beta * (found - dot.k[i])  # before k, which may be the same array
         out.k_out_dot[i] = found
-
-    typed = TypesByName(real, {seen: "of", bars: "bar", six: "S", neighbourhood: "s", vector: "x g u", matrix: "A"})
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     @typed.arrays
