@@ -18,7 +18,9 @@ def environment_kernels(precision: Precision) -> Any:
     ``per``: particles of a scene; ``factor`` (scenes,) scales derivatives; a ``period`` from ``origin`` [m], and its
     ``frequency`` [1/m], are 0 along axes without one."""
     real, vector = precision.real, precision.vector
-    module = kernel_module(f"environments_{precision.name}")
+    module, boxes = kernel_module(f"environments_{precision.name}"), wp.array2d(dtype=vector)
+    samples, names = wp.array(dtype=wp.float32, ndim=4), "r period frequency x v place"
+    typed = TypesByName(real, {vector: names, wp.int32: "chosen step", wp.float64: "value"})
 
     @wp.func
     def rounded(t: vector):
@@ -30,17 +32,8 @@ def environment_kernels(precision: Precision) -> Any:
         return r - wp.cw_mul(rounded(wp.cw_mul(r, frequency)), period)
 
     @wp.kernel(module=module, enable_backward=False)
-    def sample(
-        per: int,
-        origin: vector,
-        period: vector,
-        frequency: vector,
-        chosen: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        # out
-        seen: wp.array(dtype=wp.float32, ndim=4),
-    ):
+    @typed.arrays
+    def sample(per: int, origin: vector, period: vector, frequency: vector, chosen, x, v, seen: samples):
         """Write positions, wrapped into the period, and velocities of some particles."""
         b, p, axis = wp.tid()
         i = b * per + chosen[p]
@@ -53,11 +46,9 @@ def environment_kernels(precision: Precision) -> Any:
         c, s = wp.cos(angle), wp.sin(angle)
         return vector(c * r[0] - s * r[1], s * r[0] + c * r[1], r[2])
 
-    typed = TypesByName(real, {vector: "r period frequency x", wp.int32: "chosen step", wp.float64: "value"})
-
     @wp.func
     @typed
-    def outside(r, angle, period, frequency, b: int, lower: wp.array2d(dtype=vector), upper: wp.array2d(dtype=vector)):
+    def outside(r, angle, period, frequency, b: int, lower: boxes, upper: boxes):
         """Return the place of a particle's image in the frame of the boxes, and the vector to it from the nearest point
         of the nearest box."""
         place, found, least = vector(), vector(), real(FAR)
@@ -73,18 +64,9 @@ def environment_kernels(precision: Precision) -> Any:
         return place, found
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def share(
-        per: int,
-        width: real,
-        period: vector,
-        frequency: vector,
-        x: wp.array(dtype=vector),
-        place: wp.array(dtype=vector),
-        turn: wp.array(dtype=real),
-        lower: wp.array2d(dtype=vector),
-        upper: wp.array2d(dtype=vector),
-        # out
-        value: wp.array(dtype=wp.float64),
+        per: int, width: real, period: vector, frequency: vector, x, place, turn, lower: boxes, upper: boxes, value
     ):
         """Write 1 / (1 + e^2 / w^2) for each particle, with its distance e to the nearest of some boxes, which may be
         fixed to a solid in the plane."""
@@ -104,8 +86,8 @@ def environment_kernels(precision: Precision) -> Any:
         x: wp.array(dtype=vector),
         place: wp.array(dtype=vector),
         turn: wp.array(dtype=real),
-        lower: wp.array2d(dtype=vector),
-        upper: wp.array2d(dtype=vector),
+        lower: boxes,
+        upper: boxes,
         # out
         x_bar: wp.array(dtype=vector),
         place_bar: wp.array(dtype=vector),

@@ -77,17 +77,17 @@ class Snapshot:
     @property
     def lattice(self) -> Lattice:
         """Constants of the particles at rest, such as their volume."""
-        return moment_of(self).lattice
+        return moment_of(self).evaluator().lattice
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
         """Tables of the scene's solids as they begin; fields of the state say where a moving one is now."""
-        return moment_of(self).solids
+        return moment_of(self).evaluator().solids
 
     @property
     def container(self) -> Container:
         """The container of the scene."""
-        return moment_of(self).container
+        return moment_of(self).evaluator().container
 
     def _field(self, name: str) -> np.ndarray:
         return _read_only(self.state.numpy(self.dimension, only=[name])[name])

@@ -17,7 +17,6 @@ from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Fields, Parameters, State
 from cortado.rollout.rollout import Rollout
 from cortado.runs.quantity_formulas import OnDevice, Particles, Pressures, Sums, formulas
-from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.quantity_names import LOAD, QUANTITIES, check_quantity, is_load
 from cortado.scene.scene import Scene
@@ -56,21 +55,6 @@ class Moment:
         if size is not None:
             parameters["time_step"] = size
         return cls(state, parameters, rollout.substeps, step, evaluator)
-
-    @property
-    def lattice(self) -> Lattice:
-        """Return the constants of the lattice of particles at rest."""
-        return self.evaluator().lattice
-
-    @property
-    def solids(self) -> tuple[SolidTable, ...]:
-        """Return the solids of the scene, as they begin."""
-        return self.evaluator().solids
-
-    @property
-    def container(self) -> Container:
-        """Return the container of the scene."""
-        return self.evaluator().container
 
     def value(self, name: str) -> NDArray:
         """Return a quantity of the state, float64, read-only, of a batch with a first axis for the scenes."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cortado.cli.commands.options import HERE, Where
+from cortado.cli.commands.options import HERE, Where, require_shared
 from cortado.errors import (
     ComputationError,
     CortadoWarning,
@@ -68,11 +68,7 @@ class Member:
 
     def __call__(self, number: int) -> tuple[bool, list[str]]:
         """Compute a run and write it; return True if there is one, and its warnings."""
-        if not (self.out / LOCK).exists():
-            raise InputError(
-                f"A worker does not see {self.out}, but the scene and the folder of a data set must be in a file "
-                "system that all machines share."
-            )
+        require_shared(self.out, "the scene and the folder of a data set")
         parts = Parts(self.out)
         with warnings.catch_warnings(record=True) as caught, untracked():
             warnings.simplefilter("always", CortadoWarning)

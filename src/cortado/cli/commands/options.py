@@ -10,6 +10,7 @@ import numpy as np
 
 from cortado.errors import CortadoError, InputError, shown
 from cortado.executors import Distributed, Executor, InProcess, local_workers, require_processes
+from cortado.files.disk import LOCK
 from cortado.files.interruption import keeping
 from cortado.optimisation.sweep import folders_in
 from cortado.runs.run_folder import RunFolder
@@ -54,6 +55,12 @@ class Where:
 
 HERE = Where()
 """Computation in this process."""
+
+
+def require_shared(out: Path, what: str) -> None:
+    """Raise `InputError` where a worker process does not see a folder in which its command is at work."""
+    if not (out / LOCK).exists():
+        raise InputError(f"A worker does not see {out}, but {what} must be in a file system that all machines share.")
 
 
 def named_runs(folders: Sequence[Path]) -> list[RunFolder]:

@@ -2,17 +2,16 @@
 
 import warnings
 from dataclasses import dataclass
-from math import inf
 from pathlib import Path
 from typing import Any
 
 from cortado.arrays import check_steps
-from cortado.cli.arguments import ALL_FRAMES, STEPS, FrameOptions
+from cortado.cli.arguments import ALL_FRAMES, FrameOptions, steps_or_time
 from cortado.cli.commands.optimise import optimise_task, search_settings
-from cortado.cli.commands.options import HERE, Where
+from cortado.cli.commands.options import HERE, Where, require_shared
 from cortado.cli.commands.run import RunRequest, run_scene, run_settings
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, unwarned, warn
-from cortado.files.disk import LOCK, locked
+from cortado.files.disk import locked
 from cortado.files.interruption import Interrupted, keeping
 from cortado.files.terminal import track, untracked
 from cortado.optimisation.inverse.task import load_task
@@ -46,11 +45,7 @@ class Member:
 
     def __call__(self, combination: Combination) -> dict[str, Any]:
         """Return a combination's result, as in result.json, computed if need be. Warnings name the folder."""
-        if not (self.out / LOCK).exists():
-            raise InputError(
-                f"A worker does not see {self.out}, but the task and the folder of a sweep must be in a file system "
-                "that all machines share."
-            )
+        require_shared(self.out, "the task and the folder of a sweep")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             found = self.finished(combination) or self._computed(combination)
@@ -194,13 +189,10 @@ def _duration(file: Path, chosen: list[Combination], steps: int | None, time: fl
             if value is not None:
                 raise InputError(f"--{name} is given, but must be left out, as the task says problem.steps.")
         return None
-    if time is not None and steps is not None:
-        raise InputError("--time is given, but must be left out, as --steps says how long the scene is simulated.")
-    if time is not None:
-        if not 0.0 < time < inf:
-            raise InputError(f"--time is {time:g}, but must be a number of seconds greater than 0.")
+    steps = steps_or_time(steps, time)
+    if steps is None:
         return time
-    number = check_steps(STEPS if steps is None else steps)
+    number = check_steps(steps)
     return number * min(_time_step(file, one) for one in chosen)
 
 
