@@ -11,11 +11,10 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_number, is_whole
-from cortado.device.lanes import lane_functions
 from cortado.device.precision import TypesByName
 from cortado.errors import InputError, shown
 from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estimate, Filtered, checked_estimator
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum
 from cortado.particles.state import Parameters, State
 from cortado.rollout.rollout import AdjointStep, BackwardStep, Observer, Rollout
@@ -32,12 +31,10 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     and ``sort`` sorts them for ``viscosity``, which needs ``crowd`` and ``strength`` before it. Owing to the division
     by S it acts at a surface, and in a drop of a few particles, as it does within the fluid; W(h / 2) limits it where
     particles hardly touch."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, per_size = pair.weight, pair.per_size
-    LANES = discretisation.lanes
-    lane = lane_functions(discretisation.precision, LANES).lane
+    LANES, lane = discretisation.lanes, discretisation.lane
     module = discretisation.module(False, "adjoint_filters")
     strongest = wp.constant(real(STRONGEST))
 

@@ -47,8 +47,7 @@ def append_function(discretisation: Discretisation) -> Any:
 def scan_by_bits(discretisation: Discretisation) -> Any:
     """Make the Warp function for one lane that appends particles first ... last - 1 within reach; ``own`` is left
     out."""
-    vector = discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    _, vector, neighbourhood = discretisation.types
     separation = pair_functions(discretisation).separation
     load = loads(discretisation.precision, discretisation.taped).vector
 
@@ -100,12 +99,10 @@ def scan_by_bits(discretisation: Discretisation) -> Any:
 @cache
 def scan_by_lanes(discretisation: Discretisation) -> Any:
     """Make the Warp function for several lanes that appends particles first ... last - 1 within reach but ``own``."""
-    vector = discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    _, vector, neighbourhood = discretisation.types
     separation = pair_functions(discretisation).separation
     load = loads(discretisation.precision, discretisation.taped).vector
-    LANES = discretisation.lanes
-    lane, append = lane_functions(discretisation.precision, LANES).lane, append_function(discretisation)
+    LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
 
     @wp.func
     def scan(
@@ -191,8 +188,7 @@ def scan_at_once(discretisation: Discretisation) -> Any:
     wrap, below, above = cells.wrap, cells.below, cells.above
     separation = pair_functions(discretisation).separation
     load = loads(discretisation.precision, discretisation.taped).vector
-    LANES = discretisation.lanes
-    lane, append = lane_functions(discretisation.precision, LANES).lane, append_function(discretisation)
+    LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
     scan_rows = scan_by_rows(discretisation)
     one_of_each_row = wp.types.vector(length=ROWS, dtype=wp.int32)
     candidates = wp.types.vector(length=UNROLL, dtype=wp.int32)

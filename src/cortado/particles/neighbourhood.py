@@ -19,7 +19,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import set_lanes
+from cortado.device.lanes import lane_functions, set_lanes
 from cortado.device.modules import kernel_module, kind_of
 from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import SmoothingKernel
@@ -170,6 +170,16 @@ class Discretisation:
     """True where walls move: sums know their velocities."""
     taped: bool = False
     """True for forward kernels that a tape can differentiate: they get Warp's own adjoint, which takes one lane."""
+
+    @property
+    def types(self) -> tuple[Any, Any, Any]:
+        """Return the Warp types of numbers, of vectors, and of what lies around a particle, ``s`` of kernels."""
+        return self.precision.real, self.precision.vector, neighbourhood_type(self.precision)
+
+    @property
+    def lane(self) -> Any:
+        """Return the Warp function that says which of its particle's threads a thread is, from 0 on."""
+        return lane_functions(self.precision, self.lanes).lane
 
     @property
     def still(self) -> "Discretisation":

@@ -16,7 +16,6 @@ import warp as wp
 
 from cortado.device.cells import CellSort, cell_functions, cell_grid_type
 from cortado.device.grid import Grid
-from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, HostCopy, KernelLauncher
 from cortado.errors import InputError
 from cortado.particles.candidates import append_function, scan_around
@@ -43,8 +42,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
     neighbourhood = neighbourhood_type(precision)
     cell_of = cell_functions(precision).cell_of
     scan = scan_around(discretisation)
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
+    LANES, lane = discretisation.lanes, discretisation.lane
 
     @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
     def fill(
@@ -106,8 +104,7 @@ def image_kernel(discretisation: Discretisation) -> Any:
     separation, reflects, reflection = pair.separation, pair.reflects, pair.reflection
     near_mirrors, before_mirrors = pair.near_mirrors, pair.before_mirrors
     load_vector, neighbour = load.vector, pair.neighbour
-    LANES = discretisation.lanes
-    lane, append = lane_functions(discretisation.precision, LANES).lane, append_function(discretisation)
+    LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
 
     @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
     def fill_images(

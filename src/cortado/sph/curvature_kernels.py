@@ -31,7 +31,7 @@ import warp as wp
 
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.sph.curvature import curvature_functions, curvature_sums
 from cortado.sph.moment_functions import matrix_type, moment_functions
@@ -58,9 +58,8 @@ class CurvatureKernels:
 @cache
 def curvature_kernels(discretisation: Discretisation, dimension: int) -> CurvatureKernels:
     """Make the kernels of tension by curvature, in 2 or 3 dimensions; ``depth`` is delta and ``per_width`` 1 / J."""
-    precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    neighbourhood, sums = neighbourhood_type(precision), curvature_sums(discretisation)
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    matrix, sums = matrix_type(precision), curvature_sums(discretisation)
     moments = moment_functions(precision, dimension)
     whole, even = moments.whole, moments.change
     topic = f"surface_curvature_{dimension}d"
@@ -117,9 +116,8 @@ def curvature_kernels(discretisation: Discretisation, dimension: int) -> Curvatu
 @cache
 def curvature_tangents(discretisation: Discretisation, dimension: int, topic: str) -> tuple[Any, ...]:
     """Make the tangents of the four curvature kernels, in 2 or 3 dimensions, in the Warp module of a topic."""
-    precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    neighbourhood, sums = neighbourhood_type(precision), curvature_sums(discretisation)
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    matrix, sums = matrix_type(precision), curvature_sums(discretisation)
     even = moment_functions(precision, dimension).change
     module = discretisation.tangent_module(topic)
     own = curvature_functions(precision, dimension, module)
@@ -196,9 +194,8 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
 @cache
 def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: str) -> tuple[Any, ...]:
     """Make the adjoints of the four curvature kernels; the last has two, the first of which has no neighbours."""
-    precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    neighbourhood, sums = neighbourhood_type(precision), curvature_sums(discretisation)
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    matrix, sums = matrix_type(precision), curvature_sums(discretisation)
     module = discretisation.module(False, topic)
     own = curvature_functions(precision, dimension, module)
     normal_work, curvature_of, outermost = own.normal_work, own.curvature, own.outermost

@@ -37,8 +37,7 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
     """Make the raw neighbour sums of the density: ``weights`` (sum of W, with what fills the list up),
     ``weights_tangent`` and ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b w_b r_i G_ib). The last is the adjoint
     of positions for an adjoint r of every particle's sum."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, slope, gradient = pair.weight, pair.slope, pair.gradient
 

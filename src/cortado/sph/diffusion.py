@@ -24,7 +24,7 @@ from cortado.device.precision import TypesByName
 from cortado.discretise.calibration import diffusion_limit
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.errors import OutOfRangeError
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.particles.particle_kernels import dotted, over, particle_kernel
 from cortado.scene.scene import Scene
@@ -43,9 +43,8 @@ class PairwiseLaplacian:
 @cache
 def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) -> PairwiseLaplacian:
     """Make raw sums of B / V over the neighbours: ``spread``, ``spread_tangent``, ``spread_adjoint``."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
+    real, vector, neighbourhood = discretisation.types
     fractions = discretisation.precision.fractions(phases)
-    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     factor, factor_gradient = pair.factor, pair.factor_gradient
 
@@ -147,9 +146,8 @@ class DiffusionKernels:
 def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
     """Make kernels of the chemical potential, of the flux, and of the adjoint of the flux's scale."""
     discretisation, phases = diffusion.discretisation, diffusion.phases
-    precision = discretisation.precision
-    real, vector, fractions = precision.real, precision.vector, precision.fractions(phases)
-    neighbourhood = neighbourhood_type(precision)
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    fractions = precision.fractions(phases)
     sums = pairwise_laplacian_functions(discretisation, phases)
     spread, spread_tangent, spread_adjoint = sums.spread, sums.spread_tangent, sums.spread_adjoint
     energy, form = diffusion.energy.functions(precision, phases), diffusion.mobility.functions(precision, phases)

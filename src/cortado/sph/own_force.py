@@ -30,7 +30,7 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum
 from cortado.particles.particle_kernels import pointwise_kernels, sum_kernels
 from cortado.particles.state import padded
@@ -259,9 +259,8 @@ def term(
     discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int, module: Any
 ) -> Callable[..., Any]:
     """Make the Warp function of a pair's share in a particle's acceleration times its volume, by a user's function."""
-    precision = discretisation.precision
-    real, vector, theta_type = precision.real, precision.vector, theta_of(precision, ranks)
-    neighbourhood, weight = neighbourhood_type(precision), pair_functions(discretisation).weight
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    theta_type, weight = theta_of(precision, ranks), pair_functions(discretisation).weight
     force = applied(text, precision, ranks, dimension, module)
 
     def pair(x_ij: vector, v_ij: vector, m_i: real, theta: theta_type, i: int, j: int, s: neighbourhood) -> vector:

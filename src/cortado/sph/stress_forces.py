@@ -43,8 +43,7 @@ class ContactFunctions:
 @cache
 def contact_functions(discretisation: Discretisation) -> ContactFunctions:
     """Return the Warp functions by which walls and particles hold each other in the viscous stress."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     slope, slope_gradient = pair.slope, pair.slope_gradient
 
@@ -104,9 +103,7 @@ class StressSums:
 @cache
 def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
     """Make the viscous acceleration's sums, with walls without slip if fluid ``sticks``; ``control`` is C."""
-    precision = discretisation.precision
-    real, vector = precision.real, precision.vector
-    neighbourhood = neighbourhood_type(precision)
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
     hold, hold_gradient = contact.hold, contact.hold_gradient

@@ -154,9 +154,7 @@ class MomentSums:
 @cache
 def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
     """Make the sums of M, A and R over neighbours, with walls without slip if fluid ``sticks``."""
-    precision = discretisation.precision
-    real, vector = precision.real, precision.vector
-    neighbourhood = neighbourhood_type(precision)
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
     hold, hold_gradient = contact.hold, contact.hold_gradient

@@ -31,7 +31,7 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
 from cortado.discretise.calibration import lattice_offsets
 from cortado.errors import warn
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.particles.particle_kernels import sum_kernel, sum_kernels
 from cortado.particles.state import Layout, zeros
@@ -100,8 +100,7 @@ def tension_functions(discretisation: Discretisation) -> TensionFunctions:
 @cache
 def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
     """Make the kernels of the acceleration by surface tension; ``scale`` is 1 / (Gamma s^d), with the spacing s."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    real, vector, neighbourhood = discretisation.types
     functions = tension_functions(discretisation)
     pull, pull_derivative = functions.pull, functions.pull_derivative
     stress, stress_change, stress_derivative = functions.stress, functions.stress_change, functions.stress_derivative
@@ -162,8 +161,7 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
 @cache
 def normal_kernels(discretisation: Discretisation) -> Kernels:
     """Make the kernels of the surface normals n of particles; ``inverse`` is 1 / N."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    real, vector, neighbourhood = discretisation.types
     one = wp.constant(real(1.0))
 
     @fluid_sum(discretisation)

@@ -42,8 +42,7 @@ class PairForce:
 @cache
 def pairwise(discretisation: Discretisation) -> PairForce:
     """Make the Warp functions of the pair force phi: ``force``, ``tangent``, ``adjoint_x`` and ``adjoint_v``."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     slope, slope_change, per_size = pair.slope, pair.slope_change, pair.per_size
 
@@ -77,8 +76,7 @@ def pairwise(discretisation: Discretisation) -> PairForce:
 def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
     """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration; all walls slip freely unless
     fluid ``sticks`` to some."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    real, vector, neighbourhood = discretisation.types
     phi = pairwise(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
     reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal

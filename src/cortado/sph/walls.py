@@ -35,8 +35,7 @@ class WallSlope:
 @cache
 def wall_slope_sums(discretisation: Discretisation) -> WallSlope:
     """Make the Warp functions of sums over walls ``slope(i, x, s)`` and ``change(i, x, along, s)``."""
-    vector = discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    _, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     gradient, hessian_product = pair.gradient, pair.hessian_product
 

@@ -17,7 +17,6 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
@@ -42,8 +41,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     values = bundle(n=real, m=real, rho_0=real, y=real, p_in=real, p_out=real)
     changes = bundle(n=real, m=real, rho_0=real, y=real, p_in=real)
     adjoin_prediction = prediction_share(discretisation.precision)
-    LANES = discretisation.lanes
-    lane = lane_functions(discretisation.precision, LANES).lane
+    LANES, lane = discretisation.lanes, discretisation.lane
 
     names = {neighbourhood: "s", wp.int32: "rounds", vector: "x v scaled", pair_of: "error"}
     typed = TypesByName(real, {**names, values: "at", changes: "dot"})
@@ -140,13 +138,11 @@ def _work(d: Discretisation) -> Any:
 @cache
 def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     """Make kernels ``forward``, ``tangent``, ``adjoint`` of the pressure force and the prediction that follows it."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     slope, slope_change = pair.slope, pair.slope_change
     gradient, hessian_product = pair.gradient, pair.hessian_product
-    LANES = discretisation.lanes
-    lane = lane_functions(discretisation.precision, LANES).lane
+    LANES, lane = discretisation.lanes, discretisation.lane
     moved = bundle(m=real, x=vector, v=vector, acceleration=vector, c=real)
     values = bundle(n=real, m=real, rho_0=real, y=real, p_in=real, p_out=real)
     adjoints = bundle(m=real, rho_0=real, y=real, p=real, time_step=real)

@@ -34,9 +34,8 @@ from typing import Any
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.lanes import lane_functions
 from cortado.device.modules import Kernels
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.particles.state import Parameters, State
@@ -63,8 +62,7 @@ class DensityRatioKernels(Kernels):
 @cache
 def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels:
     """Make the kernels of the density-ratio relaxation for a smoothing kernel and a precision."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, gradient = pair.weight, pair.gradient
     module, tangent_module, adjoint_module = discretisation.modules("density_ratio")
@@ -131,12 +129,11 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
 @cache
 def wall_kernels(discretisation: Discretisation) -> Kernels:
     """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the pressure relaxation beside walls."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    real, vector, neighbourhood = discretisation.types
     sums = wall_slope_sums(discretisation)
     slope, change, LANES = sums.slope, sums.change, discretisation.lanes
     module, tangent_module, adjoint_module = discretisation.modules("pcisph")
-    lane = lane_functions(discretisation.precision, LANES).lane
+    lane = discretisation.lane
 
     @particle_kernel(module, "y", [over(slope, "total")])
     def wall_relaxation(total: vector, s: neighbourhood) -> real:

@@ -24,7 +24,7 @@ import warp as wp
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.moving_walls import matrix_of
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
 from cortado.solvers.projection.walls import normal_part
@@ -52,9 +52,8 @@ class BodyKernels:
 @cache
 def body_kernels(discretisation: Discretisation) -> BodyKernels:
     """Make the kernels by which the projection moves bodies, for a discretisation."""
-    precision = discretisation.precision
-    real, vector, pair_of = precision.real, precision.vector, precision.pair
-    neighbourhood, pair = neighbourhood_type(precision), pair_functions(discretisation)
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    pair_of, pair = precision.pair, pair_functions(discretisation)
     gradient, hessian_product, separation = pair.gradient, pair.hessian_product, pair.separation
     normal = normal_part(discretisation)
     topic = "projection_bodies"

@@ -20,7 +20,7 @@ import warp as wp
 
 from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.solvers.projection.effects import image_sums, weights_type
@@ -44,9 +44,8 @@ class CoarseSums:
 @cache
 def coarse_sums(discretisation: Discretisation) -> CoarseSums:
     """Make the sums over neighbours of the push by a coarse pressure, for a discretisation."""
-    precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    neighbourhood, pair = neighbourhood_type(precision), pair_functions(discretisation)
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    matrix, pair = matrix_type(precision), pair_functions(discretisation)
     packed, cross_terms = symmetric(precision), cross_terms_function(precision)
     six, times = packed.kind, packed.times
     gradient, hessian_product = pair.gradient, pair.hessian_product

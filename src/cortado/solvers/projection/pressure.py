@@ -38,11 +38,10 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import particle_kernel
 from cortado.solvers.projection.effects import image_sums, weights_type
 from cortado.solvers.projection.sums import projection_sums
@@ -112,9 +111,8 @@ class PressureKernels:
 @cache
 def pressure_kernels(discretisation: Discretisation, dimension: int) -> PressureKernels:
     """Make the kernels of one pressure iteration, in 2 or 3 dimensions."""
-    precision = discretisation.precision
-    real, vector, pair_of = precision.real, precision.vector, precision.pair
-    neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    pair_of, sums = precision.pair, projection_sums(discretisation)
     packed, matrix = symmetric(precision), matrix_type(precision)
     six, pack = packed.kind, packed.pack
     mirrors = image_sums(discretisation)
@@ -134,7 +132,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     moving, moved = bundle(u=vector, y=real, k=real, **own), bundle(A_dot=matrix, k_out_dot=real, y_out_dot=real)
     clamp, LANES = clamp_functions(precision), discretisation.lanes
     wanted, wanted_tangent, parts = clamp.wanted, clamp.wanted_tangent, clamp.parts
-    lane = lane_functions(precision, LANES).lane
+    lane = discretisation.lane
 
     names = {seen: "of", bars: "bar", six: "S T", neighbourhood: "s", vector: "x g u", matrix: "A", iterate: "at"}
     typed = TypesByName(real, names)

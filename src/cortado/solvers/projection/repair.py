@@ -19,11 +19,10 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.solvers.projection.effects import image_sums, weights_type
 from cortado.solvers.projection.sums import projection_sums
@@ -48,9 +47,8 @@ class RepairKernels:
 @cache
 def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKernels:
     """Make the kernels of one repair of the density, in 2 or 3 dimensions."""
-    precision = discretisation.precision
-    real, vector, pair_of = precision.real, precision.vector, precision.pair
-    neighbourhood, weights4 = neighbourhood_type(precision), weights_type(precision)
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    pair_of, weights4 = precision.pair, weights_type(precision)
     sums, densities = projection_sums(discretisation), density_sums(discretisation)
     push, push_tangent, push_back = sums.push, sums.push_tangent, sums.push_back
     mirrors = image_sums(discretisation)
@@ -67,8 +65,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     module, tangent_module, adjoint_module = discretisation.modules(topic)
     own = {name: kind for name, kind in entries(precision).items() if name in ("gamma", "a", "weights", "image")}
     seen, bars = bundle(**own), bundle(x=vector, m=real, **own)
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
+    LANES, lane = discretisation.lanes, discretisation.lane
     farthest = wp.constant(real(FARTHEST))
 
     @wp.func

@@ -14,7 +14,7 @@ import warp as wp
 
 from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName, arithmetic
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.solvers.projection.effects import image_sums
@@ -68,8 +68,8 @@ class ProjectionSums:
 @cache
 def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     """Make the sums over neighbours of the projection, for a discretisation."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood, matrix = neighbourhood_type(discretisation.precision), matrix_type(discretisation.precision)
+    real, vector, neighbourhood = discretisation.types
+    matrix = matrix_type(discretisation.precision)
     pair = pair_functions(discretisation)
     packed, cross_terms = symmetric(discretisation.precision), cross_terms_function(discretisation.precision)
     six, times = packed.kind, packed.times

@@ -7,7 +7,6 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
@@ -66,8 +65,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     image_along = image_share(precision, dimension, tangent_module)[1]
     image_back = image_share(precision, dimension, adjoint_module)[1]
     around, bars = bundle(**entries(precision)), bundle(**bar_entries(precision))
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
+    LANES, lane = discretisation.lanes, discretisation.lane
 
     typed = TypesByName(real, {neighbourhood: "s", vector: "x v", around: "of dot", bars: "bar", six: "M Q"})
 
