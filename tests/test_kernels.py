@@ -266,8 +266,10 @@ class DensityRatio(Operation):
 
     def adjoint(self, values, bars):
         given = {**values, **{name: self.forward(values)[name] for name in ("t", "y")}}
-        bar = launch(Kernels.density_ratio.factor_adjoint, s=self.s, **given, y_bar=bars["y"], t_bar=np.zeros(N))
-        found = launch(Kernels.density_ratio.adjoint, s=self.s, **given, t_bar=bar["t_bar"], **zeros("x_bar", "m_bar"))
+        bar = launch(Kernels.density_ratio.adjoint[0], s=self.s, **given, y_bar=bars["y"], t_bar=np.zeros(N))
+        found = launch(
+            Kernels.density_ratio.adjoint[1], s=self.s, **given, t_bar=bar["t_bar"], **zeros("x_bar", "m_bar")
+        )
         return {"x": found["x_bar"], "m": found["m_bar"], "wall_y": bar["y_bar"]}
 
 

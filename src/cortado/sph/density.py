@@ -9,7 +9,6 @@ Pajarola 2008): the density of a heavy fluid is not smeared into a light one.
 subclass of its own.
 """
 
-from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
@@ -23,20 +22,11 @@ from cortado.particles.wall_terms import solid_kernel
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 
-@dataclass(frozen=True)
-class DensitySums:
-    """Warp functions of the sums over neighbours in the number density."""
-
-    weights: Any
-    weights_tangent: Any
-    weights_adjoint: Any
-
-
 @cache
-def density_sums(discretisation: Discretisation) -> DensitySums:
-    """Make the raw neighbour sums of the density: ``weights`` (sum of W, with what fills the list up),
-    ``weights_tangent`` and ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b w_b r_i G_ib). The last is the adjoint
-    of positions for an adjoint r of every particle's sum."""
+def density_sums(discretisation: Discretisation) -> Kernels:
+    """Make the Warp functions of the raw neighbour sums of the density: the sum of W, with what fills the list up, and
+    its derivatives. The adjoint is that of positions for an adjoint r of every particle's sum, sum_j (r_i + r_j) G_ij +
+    sum_b w_b r_i G_ib."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, slope, gradient = pair.weight, pair.slope, pair.gradient
@@ -55,7 +45,7 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
     def weights_adjoint(x_ij: vector, r_i: real, r_j: real, s: neighbourhood) -> vector:
         return ((r_i + r_j) * slope(x_ij, s)) * x_ij
 
-    return DensitySums(weights=weights, weights_tangent=weights_tangent, weights_adjoint=weights_adjoint)
+    return Kernels(weights, weights_tangent, weights_adjoint)
 
 
 @cache
@@ -81,14 +71,14 @@ def density_kernels(discretisation: Discretisation, topic: str = "density") -> K
     module, tangent_module, adjoint_module = discretisation.modules(topic)
     sums = density_sums(discretisation)
 
-    @particle_kernel(module, "n", [over(sums.weights, "total")])
+    @particle_kernel(module, "n", [over(sums.forward, "total")])
     def density(i: int, total: real, s: neighbourhood) -> real:
         return s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
 
     return Kernels(
         density,
-        sum_kernel("density_tangent", tangent_module, "n_dot", sums.weights_tangent, times="s.volume"),
-        sum_kernel("density_adjoint", adjoint_module, "+x_bar", sums.weights_adjoint, times="s.volume", r="n_bar"),
+        sum_kernel("density_tangent", tangent_module, "n_dot", sums.tangent, times="s.volume"),
+        sum_kernel("density_adjoint", adjoint_module, "+x_bar", sums.adjoint, times="s.volume", r="n_bar"),
     )
 
 

@@ -31,18 +31,9 @@ from cortado.scene.scene import Scene
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy, Mobility
 
 
-@dataclass(frozen=True)
-class PairwiseLaplacian:
-    """The pairwise Laplacian as a function of Warp, with its derivatives."""
-
-    spread: Any
-    spread_tangent: Any
-    spread_adjoint: Any
-
-
 @cache
-def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) -> PairwiseLaplacian:
-    """Make raw sums of B / V over the neighbours: ``spread``, ``spread_tangent``, ``spread_adjoint``."""
+def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) -> Kernels:
+    """Make the Warp functions of the raw sums of B / V over the neighbours, with their derivatives."""
     real, vector, neighbourhood = discretisation.types
     fractions = discretisation.precision.fractions(phases)
     pair = pair_functions(discretisation)
@@ -80,7 +71,7 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
         n_bar = -w_j * f * work / (n_i * n_i)
         return x_bar, n_bar, f * work / n_j, (weight * f) * y_ij, weight * f * wp.dot(u_ij, y_i)
 
-    return PairwiseLaplacian(spread=spread, spread_tangent=spread_tangent, spread_adjoint=spread_adjoint)
+    return Kernels(spread, spread_tangent, spread_adjoint)
 
 
 MOST_SUBSTEPS = 10_000
@@ -139,17 +130,17 @@ class DiffusionKernels:
 
     potential: Kernels
     flux: Kernels
-    scale_adjoint: Any
+    """Its adjoint is two kernels, of the scale of the sum and of the sum itself."""
 
 
 @cache
 def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
-    """Make kernels of the chemical potential, of the flux, and of the adjoint of the flux's scale."""
+    """Make kernels of the chemical potential and of the flux."""
     discretisation, phases = diffusion.discretisation, diffusion.phases
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     fractions = precision.fractions(phases)
     sums = pairwise_laplacian_functions(discretisation, phases)
-    spread, spread_tangent, spread_adjoint = sums.spread, sums.spread_tangent, sums.spread_adjoint
+    spread, spread_tangent, spread_adjoint = sums.forward, sums.tangent, sums.adjoint
     energy, form = diffusion.energy.functions(precision, phases), diffusion.mobility.functions(precision, phases)
     energy_gradient, energy_hessian_product = energy.gradient, energy.hessian_product
     mobile, mobile_gradient = form.value, form.gradient
@@ -252,6 +243,5 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
 
     return DiffusionKernels(
         Kernels(potential, potential_tangent, potential_adjoint),
-        Kernels(flux, flux_tangent, flux_adjoint),
-        scale_adjoint,
+        Kernels(flux, flux_tangent, (scale_adjoint, flux_adjoint)),
     )

@@ -224,9 +224,10 @@ class MixtureAdjoint(PartAdjoint):
         step.launch(kernels.blend.adjoint, *known, c=mixture.c[substeps], c_scene_bar=fractions_bar, c_bar=c_bar)
         for k in reversed(range(substeps)):
             assert diffusion is not None
+            scale, flux = diffusion.flux.adjoint
             c, chi, w = mixture.c[k], mixture.chi[k], mixture.w[k]
-            step.launch(diffusion.scale_adjoint, substeps=substeps, c_bar=c_bar, y=y)
-            step.launch(diffusion.flux.adjoint, *known, strength=strength, c=c, chi=chi, w=w, y=y, c_bar=c_bar, z=z)
+            step.launch(scale, substeps=substeps, c_bar=c_bar, y=y)
+            step.launch(flux, *known, strength=strength, c=c, chi=chi, w=w, y=y, c_bar=c_bar, z=z)
             step.launch(diffusion.potential.adjoint, *known, c=c, z=z, c_bar=c_bar)
         if mixture.phases.count > 1:
             step.launch(kernels.order.unsort, a=c_bar, a_scene=fractions_bar)

@@ -139,21 +139,11 @@ def stress_of_particle(precision: Precision, dimension: int, law: Law, module: A
     return stress
 
 
-@dataclass(frozen=True)
-class MomentSums:
-    """Warp functions of the moments' sums over neighbours."""
-
-    sums: Any
-    """The diagonal of M, its entries yz, xz and xy, the rows of A, and R."""
-    tangent: Any
-    """The tangents of these sums."""
-    back: Any
-    """From the sums' adjoints, two matrices and a number for each particle, to those of its x, v and mu."""
-
-
 @cache
-def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
-    """Make the sums of M, A and R over neighbours, with walls without slip if fluid ``sticks``."""
+def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
+    """Make the Warp functions of the sums over neighbours of the diagonal of M, its entries yz, xz and xy, the rows of
+    A, and R, with walls without slip if fluid ``sticks``; the adjoint is from those of M, A and R to those of a
+    particle's x, v and mu."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
@@ -249,7 +239,7 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
         x_part = (-s.volume * level) * slope_gradient(x_ij, s) + w * by_x
         return x_part, w * pulled, -R_bar_j * w * square * thin_i * thin_i
 
-    return MomentSums(moments, moments_tangent, moments_back)
+    return Kernels(moments, moments_tangent, moments_back)
 
 
 def moments_work(d: Discretisation) -> Any:
@@ -325,9 +315,9 @@ def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sti
 
     return StressKernels(
         Kernels(
-            moments_of("moments", modules[0], "M A R", sums.sums, known.whole),
+            moments_of("moments", modules[0], "M A R", sums.forward, known.whole),
             moments_of("moments_tangent", modules[1], "M_dot A_dot R_dot", sums.tangent, known.change),
-            sum_kernel("moments_adjoint", modules[2], "+x_bar +v_bar +mu_bar", sums.back, numbers=["least"]),
+            sum_kernel("moments_adjoint", modules[2], "+x_bar +v_bar +mu_bar", sums.adjoint, numbers=["least"]),
         ),
         pointwise_kernels(
             precision,

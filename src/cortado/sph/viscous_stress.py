@@ -208,7 +208,7 @@ def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, s
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     module = discretisation.module(False, f"implicit_viscosity_{law.topic}{dimension}d" + "_no_slip" * sticks)
     traction = traction_function(precision, dimension, module)
-    moments, force = moment_sums(discretisation, sticks).sums, stress_sums(discretisation, sticks).force
+    moments, force = moment_sums(discretisation, sticks).forward, stress_sums(discretisation, sticks).force
     constants = ["control", "least"]
 
     @particle_kernel(module, "A T", [over(moments, "diagonal others row_x row_y row_z thin")], numbers=constants)

@@ -37,7 +37,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     )
     neighbourhood = neighbourhood_type(discretisation.precision)
     sums = density_sums(discretisation)
-    weights, weights_tangent, weights_adjoint = sums.weights, sums.weights_tangent, sums.weights_adjoint
+    weights, weights_tangent, weights_adjoint = sums.forward, sums.tangent, sums.adjoint
     values = bundle(n=real, m=real, rho_0=real, y=real, p_in=real, p_out=real)
     changes = bundle(n=real, m=real, rho_0=real, y=real, p_in=real)
     adjoin_prediction = prediction_share(discretisation.precision)

@@ -99,8 +99,9 @@ class PcisphAdjoint(ParticleAdjoint):
         self.predict(context, within)
         if kernels.density_ratio:
             factors = {"t": solver.density_ratio, "y": solver.pressure_relaxation, "y_bar": self._y_bar}
-            context.launch(kernels.density_ratio.factor_adjoint, **factors, t_bar=self._t_bar)
-            context.launch(kernels.density_ratio.adjoint, *known, t_bar=self._t_bar)
+            factor, total = kernels.density_ratio.adjoint
+            context.launch(factor, **factors, t_bar=self._t_bar)
+            context.launch(total, *known, t_bar=self._t_bar)
         self.relax_beside_walls(context)
         self.mix(context, state_bar)
         self.sort(context, state_bar)

@@ -51,17 +51,9 @@ SOFTNESS = 0.2
 """The softness a of the density-ratio relaxation [-]."""
 
 
-@dataclass(frozen=True)
-class DensityRatioKernels(Kernels):
-    """The kernels of the relaxation by density ratios in PCISPH; the adjoint has two of them."""
-
-    factor_adjoint: Any
-    """Comes before ``adjoint``."""
-
-
 @cache
-def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels:
-    """Make the kernels of the density-ratio relaxation for a smoothing kernel and a precision."""
+def density_ratio_kernels(discretisation: Discretisation) -> Kernels:
+    """Make the kernels of the density-ratio relaxation; the adjoint is two, of the factor and of the sum."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, gradient = pair.weight, pair.gradient
@@ -123,7 +115,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
     density_ratio_adjoint = sum_kernel(
         "density_ratio_adjoint", adjoint_module, "+x_bar +m_bar", density_ratio_sum_adjoint, times="s.volume"
     )
-    return DensityRatioKernels(density_ratio, density_ratio_tangent, density_ratio_adjoint, factor_adjoint)
+    return Kernels(density_ratio, density_ratio_tangent, (factor_adjoint, density_ratio_adjoint))
 
 
 @cache
@@ -203,7 +195,7 @@ class PcisphKernels:
     """The kernels that only PCISPH needs, by topic, each with its forward, tangent and adjoint."""
 
     wall_relaxation: Kernels
-    density_ratio: DensityRatioKernels | None
+    density_ratio: Kernels | None
     """Only where there are several phases."""
     pressure: Kernels
     force: Kernels

@@ -137,7 +137,7 @@ class Coarse:
     def correct(self, context: StepContext, k: int, around: Named, at: Named, new: Named, T: wp.array) -> None:
         """Correct the pressure before iteration k: from an iterate ``at`` with A and divergence, write k, y and u of a
         ``new`` one, which has `room` for the rest. ``around`` has the drift of walls; ``T`` is overwritten."""
-        context.launch(self.residual.residual, around, at, self.source, r=new["r"])
+        context.launch(self.residual.forward, around, at, self.source, r=new["r"])
         self.solve(context, self._none, new["e"])
         own = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
         context.launch(self.pressure.correct, own, around, at, self.grid, T=T)
@@ -180,7 +180,7 @@ class CoarseTangent:
         own, change = self._coarse, {name: self._change[f"{name}_dot"] for name in ("change", "thrust", "r", "T", "u")}
         found = {f"{name}_dot": change[name] for name in ("change", "thrust", "r")}
         left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
-        context.launch(own.residual.residual_tangent, at, *known, found)
+        context.launch(own.residual.tangent, at, *known, found)
         every = (own.grid, left, own.pushed, self._change, *known)
         context.launch(own.pressure.source_tangent, *every, own.source)
         if self._bodies is not None:
@@ -251,7 +251,7 @@ class CoarseAdjoint:
         context.launch(own.pressure.source_adjoint, *every, multiplier=self._multiplier)
         if self._bodies is not None:
             self._bodies.add_source(context, every, new["e"], self._multiplier)
-        context.launch(own.residual.residual_adjoint, steps, found, at, *known)
+        context.launch(own.residual.adjoint, steps, found, at, *known)
 
     def finish(self, context: StepContext, known: tuple[Named, ...]) -> None:
         """Turn the adjoints of the coarse push h and N into those of particles and their surroundings."""

@@ -12,9 +12,7 @@ N is 1 inside of the fluid, and h is 0 there.
 The residual r of `cortado.solvers.projection.coarse_pressure` is the divergence that the coarse pressure takes away.
 """
 
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import warp as wp
 
@@ -29,21 +27,11 @@ from cortado.solvers.projection.sums import projection_sums
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions, symmetric
 
 
-@dataclass(frozen=True)
-class CoarseSums:
-    """Warp functions of the sums over neighbours for the push by a coarse pressure."""
-
-    push: Any
-    """sum T_j g_ij, which T_i g_i and c_i gamma_i complete to h, and the rows of N, for T = c L."""
-    push_tangent: Any
-    push_back: Any
-    """From adjoints of h and N: the symmetric part of the adjoint of T, as its diagonal and its other entries, and that
-    of x."""
-
-
 @cache
-def coarse_sums(discretisation: Discretisation) -> CoarseSums:
-    """Make the sums over neighbours of the push by a coarse pressure, for a discretisation."""
+def coarse_sums(discretisation: Discretisation) -> Kernels:
+    """Make the Warp functions of the sums over neighbours of the push by a coarse pressure, for T = c L: sum T_j g_ij,
+    which T_i g_i and c_i gamma_i complete to h, and the rows of N. The adjoint is from those of h and N to the
+    symmetric part of that of T, as its diagonal and its other entries, and to that of x."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     matrix, pair = matrix_type(precision), pair_functions(discretisation)
     packed, cross_terms = symmetric(precision), cross_terms_function(precision)
@@ -82,7 +70,7 @@ def coarse_sums(discretisation: Discretisation) -> CoarseSums:
         others = real(-0.5) * (cross_terms(from_j, g) + cross_terms(g, from_j))
         return -wp.cw_mul(from_j, g), others, x_part
 
-    return CoarseSums(push, push_tangent, push_back)
+    return Kernels(push, push_tangent, push_back)
 
 
 @cache
@@ -91,7 +79,7 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     sums, packed = coarse_sums(discretisation), symmetric(precision)
-    push, push_tangent, push_back = sums.push, sums.push_tangent, sums.push_back
+    push, push_tangent, push_back = sums.forward, sums.tangent, sums.adjoint
     six, pack, times = packed.kind, packed.pack, packed.times
     whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
     module, tangent_module, adjoint_module = discretisation.modules(topic)
@@ -134,24 +122,16 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     return Kernels((pull, coarse_push), (pull_tangent, coarse_push_tangent), (pull, coarse_push_adjoint))
 
 
-@dataclass(frozen=True)
-class ResidualKernels:
-    """Kernels of the residual r, the part of the divergence that a coarse pressure is to take away."""
-
-    residual: Any
-    residual_tangent: Any
-    residual_adjoint: Any
-    """From the adjoint of r to d_bar of D u and to S = d_bar L, which the adjoint of the pressure's update uses."""
-
-
 @cache
-def residual_kernels(discretisation: Discretisation, dimension: int) -> ResidualKernels:
-    """Make the kernels of the divergence that a coarse pressure takes away, in 2 or 3 dimensions."""
+def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
+    """Make the kernels of the residual r, the part of the divergence that a coarse pressure is to take away, in 2 or 3
+    dimensions. The adjoint is from that of r to d_bar of D u and to S = d_bar L, which the adjoint of the pressure's
+    update uses."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     sums = projection_sums(discretisation)
     spread, spread_tangent = image_sums(discretisation).spread, image_sums(discretisation).spread_tangent
-    gradient, gradient_tangent = sums.velocity_gradient, sums.velocity_gradient_tangent
+    gradient, gradient_tangent = sums.velocity_gradient.forward, sums.velocity_gradient.tangent
     packed, clamp = symmetric(precision), clamp_functions(precision)
     wanted, wanted_tangent = clamp.wanted, clamp.wanted_tangent
     six, pack = packed.kind, packed.pack
@@ -244,4 +224,4 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
             full_part = (real(1.0) - n_i) / time_step * found
         return n_part, weights4(no, full_part, no, no), b / time_step * found, -found, found, found * pack(L_i)
 
-    return ResidualKernels(residual, residual_tangent, residual_adjoint)
+    return Kernels(residual, residual_tangent, residual_adjoint)

@@ -117,7 +117,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     six, pack = packed.kind, packed.pack
     mirrors = image_sums(discretisation)
     spread, spread_tangent, lift, lift_back = mirrors.spread, mirrors.spread_tangent, mirrors.lift, mirrors.lift_back
-    gradient, gradient_tangent = sums.velocity_gradient, sums.velocity_gradient_tangent
+    gradient, gradient_tangent = sums.velocity_gradient.forward, sums.velocity_gradient.tangent
     topic = f"projection_{dimension}d"
     module, tangent_module, adjoint_module = discretisation.modules(topic)
     weights4 = weights_type(precision)
@@ -262,7 +262,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         return A * v
 
     even = divergence_adjoint_of("divergence_adjoint", sums.divergence_back, six, packed.times)
-    uneven = divergence_adjoint_of("divergence_adjoint_whole", sums.velocity_gradient_back, matrix, whole_times)
+    uneven = divergence_adjoint_of("divergence_adjoint_whole", sums.velocity_gradient.adjoint, matrix, whole_times)
     return PressureKernels(
         Kernels(update, update_tangent, (clamp_adjoint, even, uneven)),
         whole_adjoint,

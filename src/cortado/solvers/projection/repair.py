@@ -50,17 +50,13 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, weights4 = precision.pair, weights_type(precision)
     sums, densities = projection_sums(discretisation), density_sums(discretisation)
-    push, push_tangent, push_back = sums.push, sums.push_tangent, sums.push_back
+    push, push_tangent, push_back = sums.push.forward, sums.push.tangent, sums.push.adjoint
     mirrors = image_sums(discretisation)
     image_weights, image_weights_tangent = mirrors.weights, mirrors.weights_tangent
     lift, lift_tangent, lift_back = mirrors.lift, mirrors.lift_tangent, mirrors.lift_back
     behind, behind_tangent, behind_back = mirrors.behind, mirrors.behind_tangent, mirrors.behind_back
     mirror_of = mirrors.mirror_of
-    weights, weights_tangent, weights_adjoint = (
-        densities.weights,
-        densities.weights_tangent,
-        densities.weights_adjoint,
-    )
+    weights, weights_tangent, weights_adjoint = densities.forward, densities.tangent, densities.adjoint
     topic = f"projection_{dimension}d"
     module, tangent_module, adjoint_module = discretisation.modules(topic)
     own = {name: kind for name, kind in entries(precision).items() if name in ("gamma", "a", "weights", "image")}

@@ -38,31 +38,22 @@ class ProjectionSums:
     """Warp functions of the projection's sums over neighbours; a symmetric matrix comes as its diagonal and its entries
     yz, xz and xy."""
 
-    moments: Any
+    moments: Kernels
     """M = -sum g_ij x_ij^T, Q = sum h_ij g_ij g_ij^T / m_j, g = sum g_ij, the crowding sum (1 + R q / (1 + q / 4))
     g_ij, with h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2 and q = (W_ij / W(s))^4, for 1 / (V W(s)) ``per_nearest``;
     sum p_ij with p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij, which moves pairs apart, for 1 / (0.65 s)^2
-    ``per_apart``; and sum V W_ij, to which what fills lists up adds."""
-    moments_tangent: Any
-    moments_back: Any
-    """The adjoints of x and m by those of the moments, with ``n_bar`` of the last one."""
-    force: Any
-    """sum_j T_j g_ij, for T = k L, which T_i g_i completes."""
-    force_tangent: Any
-    force_back: Any
-    """From adjoints f of the force: the symmetric part of sum f_ij g_ij^T, and the adjoint of x."""
-    velocity_gradient: Any
-    """The rows of A = sum v_ij g_ij^T, which lacks M^-1 to be the gradient."""
-    velocity_gradient_tangent: Any
-    velocity_gradient_back: Any
-    """From an adjoint of A: the adjoint of v without A_bar_i g_i, and that of x."""
+    ``per_apart``; and sum V W_ij, to which what fills lists up adds. The adjoint is that of x and m, with ``n_bar`` of
+    the last sum."""
+    force: Kernels
+    """sum_j T_j g_ij, for T = k L, which T_i g_i completes. From adjoints f of it: the symmetric part of
+    sum f_ij g_ij^T, and the adjoint of x."""
+    velocity_gradient: Kernels
+    """The rows of A = sum v_ij g_ij^T, which lacks M^-1 to be the gradient. From an adjoint of A: that of v without
+    A_bar_i g_i, and that of x."""
     divergence_back: Any
     """The adjoints of v and x where that of A is symmetric, S = d L for an adjoint d of the divergence L : A."""
-    push: Any
-    """sum (c_i + c_j) g_ij"""
-    push_tangent: Any
-    push_back: Any
-    """From adjoints f of the push: sum g_ij . f_ij, and the adjoint of x."""
+    push: Kernels
+    """sum (c_i + c_j) g_ij. From adjoints f of it: sum g_ij . f_ij, and the adjoint of x."""
 
 
 @cache
@@ -254,10 +245,11 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         )
 
     return ProjectionSums(
-        *(moments, moments_tangent, moments_back),
-        *(force, force_tangent, force_back),
-        *(velocity_gradient, velocity_gradient_tangent, velocity_gradient_back, divergence_back),
-        *(push, push_tangent, push_back),
+        Kernels(moments, moments_tangent, moments_back),
+        Kernels(force, force_tangent, force_back),
+        Kernels(velocity_gradient, velocity_gradient_tangent, velocity_gradient_back),
+        divergence_back,
+        Kernels(push, push_tangent, push_back),
     )
 
 
@@ -287,7 +279,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
 
     typed = TypesByName(real, {vector: "total lifted g gamma v diagonal others x f", six: "T", matrix: "L"})
 
-    @particle_kernel(module, "kick u", [over(sums.force, "total"), over(mirrors.lift, "lifted")])
+    @particle_kernel(module, "kick u", [over(sums.force.forward, "total"), over(mirrors.lift, "lifted")])
     @typed
     def velocity(total, lifted, m_i, y_i, T_i, g_i, gamma_i, v_star_i) -> tuple[vector, vector]:
         """Return the kick -D^T y / m by the pressure y, and the velocity u = v* + kick; T is y L."""
@@ -299,7 +291,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         """Return the pull T = y L of a pressure, and its tangent."""
         return y_i * pack(L_i), y_dot_i * pack(L_i) + y_i * pack(L_dot_i)
 
-    both = [over(sums.force_tangent, "total"), over(mirrors.lift_tangent, "lifted")]
+    both = [over(sums.force.tangent, "total"), over(mirrors.lift_tangent, "lifted")]
 
     @particle_kernel(tangent_module, "kick_dot u_dot", both)
     def velocity_tangent(
@@ -324,7 +316,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         kick_dot = -(change + m_dot_i * (u_i - v_star_i)) / m_i
         return kick_dot, v_star_dot_i + kick_dot
 
-    both = [over(sums.force_back, "diagonal others x_part"), over(mirrors.lift_back, "widened x_lift")]
+    both = [over(sums.force.adjoint, "diagonal others x_part"), over(mirrors.lift_back, "widened x_lift")]
 
     @particle_kernel(adjoint_module, "+y_bar +image_bar +L_bar +gamma_bar +x_bar", both)
     @typed
@@ -366,7 +358,7 @@ def velocity_gradient_kernels(discretisation: Discretisation, dimension: int) ->
 
         return velocity_gradient
 
-    back = over(sums.velocity_gradient_back, "v_part x_part", v="v_flow")
+    back = over(sums.velocity_gradient.adjoint, "v_part x_part", v="v_flow")
 
     @particle_kernel(modules[2], "+x_bar +v_flow_bar", [back])
     def velocity_gradient_adjoint(
@@ -375,7 +367,7 @@ def velocity_gradient_kernels(discretisation: Discretisation, dimension: int) ->
         return x_part, v_part + A_bar_i * g_i
 
     return Kernels(
-        gradient("velocity_gradient", modules[0], "A", sums.velocity_gradient),
-        gradient("velocity_gradient_tangent", modules[1], "A_dot", sums.velocity_gradient_tangent),
+        gradient("velocity_gradient", modules[0], "A", sums.velocity_gradient.forward),
+        gradient("velocity_gradient_tangent", modules[1], "A_dot", sums.velocity_gradient.tangent),
         velocity_gradient_adjoint,
     )

@@ -43,7 +43,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
-    moments, moments_tangent, moments_back = sums.moments, sums.moments_tangent, sums.moments_back
+    moments, moments_tangent, moments_back = sums.moments.forward, sums.moments.tangent, sums.moments.adjoint
     walls = beside_sums(discretisation)
     beside, beside_tangent, beside_back = walls.sums, walls.tangent, walls.back
     mirrors = image_sums(discretisation)
