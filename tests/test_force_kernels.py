@@ -207,7 +207,7 @@ class Emitter(Operation):
     """The last third of the particles wait in a nozzle, and some of them have left it."""
 
     inputs = ("x_free", "v_free", "outlet_in", "emitted_in", "nozzle_path", "flow_rate", "time_step")
-    outputs = ("x", "v", "outlet_out", "emitted_out")
+    outputs = ("x", "v", "outlet", "emitted")
 
     def __init__(self, cloud):
         super().__init__(cloud)
@@ -233,37 +233,36 @@ class Emitter(Operation):
             "flow_rate": random.uniform(0.2, 0.4, 1),
         }
 
-    def begun(self, values):
-        found = launch(self.kernels.begin, 1, **self.known, **values, outlet=np.zeros((1, 3)), emitted=np.zeros(1))
-        return {name: found[name] for name in ("outlet", "emitted")}
+    def begun(self, values, kind="forward", suffix=""):
+        known = self.known if kind == "forward" else {**self.known, "drift": self.begun(values)["drift"]}
+        out = {"outlet": np.zeros((1, 3)), "drift": np.zeros((1, 3)), "emitted": np.zeros(1)}
+        out = {f"{name}{suffix}": array for name, array in out.items()}
+        found = launch(getattr(self.kernels.begin, kind), 1, **known, **values, **out)
+        return {name: found[name] for name in out}
 
     def forward(self, values):
         given = {name: value for name, value in values.items() if name not in ("x", "v")}
-        out = {"x": VECTORS, "v": VECTORS, "outlet_out": np.zeros((1, 3)), "emitted_out": np.zeros(1)}
-        return launch(self.kernels.forward, **self.known, **given, **self.begun(values), **out)
+        begun = self.begun(values)
+        found = launch(self.kernels.forward, **self.known, **given, **begun, x=VECTORS, v=VECTORS)
+        return {**begun, **{name: found[name] for name in "xv"}}
 
     def tangent(self, values, dots):
-        given = {**self.known, **values, **dotted(dots)}
-        out = {"outlet_dot": np.zeros((1, 3)), "emitted_dot": np.zeros(1)}
-        begun = launch(self.kernels.begin_tangent, 1, **given, **out)
-        given |= {**self.begun(values), **{name: begun[name] for name in out}}
-        moved = {"x_dot": dots["x_free"], "v_dot": dots["v_free"]}
-        ends = {"outlet_out_dot": np.zeros((1, 3)), "emitted_out_dot": np.zeros(1)}
-        found = launch(self.kernels.tangent, **{**given, **moved, **ends})
-        return {name: found[f"{name}_dot"] for name in self.outputs}
+        begun = self.begun({**values, **dotted(dots)}, "tangent", "_dot")
+        given = {**self.known, **values, **self.begun(values), **dotted(dots), **begun}
+        found = launch(self.kernels.tangent, **{**given, "x_dot": dots["x_free"], "v_dot": dots["v_free"]})
+        return {
+            **{name: begun[f"{name}_dot"] for name in ("outlet", "emitted")},
+            **{n: found[f"{n}_dot"] for n in "xv"},
+        }
 
     def adjoint(self, values, bars):
         given = {**self.known, **values, **self.begun(values)}
         moved = {f"{name}_{kind}_bar": VECTORS for name in "xv" for kind in ("free", "prescribed")}
         found = launch(self.kernels.adjoint, **given, x_bar=bars["x"], v_bar=bars["v"], **moved)
         totals = {f"{name}_total": found[f"{name}_prescribed_bar"].sum(axis=0, keepdims=True) for name in "xv"}
-        bar = {
-            "outlet_bar": bars["outlet_out"],
-            "emitted_bar": bars["emitted_out"],
-            "nozzle_path_bar": np.zeros((4, 3)),
-        }
+        bar = {"outlet_bar": bars["outlet"], "emitted_bar": bars["emitted"], "nozzle_path_bar": np.zeros((4, 3))}
         bar |= {"flow_rate_bar": np.zeros(1), "time_step_bar": np.zeros(1)}
-        last = launch(self.kernels.collect, 1, **given, **totals, **bar)
+        last = launch(self.kernels.begin.adjoint, 1, **given, **totals, **bar)
         return {
             **{f"{name}_free": found[f"{name}_free_bar"] for name in "xv"},
             **{f"{name}_in": last[f"{name}_bar"] for name in ("outlet", "emitted")},

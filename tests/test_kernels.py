@@ -266,10 +266,9 @@ class DensityRatio(Operation):
 
     def adjoint(self, values, bars):
         given = {**values, **{name: self.forward(values)[name] for name in ("t", "y")}}
-        bar = launch(Kernels.density_ratio.adjoint[0], s=self.s, **given, y_bar=bars["y"], t_bar=np.zeros(N))
-        found = launch(
-            Kernels.density_ratio.adjoint[1], s=self.s, **given, t_bar=bar["t_bar"], **zeros("x_bar", "m_bar")
-        )
+        factor, total = Kernels.density_ratio.adjoint
+        bar = launch(factor, s=self.s, **given, y_bar=bars["y"], t_bar=np.zeros(N))
+        found = launch(total, s=self.s, **given, t_bar=bar["t_bar"], **zeros("x_bar", "m_bar"))
         return {"x": found["x_bar"], "m": found["m_bar"], "wall_y": bar["y_bar"]}
 
 
@@ -605,10 +604,11 @@ class Substep(Potential):
 
     def adjoint(self, values, bars):
         given = {**self.given, **self.record(values)}
-        given |= launch(self.kernels.scale_adjoint, **{**given, "c_bar": bars["c_new"], "y": self.empty})
+        scale, flux = self.kernels.flux.adjoint
+        given |= launch(scale, **{**given, "c_bar": bars["c_new"], "y": self.empty})
         shares = ("time_step_bar", "mobility_bar", "interface_width_bar")
         bar = {"c_bar": bars["c_new"], **zeros("x_bar", "n_bar", "m_bar", *shares)}
-        found = launch(self.kernels.flux.adjoint, **{**given, **bar, "z": self.empty})
+        found = launch(flux, **{**given, **bar, "z": self.empty})
         bar |= {name: found[name] for name in bar if name in found}
         found = bar | launch(self.kernels.potential.adjoint, **{**given, **bar, "z": found["z"]})
         return {
