@@ -15,7 +15,8 @@ import warp as wp
 
 from cortado.device.cells import cell_functions, cell_grid_type
 from cortado.device.lanes import lane_functions
-from cortado.particles.neighbourhood import UNROLL, Discretisation, loads, neighbourhood_type, pair_functions
+from cortado.device.precision import TypesByName
+from cortado.particles.neighbourhood import UNROLL, Discretisation, loads, pair_functions
 
 BITS = 32
 """Candidates that one thread compares before it appends."""
@@ -28,7 +29,7 @@ LEAST_AT_ONCE = 8
 @cache
 def append_function(discretisation: Discretisation) -> Any:
     """Make the Warp function that appends the particles which lanes have found to a list, in their order."""
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    neighbourhood = discretisation.types[2]
     lanes = lane_functions(discretisation.precision, discretisation.lanes)
     vote, ones, before = lanes.vote, lanes.ones, lanes.before
 
@@ -44,24 +45,24 @@ def append_function(discretisation: Discretisation) -> Any:
 
 
 @cache
+def scan_types(discretisation: Discretisation) -> TypesByName:
+    """Return the types of what the functions of a scan are given, by name: numbers are whole, ``x_i`` is where particle
+    i is, and ``positions`` (n,) are those of all particles."""
+    _, vector, neighbourhood = discretisation.types
+    names = {wp.array(dtype=vector): "positions", cell_grid_type(discretisation.precision): "grid", wp.vec3i: "c"}
+    return TypesByName(int, {vector: "x", neighbourhood: "s", **names})
+
+
+@cache
 def scan_by_bits(discretisation: Discretisation) -> Any:
     """Make the Warp function for one lane that appends particles first ... last - 1 within reach; ``own`` is left
     out."""
-    _, vector, neighbourhood = discretisation.types
     separation = pair_functions(discretisation).separation
     load = loads(discretisation.precision, discretisation.taped).vector
 
     @wp.func
-    def scan(
-        i: int,
-        own: int,
-        first: int,
-        last: int,
-        found: int,
-        x_i: vector,
-        positions: wp.array(dtype=vector),
-        s: neighbourhood,
-    ) -> int:
+    @scan_types(discretisation)
+    def scan(i, own, first, last, found, x_i, positions, s) -> int:
         capacity = s.neighbours.shape[0]
         limit = s.reach * s.reach
         total = found
@@ -99,22 +100,13 @@ def scan_by_bits(discretisation: Discretisation) -> Any:
 @cache
 def scan_by_lanes(discretisation: Discretisation) -> Any:
     """Make the Warp function for several lanes that appends particles first ... last - 1 within reach but ``own``."""
-    _, vector, neighbourhood = discretisation.types
     separation = pair_functions(discretisation).separation
     load = loads(discretisation.precision, discretisation.taped).vector
     LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
 
     @wp.func
-    def scan(
-        i: int,
-        own: int,
-        first: int,
-        last: int,
-        found: int,
-        x_i: vector,
-        positions: wp.array(dtype=vector),
-        s: neighbourhood,
-    ) -> int:
+    @scan_types(discretisation)
+    def scan(i, own, first, last, found, x_i, positions, s) -> int:
         limit = s.reach * s.reach
         total = found
         for candidate in range(first, last, LANES):
@@ -138,25 +130,13 @@ def scan_around(discretisation: Discretisation) -> Any:
 @cache
 def scan_by_rows(discretisation: Discretisation) -> Any:
     """Make the Warp function of `scan_around` that visits one row of cells after the other."""
-    vector = discretisation.precision.vector
-    grid_type = cell_grid_type(discretisation.precision)
-    neighbourhood = neighbourhood_type(discretisation.precision)
     cells = cell_functions(discretisation.precision)
     wrap, below, above = cells.wrap, cells.below, cells.above
     scan = scan_by_bits(discretisation) if discretisation.lanes == 1 else scan_by_lanes(discretisation)
 
     @wp.func
-    def scan_rows(
-        i: int,
-        own: int,
-        bottom: int,
-        c: wp.vec3i,
-        found: int,
-        x_i: vector,
-        positions: wp.array(dtype=vector),
-        grid: grid_type,
-        s: neighbourhood,
-    ) -> int:
+    @scan_types(discretisation)
+    def scan_rows(i, own, bottom, c, found, x_i, positions, grid, s) -> int:
         n_x = grid.shape[0]
         n_y = grid.shape[1]
         n_z = grid.shape[2]
@@ -181,9 +161,6 @@ def scan_by_rows(discretisation: Discretisation) -> Any:
 @cache
 def scan_at_once(discretisation: Discretisation) -> Any:
     """Make the Warp function of `scan_around` that visits all rows as one range, or row by row at the grid's ends."""
-    vector = discretisation.precision.vector
-    grid_type = cell_grid_type(discretisation.precision)
-    neighbourhood = neighbourhood_type(discretisation.precision)
     cells = cell_functions(discretisation.precision)
     wrap, below, above = cells.wrap, cells.below, cells.above
     separation = pair_functions(discretisation).separation
@@ -194,17 +171,8 @@ def scan_at_once(discretisation: Discretisation) -> Any:
     candidates = wp.types.vector(length=UNROLL, dtype=wp.int32)
 
     @wp.func
-    def scan_all(
-        i: int,
-        own: int,
-        bottom: int,
-        c: wp.vec3i,
-        found: int,
-        x_i: vector,
-        positions: wp.array(dtype=vector),
-        grid: grid_type,
-        s: neighbourhood,
-    ) -> int:
+    @scan_types(discretisation)
+    def scan_all(i, own, bottom, c, found, x_i, positions, grid, s) -> int:
         n_x = grid.shape[0]
         n_y = grid.shape[1]
         n_z = grid.shape[2]
