@@ -81,7 +81,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
     """Return the ray marching kernels: ``forward``, ``tangent`` and ``adjoint`` over pixels, ``gather`` over nodes."""
     real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
-    camera_tangent = camera_tangent_type(precision)
+    change = camera_tangent_type(precision)
     rays, interpolation = ray_functions(precision), interpolation_functions(precision)
     start, direction, distance = rays.start, rays.direction, rays.distance
     start_tangent, direction_tangent = rays.start_tangent, rays.direction_tangent
@@ -97,11 +97,13 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         """Return the diagonal vector of one cell [m]."""
         return vector(nodes.cell, nodes.cell, nodes.cell)
 
-    typed = TypesByName(real, {camera_struct: "camera", nodes_struct: "nodes", vector: "image", wp.vec2i: "spans"})
+    samples, poses = wp.array2d(dtype=rgba), wp.array(dtype=pose)
+    names = {camera_struct: "camera", change: "camera_dot", nodes_struct: "nodes", vector: "image", wp.vec2i: "spans"}
+    typed = TypesByName(real, {**names, wp.array3d(dtype=rgba): "field"})
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
-    def march(camera, nodes, thickness: real, background: vector, field: wp.array3d(dtype=rgba), image, spans):
+    def march(camera, nodes, thickness: real, background: vector, field, image, spans):
         """Write the image of a field, and as ``spans`` the range of samples of each ray that may lie in the field."""
         pixel = wp.tid()
         o = start(pixel, camera)
@@ -120,17 +122,9 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         spans[pixel] = span
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def march_tangent(
-        camera: camera_struct,
-        nodes: nodes_struct,
-        thickness: real,
-        background: vector,
-        spans: wp.array(dtype=wp.vec2i),
-        field: wp.array3d(dtype=rgba),
-        camera_dot: camera_tangent,
-        field_dot: wp.array3d(dtype=rgba),
-        # out
-        image_dot: wp.array(dtype=vector),
+        camera, nodes, thickness: real, background: vector, spans, field, camera_dot, field_dot, image_dot
     ):
         pixel = wp.tid()
         o = start(pixel, camera)
@@ -159,17 +153,9 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         image_dot[pixel] = total_dot + transmitted_dot * background
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def march_adjoint(
-        camera: camera_struct,
-        nodes: nodes_struct,
-        thickness: real,
-        field: wp.array3d(dtype=rgba),
-        image: wp.array(dtype=vector),
-        spans: wp.array(dtype=wp.vec2i),
-        image_bar: wp.array(dtype=vector),
-        # out
-        samples_bar: wp.array2d(dtype=rgba),
-        pose_bar: wp.array(dtype=pose),
+        camera, nodes, thickness: real, field, image, spans, image_bar, samples_bar: samples, pose_bar: poses
     ):
         """Write the adjoints of samples, [sample of the span, pixel], and of the pose, ray by ray."""
         pixel = wp.tid()
@@ -202,7 +188,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
-    def gather(camera, nodes, spans, samples_bar: wp.array2d(dtype=rgba), field_bar: wp.array3d(dtype=rgba)):
+    def gather(camera, nodes, spans, samples_bar: samples, field_bar):
         """Sum each node's adjoint from the samples in the eight cells around it, found by way of the screen."""
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)

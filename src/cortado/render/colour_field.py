@@ -151,7 +151,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
     wrap, cell_of, below, above = cells.wrap, cells.cell_of, cells.below, cells.above
     weight, gradient = smooth.weight, smooth.gradient
     place, nearest, image = node_functions(precision)
-    module = discretisation.module(False, "colour_field")
+    module, fields = discretisation.module(False, "colour_field"), wp.array3d(dtype=rgba)
 
     typed = TypesByName(real, {vector: "x colour", nodes_struct: "nodes", grid_type: "grid"})
 
@@ -173,9 +173,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
-    def colour_field(
-        nodes, grid, h: real, per_h: real, sigma: real, volume: real, x, colour, field: wp.array3d(dtype=rgba)
-    ):
+    def colour_field(nodes, grid, h: real, per_h: real, sigma: real, volume: real, x, colour, field: fields):
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)
         c = cell_of(x_g, grid)
@@ -189,19 +187,9 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
         field[k, j, i] = volume * total
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def colour_field_tangent(
-        nodes: nodes_struct,
-        grid: grid_type,
-        h: real,
-        per_h: real,
-        sigma: real,
-        volume: real,
-        x: wp.array(dtype=vector),
-        colour: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        colour_dot: wp.array(dtype=vector),
-        # out
-        field_dot: wp.array3d(dtype=rgba),
+        nodes, grid, h: real, per_h: real, sigma: real, volume: real, x, colour, x_dot, colour_dot, field_dot: fields
     ):
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)
