@@ -17,6 +17,7 @@ import warp as wp
 from cortado.device.cells import CellSort, cell_functions, cell_grid_type
 from cortado.device.grid import Grid
 from cortado.device.launching import MOST_PARTS, HostCopy, KernelLauncher
+from cortado.device.precision import TypesByName
 from cortado.errors import InputError
 from cortado.particles.candidates import append_function, scan_around
 from cortado.particles.moving_walls import MovingWalls, WallArrays
@@ -36,30 +37,16 @@ MOST_IMAGED = (2**31 - 1) // REFLECTIONS
 
 @cache
 def fill_kernel(discretisation: Discretisation) -> Any:
-    precision = discretisation.precision
-    vector = precision.vector
-    grid_type = cell_grid_type(precision)
-    neighbourhood = neighbourhood_type(precision)
+    precision, (_, vector, neighbourhood) = discretisation.precision, discretisation.types
+    kinds = {neighbourhood: "s", cell_grid_type(precision): "grid wall_grid moving_grid", wp.bool: "near_walls"}
+    typed = TypesByName(wp.int32, {**kinds, vector: "x"})
     cell_of = cell_functions(precision).cell_of
     scan = scan_around(discretisation)
     LANES, lane = discretisation.lanes, discretisation.lane
 
     @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
-    def fill(
-        s: neighbourhood,
-        grid: grid_type,
-        wall_grid: grid_type,
-        moving_grid: grid_type,
-        near_walls: wp.array(dtype=wp.bool),
-        bad_step: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vector),
-        # out
-        fluid_count: wp.array(dtype=wp.int32),
-        filling: wp.array(dtype=wp.int32),
-        count: wp.array(dtype=wp.int32),
-        all_count: wp.array(dtype=wp.int32),
-        needed: wp.array(dtype=wp.int32),
-    ):
+    @typed.arrays
+    def fill(s, grid, wall_grid, moving_grid, near_walls, bad_step, x, fluid_count, filling, count, all_count, needed):
         """List neighbours; ``needed``, for each range, becomes the longest list, also where there is no room for it.
         Scenes that have lost a particle, in ``bad_step``, get empty lists. ``near_walls`` comes from `_near_walls`."""
         i = s.first + wp.tid() // LANES

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import Named, bundle
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_of
 from cortado.particles.moving_walls import matrix_of
 from cortado.particles.particle_kernels import pointwise_kernels
@@ -115,16 +115,12 @@ def contact_kernels(precision: Precision) -> ContactKernels:
             of.shift[j] = way - x + origin
             of.depth[j] = d
 
+    vectors = "after other_after own face shift push twist other_sum"
+    typed = TypesByName(real, {vector: vectors, matrix: "turns other_turns", pair: "volumes", bool: "is_free"})
+
+    @typed
     def push(
-        after: vector,
-        turns: matrix,
-        other_after: vector,
-        other_turns: matrix,
-        other_scales: real,
-        own_i: vector,
-        face_i: vector,
-        plane_i: real,
-        shift_i: vector,
+        after, turns, other_after, other_turns, other_scales, own_i, face_i, plane_i, shift_i
     ) -> tuple[vector, vector, vector, real]:
         r = turns * own_i
         x, n = after + r - other_after - shift_i, other_turns * face_i
@@ -132,16 +128,9 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         f = (d * d * d) * n
         return f, wp.cross(r, f), wp.cross(x, f), d * d * d * d
 
+    @typed
     def give(
-        time_step_i: real,
-        density_i: real,
-        other_density_i: real,
-        is_free: bool,
-        volumes: pair,
-        push_sum_i: vector,
-        twist_sum_i: vector,
-        other_sum_i: vector,
-        square_sum_i: real,
+        time_step_i, density_i, other_density_i, is_free, volumes, push_sum_i, twist_sum_i, other_sum_i, square_sum_i
     ) -> tuple[vector, vector, vector, vector]:
         mass, other, strength = density_i * volumes[0], other_density_i * volumes[1], real(0.0)
         both = wp.where(is_free, mass * other / (mass + other), mass)
