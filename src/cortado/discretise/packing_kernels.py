@@ -105,23 +105,14 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
     functions = smoothing_functions(smoothing, FLOAT64)
     weight, slope = functions.weight, functions.slope
     module = kernel_module(f"packing_{smoothing.name}")
+    structs = {Around: "around", Placed: "placed", Equations: "equations", grid_type: "grid"}
+    whole = "starts counts others ends listed"
+    typed = TypesByName(real, {**structs, wp.bool: "free blind", wp.int32: whole, vector: "x moves"})
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def look_around(
-        first: wp.int32,
-        x: wp.array(dtype=vector),
-        blind: wp.array(dtype=wp.bool),
-        are_own: wp.bool,
-        around: Around,
-        placed: Placed,
-        grid: grid_type,
-        reach: real,
-        most: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        # out
-        counts: wp.array(dtype=wp.int32),
-        sums: wp.array(dtype=real),
-        others: wp.array(dtype=wp.int32),
+        first: int, x, blind, are_own: bool, around, placed, grid, reach: real, most: int, starts, counts, sums, others
     ):
         """Count the points ``around`` within reach of particles at x, up to ``most``; list them, as far as there is
         room from ``starts`` on; and sum up their weighted kernels. ``blind`` particles do not see air; where they
@@ -149,11 +140,9 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         counts[i] = count
         sums[i] = total
 
-    typed = TypesByName(real, {wp.bool: "free", wp.int32: "starts ends listed", vector: "moves"})
-
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
-    def linearise(around: Around, free, starts, ends, listed, close: real, sums, equations: Equations, distances):
+    def linearise(around, free, starts, ends, listed, close: real, sums, equations, distances):
         """Add up the weighted kernels of points ``listed`` between ``starts`` and ``ends``. Behind the pairs of the
         particles before it, each particle appends its own to the equations, if one of them is free; and the distances
         of pairs nearer than ``close`` [m]."""
@@ -193,7 +182,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
-    def multiply(equations: Equations, moves, changes, approaches):
+    def multiply(equations, moves, changes, approaches):
         """Add the changes of sums of kernels and distances by the particles' moves."""
         i = wp.tid()
         move = moves[i]
@@ -209,7 +198,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
-    def multiply_back(equations: Equations, changes, approaches, moves):
+    def multiply_back(equations, changes, approaches, moves):
         """Add the product of changes and approaches with the transposed derivatives to the moves."""
         i = wp.tid()
         change = changes[i]
