@@ -216,14 +216,11 @@ def test_a_batch_goes_on_from_where_it_stopped():
         simulation.run(2, state=[run.last_state for run in first[:2]])
 
 
-def test_a_batch_of_one_has_an_axis():
+def test_a_batch_of_one_has_an_axis_and_gradients_an_entry_for_each_scene():
     problem = Problem(Simulation(scenes.plane(), batch=1), 3, CentreOfMass([0.1, 0.1]))
     loss, gradient = problem.value_and_gradient({"gravity": [0.0, -9.0], "viscosity": [0.1]})
     assert loss.shape == (1,) and gradient["gravity"].shape == (1, 2) and gradient["viscosity"].shape == (1,)
-
-
-def test_gradients_have_an_entry_for_each_scene():
-    """In the shape of a value that has one, and with an axis more than a value for all."""
+    # In the shape of a value that has one, and with an axis more than a value for all.
     problem = Problem(Simulation(scenes.plane(), batch=4), 3, CentreOfMass([0.1, 0.1]))
     shapes = {"gravity": (4, 1, 2), "viscosity": (), "time_step": (4,), "initial_velocities": (64, 2)}
     given = {name: np.full(shape, 0.002) for name, shape in shapes.items()}

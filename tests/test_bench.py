@@ -73,14 +73,11 @@ def test_floors_are_those_of_the_passes_and_only_sums_over_neighbours_have_pairs
     assert 0.0 < memory["forward_bytes_per_particle"] < memory["gradient_bytes_per_particle"]
 
 
-def test_bytes_of_a_launch_are_its_entries():
+def test_bytes_of_a_launch_are_its_entries_and_of_a_sum_over_neighbours_its_list():
     x, y = wp.zeros(10, dtype=wp.vec3f, device="cpu"), wp.zeros(20, dtype=wp.int32, device="cpu")
     assert least_bytes([x, y, 3.0], 10, 10, 0) == 10 * 12 + 10 * 4
     assert least_bytes([x, x], 10, 10, 0) == 120, "an array counts once"
     assert least_bytes([x, y], 1, 10, 0) == 12 + 4, "one thread, one entry"
-
-
-def test_bytes_of_a_sum_over_neighbours_have_its_list():
     solver = Simulation(dam_break(27)).solver
     neighbourhood = solver.context(solver.new_parameters(1)).neighbourhood
     x = solver.fields["x"]

@@ -145,12 +145,9 @@ def test_pairs_are_those_of_all_pairs(monkeypatch, lengths):
     assert len(np.unique(np.stack([first, second]), axis=1).T) == len(first)
 
 
-def test_a_point_just_below_the_period_is_in_it():
+def test_a_point_just_below_the_period_is_in_it_and_no_points_have_no_pairs():
     points = np.array([[-1e-18, 0.0], [0.9, 0.0]])  # the remainder of the first is the length itself
     assert sorted(pairs_within(points, points, 0.15, 0.0, [1.0, 0.0])[2].round(12)) == [0.0, 0.0, 0.1, 0.1]
-
-
-def test_no_points_have_no_pairs():
     none = np.zeros((0, 3))
     assert [len(part) for part in pairs_within(none, none, 0.1)] == [0, 0, 0]
 

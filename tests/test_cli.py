@@ -122,15 +122,12 @@ def test_options_of_run_and_the_scene_of_a_folder_give_the_same_run(run):
     np.testing.assert_array_equal(again.positions[[0, 2, 4, 5]], trajectory.positions)
 
 
-def test_an_earlier_run_is_kept_unless_overwritten(run):
+def test_an_earlier_run_is_kept_unless_overwritten_and_other_files_are_never(run, folder):
     run("--steps", 2)
     assert_refused(run("--steps", 3), "already holds a run", "--overwrite")
     assert len(metrics("dam")) == 2
     assert run("--steps", 3, "--overwrite")[0] == 0
     assert len(metrics("dam")) == 3 and len(Trajectory.load("dam/trajectory.vtkhdf").times) == 4
-
-
-def test_other_files_are_never_overwritten(run, folder):
     (folder / "figures").mkdir()
     assert_refused(run("--overwrite", out="."), "no run of Cortado")
     assert_refused(run(out="task.toml"), "cannot be written")
@@ -761,16 +758,13 @@ def test_a_wrong_task_of_images_is_refused(optimise, folder, override, words):
 # ---- gradients and bench -----------------------------------------------------------------------------------------
 
 
-def test_a_right_gradient_passes_the_check(cortado_command):
+def test_a_right_gradient_passes_the_check_in_words_and_in_json(cortado_command):
     code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 3)
     assert (code, err) == (0, "") and "64 particles, 3 steps" in out
     rows = [line for line in out.splitlines() if line.rstrip(" │").endswith("right")]
     assert len(rows) == 6 and "WRONG" not in out
     assert "The adjoint is right: reverse and forward mode agree to 1" in out
     assert out.endswith("For 3 steps use gradients.Exact().\n")
-
-
-def test_the_check_speaks_json(cortado_command):
     code, out, _ = cortado_command("gradients", "check", "scene.toml", "--steps", 3, "--json")
     certificate = json.loads(out)
     assert code == 0 and certificate["right"] is True and certificate["wrong"] == []

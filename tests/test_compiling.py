@@ -208,13 +208,10 @@ def test_kernels_for_a_cpu_are_vectorised_deeper_unless_flags_are_given(monkeypa
     assert kernel_module("of_a_test").options["cpu_compiler_flags"] == wanted
 
 
-def test_warps_own_flags_are_those_that_were_measured():
+def test_kernels_have_the_flags_that_were_measured():
     program = "import warp; print(warp.config.cpu_compiler_flags)"  # in the tests they are others
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert SHALLOW in found.stdout
-
-
-def test_all_modules_are_compiled_with_the_same_flags():
     kernels = kernels_of(cortado.Simulation(plane()).solver)
     assert kernels and all(kernel.module.options["cpu_compiler_flags"] is not None for kernel in kernels)
 

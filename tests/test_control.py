@@ -86,15 +86,12 @@ def test_a_tank_always_arrives_and_stands(blocks):
     assert chosen.time_step * velocities.sum() == pytest.approx(chosen.distance)
 
 
-def test_a_cup_always_arrives_and_stands():
+def test_a_cup_always_arrives_and_a_nozzle_stays_in_its_reach():
     chosen = task("carry_cup", "small")
     u = np.random.default_rng(0).uniform(-1.0, 1.0, chosen.controls.numbers)
     path = chosen.controls.parameters(u)["cup.displacement"]
     np.testing.assert_allclose(path[chosen.moving - 1 :], [[chosen.distance, 0.0]] * (chosen.standing + 1), atol=1e-12)
     assert np.abs(path[0]).max() < 1e-3 and np.ptp(path[:, 0]) > 0.1
-
-
-def test_a_nozzle_stays_in_its_reach():
     chosen = task("latte", "small")
     for u in (np.ones(25), -np.ones(25), np.random.default_rng(0).choice([-1.0, 1.0], 25)):
         path = chosen.controls.parameters(u)["nozzle_path"]
@@ -227,7 +224,7 @@ def record_of(seed, loss=0.5):
     return Record(run, [10.0], [loss], [0.0], {"sloshing": loss}, 10, 10, 0.1, "0.1.0")
 
 
-def test_a_record_is_added_to_the_end_of_its_file(tmp_path):
+def test_a_record_is_added_to_the_end_of_its_file_and_the_last_of_a_run_counts(tmp_path):
     """A file that is written anew for each record takes longer with each."""
     records = Records(tmp_path / "runs.jsonl")
     records.add(record_of(1))
@@ -235,6 +232,10 @@ def test_a_record_is_added_to_the_end_of_its_file(tmp_path):
     records.add(record_of(2))
     assert records.path.stat().st_ino == before[0] and records.path.read_bytes().startswith(before[1])
     assert records.read() == [record_of(1), record_of(2)]
+    records = Records(tmp_path / "runs.jsonl")
+    for one in (record_of(1), record_of(2), record_of(1, loss=0.25)):
+        records.add(one)
+    assert records.read() == [record_of(1, loss=0.25), record_of(2)]
 
 
 def test_a_record_that_was_cut_off_is_left_aside(tmp_path):
@@ -250,13 +251,6 @@ def test_a_record_that_was_cut_off_is_left_aside(tmp_path):
     records.path.write_bytes(b"{}\n" + whole)
     with pytest.raises(InputError, match=r"Line 1 of .*runs\.jsonl is no run of this benchmark"):
         records.read()
-
-
-def test_the_last_record_of_a_run_counts(tmp_path):
-    records = Records(tmp_path / "runs.jsonl")
-    for one in (record_of(1), record_of(2), record_of(1, loss=0.25)):
-        records.add(one)
-    assert records.read() == [record_of(1, loss=0.25), record_of(2)]
 
 
 @pytest.mark.parametrize(

@@ -126,25 +126,19 @@ def test_links_lead_to_files():
     assert not missing
 
 
-def test_paths_in_backticks_are_there():
+def test_there_is_code_and_names_and_paths_in_files_are_there():
+    assert CODE["runs.md"]
+    assert len(TUTORIALS) == 8 and len(COMMANDS) > 15
+    # Of "`NAME` of `path`" and the like, in what contributors read.
+    text = "".join((ROOT / name).read_text(encoding="utf-8") for name in ("CONTRIBUTING.md", "docs/adding_parts.md"))
+    found = re.findall(r"`(\w+)`\s+(?:of|in|there in)\s+`((?:src|tests)/\S+\.py)`", text)
+    assert len(found) > 15
+    assert not [(name, path) for name, path in found if not re.search(rf"\b{name}\b", (ROOT / path).read_text("utf-8"))]
     texts = [*DOCUMENTS.values(), *((ROOT / name).read_text("utf-8") for name in ("README.md", "CONTRIBUTING.md"))]
     path = r"`((?:src|tests|docs|examples|reference|fuzz|validation)/[^` *]*)`"
     found = {one for text in texts for one in re.findall(path, text)}
     assert len(found) > 50
     assert not {path for path in found if not (ROOT / path).exists()}
-
-
-def test_names_in_files_are_there():
-    """Of "`NAME` of `path`" and the like, in what contributors read."""
-    text = "".join((ROOT / name).read_text(encoding="utf-8") for name in ("CONTRIBUTING.md", "docs/adding_parts.md"))
-    found = re.findall(r"`(\w+)`\s+(?:of|in|there in)\s+`((?:src|tests)/\S+\.py)`", text)
-    assert len(found) > 15
-    assert not [(name, path) for name, path in found if not re.search(rf"\b{name}\b", (ROOT / path).read_text("utf-8"))]
-
-
-def test_there_is_code():
-    assert CODE["runs.md"]
-    assert len(TUTORIALS) == 8 and len(COMMANDS) > 15
 
 
 PAGE, FILMS = ROOT / "docs/gallery.md", ROOT / "docs/images/films"
@@ -204,16 +198,13 @@ def test_a_page_from_elsewhere_is_there_and_says_where(page, file):
     assert f"](../{file})" in (DOCS / f"{page}.md").read_text(encoding="utf-8")
 
 
-def test_bars_around_a_number_are_no_relations():
+def test_bars_and_primes_of_formulas_are_as_they_should():
     """Without a form, a bar inside of a formula has room on both sides, and its superscript hangs below it."""
     bar = '<mo form="{}" stretchy="false" lspace="0" rspace="0">&#x0007C;</mo>'
     left, right, alone = bar.format("prefix"), bar.format("postfix"), '<mo stretchy="false">&#x0007C;</mo>'
     made = mathml.mathml(r"a \lvert c_i - c_j \rvert^2 + P(x | y) \lvert z \rvert", "inline")
     assert re.findall(r"<mo[^>]*>&#x0007C;</mo>", made) == [left, right, alone, left, right]
     assert f"<msup>{right}<mn>2</mn></msup>" in made
-
-
-def test_primes_are_as_large_as_their_letter():
     made = mathml.mathml(r"\alpha f'' + f'(x) + g^2", "block")
     assert made.count("<msup>") == 1 and 'display="block"' in made
     for prime in ("2", "3"):

@@ -20,9 +20,12 @@ from cortado.runs.frames import Pace
 from cortado.scene.appearance import Moment, View
 from cortado.scene.model import Bingham, SceneTables
 from every_key import given, key_at, keys_of, places, put, same, told
-from scenes import jet, plane, plane_of_three, scene, two_layers
+from scenes import box, jet, plane, plane_of_three, scene, two_layers
 
-ROOM = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8], "slip": "no"}
+ROOM = box([0.0, 0.0], [0.6, 0.8], slip="no")
+RENDER = {"resolution": [16, 16]}
+ROUND = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.4}
+MOVED = {"times": [0.0, 0.01], "values": [[0.3, 0.26], [0.31, 0.26]]}
 LAW = {"kind": "bingham", "yield_stress": 3.0, "regularisation": 0.2}
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.5}
 OF_WATER = {"phase": "water", "velocity": [0.1, 0.0], "angular_velocity": 3.0}
@@ -51,24 +54,16 @@ np.save(DROPS, (np.array(BESIDE)[:, None] + 0.05 * np.array([[0.0, 0.0], [-1.0, 
 np.save(AROUND, [[0.35, 0.3, 0.3], [0.6, 0.3, 0.3], [0.85, 0.3, 0.3]])
 IN_THE_PLANE = [
     {
-        **{"name": "box", "shape": "box", "lower": [0.1, 0.3], "upper": [0.3, 0.5], "rotation": 0.3},
+        **box([0.1, 0.3], [0.3, 0.5], name="box", rotation=0.3, colour=[0.2, 0.5, 0.3], transparency=0.3),
         **{"motion": "path", "times": [0.0, 0.1], "positions": [[0.2, 0.4], [0.3, 0.4]], "rotations": [0.0, 0.1]},
-        **{"colour": [0.2, 0.5, 0.3], "transparency": 0.3},
     },
     {
-        **{"name": "disc", "shape": "sphere", "centre": [0.5, 0.42], "radius": 0.1},
-        **{"motion": "free", "density": 300.0, "velocity": [0.3, 0.1], "angular_velocity": 1.0, "slip": "free"},
+        **{"name": "disc", "shape": "sphere", "centre": [0.5, 0.42], "radius": 0.1, "slip": "free"},
+        **{"motion": "free", "density": 300.0, "velocity": [0.3, 0.1], "angular_velocity": 1.0},
     },
     {
-        **{
-            "name": "rod",
-            "shape": "capsule",
-            "start": [0.7, 0.3],
-            "end": [0.7, 0.4],
-            "radius": 0.05,
-            "position": [0.7, 0.36],
-        },
-        **{"motion": "path", "velocity": [0.3, 0.0], "angular_velocity": 2.0},
+        **{"name": "rod", "shape": "capsule", "start": [0.7, 0.3], "end": [0.7, 0.4], "radius": 0.05},
+        **{"position": [0.7, 0.36], "motion": "path", "velocity": [0.3, 0.0], "angular_velocity": 2.0},
     },
     {
         **{"name": "cup", "shape": "cup", "base": [1.0, 0.2], "radius": 0.1, "height": 0.3, "thickness": 0.06},
@@ -94,19 +89,14 @@ BASES = {
         container=ROOM,
         emitter={**jet().emitter.model_dump(), "duration": 0.5},
         solver={"kind": "projection", "tolerance": 3e-5, "time_step": 0.001, "velocities_follow": True},
-        schedule={
-            "tilt": {"times": [0.0, 1.0], "values": [[5.0], [20.0]]},
-            "nozzle_path": {"times": [0.0, 0.01], "values": [[0.3, 0.26], [0.31, 0.26]]},
-        },
+        schedule={"tilt": {"times": [0.0, 1.0], "values": [[5.0], [20.0]]}, "nozzle_path": MOVED},
     ),
     "chosen": lambda: jet(
         phase=[{**WATER, "rheology": {"kind": "power_law", "flow_index": 0.6, "least_shear_rate": 0.1}}],
         solver={"kind": "pcisph", "time_step": "auto", "courant": 0.02},
         forces={"surface_tension": 0.07},
     ),
-    "mixture": lambda: plane_of_three(
-        render={"resolution": [16, 16], "background": [0.5, 0.6, 0.7], "extinction": 5.0},
-    ),
+    "mixture": lambda: plane_of_three(render={**RENDER, "background": [0.5, 0.6, 0.7], "extinction": 5.0}),
     "bodies": lambda: plane(
         phase=[{**WATER, "rheology": {**LAW, "kind": "herschel_bulkley", "flow_index": 0.5, "least_shear_rate": 0.1}}],
         fluid=[
@@ -140,16 +130,9 @@ BASES = {
         discretisation=COARSE,
         phase=[{**WATER, "rheology": {"kind": "carreau", "relaxation_time": 0.1, "flow_index": 0.5}}],
         forces={},
-        container={"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.4, "height": 0.9, "slip": "no", **GLASS},
+        container={**ROUND, "height": 0.9, "slip": "no", **GLASS},
         fluid=[
-            {
-                "shape": "cylinder",
-                "base": [0.0, 0.0, 0.0],
-                "radius": 0.4,
-                "height": 0.2,
-                "rotation": [0.1, 0.0, 0.0],
-                "phase": "water",
-            },
+            {**ROUND, "height": 0.2, "rotation": [0.1, 0.0, 0.0], "phase": "water"},
             {"shape": "mesh", "file": BLOCK, "scale": 0.2, "position": [0.0, 0.6, 0.0], "phase": "water"},
         ],
         picture={"width": 64, "height": 64, "surface": "spheres", "camera_path": FRAMES},
@@ -233,9 +216,12 @@ def test_a_key_changed_alone_acts_or_is_refused(base, path):
     assert acts
 
 
-BELT = {"name": "belt", "shape": "box", "lower": [0.2, 0.3], "upper": [0.4, 0.4]}
-TANK = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8]}
+BELT = box([0.2, 0.3], [0.4, 0.4], name="belt")
+TANK = box([0.0, 0.0], [0.6, 0.8])
 MUD_PHASE = {"name": "mud", "rest_density": 1000.0, "viscosity": 0.5}
+PROJECTION = {"kind": "projection", "time_step": 1e-3}
+BALL = {"name": "ball", "shape": "sphere", "centre": [0.5, 0.6], "radius": 0.1}
+STIFF = Bingham(yield_stress=0.0, regularisation=0.3)
 SHAKEN = {"gravity": {"times": [0.0, 1.0], "values": [[0.0, -9.81], [2.0, -9.81]]}}
 MUD = {"fluid": [{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.2], "phase": "mud"}]}
 KEYFRAMES = {"kind": "keyframes", "times": [0.0, 1.0], "cameras": [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]}
@@ -269,17 +255,11 @@ REFUSED = {
 WARNED = {
     "mixture.strength": lambda: two_layers(mixture={"strength": 2.0, "mobility": 0.0}),
     "container.slip": lambda: plane(container={**TANK, "slip": "no"}, forces={"viscosity": "none"}),
-    "solver.iterations": lambda: plane(
-        solver={"kind": "projection", "time_step": 1e-3, "iterations": 5}, forces={"pressure": False}
-    ),
+    "solver.iterations": lambda: plane(solver={**PROJECTION, "iterations": 5}, forces={"pressure": False}),
     "emitter.length": lambda: jet(emitter={**jet().emitter.model_dump(), "length": 1.0, "duration": 0.05}),
-    "solid[0].centre": lambda: plane(
-        solid=[{"name": "ball", "shape": "sphere", "centre": [0.5, 0.6], "radius": 0.1, "position": [0.5, 0.7]}]
-    ),
+    "solid[0].centre": lambda: plane(solid=[{**BALL, "position": [0.5, 0.7]}]),
     "discretisation.jitter": lambda: jet(discretisation={"spacing": 0.05, "jitter": 0.1}, fluid=[]),
-    "phase[0].rheology.regularisation": lambda: plane(
-        phase=[{**MUD_PHASE, "rheology": Bingham(yield_stress=0.0, regularisation=0.3)}], **MUD
-    ),
+    "phase[0].rheology.regularisation": lambda: plane(phase=[{**MUD_PHASE, "rheology": STIFF}], **MUD),
 }
 
 

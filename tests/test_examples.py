@@ -177,26 +177,17 @@ def test_a_command_is_one(command, monkeypatch):
             assert load(word) is not None
 
 
-def test_there_are_commands():
+def test_the_readme_has_commands_files_and_targets_that_are_there():
     wanted = {"new", "describe", "run", "optimise", "sweep", "gradients"}
     assert {command.split()[0] for command in COMMANDS} == wanted
-
-
-def test_its_files_are_there():
     linked = re.findall(r"\]\(([^):]+)\)", README)
     named = re.findall(r"\b(?:docs|examples|tests|validation)/[\w/.]+\w", README)
     assert len(linked) >= 3 and len(named) >= 8
     assert [name for name in [*linked, *named] if not (ROOT / name).exists()] == []
-
-
-def test_its_targets_are_in_the_makefile():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     targets = re.findall(r"^    make (\w+)$", README, re.MULTILINE)
     assert targets == ["demo", "test"]
     assert set(targets) <= set(re.search(r"^TASKS := (.*)$", makefile, re.MULTILINE)[1].split())
-
-
-def test_it_names_no_path_of_a_machine():
     assert re.findall(r"(?<![\w.:/])/(?:home|root|work|tmp|Users|mnt)\b", README) == []
 
 

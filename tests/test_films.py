@@ -35,27 +35,18 @@ def frames_of(path):
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
-def test_an_orbit_goes_around_what_it_looks_at():
+def test_cameras_orbit_come_near_go_through_keyframes_and_follow():
     quarter = Orbit().view(HOME, moment(0.25))
     np.testing.assert_allclose(quarter.eye, [4.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(quarter.look_at, HOME.look_at)
     np.testing.assert_allclose(Orbit(turns=-0.5).view(HOME, moment(0.5)).eye, [-4.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(Orbit(turns=2.0).view(HOME, moment(1.0)).eye, HOME.eye, atol=1e-12)
-
-
-def test_a_dolly_comes_near():
     distances = [np.linalg.norm(Dolly(distance=0.5).view(HOME, moment(s)).eye - HOME.look_at) for s in (0.0, 0.5, 1.0)]
     np.testing.assert_allclose(distances, [4.0, 4.0 * 0.5**0.5, 2.0])
-
-
-def test_keyframes_are_gone_through_and_rested_at():
     path = Keyframes(times=[1.0, 2.0, 4.0], cameras=[[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 2.0, 1.0]])
     for time, place in ((0.0, [0, 0, 1]), (1.0, [0, 0, 1]), (2.0, [1, 0, 1]), (4.0, [1, 2, 1]), (9.0, [1, 2, 1])):
         np.testing.assert_allclose(path.view(HOME, moment(0.0, time)).eye, place, atol=1e-12)
     np.testing.assert_allclose(path.view(HOME, moment(0.0, 1.5)).look_at, HOME.look_at)
-
-
-def test_who_follows_a_solid_has_it_in_the_middle():
     seen = Follow(solid="raft", distance=0.5).view(HOME, moment(0.3, raft=np.array([3.0, 0.0, 1.0])))
     np.testing.assert_allclose(seen.look_at, [3.0, 0.0, 1.0])
     np.testing.assert_allclose(seen.eye, [3.0, 0.0, 3.0])

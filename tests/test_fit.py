@@ -327,15 +327,12 @@ def test_a_wrong_model_is_doubted_and_a_notebook_shows_numbers_with_bars_and_dou
     assert not cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5}).doubts
 
 
-def test_two_experiments_tell_more_than_one(shaken):
+def test_a_fit_of_two_experiments_tells_more_and_its_profile_is_a_parabola(shaken):
     pair = [with_shake(shaken, seed) for seed in (0, 1)]
     both = cortado.fit(pair, {"viscosity": 1.5})
     alone = cortado.fit(pair[0], {"viscosity": 1.5})
     assert both.standard_errors["viscosity"] < 0.95 * alone.standard_errors["viscosity"]
     assert [part.label for part in both.parts] == ["tracers of experiment 1", "tracers of experiment 2"]
-
-
-def test_a_profile_of_small_noise_is_a_parabola(shaken):
     found = cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5}).profile("viscosity", points=3)
     assert found.deviance == pytest.approx(found.expected, rel=0.1, abs=0.05)
 

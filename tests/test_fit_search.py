@@ -103,15 +103,12 @@ def test_a_search_holds_what_is_fixed_and_says_when_it_ran_out_of_trials():
     assert not search(made, begun, WEIGHTS, 1, 1e-12).converged
 
 
-def test_slopes_of_a_linear_function_are_exact():
+def test_slopes_of_linear_smooth_and_rough_values():
     random = np.random.default_rng(0)
     x, slopes = random.standard_normal((7, 3)), random.standard_normal((3, 5))
     values = 2.0 + x @ slopes
     weights = slope_weights(x, values @ values.T, 4)
     assert weights @ values == pytest.approx(slopes, abs=1e-9)
-
-
-def test_of_smooth_values_slopes_tell_the_curvature_and_of_rough_ones_the_trend():
     x = np.linspace(0.0, 1.0, 6)[:, None]
     smooth, rough = x**2, 0.1 * np.random.default_rng(0).standard_normal((6, 1000)) + x
     found = [(slope_weights(x, values @ values.T, 5) @ values).mean() for values in (smooth, rough)]

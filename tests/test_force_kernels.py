@@ -28,6 +28,13 @@ from test_kernels import CPU, DISCRETISATION, FLOAT64, N, Operation, by_input, c
 VECTORS = np.zeros((N, 3))
 
 
+def shares_of(found, bars):
+    """The adjoints of what surface tension depends on."""
+    tension = found["surface_tension_bar"].sum(keepdims=True)
+    own = {"x": found["x_bar"], "m": found["m_bar"], "surface_tension": tension}
+    return {**own, "acceleration_in": bars["acceleration"]}
+
+
 class SurfaceTension(Operation):
     """Normals and then the force."""
 
@@ -58,12 +65,7 @@ class SurfaceTension(Operation):
         bar = zeros("x_bar", "m_bar", "surface_tension_bar")
         bar |= launch(self.force.adjoint, **given, **bar, normals_bar=VECTORS)
         found = launch(self.normal.adjoint, **{**given, **bar})
-        return {
-            "x": found["x_bar"],
-            "m": bar["m_bar"],
-            "surface_tension": bar["surface_tension_bar"].sum(keepdims=True),
-            "acceleration_in": bars["acceleration"],
-        }
+        return shares_of({**bar, "x_bar": found["x_bar"]}, bars)
 
 
 class CurvatureTension(Operation):
@@ -108,12 +110,7 @@ class CurvatureTension(Operation):
         known = {**self.known(values), **change, **zeros("x_bar", "m_bar", "surface_tension_bar")}
         colour, normal, bend, mean = self.adjoints
         found = self.through((*mean, bend, normal, colour), {**known, "acceleration_bar": bars["acceleration"]})
-        return {
-            "x": found["x_bar"],
-            "m": found["m_bar"],
-            "surface_tension": found["surface_tension_bar"].sum(keepdims=True),
-            "acceleration_in": bars["acceleration"],
-        }
+        return shares_of(found, bars)
 
 
 class Circulation(Operation):

@@ -26,14 +26,8 @@ DISTANCES = {"top": SquaredDifference(), "volume": Pyramid(), "plane": Pyramid(l
 scenes = pytest.mark.parametrize("name", MAKERS)
 FRAMES = (0, 4, 12)
 SIZES = {
-    "gravity": 1.0,
-    "gravity over time": 1.0,
-    "initial_positions": 0.01,
-    "initial_velocities": 0.1,
-    "mass_fractions": 0.1,
-    "colours": 0.3,
-    "mobility": 0.01,
-    "viscosity": 0.05,
+    **{"gravity": 1.0, "gravity over time": 1.0, "initial_positions": 0.01, "initial_velocities": 0.1},
+    **{"mass_fractions": 0.1, "colours": 0.3, "mobility": 0.01, "viscosity": 0.05},
 }
 """Size of a direction of each parameter."""
 
@@ -107,9 +101,8 @@ def test_frames_add_up(name):
     problem, _ = case(name)
     point = point_of(problem)
     loss, gradient = problem.value_and_gradient(point)
-    alone = [
-        Problem(problem.simulation, step, one).value_and_gradient(point) for step, one in problem.loss.losses.items()
-    ]
+    own = problem.loss.losses.items()
+    alone = [Problem(problem.simulation, step, one).value_and_gradient(point) for step, one in own]
     assert loss == pytest.approx(sum(value for value, _ in alone), rel=1e-14)
     for key, found in gradient.items():
         parts = sum(part[key] for _, part in alone)
@@ -150,7 +143,7 @@ def test_a_target_cannot_be_changed_behind_the_back():
         loss.target[0] = 1.0
 
 
-def test_fingerprints_tell_targets_and_distances_apart():
+def test_fingerprints_tell_targets_distances_and_grids_apart():
     _, renderer = case("plane")
     made = [
         losses.Image(renderer, target_of(renderer)),
@@ -162,21 +155,28 @@ def test_fingerprints_tell_targets_and_distances_apart():
     ]
     assert len({loss.fingerprint for loss in made}) == len(made)
     assert made[0].fingerprint == losses.Image(renderer, target_of(renderer), SquaredDifference()).fingerprint
+    assert len({loss.fingerprint for loss in LOSSES}) == len(LOSSES)
+    assert Pyramid(weights=[1, 2]).fingerprint == Pyramid(weights=(1.0, 2.0)).fingerprint
+    given = {"smoothing": CUBIC_SPLINE, "support": 0.2, "volume": 1e-3, "particles": 5, "phases": 1}
+    view = TopView((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1, (20, 16))
+    grids = [
+        Renderer(view, np.zeros(3), upper, **given, precision=FLOAT64, device="cpu", cell=cell)
+        for upper, cell in (([1.0, 1.0, 1.0], 0.1), ([1.0, 1.0, 1.0], 0.05), ([1.0, 2.0, 1.0], 0.1))
+    ]
+    assert len({renderer.fingerprint for renderer in grids}) == 3
 
 
 def test_a_target_of_another_size_is_a_sentence():
     _, renderer = case("plane")
+    light = "but must be linear light from 0 to 1, as"
     for target, wanted in [
-        (
-            np.zeros((16, 21, 3)),
-            r"shape \(16, 21, 3\), but must have that of the renderer's pictures, \(16, 20, 3\)\.$",
-        ),
+        (np.zeros((16, 21, 3)), r"shape \(16, 21, 3\), but must have that of the renderer's .*, \(16, 20, 3\)\.$"),
         (np.zeros((16, 20)), r"shape \(16, 20\), but must be a picture \(rows, columns, 3\)\.$"),
         (np.full((16, 20, 3), np.nan), r"not finite, but must be made of finite numbers\.$"),
         ("heart", r"^target is 'heart', but must be a number or an array"),
-        (np.full((16, 20, 3), 200.0), r"a value of 200, but must be linear light from 0 to 1, as that of cortado"),
-        (np.full((16, 20, 3), -5.0), r"a value of -5, but must be linear light from 0 to 1, as that of cortado"),
-        (np.ones((16, 20, 3), np.uint8), r"made of whole numbers, but must be linear light from 0 to 1, as"),
+        (np.full((16, 20, 3), 200.0), f"a value of 200, {light} that of cortado"),
+        (np.full((16, 20, 3), -5.0), f"a value of -5, {light} that of cortado"),
+        (np.ones((16, 20, 3), np.uint8), f"made of whole numbers, {light}"),
     ]:
         with pytest.raises(InputError, match=wanted):
             losses.Image(renderer, target)
@@ -187,16 +187,6 @@ def test_a_distance_that_is_none_is_a_sentence(distance):
     _, renderer = case("plane")
     with pytest.raises(InputError, match=r"^distance is .*, but must be an object such as cortado.image_lo"):
         losses.Image(renderer, np.zeros((16, 20, 3)), distance)
-
-
-def test_fingerprints_tell_grids_of_one_view_apart():
-    given = {"smoothing": CUBIC_SPLINE, "support": 0.2, "volume": 1e-3, "particles": 5, "phases": 1}
-    view = TopView((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1, (20, 16))
-    made = [
-        Renderer(view, np.zeros(3), upper, **given, precision=FLOAT64, device="cpu", cell=cell)
-        for upper, cell in (([1.0, 1.0, 1.0], 0.1), ([1.0, 1.0, 1.0], 0.05), ([1.0, 2.0, 1.0], 0.1))
-    ]
-    assert len({renderer.fingerprint for renderer in made}) == 3
 
 
 def cup() -> Scene:
@@ -277,12 +267,14 @@ def test_adjoint_is_the_limit_of_differences(loss, size):
 
 
 @pytest.mark.parametrize("size", [*IMAGES, (33, 64)])
-def test_reduce_and_its_transpose(size):
+def test_reduce_has_a_transpose_and_keeps_what_is_constant(size):
     image = image_of(size)
     next_level = reduce(image)
     bar = image_of(next_level.shape[:2], 1)
     forward, backward = np.sum(bar * next_level), np.sum(reduce_transposed(bar, size) * image)
     assert forward == pytest.approx(backward, rel=1e-13)
+    colour = np.array([0.2, 0.5, 0.9])
+    assert np.allclose(reduce(np.ones((*size, 3)) * colour), colour, rtol=1e-14, atol=0.0)
 
 
 def weights_by_hand(size: int, place: int) -> dict[int, float]:
@@ -316,24 +308,16 @@ def test_reduce_is_the_binomial(size):
     assert np.allclose(reduce(image[::-1, ::-1]), reduce(image)[::-1, ::-1], rtol=1e-14, atol=0.0)
 
 
-@pytest.mark.parametrize("size", [*IMAGES, (33, 64)])
-def test_a_constant_stays_constant(size):
-    colour = np.array([0.2, 0.5, 0.9])
-    assert np.allclose(reduce(np.ones((*size, 3)) * colour), colour, rtol=1e-14, atol=0.0)
-
-
 def test_a_pyramid_adds_its_levels():
     image, target = image_of((16, 12)), image_of((16, 12), 1)
     squares = []
     for _ in range(4):  # 16 x 12, 8 x 6, 4 x 3, 2 x 2
         squares.append(np.mean((image - target) ** 2))
         image, target = reduce(image), reduce(target)
-    assert Pyramid().value(image_of((16, 12)), image_of((16, 12), 1)) == pytest.approx(
-        np.dot((1.0, 2.0, 4.0, 8.0), squares)
-    )
+    pair = image_of((16, 12)), image_of((16, 12), 1)
+    assert Pyramid().value(*pair) == pytest.approx(np.dot((1.0, 2.0, 4.0, 8.0), squares))
     weights = (0.5, 0.0, 3.0, 1.0)
-    weighted = np.dot(weights, squares)
-    assert Pyramid(weights=weights).value(image_of((16, 12)), image_of((16, 12), 1)) == pytest.approx(weighted)
+    assert Pyramid(weights=weights).value(*pair) == pytest.approx(np.dot(weights, squares))
 
 
 def disc(place: np.ndarray, size: int) -> np.ndarray:
@@ -370,11 +354,6 @@ def test_noise_ratio():
     target = image_of((4, 5))
     assert psnr(target + 0.1, target) == pytest.approx(20.0)
     assert psnr(target, target) == np.inf
-
-
-def test_fingerprints_tell_losses_apart():
-    assert len({loss.fingerprint for loss in LOSSES}) == len(LOSSES)
-    assert Pyramid(weights=[1, 2]).fingerprint == Pyramid(weights=(1.0, 2.0)).fingerprint
 
 
 def test_wrong_settings_are_a_sentence():

@@ -35,12 +35,9 @@ PREDICT = integration_kernels(FLOAT64, False).predict
 NAMES = ("particles", "time_step", "x", "v", "acceleration", "x_star", "v_star")
 
 
-def test_arguments_come_in_the_order_of_the_kernel():
+def test_arguments_come_in_the_order_of_the_kernel_and_of_groups():
     given = {name: name.upper() for name in reversed(NAMES)}
     assert bound(PREDICT, (), given, Bundles()) == [name.upper() for name in NAMES]
-
-
-def test_what_is_given_comes_before_groups_and_groups_in_their_order():
     first, second = {"x": 1, "v": 2, "other": 0}, {"x": 10, "v": 20, "time_step": 30, "x_star": 40, "v_star": 50}
     found = bound(PREDICT, (first, second), {"v": 3, "acceleration": 4, "particles": 60}, Bundles())
     assert found == [60, 30, 1, 3, 4, 40, 50]

@@ -91,13 +91,10 @@ def on_top_of_the_core(sources: dict[str, str]) -> list[tuple[str, str]]:
     return [(module, name) for module, name in found if is_on_top(name)]
 
 
-def test_the_core_imports_nothing_that_lies_on_top_of_it():
+def test_the_core_imports_nothing_on_top_of_it_and_what_it_asks_of_that_is_there():
     assert not on_top_of_the_core({module: path.read_text() for module, path in MODULES.items()})
     late = {"problem": "def f():\n    from cortado.pictures.film import film", "pictures.film": ""}
     assert on_top_of_the_core(late) == [("problem", "pictures.film")]
-
-
-def test_what_the_core_asks_of_packages_on_top_is_there():
     for name, home in FUNCTIONS.items():
         assert is_on_top(home) and callable(on_top(name)), f"{home}.{name}"
 

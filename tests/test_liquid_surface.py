@@ -101,14 +101,11 @@ def test_points_have_the_colours_of_particles_near_them():
     np.testing.assert_allclose(found.colours.sum(axis=1), 1.0, atol=1e-5)
 
 
-def test_what_is_very_far_away_is_left_out():
+def test_what_is_far_away_is_left_out_and_what_is_no_number_is_a_sentence():
     positions = ball(0.3)
     alone = surface_of(positions)
     found = surface_of(np.concatenate([positions, [[1e7, 0.0, 0.0], [0.0, -1e9, 0.0]]]))
     np.testing.assert_allclose(found.points, alone.points, atol=1e-6)
-
-
-def test_positions_that_are_not_numbers_are_a_sentence():
     with pytest.raises(ComputationError, match="2 particles cannot be drawn, whose positions are not finite"):
         surface_of(np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]]))
 

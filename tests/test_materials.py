@@ -54,13 +54,10 @@ def middle(image):
     return image[28:36, 28:36].mean(axis=(0, 1))
 
 
-def test_one_sees_through_2_cm_of_water_and_not_of_milk():
+def test_one_sees_through_water_and_not_milk_and_honey_takes_blue():
     water, milk = (middle(drawn(scene_of(name))) for name in ("water", "milk"))
     empty = middle(drawn(scene_of("water"), shown=False))
     assert np.abs(water - empty).max() < 0.05 and (milk - empty).min() > 0.2
-
-
-def test_deeper_honey_takes_more_of_the_blue():
     bright = {"background": (0.7,) * 3}
     thin, thick = (middle(drawn(scene_of("honey", depth=depth, picture=bright))) for depth in (0.01, 0.04))
     assert thick[2] / thick[0] < 0.7 * thin[2] / thin[0] < 0.7

@@ -23,10 +23,14 @@ def run(tmp_path, monkeypatch):
     return folder
 
 
-def test_readings_come_back_bit_for_bit(run):
+def test_readings_come_back_bit_for_bit_and_what_is_missing_is_a_sentence(run, cortado_command):
     found = run.read_sensors()["gauge"]
     assert found.units == {"height": "m", "f": "N"}
     np.testing.assert_array_equal(found["height"], 2 * np.linspace(0.0, 1.0, 11))
+    assert "cannot be read" in cortado_command("compare", "run", "data.csv")[2]
+    run.sensors.unlink()
+    code, _, err = cortado_command("compare", "run", "data.csv")
+    assert code == 2 and "has no sensors.csv" in err
 
 
 @pytest.mark.parametrize("head", ["time,gauge.height", "time [s], gauge.height [m]"])
@@ -61,10 +65,3 @@ def test_tables_that_do_not_fit_are_sentences(cortado_command, text, words):
     code, out, err = cortado_command("compare", "run", "data.csv")
     assert (code, out) == (2, "") and words in err, err
     assert_one_sentence(err.removesuffix("\n"))
-
-
-def test_what_is_missing_is_a_sentence(run, cortado_command):
-    assert "cannot be read" in cortado_command("compare", "run", "data.csv")[2]
-    run.sensors.unlink()
-    code, _, err = cortado_command("compare", "run", "data.csv")
-    assert code == 2 and "has no sensors.csv" in err

@@ -98,14 +98,11 @@ def test_more_steps_than_any_machine_has_room_for():
         problem().simulation.rollout(100_000_000_000)
 
 
-def test_the_limit_of_a_process_counts():
+def test_the_limit_of_a_process_and_of_a_container_counts(monkeypatch, tmp_path):
     program = "from cortado.device import memory; print(memory.available())"
     line = f'ulimit -v 2000000; "{sys.executable}" -c "{program}"'
     free = float(subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True).stdout)
     assert 1e8 < free < 2.05e9
-
-
-def test_the_limit_of_a_container_counts(monkeypatch, tmp_path):
     for name, content in {"max": "3000", "current": "1500", "stat": "anon 1\ninactive_file 400"}.items():
         (tmp_path / f"memory.{name}").write_text(content)
     monkeypatch.setattr(memory, "_CGROUP", tmp_path)

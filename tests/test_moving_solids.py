@@ -323,8 +323,13 @@ def test_a_bad_path_is_a_sentence(changes, sentence):
     assert sentence in str(error.value) and "solid[0]" in str(error.value)
 
 
-def test_a_scene_with_a_path_is_written_and_read():
+def test_a_path_is_written_and_read_and_a_solid_that_no_run_moved_is_a_sentence():
     assert Scene.from_json(space().to_json()) == space()
+    run = Simulation(plane(ROTOR)).run(1)
+    with pytest.raises(InputError, match="solids has no 'paddle', as the run moved rotor"):
+        run.solids["paddle"]
+    assert run[-1:].solids["rotor"].positions.shape == (1, 2)
+    assert "paddle" not in run.solids
 
 
 def test_pictures_and_films_show_solids_where_they_are(tmp_path):
@@ -345,14 +350,6 @@ def test_pictures_and_films_show_solids_where_they_are(tmp_path):
     (down, right), there = middle(films[0][2]) - middle(films[0][0]), run.solids["rotor"].positions
     moved = there[2] - there[0]
     assert right > 3.0 and down < -1.0 and right / -down == pytest.approx(moved[0] / moved[1], rel=0.3)
-
-
-def test_a_solid_that_no_run_moved_is_a_sentence():
-    run = Simulation(plane(ROTOR)).run(1)
-    with pytest.raises(InputError, match="solids has no 'paddle', as the run moved rotor"):
-        run.solids["paddle"]
-    assert run[-1:].solids["rotor"].positions.shape == (1, 2)
-    assert "paddle" not in run.solids
 
 
 @pytest.mark.parametrize(
