@@ -3,6 +3,7 @@
 import numpy as np
 
 from projected_flows import C2, PROJECTION, box, simulated
+from scenes import box as walls
 
 GRAVITY = 9.81
 DEPTH = 0.4
@@ -25,13 +26,7 @@ def sloping_film(slope, deep, solver=PROJECTION, device="cpu"):
             discretisation=C2,
             phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 1000.0 * NU}],
             fluid=[box([0.0, 0.0], [16.0 * spacing, DEPTH])],
-            container={
-                "shape": "box",
-                "lower": [0.0, 0.0],
-                "upper": [16.0 * spacing, 2.0 * DEPTH],
-                "periodic": [True, False],
-                "slip": "no",
-            },
+            container=walls([0.0, 0.0], [16.0 * spacing, 2.0 * DEPTH], periodic=[True, False], slip="no"),
             forces={"gravity": [GRAVITY * slope / size, -GRAVITY / size], "viscosity": "stress"},
             solver={**solver, "time_step": step},
             device=device,

@@ -13,14 +13,14 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import potential_flow
-from cortado import Scene, Simulation
+from cortado import Simulation
 from cortado.discretise.calibration import rest_volume
 from cortado.discretise.smoothing import smoothing_kernel
-from scenes import box
+from scenes import bodies, box, pool
 
 DATA = Path(__file__).parent / "data"
 GRAVITY = 9.81
-WATER = {"name": "water", "rest_density": 1000.0}
+PCISPH = {"kind": "pcisph", "maximum_iterations": 100}
 
 
 def published(name: str) -> np.ndarray:
@@ -58,32 +58,19 @@ class Rest:
         return float(np.sqrt(np.mean(self.errors[self.interior] ** 2)))
 
 
-def column_at_rest(
-    across: int = 20,
-    kernel: str = "wendland_c4",
-    support: float = 3.0,
-    tolerance: float = 0.001,
-) -> Rest:
+def column_at_rest(across=20, kernel="wendland_c4", support=3.0, tolerance=0.001) -> Rest:
     """p = rho g (H - y) in a box 0.8 H wide, H = 1 m, ``across`` particles high; 5 Pa s let it settle."""
     width, spacing = 0.8, 1.0 / across
     time_step = 0.08 * spacing
-    simulation = Simulation(
-        Scene(
-            dimension=2,
-            discretisation={"spacing": spacing, "support": support, "kernel": kernel},
-            phase=[{**WATER, "viscosity": 5.0}],
-            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [width, 1.0], "phase": "water"}],
-            container={"shape": "box", "lower": [0.0, 0.0], "upper": [width, 1.5]},
-            forces={"gravity": [0.0, -GRAVITY], "viscosity": "pairwise"},  # see validation/README.md
-            solver={
-                "kind": "pcisph",
-                "time_step": time_step,
-                "maximum_iterations": 100,
-                "density_tolerance": tolerance,
-            },
-        ),
-        precision="float32",
+    scene = pool(
+        [width, 1.0],
+        [width, 1.5],
+        viscosity=5.0,
+        discretisation={"spacing": spacing, "support": support, "kernel": kernel},
+        forces={"gravity": [0.0, -GRAVITY], "viscosity": "pairwise"},  # see validation/README.md
+        solver={**PCISPH, "time_step": time_step, "density_tolerance": tolerance},
     )
+    simulation = Simulation(scene, precision="float32")
     first, count = round(2.0 / time_step), round(0.5 / time_step)
     pressures, positions = np.zeros(simulation.particles), np.zeros((simulation.particles, 2))
 
@@ -97,7 +84,7 @@ def column_at_rest(
     x, y = positions.T
     margin = support * spacing
     interior = (x > margin) & (x < width - margin) & (y > margin) & (y < 1.0 - margin)
-    return Rest(positions, pressures / (WATER["rest_density"] * GRAVITY), interior)
+    return Rest(positions, pressures / (1000.0 * GRAVITY), interior)
 
 
 @pytest.mark.parametrize(("across", "tolerance"), [(20, 0.001), (20, 0.01), (30, 0.001)])
@@ -144,15 +131,8 @@ def dam_break(across: int = 20, length: float = 4.0, until: float = 3.15, **chan
     spacing = wide / across
     unit = np.sqrt(wide / (2.0 * GRAVITY))
     time_step = 0.074 * spacing  # a quarter of a spacing at 3.4 m/s, faster than the front
-    scene = {
-        "dimension": 2,
-        "discretisation": {"spacing": spacing},
-        "phase": [{**WATER, "viscosity": 0.001}],
-        "fluid": [{"shape": "box", "lower": [0.0, 0.0], "upper": [wide, 2.0 * wide], "phase": "water"}],
-        "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [length * wide, 3.0 * wide]},
-        "forces": {"gravity": [0.0, -GRAVITY]},
-        "solver": {"kind": "pcisph", "time_step": time_step},
-    }
+    tables = {"forces": {"gravity": [0.0, -GRAVITY]}, "solver": {"kind": "pcisph", "time_step": time_step}, **changes}
+    scene = pool([wide, 2.0 * wide], [length * wide, 3.0 * wide], spacing, **tables)
     steps = int(np.ceil(until * unit / time_step))
     places = [wide]
 
@@ -160,7 +140,7 @@ def dam_break(across: int = 20, length: float = 4.0, until: float = 3.15, **chan
         x, y = state.numpy(2)["positions"].T
         places.append(x[y < 2.0 * spacing].max() + 0.5 * spacing)
 
-    Simulation(Scene(**{**scene, **changes})).rollout(steps).forward(observe, keep=False)
+    Simulation(scene).rollout(steps).forward(observe, keep=False)
     return Front(np.arange(steps + 1) * time_step / unit, np.array(places) / wide)
 
 
@@ -269,18 +249,16 @@ def poiseuille(times: np.ndarray, across: int) -> Channel:
     length = 8 * spacing
     interval = 0.0225
     time_step = interval / np.ceil(interval / (0.12 * spacing**2 / KINEMATIC))
-    simulation = Simulation(
-        Scene(
-            dimension=2,
-            discretisation={"spacing": spacing, "support": 2.0, "kernel": "cubic_spline"},
-            phase=[{**WATER, "viscosity": 1000.0 * KINEMATIC}],
-            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [length, CHANNEL], "phase": "water"}],
-            container=box([0.0, 0.0], [length, CHANNEL], periodic=[True, False], slip="no"),
-            forces={"gravity": [PUSH, 0.0]},
-            solver={"kind": "pcisph", "time_step": time_step, "density_tolerance": 0.001},
-        ),
-        precision="float64",
+    scene = pool(
+        [length, CHANNEL],
+        [length, CHANNEL],
+        viscosity=1000.0 * KINEMATIC,
+        discretisation={"spacing": spacing, "support": 2.0, "kernel": "cubic_spline"},
+        container=box([0.0, 0.0], [length, CHANNEL], periodic=[True, False], slip="no"),
+        forces={"gravity": [PUSH, 0.0]},
+        solver={"kind": "pcisph", "time_step": time_step, "density_tolerance": 0.001},
     )
+    simulation = Simulation(scene, precision="float64")
     wanted = np.rint(np.asarray(times) / time_step).astype(int)
     heights = np.unique(simulation.positions[:, 1])
     row = np.searchsorted(heights, simulation.positions[:, 1])
@@ -335,6 +313,10 @@ def vortices(points: np.ndarray) -> np.ndarray:
     return np.column_stack([-np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)])
 
 
+DENSITY_TOLERANCE = 0.001
+"""Average compression at which `taylor_green` stops iterating."""
+
+
 def taylor_green(
     folder: Path,
     across: int = 20,
@@ -353,33 +335,22 @@ def taylor_green(
     file = folder / f"lattice_{across}.npy"
     np.save(file, points)
     steps = int(np.ceil(until / (min(0.05, 1.0 / across) / across)))
-    simulation = Simulation(
-        Scene(
-            dimension=2,
-            discretisation={"spacing": (1.0 - room) / across, "support": support, "kernel": kernel},
-            phase=[{**WATER, "viscosity": 1000.0 * (1.0 - room) ** 2 / reynolds}],  # the density is less by that
-            fluid=[{"shape": "points", "file": str(file), "phase": "water"}],
-            container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "periodic": [True, True]},
-            forces={"gravity": [0.0, 0.0]},
-            solver={
-                "kind": "pcisph",
-                "time_step": until / steps,
-                "maximum_iterations": 100,
-                "density_tolerance": DENSITY_TOLERANCE,
-            },
-        ),
-        precision="float64",
+    scene = bodies(
+        2,
+        [{"shape": "points", "file": str(file)}],
+        box([0.0, 0.0], [1.0, 1.0], periodic=[True, True]),
+        viscosity=1000.0 * (1.0 - room) ** 2 / reynolds,  # the density is less by that
+        discretisation={"spacing": (1.0 - room) / across, "support": support, "kernel": kernel},
+        forces={"gravity": [0.0, 0.0]},
+        solver={**PCISPH, "time_step": until / steps, "density_tolerance": DENSITY_TOLERANCE},
     )
+    simulation = Simulation(scene, precision="float64")
     velocities = vortices(points)
     rollout = simulation.rollout(steps)
     rollout.initial.set({"positions": points, "velocities": velocities})
     energies = [np.sum(velocities**2)]
     rollout.forward(lambda step, state: energies.append(np.sum(state.numpy(2)["velocities"] ** 2)), keep=False)
     return np.arange(steps + 1) * until / steps, np.array(energies) / energies[0]
-
-
-DENSITY_TOLERANCE = 0.001
-"""Average compression at which `taylor_green` stops iterating."""
 
 
 def exact_energies(times: np.ndarray, reynolds: float) -> np.ndarray:
@@ -392,11 +363,7 @@ def taylor_green_error(times: np.ndarray, energies: np.ndarray, reynolds: float 
     return float(np.abs(energies - exact_energies(times, reynolds)).max())
 
 
-def carried_densities(
-    times: np.ndarray,
-    reynolds: float = 10.0,
-    room: float = 0.01,
-) -> np.ndarray:
+def carried_densities(times: np.ndarray, reynolds: float = 10.0, room: float = 0.01) -> np.ndarray:
     """Mean densities, in the rest density, of the lattice of `taylor_green` if the exact flow carries it along."""
     spacing, smoothing = (1.0 - room) / 20, smoothing_kernel("cubic_spline")
     radius = 2.0 * spacing

@@ -7,11 +7,12 @@ import pytest
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import brentq
 
-from cortado import Scene, Simulation
+from cortado import Simulation
 from cortado.sph.curvature import CurvatureConstants
 from falling_jets import falling_jet
 from oscillating_drops import C2, C4, Drop, exact_mode, packed_disc
 from projected_flows import dam_break, elliptical_drop, hung_block, oblique_wave, rotating_patch, taylor_green
+from scenes import box, pool
 from sloping_films import sloping_film
 from standing_waves import standing_wave
 from still_fluids import still_water
@@ -116,20 +117,12 @@ ACROSS = 40
 
 def channel(viscosity, rheology, speeds, time_step, steps):
     """Heights [m] and speeds [m/s] of particles after so many steps; ``speeds``, of heights, are those at the start."""
-    spacing = 1.0 / ACROSS
-    upper = [10.0 * spacing, 1.0]
-    simulation = Simulation(
-        Scene(
-            dimension=2,
-            discretisation={"spacing": spacing},
-            phase=[{"name": "paste", "rest_density": DENSITY, "viscosity": viscosity, "rheology": rheology}],
-            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": upper, "phase": "paste"}],
-            container={"shape": "box", "lower": [0.0, 0.0], "upper": upper, "periodic": [True, False], "slip": "no"},
-            forces={"gravity": [PUSH, 0.0]},
-            solver={"kind": "pcisph", "time_step": time_step, "density_tolerance": 0.001},
-        ),
-        precision="float64",
-    )
+    upper = [10.0 / ACROSS, 1.0]
+    paste = {"name": "paste", "rest_density": DENSITY, "viscosity": viscosity, "rheology": rheology}
+    tables = {"phase": [paste], "fluid": [box([0.0, 0.0], upper, phase="paste")], "forces": {"gravity": [PUSH, 0.0]}}
+    tables["container"] = box([0.0, 0.0], upper, periodic=[True, False], slip="no")
+    solver = {"kind": "pcisph", "time_step": time_step, "density_tolerance": 0.001}
+    simulation = Simulation(pool(upper, upper, 1.0 / ACROSS, solver=solver, **tables), precision="float64")
     along = np.zeros_like(simulation.positions)
     along[:, 0] = speeds(simulation.positions[:, 1])
     state = simulation.step(simulation.state({"initial_velocities": along}), {}, steps=steps)

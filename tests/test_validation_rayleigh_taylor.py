@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from cortado import Scene, Simulation
+from cortado import Simulation
 from cortado.discretise.calibration import lattice_offsets
 from cortado.discretise.smoothing import smoothing_kernel
-from scenes import box
+from scenes import bodies, box
 
 GRAVITY = 1.0
+PCISPH = {"kind": "pcisph", "maximum_iterations": 50, "density_tolerance": 0.001}
 HEAVY, LIGHT = 1800.0, 1000.0
 """Rest densities [kg/m3]."""
 FIRST, WINDOW = 0.01, (0.02, 0.1)
@@ -194,29 +195,17 @@ def rayleigh_taylor(
     nu = damping * Mode(wave, depth).inviscid / wave**2
     mode = Mode(wave, depth, kinematic=nu)
     time_step = 0.25 * spacing
-    simulation = Simulation(
-        Scene(
-            dimension=2,
-            discretisation={"spacing": spacing, "support": support, "kernel": kernel},
-            phase=[
-                {"name": "heavy", "rest_density": HEAVY, "viscosity": nu * HEAVY},
-                {"name": "light", "rest_density": LIGHT, "viscosity": nu * LIGHT},
-            ],
-            fluid=[
-                {"shape": "box", "lower": [0.0, -depth], "upper": [1.0, 0.0], "phase": "light"},
-                {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, depth], "phase": "heavy"},
-            ],
-            container=box([0.0, -depth], [1.0, depth + spacing], periodic=[True, False]),
-            forces={"gravity": [0.0, -GRAVITY]},
-            solver={
-                "kind": "pcisph",
-                "time_step": time_step,
-                "maximum_iterations": 50,
-                "density_tolerance": 0.001,
-                **solver,
-            },
-        )
+    densities = {"heavy": HEAVY, "light": LIGHT}
+    scene = bodies(
+        2,
+        [box([0.0, -depth], [1.0, 0.0], phase="light"), box([0.0, 0.0], [1.0, depth], phase="heavy")],
+        box([0.0, -depth], [1.0, depth + spacing], periodic=[True, False]),
+        discretisation={"spacing": spacing, "support": support, "kernel": kernel},
+        phase=[{"name": name, "rest_density": rho, "viscosity": nu * rho} for name, rho in densities.items()],
+        forces={"gravity": [0.0, -GRAVITY]},
+        solver={**PCISPH, "time_step": time_step, **solver},
     )
+    simulation = Simulation(scene)
     heavy = simulation.mass_fractions[:, 0] > 0.5
     positions = displaced(mode.velocity, simulation.positions, FIRST / waves)
     positions[:, 0] %= 1.0
