@@ -240,54 +240,19 @@ psnr = 3.0
 TINY_LATTE = """\
 name = "tiny latte"
 dimension = 3
-
-[discretisation]
-spacing = 0.0035
-
-[[phase]]
-name = "coffee"
-rest_density = 1000.0
-viscosity = 0.02
-colour = [0.20, 0.09, 0.04]
-
-[[phase]]
-name = "milk"
-rest_density = 900.0
-viscosity = 0.04
-colour = [0.95, 0.92, 0.85]
-
-[[fluid]]
-shape = "cylinder"
-base = [0.0, 0.0, 0.0]
-radius = 0.0105
-height = 0.007
-phase = "coffee"
-
-[[fluid]]
-shape = "cylinder"
-base = [0.0, 0.007, 0.0]
-radius = 0.006
-height = 0.0035
-phase = "milk"
-
-[container]
-shape = "cylinder"
-base = [0.0, 0.0, 0.0]
-radius = 0.0105
-height = 0.03
-
-[mixture]
-mobility = 1e-5
-
-[solver]
-kind = "pcisph"
-time_step = 0.002
-minimum_iterations = 3
-maximum_iterations = 3
-
-[render]
-view = "top"
-resolution = [16, 12]
+discretisation = { spacing = 0.0035 }
+phase = [
+  { name = "coffee", rest_density = 1000.0, viscosity = 0.02, colour = [0.20, 0.09, 0.04] },
+  { name = "milk", rest_density = 900.0, viscosity = 0.04, colour = [0.95, 0.92, 0.85] },
+]
+fluid = [
+  { shape = "cylinder", base = [0.0, 0.0, 0.0], radius = 0.0105, height = 0.007, phase = "coffee" },
+  { shape = "cylinder", base = [0.0, 0.007, 0.0], radius = 0.006, height = 0.0035, phase = "milk" },
+]
+container = { shape = "cylinder", base = [0.0, 0.0, 0.0], radius = 0.0105, height = 0.03 }
+mixture = { mobility = 1e-5 }
+solver = { kind = "pcisph", time_step = 0.002, minimum_iterations = 3, maximum_iterations = 3 }
+render = { view = "top", resolution = [16, 12] }
 
 [problem]
 steps = 6

@@ -170,6 +170,7 @@ REFUSED = [
     (lambda at: at.act(np.array([np.nan, 0])), "action has a value that is not finite, but must be numbers from"),
     (lambda at: at.act(np.array([np.inf, 0])), "action has a value that is not finite, but must be numbers from"),
     (lambda at: at.act("left"), "action is 'left', but must be a number or an array of real"),
+    (lambda at: at.act(["a", "b"]), "action is made of text, but must be a number or an"),
     (lambda at: at.act(np.array([1j, 0])), "action is made of complex numbers, but must be a number or an"),
     (lambda at: at.act(None), "action is None, but must be a number or an array of real"),
     (
@@ -218,6 +219,7 @@ REFUSED = [
     (lambda at: at.fit([1.0]), "start is [1.0], but must be given by name, as {'viscosity':"),
     (lambda at: at.fit({}), "start is empty, but must have a parameter to fit."),
     (lambda at: at.fit({"viscocity": 1.0}), "parameter 'viscocity' is unknown, but must be one of gravity,"),
+    (lambda at: at.fit({"viscosity": 1.0}, bounds={"viscosity": (1.0, 1.0)}), "0 free numbers"),
     (lambda at: at.fit({"viscosity": np.nan}), "start of viscosity is nan, but must be within its bounds."),
     (lambda at: at.fit({"viscosity": -1.0}), "parameter viscosity is -1.0, but must be at least 0."),
     (lambda at: at.fit({"viscosity": "thick"}), "start of viscosity is 'thick', but must be a number or an array"),

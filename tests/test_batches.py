@@ -59,11 +59,7 @@ CASES: dict[str, tuple[Any, dict[str, Any], dict[str, Any]]] = {
     "tension": (tension, {"surface_tension": RANDOM.uniform(0.1, 1.0, 3)}, {"gravity": [0.0, -9.0]}),
     "tension by curvature": (curved_tension, {"surface_tension": RANDOM.uniform(0.1, 1.0, 3)}, {}),
     "bodies": (touching, {"raft.density": np.array([300.0, 700.0])}, {}),
-    "rotor": (
-        lambda: beside(ROTOR),
-        {"gravity": random_gravity(2.0, 2, 1, 2)},
-        {},
-    ),
+    "rotor": (lambda: beside(ROTOR), {"gravity": random_gravity(2.0, 2, 1, 2)}, {}),
     "tilt": (scenes.scene, {"tilt": RANDOM.uniform(-20.0, 20.0, (3, STEPS, 2))}, {}),
 }
 

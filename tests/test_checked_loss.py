@@ -82,10 +82,7 @@ LOST = np.diag([1.0, np.nan, 1.0, 1.0, 1.0])[:, :2]
 WARPED = r"is a Warp array of vec3d of shape \(6,\) on cpu, but must be .* \(5,\)"
 OF_END = r"takes the arguments '\(end\)', but .* is an object with value\(end\) and adjoint\(end\)\.$"
 BAD_ADJOINTS = {
-    "an adjoint that is not finite": (
-        a_pair(LOST),
-        r"positions has a value in row 1 .* must be made of numbers\.$",
-    ),
+    "an adjoint that is not finite": (a_pair(LOST), r"positions has a value in row 1 .* must be made of numbers\.$"),
     "one of a quantity": ({"velocities": np.full((N, 2), np.inf)}, "of velocities has a value in row 0"),
     "no adjoint": (None, "is a NoneType"),
     "one array": (ONES, "is a ndarray"),

@@ -291,16 +291,6 @@ def test_wrong_usage_is_refused(cortado_command, folder, line, words):
     assert_nothing_made(folder)
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["optimise"], ["gradients"], ["gradients", "check"], ["sweep"]])
-def test_every_command_has_help(cortado_command, command):
-    code, out, err = cortado_command(*command, "--help")
-    assert (code, err) == (0, "") and out.startswith(" ".join(["usage: cortado", *command]))
-
-
-def test_the_version_is_printed(cortado_command):
-    assert cortado_command("--version") == (0, f"cortado {cortado.__version__}\n", "")
-
-
 def test_a_process_of_its_own_says_no_more_than_the_sentence(folder):
     process = start("run", "scene.toml", "--steps", "0", "--out", "dam")
     out, err = process.communicate(timeout=60)

@@ -37,10 +37,14 @@ def run(out, *options):
     main(["run", "scene.toml", "--steps", "4", "--out", out, "--quiet", "--no-pictures", *options])
 
 
-def compared(capsys, *arguments):
+def said(capsys, *arguments):
     capsys.readouterr()
-    main(["compare", *arguments, "--json"])
-    return json.loads(capsys.readouterr().out)
+    main(["compare", *arguments])
+    return capsys.readouterr().out
+
+
+def compared(capsys, *arguments):
+    return json.loads(said(capsys, *arguments, "--json"))
 
 
 def test_a_run_equals_itself_made_again(capsys):
@@ -48,8 +52,7 @@ def test_a_run_equals_itself_made_again(capsys):
     found = compared(capsys, "one", "again")
     assert found["equal"] is True and not found["scene"] and not found["metrics"]
     assert all(field["greatest"] == 0.0 for field in found["last_state"]["fields"].values())
-    main(["compare", "one", "again"])
-    out = capsys.readouterr().out
+    out = said(capsys, "one", "again")
     assert out.endswith("The two runs are equal.\n") and "bit for bit" in out
 
 
@@ -64,15 +67,13 @@ def test_differences_are_numbers_with_units(capsys):
     positions = found["last_state"]["fields"]["positions"]
     assert positions["greatest"] == pytest.approx(apart.max()) and positions["unit"] == "m"
     assert positions["root_mean_square"] == pytest.approx(np.sqrt((apart**2).mean()))
-    main(["compare", "one", "faster"])
-    out = capsys.readouterr().out
+    out = said(capsys, "one", "faster")
     assert "fluid.0.velocity: [0.0, 0.0] | [0.5, 0.0]" in out and f"at most {apart.max():.3g} m (particle" in out
     assert out.endswith("The two runs differ.\n")
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "part"),
-    [('"version_of_nothing": 1', "", ""), ('"cortado": "', '"cortado": "9', "environment")],
+    ("old", "new", "part"), [('"version_of_nothing": 1', "", ""), ('"cortado": "', '"cortado": "9', "environment")]
 )
 def test_another_machine_is_told_but_is_no_difference(capsys, old, new, part):
     file = Path("other/environment.json")
@@ -109,8 +110,7 @@ def test_searches_can_be_compared_too(capsys):
     main(["optimise", "task.toml", "--out", "b", *easy, "--set", "optimise.learning_rate=0.1"])
     found = compared(capsys, "a", "b")
     assert found["last_state"] is None and "optimise.learning_rate" in found["settings"] and not found["equal"]
-    main(["compare", "a", "one"])
-    assert "kind: 'optimise' | 'run'" in capsys.readouterr().out
+    assert "kind: 'optimise' | 'run'" in said(capsys, "a", "one")
 
 
 @pytest.mark.parametrize(
@@ -150,8 +150,7 @@ def test_states_of_other_times_are_not_subtracted(capsys):
     found = compared(capsys, "one", "longer")["last_state"]
     assert found["times_s"] == pytest.approx([0.0084, 0.0126]) and found["compared_at_s"] == pytest.approx(0.0084)
     assert found["fields"]["positions"]["greatest"] == 0.0
-    main(["compare", "one", "longer"])
-    out = capsys.readouterr().out
+    out = said(capsys, "one", "longer")
     assert "last state at 0.0084 s | 0.0126 s, compared at 0.0084 s: positions the same bit for bit" in out
     assert out.endswith("The two runs differ.\n")
 
@@ -164,8 +163,7 @@ def test_runs_with_other_time_steps_are_compared_at_the_same_time(capsys):
     apart = np.linalg.norm(positions_at("one", 0.0063) - positions_at("halved", 0.0063), axis=1)
     assert state["fields"]["positions"]["greatest"] == pytest.approx(apart.max())
     assert found["metrics"] == {"unlike": "time steps of 0.0021 s and 0.00105 s cannot be compared one by one"}
-    main(["compare", "one", "halved"])
-    assert "metrics: time steps of 0.0021 s and 0.00105 s cannot be compared" in capsys.readouterr().out
+    assert "metrics: time steps of 0.0021 s and 0.00105 s cannot be compared" in said(capsys, "one", "halved")
 
 
 def test_runs_without_a_common_time_are_not_compared(capsys):
@@ -173,13 +171,11 @@ def test_runs_without_a_common_time_are_not_compared(capsys):
     found = compared(capsys, "one", "other_times")
     assert not found["last_state"]["fields"] and "different times" in found["last_state"]["unlike"]
     assert found["equal"] is False
-    main(["compare", "one", "other_times"])
-    assert "last state at 0.0084 s | 0.0039 s: these are different times" in capsys.readouterr().out
+    assert "last state at 0.0084 s | 0.0039 s: these are different times" in said(capsys, "one", "other_times")
 
 
 def test_as_many_steps_of_other_lengths_may_end_at_the_same_time(capsys):
     run("halved", "--steps", "8", "--set", "solver.time_step=0.00105")
     state = compared(capsys, "one", "halved")["last_state"]
     assert state["compared_at_s"] == pytest.approx(0.0084) and state["fields"]["positions"]["greatest"] > 0.0
-    main(["compare", "one", "halved"])
-    assert "last state at 0.0084 s: positions apart by" in capsys.readouterr().out
+    assert "last state at 0.0084 s: positions apart by" in said(capsys, "one", "halved")

@@ -32,9 +32,13 @@ def folder(tmp_path, monkeypatch, unrendered):
     return tmp_path
 
 
+def told(capsys, *arguments):
+    main(["describe", *arguments])
+    return capsys.readouterr().out
+
+
 def described(capsys, *arguments):
-    main(["describe", *arguments, "--json"])
-    return json.loads(capsys.readouterr().out)
+    return json.loads(told(capsys, *arguments, "--json"))
 
 
 def test_it_says_what_the_scene_has(capsys, monkeypatch):
@@ -90,8 +94,7 @@ def test_a_run_has_the_steps_and_the_frames_that_were_told(time, steps, choice):
 
 
 def test_the_run_and_its_film_are_told(capsys):
-    main(["describe", "scene.toml", "--time", "1.05", "--set", "picture.film_speed=0.5"])
-    out = capsys.readouterr().out
+    out = told(capsys, "scene.toml", "--time", "1.05", "--set", "picture.film_speed=0.5")
     assert "500 steps, 1.05 s of motion: about" in out and "film        53 frames, 2.1 s, at 0.5 x; 448 of" in out
     assert "; about 26 s to draw, 0.5 s for the first state; splashes take up to twice as long\n" in out
     none = cortado.Simulation(cortado.load_scene("scene.toml", ["picture.film_frames=0"]))
@@ -130,8 +133,7 @@ def test_phases_and_an_emitter_are_told(capsys):
     found = described(capsys, "latte.toml")
     each = found["particles_of_phase"].values()
     assert sum(each) == found["particles"] and min(each) > 0
-    main(["describe", "latte.toml"])
-    out = capsys.readouterr().out
+    out = told(capsys, "latte.toml")
     assert "milk" in out and "in 3-D" in out and "limits: " in out and "ms a step on cpu in float32" in out
 
 
@@ -155,8 +157,9 @@ def test_an_opening_that_is_no_whole_number_of_cells_is_told(capsys):
 
 
 def test_a_schedule_is_told(capsys):
-    main(["describe", "scene.toml", "--set", "schedule.gravity={times=[0,0.2],values=[[0,-9.81],[3,-9]]}"])
-    assert "gravity changes until 0.2 s, and is constant from then on" in capsys.readouterr().out
+    course = "schedule.gravity={times=[0,0.2],values=[[0,-9.81],[3,-9]]}"
+    out = told(capsys, "scene.toml", "--set", course)
+    assert "gravity changes until 0.2 s, and is constant from then on" in out
 
 
 @pytest.mark.usefixtures("rendered")
@@ -171,8 +174,7 @@ def test_a_scene_that_does_not_bear_its_first_steps(capsys, monkeypatch):
     monkeypatch.setattr("cortado.cli.commands.describe.MOST_STEPS", 100)
     found = described(capsys, "scene.toml", "--set", "fluid.0.velocity=[10,25]")
     assert "diverged in step" in found["diverged"] and "milliseconds_per_step" not in found
-    main(["describe", "scene.toml", "--set", "fluid.0.velocity=[10,25]"])
-    assert "unknown. The simulation diverged" in capsys.readouterr().out
+    assert "unknown. The simulation diverged" in told(capsys, "scene.toml", "--set", "fluid.0.velocity=[10,25]")
 
 
 @pytest.mark.parametrize(

@@ -274,22 +274,6 @@ def test_in_a_batch_the_others_go_on():
 
 
 @pytest.mark.parametrize(
-    ("action", "sentence"),
-    [
-        ([0.0], r"action has shape \(1,\), but must be \(2,\)"),
-        ([0.0, np.nan], "action has a value that is not finite"),
-        (["a", "b"], "action"),
-        (None, "action"),
-    ],
-)
-def test_bad_actions_are_refused_in_a_sentence(environments, action, sentence):
-    env = environments("Carry").unwrapped
-    env.reset(seed=1, options={})
-    with pytest.raises(InputError, match=sentence):
-        env.step(action)
-
-
-@pytest.mark.parametrize(
     ("settings", "sentence"),
     [
         ({"size": "huge"}, 'size is \'huge\', but must be "small" or "large"'),

@@ -44,10 +44,7 @@ COMMANDS = {
     ),
     "export": ("run --to vtp", "to ply, out there, every 2, set picture.colour=speed"),
     "convergence": ("run finer finest", "quantity absent.py:f, json"),
-    "dataset": (
-        "task.toml --runs 3",
-        "runs 4, out other, set dataset.seed=4, device cuda:99, precision float64",
-    ),
+    "dataset": ("task.toml --runs 3", "runs 4, out other, set dataset.seed=4, device cuda:99, precision float64"),
     "sweep": (
         "scene.toml --set solver.time_step=0.001,0.002 --steps 3 --no-pictures",
         "set phase.0.viscosity=0.1,0.2, zip phase.0.viscosity=0.1,0.2, steps 4, time 0.1, out other, device cuda:99, "

@@ -139,19 +139,11 @@ class Exits:
 @pytest.mark.parametrize(
     ("function", "error", "words"),
     [
-        (
-            lambda _: sys.exit(3),
-            ComputationError,
-            r"^An item ended .* SystemExit: 3; what is .* not do so\.$",
-        ),
+        (lambda _: sys.exit(3), ComputationError, r"^An item ended .* SystemExit: 3; what is .* not do so\.$"),
         (lambda _: sys.exit(), ComputationError, r"^An item ended its process, by SystemExit; what is"),
         (lambda _: signal.default_int_handler(signal.SIGINT, None), ComputationError, "by KeyboardInterrupt; what is"),
         (lambda _: Exits(), ComputationError, "by SystemExit: 1; what is computed"),
-        (
-            lambda _: threading.Lock(),
-            InputError,
-            "The result cannot be sent to another process: TypeError",
-        ),
+        (lambda _: threading.Lock(), InputError, "The result cannot be sent to another process: TypeError"),
     ],
 )
 def test_an_item_that_ends_its_process_or_has_no_result_to_send_is_an_error(function, error, words):

@@ -461,29 +461,12 @@ def video(frames, **options):
         (tracks(np.zeros((4, 1, 2)), times=TIMES[::-1]), "times has 0.02 s after 0.03 s, but must rise"),
         (video(np.zeros((4, 8, 9, 3))), "frames has shape"),
         (video(np.zeros((4, 8, 8, 3)), calibrate=["up"]), "calib"),
-        (lambda s: measured.Experiment(s, {}), "observations is empty"),
-        (lambda s: cortado.fit([], {"viscosity": 1.0}), "experiments is empty"),
         (lambda s: cortado.fit("experiment", {"viscosity": 1.0}), "must be a cortado.measured.Experiment, or a list"),
     ],
 )
 def test_a_mistake_is_a_sentence(make, words, simulation):
     with one_sentence(words):
         make(simulation)
-
-
-@pytest.mark.parametrize(
-    ("start", "bounds", "words"),
-    [
-        ({"viscosity": 1.0}, {"mobility": (0.0, 1.0)}, "that start has"),
-        ({"viscosity": 1.0}, {"viscosity": (2.0, 3.0)}, "within its bounds"),
-        ({"viscosity": 1.0}, {"viscosity": (1.0, 1.0)}, "0 free numbers"),
-        ({"honey": 1.0}, None, "honey"),
-        ({"viscosity": np.nan}, None, "viscosity"),
-    ],
-)
-def test_a_wrong_start_is_a_sentence(start, bounds, words, shaken):
-    with one_sentence(words):
-        cortado.fit(shaken, start, bounds)
 
 
 def test_a_background_that_stays_tells_how_large_the_noise_is():

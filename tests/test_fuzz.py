@@ -56,8 +56,7 @@ def hold(size):
 
 
 @pytest.mark.parametrize(
-    "program",
-    [lambda: None, partial(say, 2, "scene.toml: name is 3."), partial(say, 1, "Warning: odd.", "It failed.")],
+    "program", [lambda: None, partial(say, 2, "scene.toml: name is 3."), partial(say, 1, "Warning: odd.", "It failed.")]
 )
 def test_a_good_end_is_not_complained_of(tmp_path, program):
     assert judged(tmp_path, program) == []

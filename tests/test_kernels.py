@@ -78,12 +78,7 @@ def array(values: np.ndarray, dtype: Any = wp.vec3d) -> Any:
     return wp.array(values, dtype=dtype, device=CPU)
 
 
-SINGLE: Values = {
-    "rounds": np.array([1]),
-    "x_before": np.zeros((N, 3)),
-    "v_before": np.zeros((N, 3)),
-    "cell": 0.027,
-}
+SINGLE: Values = {"rounds": np.array([1]), "x_before": np.zeros((N, 3)), "v_before": np.zeros((N, 3)), "cell": 0.027}
 """Of a single scene in the first iteration."""
 
 

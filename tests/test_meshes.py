@@ -411,8 +411,7 @@ def test_a_mesh_is_scaled_and_read_again_when_its_file_changes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("mesh", "volume"),
-    [(box([0.1, 0.2, 0.3], [0.6, 0.7, 0.5]), 0.05), (torus(), 2 * np.pi**2 * MAJOR * MINOR**2)],
+    ("mesh", "volume"), [(box([0.1, 0.2, 0.3], [0.6, 0.7, 0.5]), 0.05), (torus(), 2 * np.pi**2 * MAJOR * MINOR**2)]
 )
 def test_points_inside_are_on_the_lattice_from_the_lower_corner(mesh, volume):
     found = points_inside(solid(mesh), 0.02)
