@@ -38,8 +38,6 @@ POSE = {"absorption_kernels.march_adjoint": {"push", "turn", "pose_bar"}}
 """Not planted: a camera's pose is no parameter of a problem (its derivatives: tests/test_render.py)."""
 CONSTANTS = ("real(0.0)", "real(0.5)", "real(1.0)", "vector()")
 """Not planted: 0 and 1, and the derivative at the corner of mu_ij, where both viscosities are 0 and none is moved."""
-
-
 STEPS = 3
 """Of the runs that are judged."""
 WHOLE = 40
@@ -65,18 +63,13 @@ class Planter(ast.NodeTransformer):
         self._function = ""
         return node
 
-    def visit_For(self, node: ast.For) -> ast.AST:
-        if self._function:
-            node.body = [self.visit(statement) for statement in node.body]
-            return node
-        return self.generic_visit(node)
+    def visit_If(self, node: ast.If | ast.For) -> ast.AST:
+        if not self._function:
+            return self.generic_visit(node)
+        node.body, node.orelse = ([self.visit(one) for one in part] for part in (node.body, node.orelse))
+        return node
 
-    def visit_If(self, node: ast.If) -> ast.AST:
-        if self._function:
-            node.body = [self.visit(statement) for statement in node.body]
-            node.orelse = [self.visit(statement) for statement in node.orelse]
-            return node
-        return self.generic_visit(node)
+    visit_For = visit_If
 
     def visit_Assign(self, node: ast.Assign) -> ast.AST:
         target = node.targets[0]
@@ -178,9 +171,8 @@ def map_address() -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     libc.mmap.restype, libc.mmap.argtypes = ctypes.c_void_p, [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 4]
     protection, fixed = mmap.PROT_READ | mmap.PROT_WRITE, 0x10
-    assert (
-        libc.mmap(ADDRESS, mmap.PAGESIZE, protection, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | fixed, -1, 0) == ADDRESS
-    )
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | fixed
+    assert libc.mmap(ADDRESS, mmap.PAGESIZE, protection, flags, -1, 0) == ADDRESS
 
 
 def cases_of(scenes: dict[str, dict], precision: str) -> dict[str, tuple]:

@@ -30,12 +30,11 @@ def compiled(tmp_path_factory):
     return folder, said(folder)
 
 
-def said(cache, before="", **environment):
+def said(cache, before="", program=FIRST, options=(), **environment):
     """Lines on stdout, and stderr, of a run in a process."""
     environment = {**os.environ, "WARP_CACHE_PATH": str(cache), **environment}
-    done = subprocess.run(
-        [sys.executable, "-c", FIRST.replace("BEFORE", before)], capture_output=True, env=environment, text=True
-    )
+    command = [sys.executable, "-c", program.replace("BEFORE", before), *options]
+    done = subprocess.run(command, capture_output=True, env=environment, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines(), done.stderr
 
@@ -70,16 +69,10 @@ def test_a_level_that_was_chosen_is_kept(compiled, level, greets):
 def test_the_command_line_says_the_same(compiled, tmp_path):
     """A kernel of another viscosity is among those that it needs, at first."""
     folder, _ = compiled
-    scene = "docs/figures/dam_break_plane.toml"
-    options = ["--set", "forces.viscosity=stress", "--steps", "2", "--no-pictures", "--overwrite"]
+    words = ["run", "docs/figures/dam_break_plane.toml", "--set", "forces.viscosity=stress", "--steps", "2"]
+    options = [*words, "--no-pictures", "--overwrite", "--out", str(tmp_path)]
     program = UNOPTIMISED + "import runpy; runpy.run_module('cortado', run_name='__main__')"
-    command = [sys.executable, "-c", program, "run", scene, "--out", str(tmp_path), *options]
-    errors = []
-    for _ in range(2):
-        environment = {**os.environ, "WARP_CACHE_PATH": str(folder)}
-        done = subprocess.run(command, capture_output=True, env=environment, text=True)
-        assert done.returncode == 0, done.stderr
-        errors.append(done.stderr)
+    errors = [said(folder, program=program, options=options)[1] for _ in range(2)]
     assert COMPILING.fullmatch(errors[0]) and errors[1] == ""
 
 

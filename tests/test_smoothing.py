@@ -34,9 +34,14 @@ PIECES = {
 }
 ACCURACY = {"float32": 2e-5, "float64": 1e-12}
 
-kernels = pytest.mark.parametrize("name", KERNELS)
-dimensions = pytest.mark.parametrize("dimension", [2, 3])
+names = pytest.mark.parametrize("name", KERNELS)
+supports = pytest.mark.parametrize("support", [2.0, 2.5, 3.0])
 precisions = pytest.mark.parametrize("precision", [FLOAT32, FLOAT64], ids=lambda precision: precision.name)
+
+
+def kernels(test):
+    """For each kernel in the plane and in space."""
+    return names(pytest.mark.parametrize("dimension", [2, 3])(test))
 
 
 def radial(name, r, derivative=0):
@@ -54,11 +59,11 @@ def radial(name, r, derivative=0):
 def sigma(name, dimension):
     """1 over the integral of w over the support, by exact integration of its polynomials."""
     sphere = 2 * pi if dimension == 2 else 4 * pi
-    total = 0.0
-    for lower, upper, coefficients in PIECES[name]:
-        for power, coefficient in enumerate(coefficients):
-            n = power + dimension
-            total += coefficient * (upper**n - lower**n) / n
+    total = sum(
+        coefficient * (upper**n - lower**n) / n
+        for lower, upper, coefficients in PIECES[name]
+        for n, coefficient in enumerate(coefficients, dimension)
+    )
     return 1.0 / (sphere * total * SUPPORT**dimension)
 
 
@@ -85,12 +90,8 @@ def expected_hessian(name, dimension, x):
 @cache
 def evaluator(kernel, precision):
     functions = smoothing_functions(kernel, precision)
-    weight, gradient, slope, slope_change = (
-        functions.weight,
-        functions.gradient,
-        functions.slope,
-        functions.slope_change,
-    )
+    weight, gradient = functions.weight, functions.gradient
+    slope, slope_change = functions.slope, functions.slope_change
     real, vector = precision.real, precision.vector
     module = wp.get_module(f"test_smoothing_{kernel.name}_{precision.name}")
     module.options.update({"enable_backward": False, "optimization_level": 1})
@@ -133,8 +134,8 @@ def separations(dimension, n=400, furthest=1.4, seed=0):
 
 
 @kernels
-@dimensions
-def test_the_integral_is_one_on_a_lattice(name, dimension):
+def test_the_normalisation_is_exact_and_the_integral_one_on_a_lattice(name, dimension):
+    assert KERNELS[name].normalisation(dimension, SUPPORT) == pytest.approx(sigma(name, dimension), rel=1e-12)
     cells = {2: 100, 3: 40}[dimension]
     axis = (np.arange(-cells, cells) + 0.5) / cells * SUPPORT
     r = np.sqrt(sum(a * a for a in np.meshgrid(*[axis] * dimension, sparse=True)))
@@ -143,13 +144,6 @@ def test_the_integral_is_one_on_a_lattice(name, dimension):
 
 
 @kernels
-@dimensions
-def test_the_normalisation_is_exact(name, dimension):
-    assert KERNELS[name].normalisation(dimension, SUPPORT) == pytest.approx(sigma(name, dimension), rel=1e-12)
-
-
-@kernels
-@dimensions
 def test_numpy_forms(name, dimension):
     x, _ = separations(dimension)
     r, x_d = np.linalg.norm(x, axis=1), x[:, :dimension]
@@ -160,7 +154,6 @@ def test_numpy_forms(name, dimension):
 
 
 @kernels
-@dimensions
 @precisions
 def test_warp_forms_against_the_formulae(name, dimension, precision):
     x, u = separations(dimension)
@@ -182,7 +175,6 @@ def away_from_joints(name, x):
 
 
 @kernels
-@dimensions
 def test_warp_forms_against_central_differences(name, dimension):
     x, u = separations(dimension)
     _, g, hu = evaluate(name, FLOAT64, dimension, x, u)
@@ -198,7 +190,6 @@ def test_warp_forms_against_central_differences(name, dimension):
 
 
 @kernels
-@dimensions
 @precisions
 def test_coincident_particles(name, dimension, precision):
     u = np.array([[1.0, 0.0, 0.0], [0.3, -0.4, 0.0], [0.0, 0.0, 0.0]])
@@ -211,7 +202,7 @@ def test_coincident_particles(name, dimension, precision):
     np.testing.assert_allclose(hu, bend * u, rtol=ACCURACY[precision.name])
 
 
-@kernels
+@names
 @precisions
 @pytest.mark.parametrize("exponent", [-6, -12, -20, -30, -100, -250])
 def test_nearly_coincident_particles(name, precision, exponent):
@@ -226,7 +217,6 @@ def test_nearly_coincident_particles(name, precision, exponent):
 
 
 @kernels
-@dimensions
 @precisions
 def test_beyond_the_support_all_is_zero(name, dimension, precision):
     x, u = separations(dimension)
@@ -253,11 +243,7 @@ def lowered(name, support, dimension):
     return min(1.0, RATE_LIMIT / greatest_rate(KERNELS[name], SPACING, support, dimension))
 
 
-supports = pytest.mark.parametrize("support", [2.0, 2.5, 3.0])
-
-
 @kernels
-@dimensions
 @supports
 def test_the_lattice_has_the_rest_density_less_the_slack(name, dimension, support):
     support *= SPACING
@@ -289,30 +275,24 @@ def test_a_stretched_square_lattice_is_denser_and_a_sheared_one_need_not_be(name
 
 
 @kernels
-@dimensions
 @supports
-def test_pressure_stiffness_is_what_the_sums_say(name, dimension, support):
-    """delta = 1 / (beta (S . S + sum G . G)) with beta = 2 m^2 dt^2 / rho_0^2, summed particle by particle."""
+def test_pressure_stiffness_and_the_response_of_walls_are_what_the_sums_say(name, dimension, support):
+    """delta = 1 / (beta (S . S + sum G . G)) with beta = 2 m^2 dt^2 / rho_0^2; the sum is the response of walls."""
     support *= SPACING
     rest_density, time_step = 870.0, 0.0021
     mass = rest_density * rest_volume(KERNELS[name], SPACING, support, dimension)
     points, middle = block(dimension)
-    total, squares = np.zeros(dimension), 0.0
-    for j, point in enumerate(points):
-        if j == middle:
-            continue
-        g = KERNELS[name].gradient((points[middle] - point)[None], support)[0]
-        total += g
-        squares += g @ g
+    g = KERNELS[name].gradient(points[middle] - np.delete(points, middle, axis=0), support)
+    total, squares = g.sum(axis=0), (g * g).sum()
     beta = 2 * mass**2 * time_step**2 / rest_density**2
     delta = 1.0 / (beta * (total @ total + squares))
     stiffness = pressure_stiffness(KERNELS[name], SPACING, support, dimension)
     assert stiffness == pytest.approx(delta * time_step**2 * lowered(name, support, dimension), rel=1e-12)
     assert stiffness > 0.0
+    assert wall_response(KERNELS[name], SPACING, support, dimension) == pytest.approx(squares, rel=1e-12)
 
 
 @kernels
-@dimensions
 @supports
 def test_the_pressure_iteration_converges_on_the_lattice(name, dimension, support):
     """p <- p + delta (rho* - rho_0) linearised on a periodic lattice, as a matrix: its eigenvalues stay below 2."""
@@ -332,7 +312,6 @@ def test_the_pressure_iteration_converges_on_the_lattice(name, dimension, suppor
 
 
 @kernels
-@dimensions
 @supports
 def test_pressure_stiffness_answers_an_error_with_its_correction(name, dimension, support):
     """What delta means (Solenthaler and Pajarola 2009): one pressure p at a particle and its neighbours, acting from it
@@ -349,17 +328,6 @@ def test_pressure_stiffness_answers_an_error_with_its_correction(name, dimension
     stiffness = pressure_stiffness(kernel, SPACING, support, dimension) / lowered(name, support, dimension)
     delta = stiffness / time_step**2
     assert change == pytest.approx(-p / delta, rel=1e-9)
-
-
-@kernels
-@dimensions
-@supports
-def test_wall_response(name, dimension, support):
-    """sum_j G_j . G_j, particle by particle."""
-    points, middle = block(dimension)
-    g = KERNELS[name].gradient(points[middle] - points, support * SPACING)
-    expected = sum(float(row @ row) for row in g)
-    assert wall_response(KERNELS[name], SPACING, support * SPACING, dimension) == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_polynomials_of_this_file_have_their_textbook_normalisations():

@@ -31,9 +31,7 @@ def resting(
     scene = Scene(
         dimension=2,
         discretisation={"spacing": 1.0, "support": support, "kernel": "cubic_spline"},
-        phase=[
-            {"name": f"phase {k}", "rest_density": density, "viscosity": 0.0} for k, density in enumerate(densities)
-        ],
+        phase=[{"name": f"phase {k}", "rest_density": one, "viscosity": 0.0} for k, one in enumerate(densities)],
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": upper, "phase": "phase 0"}],
         container={"shape": "box", "lower": [0.0, 0.0], "upper": upper, "periodic": [True, True]},
         forces={"gravity": [0.0, 0.0], "viscosity": "none", "pressure": False},
@@ -195,11 +193,8 @@ def test_miscible_phases_mix_as_fast_as_they_should():
     In the engine's own substeps the error of an explicit step makes up for some of that of the lattice; 400 time steps
     leave little of it.
     """
-    errors = []
-    for wavelength in 12, 16, 24:
-        for steps in 1, 400:
-            times, variance = mixing(wavelength, steps)
-            errors.append(abs(variance[-1] / np.exp(-times[-1]) - 1.0))
+    found = [mixing(wavelength, steps) for wavelength in (12, 16, 24) for steps in (1, 400)]
+    errors = [abs(variance[-1] / np.exp(-times[-1]) - 1.0) for times, variance in found]
     assert max(errors) < 0.03
     lattice = errors[1::2]
     assert lattice[2] < 0.6 * lattice[1] < 0.4 * lattice[0]
