@@ -7,11 +7,7 @@ in `INCURABLE`, or more of them than stand there.
 from collections import Counter
 from collections.abc import Iterable
 
-INCURABLE = {
-    "there is no CUDA device": None,
-    "root may write anywhere": 2,
-    "its kernels here are those of space": 8,
-}
+INCURABLE = {"there is no CUDA device": None, "root may write anywhere": 2, "its kernels here are those of space": 8}
 """Reasons that no package can cure, and how many tests have them at most. Any number may want a GPU."""
 
 

@@ -264,11 +264,7 @@ def field(entry, first, *axis):
         (of_fields(field(Entry.VECTOR, "viscosity", Axis.SCALAR)), TypeError, "which is not a vector of the scene"),
         (lambda setting: object(), InputError, r"object, which .*Made.* made, has no shares, but must have"),
         (Duck, InputError, "the force Duck has the methods settle of a part, but is none"),
-        (
-            type("Idle", (MemoryForce,), {"end": Part.end}),
-            InputError,
-            "Idle has fields, but no method `end` that",
-        ),
+        (type("Idle", (MemoryForce,), {"end": Part.end}), InputError, "Idle has fields, but no method `end` that"),
     ],
 )
 def test_a_force_that_cannot_be_is_refused(force, error, message):

@@ -157,10 +157,7 @@ def named(kind, *lines):
     ("text", "said"),
     [
         (named("drg"), r"force\[0\].kind is .drg., but must be a name that an installed package registers "),
-        (
-            solver('kind = "dfsph"'),
-            'must be "projection" or "pcisph", or a name .*"falling", "remembering"',
-        ),
+        (solver('kind = "dfsph"'), 'must be "projection" or "pcisph", or a name .*"falling", "remembering"'),
         (solver("rate = 0.1"), r"solver.rate is not a key of \[solver\]; its keys are kind, time_step, courant"),
         (solver('kind = "remembering"', "minimum_iterations = 2"), r"solver.minimum_iterations is not a key .* rate\."),
         (THEIRS.replace("0.0021", "-1.0"), r"solver.time_step is -1.0, but must be greater than"),

@@ -39,9 +39,7 @@ UNNAMED = {
     "sph.viscosity": {"viscosity_term.made.viscosity_work"},
     "sph.walls": {"_work.wall_slope_work"},
     "sph.formula": {"packing_kernels.add_number"},
-    "sph.stress_kernels": {
-        *("moments_work.moments_work", "moment_sums.moments_back", "moment_sums.wall_moments_back"),
-    },
+    "sph.stress_kernels": {*("moments_work.moments_work", "moment_sums.moments_back", "moment_sums.wall_moments_back")},
     "sph.stress_forces": {
         *("stress_sums.traction_back", "stress_sums.wall_traction_back"),
         *("stress_sums.force_back", "stress_sums.wall_force_back", "stress_work.stress_work"),
@@ -123,10 +121,7 @@ def small(viscosity: str, **changes):
 CAMERA = {"view": "volume", "resolution": [9, 8], "position": [0.7, 0.35, 0.8], "look_at": [0.15, 0.08, 0.15]}
 VOLUME = scene(
     phase=PHASES,
-    fluid=[
-        box([0.1, 0.0, 0.1], [0.2, 0.05, 0.2], phase="water"),
-        box([0.1, 0.05, 0.1], [0.2, 0.15, 0.2], phase="oil"),
-    ],
+    fluid=[box([0.1, 0.0, 0.1], [0.2, 0.05, 0.2], phase="water"), box([0.1, 0.05, 0.1], [0.2, 0.15, 0.2], phase="oil")],
     container=box([0.0] * 3, [0.3] * 3),
     solver=SOLVER,
     render={**CAMERA, "field_of_view": 20.0, "extinction": 12.0},

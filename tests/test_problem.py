@@ -272,14 +272,8 @@ def test_numbers_of_steps_that_cannot_be_are_sentences(simulation, steps):
             r"adjoint of positions has shape \(7, 3\)",
         ),
         (lambda it: without_volume(), r"^mass_fractions of particle 5 are \[3.0, -2.0, 0.0\], but must be such"),
-        (
-            lambda it: Simulation(plane_of_three(), free_energy="miscible"),
-            "^free_energy is .miscible., but must be a",
-        ),
-        (
-            lambda it: Simulation(splash(), free_energy=MISCIBLE),
-            r"left out, as the scene has only one phase\.$",
-        ),
+        (lambda it: Simulation(plane_of_three(), free_energy="miscible"), "^free_energy is .miscible., but must be a"),
+        (lambda it: Simulation(splash(), free_energy=MISCIBLE), r"left out, as the scene has only one phase\.$"),
     ],
 )
 def test_what_does_not_fit_is_a_sentence(problem, call, said):

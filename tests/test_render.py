@@ -74,10 +74,8 @@ def weights(made: Renderer) -> np.ndarray:
 
 
 def gradient(adjoint: RenderAdjoint) -> dict[str, np.ndarray]:
-    return {
-        name: value.numpy().astype(float) if isinstance(value, wp.array) else value
-        for name, value in vars(adjoint).items()
-    }
+    found = vars(adjoint).items()
+    return {name: value.numpy().astype(float) if isinstance(value, wp.array) else value for name, value in found}
 
 
 def twin_field(nodes, values, smoothing: SmoothingKernel, dimension: int) -> np.ndarray:
@@ -463,10 +461,7 @@ def rendered(**values: Any) -> Renderer:
         (lambda: renderer(top(), cell=1e-5), "cell is 1e-05, which makes .* nodes"),
         (lambda: renderer(top()).adjoint(np.zeros((256, 256, 3))), "call render before"),
         (lambda: rendered().adjoint(np.zeros((3, 3, 3))), "image_bar has shape"),
-        (
-            lambda: renderer(top(), periods=[0.3, 0, 0]),
-            r"^periods is \[0\.3, 0\.0, 0\.0\], .* 0 or greater than two",
-        ),
+        (lambda: renderer(top(), periods=[0.3, 0, 0]), r"^periods is \[0\.3, 0\.0, 0\.0\], .* 0 or greater than two"),
         (lambda: picture(renderer(top()), scene(n=4)), r"positions is vec3d of shape \(4,\) on cpu, but"),
         (lambda: picture(renderer(top()), scene(phases=2)), "fractions is"),
         (lambda: picture(renderer(top()), scene(), FLOAT32), "positions is vec3f"),

@@ -34,9 +34,7 @@ def test_a_restart_has_the_bits_of_a_run_that_did_not_stop(name, precision, tmp_
     simulation = Simulation(MAKERS[name](), precision=precision)
     controls = controls_of(simulation)
     whole = simulation.run(FIRST + REST, controls)
-    earlier, later = (
-        {key: table[rows] for key, table in controls.items()} for rows in (slice(FIRST), slice(FIRST, None))
-    )
+    earlier, later = ({key: own[rows] for key, own in controls.items()} for rows in (slice(FIRST), slice(FIRST, None)))
     first = simulation.run(FIRST, earlier, record_every=5)
     first.save(tmp_path / "first.vtkhdf")
     for state in (first.last_state, Trajectory.load(tmp_path / "first.vtkhdf").last_state):
@@ -67,11 +65,7 @@ def test_states_that_do_not_fit_are_refused():
     emitterless = Simulation(two_layers()).run(1).last_state
     for given, controls, what in [
         (other(positions=x[:-1]), {}, "state positions has shape"),
-        (
-            other(positions=x + [0.0, 0.0, 5.0]),
-            {},
-            "positions has particle 0 at .* m, outside the container of this",
-        ),
+        (other(positions=x + [0.0, 0.0, 5.0]), {}, "positions has particle 0 at .* m, outside the container of this"),
         (other(reference_density=np.zeros(n)), {}, "state reference_density must be greater than 0"),
         (other(mass_fractions=np.full((n, 2), [2.0, -1.0])), {}, f"{wrong} 2, -1"),
         (other(mass_fractions=np.full((n, 2), [0.9, 0.2])), {}, f"{wrong} 0.9, 0.2"),

@@ -224,18 +224,8 @@ BOTH = {"tilt": [0.0, 0.0], "gravity": [0.0, -9.81, 0.0]}
         (plane(), {"tilt": 0.0}, None, r"tilt has shape \(\), but must be \(1,\) or \(12, 1\) in °"),
         (splash(), {"tilt": [np.nan, 0.0]}, None, "tilt has a value that is not finite"),
         (WEIGHTLESS, {"tilt": [1.0, 0.0]}, None, "tilt is given, .* as the scene has no gravity to lean"),
-        (
-            splash(),
-            {"gravity": [0.0, -9.0, 0.0]},
-            {"tilt": [1.0, 0.0]},
-            "direction tilt is .* as gravity is given",
-        ),
-        (
-            splash(),
-            {"tilt": [1.0, 0.0]},
-            {"gravity": [0.0, -1.0, 0.0]},
-            "direction gravity is .* as tilt is given",
-        ),
+        (splash(), {"gravity": [0.0, -9.0, 0.0]}, {"tilt": [1.0, 0.0]}, "direction tilt is .* as gravity is given"),
+        (splash(), {"tilt": [1.0, 0.0]}, {"gravity": [0.0, -1.0, 0.0]}, "direction gravity is .* as tilt is given"),
     ],
 )
 def test_a_wrong_tilt_is_a_sentence(made, values, along, words):

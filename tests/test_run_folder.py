@@ -146,21 +146,26 @@ def test_a_former_default_of_a_scene_was_not_asked_for(tmp_path):
     assert folder.read_scene().picture.film_frames == 120
 
 
+def huge(path):
+    path.write_bytes(b"{}\n")
+    os.truncate(path, 2**40)
+
+
+DAMAGE = {
+    "deep": lambda path: path.write_text("[" * 100_000 + "\n"),
+    "pipe": os.mkfifo,
+    "endless": lambda path: path.symlink_to("/dev/zero"),
+    "huge": huge,
+}
+
+
 @pytest.mark.parametrize("name", ["scene.json", "environment.json", "metrics.jsonl"])
-@pytest.mark.parametrize("damage", ["deep", "pipe", "endless", "huge"])
+@pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_folder_is_a_sentence(tmp_path, name, damage):
     folder = new_run(tmp_path / "a")
     path = folder.path / name
     path.unlink(missing_ok=True)
-    if damage == "deep":
-        path.write_text("[" * 100_000 + "\n")
-    elif damage == "pipe":
-        os.mkfifo(path)
-    elif damage == "endless":
-        path.symlink_to("/dev/zero")
-    else:
-        path.write_bytes(b"{}\n")
-        os.truncate(path, 2**40)
+    DAMAGE[damage](path)
     with pytest.raises(InputError, match=r"cannot be|no run in|not JSON"):
         RunFolder.resume(folder.path, SCENE, COMMAND).read_metrics()
 
@@ -317,13 +322,10 @@ def test_the_time_left_is_that_of_what_is_left(monkeypatch, times, number, lines
 
 
 def test_progress_on_a_terminal_is_a_bar_with_fields(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setenv("COLUMNS", "120")
-    terminal = Terminal()
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
     with track(4, "optimise", stream=terminal) as advance:
         advance(4, loss=0.123456)
     assert "optimise" in terminal.getvalue() and "4/4" in terminal.getvalue()
@@ -334,11 +336,6 @@ def torn(path):
     path.write_text(path.read_text()[:100])
 
 
-def huge(path):
-    path.write_bytes(b"{}")
-    os.truncate(path, 2**40)
-
-
 def another(make):
     """Something else in the place of a file."""
     return lambda path: (path.unlink(), make(path))
@@ -346,13 +343,13 @@ def another(make):
 
 NO_SCENES = {
     "pipe": (another(os.mkfifo), "it is a pipe, but must be a regular file"),
-    "endless": (another(lambda path: path.symlink_to("/dev/zero")), "it is a device, but must be a regular file"),
+    "endless": (another(DAMAGE["endless"]), "it is a device, but must be a regular file"),
     "folder": (another(os.mkdir), "it is a directory, but must be a regular file"),
     "missing": (Path.unlink, "No such file"),
     "huge": (huge, "but must have at most"),
     "torn": (torn, "is not valid JSON"),
     "bytes": (lambda path: path.write_bytes(b"\xff\xfe{"), "is not valid JSON"),
-    "deep": (lambda path: path.write_text("[" * 100_000), "is not valid JSON"),
+    "deep": (DAMAGE["deep"], "is not valid JSON"),
     "list": (lambda path: path.write_text("[]"), "must be"),
     "field": (lambda path: path.write_text(path.read_text().replace('"dimension": 2', '"dimension": 7')), "dimension"),
 }

@@ -362,8 +362,7 @@ def test_a_large_time_step_is_a_warning():
 def lock_exchange(time_step):
     """Heavy fluid beside light fluid, 40 spacings deep."""
     phases = [
-        {"name": name, "rest_density": density, "viscosity": 0.001}
-        for name, density in (("salt", 1200), ("fresh", 1000))
+        {"name": name, "rest_density": rho, "viscosity": 0.001} for name, rho in (("salt", 1200), ("fresh", 1000))
     ]
     fluid = [box([0.0, 0.0], [0.2, 0.4], phase="salt"), box([0.2, 0.0], [0.4, 0.4], phase="fresh")]
     return pool(

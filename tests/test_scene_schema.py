@@ -114,9 +114,7 @@ def test_what_the_schema_of_a_scene_says():
 
 
 PHASES = [{"name": name, "rest_density": 1000, "viscosity": 0.001} for name in ("water", "oil", "ink")]
-FLUIDS = [
-    box([0, low], [1, high], phase=phase) for low, high, phase in [(0.5, 1, "ink"), (0, 0.5, "water"), (1, 1.1, "oil")]
-]
+FLUIDS = [box([0, a], [1, b], phase=phase) for a, b, phase in [(0.5, 1, "ink"), (0, 0.5, "water"), (1, 1.1, "oil")]]
 
 
 def test_phases_are_counted_in_the_order_of_the_scene():

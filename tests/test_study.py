@@ -55,10 +55,7 @@ def test_what_is_no_table_is_refused(tmp_path):
         (lambda: Table.joined([{"a": 1}, {"b": 1}]), "to be joined"),
         (lambda: Table.read_csv(tmp_path / "absent.csv"), "cannot be read"),
         (lambda: Table.read_csv(tmp_path / "ragged.csv"), "longer or shorter"),
-        (
-            lambda: Table.read_csv(tmp_path / "pipe.csv"),
-            r"pipe.csv cannot be read: it is a pipe, but must be a reg",
-        ),
+        (lambda: Table.read_csv(tmp_path / "pipe.csv"), r"pipe.csv cannot be read: it is a pipe, but must be a reg"),
     ]:
         with pytest.raises(InputError, match=words):
             call()

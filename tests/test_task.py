@@ -146,10 +146,8 @@ def test_options_of_the_search(task_file):
 
 
 SMOOTHING = ['optimise.gradient.name="adjoint_viscosity"']
-SEVERAL, STILL = (
-    ["optimise.gradient.samples=4", "optimise.gradient.spread.gravity=0.5"],
-    "optimise.gradient.position_noise=0",
-)
+SEVERAL = ["optimise.gradient.samples=4", "optimise.gradient.spread.gravity=0.5"]
+STILL = "optimise.gradient.position_noise=0"
 ESTIMATORS = {
     "exact": ([], gradients.Exact()),
     "a fixed point": (['optimise.gradient.name="implicit_pressure"'], gradients.ImplicitPressure()),

@@ -348,10 +348,7 @@ def test_what_cannot_be_is_said_in_a_sentence(tmp_path):
             "sweep scene.toml --set solver.courant=0.1,0.2 --steps 3",
             '"auto", but must be a number of seconds for a sweep.',
         ),
-        (
-            "optimise task.toml --set solver.time_step=auto",
-            "a number of seconds in a task, whose runs are compared",
-        ),
+        ("optimise task.toml --set solver.time_step=auto", "a number of seconds in a task, whose runs are compared"),
         ("gradients check scene.toml --steps 3", "for a certificate, whose differences would not hold chosen ones."),
     ],
 )

@@ -333,10 +333,8 @@ def test_it_ends_within_a_second_while_pages_are_connected(file, reads):
 def test_ctrl_c_ends_the_command_while_a_page_is_connected(file):
     words = [sys.executable, "-m", "cortado", "view", str(file), "--port", str(PORT)]
     pipe = subprocess.PIPE
-    with (
-        subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, preexec_fn=listen) as command,
-        ExitStack() as ended,
-    ):
+    with ExitStack() as ended:
+        command = ended.enter_context(subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, preexec_fn=listen))
         ended.callback(command.kill)
         assert command.stderr is not None
         line = next(line for line in command.stderr if "shows it" in line)

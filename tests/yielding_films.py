@@ -77,9 +77,7 @@ def found_law(deep: int, target: np.ndarray, start: dict[str, float]) -> dict[st
         if k in (0, 2):
             slopes = sensitivities(deep, law)
         change = np.linalg.lstsq(slopes, np.log(target / observed(deep, law)), rcond=None)[0]
-        law = {
-            name: law[name] * float(np.exp(part)) for name, part in zip(law, np.clip(change, -0.4, 0.4), strict=True)
-        }
+        law = {name: law[name] * float(np.exp(by)) for name, by in zip(law, np.clip(change, -0.4, 0.4), strict=True)}
     return law
 
 
