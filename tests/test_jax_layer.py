@@ -8,7 +8,7 @@ import pytest
 
 import cortado
 import layered
-from cortado import InputError, Simulation, gradients, sensors
+from cortado import InputError, Problem, Simulation, gradients, sensors
 from cortado.optimisation.layers.layer import KEPT
 from layered import (
     BAD_PARAMETERS,
@@ -135,6 +135,39 @@ def test_compiled_scanned_and_recomputed_segments_have_the_same_gradient(jax, la
             np.testing.assert_allclose(one, other, rtol=1e-12)
 
 
+def test_steps_go_back_by_an_estimator_one_by_one_and_mapped(jax, layer, simulation, point):
+    viscous = gradients.AdjointViscosity()
+    first = {**layer.state(simulation), "velocities": point[1]}
+
+    def far(way, gravity):
+        end = way(first, {"gravity": gravity})
+        return (end["positions"] ** 2).sum() + (end["velocities"] ** 2).sum()
+
+    def scanned(state, parameters, gradient=viscous):
+        advance = partial(layer.step, simulation, parameters=parameters, steps=10, gradient=gradient)
+        return jax.lax.scan(lambda before, _: (advance(before), None), state, None, length=2)[0]
+
+    def rolled(state, parameters):
+        states = layer.rollout(simulation, state, parameters, 20, 10, viscous)
+        return {name: array[-1] for name, array in states.items()}
+
+    class Far:
+        def value(self, end):
+            return float((end.positions**2).sum() + (end.velocities**2).sum())
+
+        def adjoint(self, end):
+            return 2.0 * end.positions, 2.0 * end.velocities
+
+    problem = Problem(simulation, 20, Far(), state=layer.restart_state(simulation, first))
+    wanted = problem.value_and_gradient({"gravity": point[2]}, viscous)[1]["gravity"]
+    for way in (scanned, rolled):
+        np.testing.assert_allclose(jax.jit(jax.grad(partial(far, way)))(point[2]), wanted, rtol=1e-12)
+    exact = jax.grad(partial(far, partial(scanned, gradient=None)))(point[2])
+    assert np.abs(exact - wanted).max() > 1e-9 * np.abs(wanted).max()
+    both = jax.vmap(jax.grad(partial(far, scanned)))(jax.numpy.stack([point[2], 1.1 * point[2]]))
+    np.testing.assert_allclose(both[0], wanted, rtol=1e-12)
+
+
 def test_residuals_that_are_gone_are_computed_again(jax, layer, simulation, point, monkeypatch):
     """And none is left behind by a backward pass."""
     from cortado.optimisation.layers import with_jax
@@ -163,10 +196,15 @@ def test_a_gradient_is_taken_twice_from_one_forward_run(jax, problem, layer):
 
 # ---- bits --------------------------------------------------------------------------------------------------------
 
-ESTIMATORS = [None, gradients.AdjointViscosity(0.2), gradients.RandomizedSmoothing(samples=4)]
+ESTIMATORS = [
+    None,
+    gradients.AdjointViscosity(0.2),
+    gradients.AdjointViscosity(0.2, order=2),
+    gradients.RandomizedSmoothing(samples=4),
+]
 
 
-@pytest.mark.parametrize("gradient", ESTIMATORS, ids=lambda one: type(one).__name__)
+@pytest.mark.parametrize("gradient", ESTIMATORS, ids=["exact", "viscosity", "order 2", "smoothing"])
 def test_a_value_and_its_gradient_have_the_bits_of_the_problem(jax, layer, problem, gradient):
     parameters = {name: jax.numpy.asarray(value) for name, value in POINT.items()}
     wanted, wanted_gradient = problem.value_and_gradient(POINT, gradient)
@@ -529,6 +567,7 @@ def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, proble
         (lambda: layer.step(simulation, state, steps=0), "steps is 0, but must be a whole number of at least 1"),
         (lambda: layer.step(simulation, state, {"viscosity": single}), "parameter viscosity is float32, but must be"),
         (lambda: layer.rollout(simulation, state, steps=5, record_every=2), "record_every is 2, but must divide the 5"),
+        (lambda: layer.step(simulation, state, gradient=gentle), "estimator is .*, but must be an AdjointEstimator"),
         (lambda: layer.value(problem, gentle)({}, state), "gradient is a RandomizedSmoothing, but must go back"),
         (lambda: layer.measure(simulation, "colour"), "quantity is 'colour', but must be one of density"),
         (lambda: layer.measure(Simulation(plane(), batch=2), "density"), "simulation is a batch of 2, but must be"),

@@ -286,6 +286,32 @@ def test_segments_chained_by_vjp_have_the_bits_of_one_run(name, precision):
             assert (np.abs(found - gradient[parameter]) <= ROUND_OFF[precision] * size).all(), parameter
 
 
+@pytest.mark.parametrize(
+    "estimator",
+    [gradients.AdjointViscosity(), gradients.ImplicitPressure(), gradients.AdjointViscosity(base=gradients.Tape())],
+    ids=["viscosity", "implicit pressure", "viscosity of a tape"],
+)
+def test_segments_go_back_by_an_estimator_as_one_run_does(estimator):
+    solver = {"kind": "projection", "time_step": 0.005} if estimator == gradients.ImplicitPressure() else {}
+    made = plane(solver=solver) if solver else plane()
+    simulation = Simulation(made, precision="float64")
+    start = {"initial_velocities": simulation.velocities + np.random.default_rng(2).normal(0, 0.3, (64, 2))}
+    wanted = Problem(simulation, 20, Weighted()).value_and_gradient({"viscosity": 0.1, **start}, estimator)[1]
+    stepper, state, residuals = simulation.stepper(5), simulation.state(start), []
+    for _ in range(4):
+        state, residual = stepper.step(state, {"viscosity": 0.1})
+        residuals.append(residual)
+    exact, _ = stepper.vjp(residuals[-1], last_adjoint(state))
+    bar, viscosity_bar = last_adjoint(state), 0.0
+    for residual in reversed(residuals):
+        bar, part = stepper.vjp(residual, bar, estimator)
+        viscosity_bar += part["viscosity"]
+        if residual is residuals[-1]:
+            assert np.abs(bar["velocities"] - exact["velocities"]).max() > 1e-6
+    assert bar["velocities"].tobytes() == wanted["initial_velocities"].tobytes()
+    assert viscosity_bar == pytest.approx(wanted["viscosity"], rel=1e-12)
+
+
 def test_segments_of_a_batch_chained_by_vjp_have_the_bits_of_one_run():
     simulation = Simulation(plane_of_three(), batch=3, precision="float64")
     start = {"initial_velocities": 0.02 * np.arange(3)[:, None, None] + simulation.velocities}
@@ -460,6 +486,9 @@ def test_directions_and_residuals_that_do_not_fit_are_sentences():
         (lambda: stepper.jvp(residual, {}, {"mobility": 1.0}), "must be named where the step is taken"),
         (lambda: simulation.stepper(3).vjp(residual, {}), not_its_own),
         (lambda: stepper.vjp(3, {}), not_its_own),
+        (lambda: stepper.vjp(residual, {}, 3), "gradient is 3, but must be an AdjointEstimator"),
+        (lambda: stepper.vjp(residual, {}, gradients.Exact), "gradient is the class Exact, but must be an Adj"),
+        (lambda: stepper.vjp(residual, {}, gradients.AdjointViscosity(order=2)), "order is 2, but must be 1 where"),
         (lambda: stepper.step(state, along="mobility"), "must be a list of names"),
         (lambda: stepper.step(state, along=3), "along is 3"),
         (lambda: stepper.step(state, along=["mobil"]), "'mobil' is unknown"),

@@ -9,7 +9,7 @@ import pytest
 
 import cortado
 import layered
-from cortado import DivergedError, InputError, Simulation, gradients, sensors
+from cortado import DivergedError, InputError, Problem, Simulation, gradients, sensors
 from layered import (
     POINT,
     STIFF,
@@ -286,6 +286,16 @@ def test_a_batch_of_a_user_has_parameters_in_all_shapes(layer):
         torch.vmap(lambda m: layer.value(problem)({"viscosity": m}))(tensor([1.0, 2.0]))
 
 
+class Far:
+    """A loss of the last positions."""
+
+    def value(self, end):
+        return float((end.positions**2).sum())
+
+    def adjoint(self, end):
+        return 2.0 * end.positions, np.zeros_like(end.velocities)
+
+
 def test_a_module_learns_its_parameters(layer, simulation):
     target = simulation.run(20, {"gravity": [1.0, -9.0]}).positions[-1]
     module = layer.Steps(simulation, 20, trained={"gravity": [0.0, -9.81]})
@@ -302,6 +312,11 @@ def test_a_module_learns_its_parameters(layer, simulation):
     (gravity,) = module.parameters()
     np.testing.assert_allclose(gravity.detach(), [1.0, -9.0], atol=0.02)
     assert losses[-1] < 1e-3 * losses[0]
+    viscous = layer.Steps(simulation, 20, {"gravity": [0.0, -9.81]}, gradients.AdjointViscosity())
+    problem = Problem(simulation, 20, Far(), state=simulation.state())
+    (viscous(first)["positions"] ** 2).sum().backward()
+    wanted = problem.value_and_gradient({"gravity": [0.0, -9.81]}, gradients.AdjointViscosity())[1]
+    np.testing.assert_allclose(next(viscous.parameters()).grad, wanted["gravity"], rtol=1e-12)
     again = layer.Steps(simulation, 20, trained={"gravity": [0.0, 0.0]})
     again.load_state_dict(module.state_dict())
     with torch.no_grad():

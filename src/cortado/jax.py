@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from cortado.calls import face
-from cortado.gradients import GradientEstimator
+from cortado.gradients import AdjointEstimator, GradientEstimator
 from cortado.optimisation.layers import calls
 from cortado.optimisation.layers.with_jax import JaxBridge, jax
 from cortado.problem import Problem
@@ -46,23 +46,35 @@ def restart_state(simulation: Simulation, given: Arrays, parameters: Values | No
 
 
 def step(
-    simulation: Simulation, given: Arrays, parameters: Arrays | None = None, steps: int = 1
+    simulation: Simulation,
+    given: Arrays,
+    parameters: Arrays | None = None,
+    steps: int = 1,
+    gradient: AdjointEstimator | None = None,
 ) -> dict[str, "jax.Array"]:
     """Return the state after ``steps`` steps from ``given``: `Simulation.step` as a function of arrays.
 
     ``parameters`` are any of those of `Problem` but first values, arrays or numbers; one over time has a row for each
-    of these steps. Raises `InputError` for what does not fit, and `DivergedError` when a particle is lost; within a
-    compiled program, where values are known only as it runs, JAX raises an error of its own with the same sentence.
+    of these steps. Reverse mode goes back by the estimator ``gradient``, such as `gradients.AdjointViscosity`, exactly
+    if it is left out; forward mode is exact. Exact derivatives of chained steps grow by a constant factor a step, which
+    after some hundred steps drowns what is sought: see `docs/long_horizons.md`. Raises
+    `InputError` for what does not fit, and `DivergedError` when a particle is lost; within a compiled program, where
+    values are known only as it runs, JAX raises an error of its own with the same sentence.
     """
-    return calls.step(_BRIDGE, simulation, given, parameters, steps)
+    return calls.step(_BRIDGE, simulation, given, parameters, steps, gradient)
 
 
 def rollout(
-    simulation: Simulation, given: Arrays, parameters: Arrays | None = None, steps: int = 1, record_every: int = 1
+    simulation: Simulation,
+    given: Arrays,
+    parameters: Arrays | None = None,
+    steps: int = 1,
+    record_every: int = 1,
+    gradient: AdjointEstimator | None = None,
 ) -> dict[str, "jax.Array"]:
     """Return the states after every ``record_every`` of ``steps`` steps, the first one included, along a first axis
     (frames, ...); see `step`."""
-    return calls.rollout(_BRIDGE, simulation, given, parameters, steps, record_every)
+    return calls.rollout(_BRIDGE, simulation, given, parameters, steps, record_every, gradient)
 
 
 def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., "jax.Array"]:

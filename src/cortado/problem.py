@@ -14,7 +14,6 @@ import numpy as np
 from cortado.arrays import check_step_numbers, check_steps, require_arguments, require_function, whole_number
 from cortado.calls import Staying, fixed, public
 from cortado.code_words import code_words
-from cortado.device.memory import require
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import DivergedError, InputError, warn
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
@@ -29,6 +28,7 @@ from cortado.rollout.device_states import OfLost, without_lost
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.rollout import OBSERVED, BackwardStep, Observer, Residual, Rollout
 from cortado.rollout.run_checks import one_for_each
+from cortado.rollout.stepper import BackwardSteps
 from cortado.runs.probes import warn_of_places
 from cortado.runs.quantity_values import Moment, add_to_row, row_of
 from cortado.runs.trajectory import noted
@@ -56,7 +56,7 @@ class ProblemForwardPass(Staying):
     _values: Arrays
     _bars: Mapping[int, SnapshotAdjoint]
     _space: ParameterSpace
-    _derivatives: dict[AdjointEstimator, BackwardStep]
+    _derivatives: BackwardSteps
 
     @property
     def rollout(self) -> Rollout:
@@ -68,24 +68,6 @@ class ProblemForwardPass(Staying):
         """Lock that a thread holds while it uses the rollout."""
         return self.rollout.turn
 
-    def _derivative(self, estimator: AdjointEstimator) -> BackwardStep:
-        """Return the estimator's backward step, made once for each problem."""
-        if self.rollout.solver.layout.batch is not None and not estimator.batches:
-            raise InputError(
-                f"{type(estimator).__name__} is given a batch, but has no `batches = True`, which says that it treats "
-                "each scene by itself."
-            )
-        try:
-            is_new = estimator not in self._derivatives
-        except TypeError as error:
-            raise InputError(f"estimator has an {error}, but must be a dataclass(frozen=True) of numbers.") from None
-        if is_new:
-            solver = self.rollout.solver
-            parts = solver.gradient_memory(self.rollout.log)
-            require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
-            self._derivatives[estimator] = estimator.derivative(self.rollout)
-        return self._derivatives[estimator]
-
     @in_turn
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
         """Return the gradient by an estimator; ``observe`` is given the number and the adjoint of every state, from the
@@ -95,14 +77,14 @@ class ProblemForwardPass(Staying):
         whose settings may change, as its backward step would keep the first ones, and for one that may mix up the
         scenes of a batch.
         """
-        derivative = self._derivative(estimator)
+        derivative = self._derivatives.of(estimator)
         return self._gradient(derivative, self._first_adjoint(derivative, observe))
 
     @in_turn
     def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
         """Return the gradient by an estimator, and the derivatives with respect to the fields of the first state, by
         name, and its ``time``."""
-        derivative = self._derivative(estimator)
+        derivative = self._derivatives.of(estimator)
         first = self._first_adjoint(derivative)
         initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
         return self._gradient(derivative, first), without_lost(self._lost, initial_state)
@@ -199,7 +181,7 @@ class Problem:
         warn_of_places(simulation, self._losses.sensors)
         self._space = ParameterSpace(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, self.memory_budget)
-        self._derivatives: dict[AdjointEstimator, BackwardStep] = {}
+        self._derivatives = BackwardSteps(self._rollout)
         self._batches: dict[int, Problem] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:

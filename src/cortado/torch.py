@@ -10,7 +10,7 @@ from typing import Any
 
 from cortado.calls import face
 from cortado.errors import InputError
-from cortado.gradients import GradientEstimator
+from cortado.gradients import AdjointEstimator, GradientEstimator
 from cortado.optimisation.layers import calls
 from cortado.optimisation.layers.with_torch import TorchBridge, torch
 from cortado.problem import Problem
@@ -46,22 +46,34 @@ def restart_state(simulation: Simulation, given: Tensors, parameters: Values | N
 
 
 def step(
-    simulation: Simulation, given: Tensors, parameters: Tensors | None = None, steps: int = 1
+    simulation: Simulation,
+    given: Tensors,
+    parameters: Tensors | None = None,
+    steps: int = 1,
+    gradient: AdjointEstimator | None = None,
 ) -> dict[str, "torch.Tensor"]:
     """Return the state after ``steps`` steps from ``given``: `Simulation.step` as a function of tensors.
 
     ``parameters`` are any of those of `Problem` but first values, tensors or numbers; one over time has a row for each
-    of these steps. Raises `InputError` for what does not fit, and `DivergedError` when a particle is lost.
+    of these steps. Reverse mode goes back by the estimator ``gradient``, such as `gradients.AdjointViscosity`, exactly
+    if it is left out; forward mode is exact. Exact derivatives of chained steps grow by a constant factor a step, which
+    after some hundred steps drowns what is sought: see `docs/long_horizons.md`. Raises
+    `InputError` for what does not fit, and `DivergedError` when a particle is lost.
     """
-    return calls.step(_BRIDGE, simulation, given, parameters, steps)
+    return calls.step(_BRIDGE, simulation, given, parameters, steps, gradient)
 
 
 def rollout(
-    simulation: Simulation, given: Tensors, parameters: Tensors | None = None, steps: int = 1, record_every: int = 1
+    simulation: Simulation,
+    given: Tensors,
+    parameters: Tensors | None = None,
+    steps: int = 1,
+    record_every: int = 1,
+    gradient: AdjointEstimator | None = None,
 ) -> dict[str, "torch.Tensor"]:
     """Return the states after every ``record_every`` of ``steps`` steps, the first one included, along a first axis
     (frames, ...); see `step`."""
-    return calls.rollout(_BRIDGE, simulation, given, parameters, steps, record_every)
+    return calls.rollout(_BRIDGE, simulation, given, parameters, steps, record_every, gradient)
 
 
 def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., "torch.Tensor"]:
@@ -97,11 +109,18 @@ def picture(renderer: Renderer, positions: Any, fractions: Any = None, colours: 
 class Steps(torch.nn.Module):
     """A PyTorch module that takes ``steps`` steps of a simulation, with trained parameters of the simulation."""
 
-    def __init__(self, simulation: Simulation, steps: int = 1, trained: Values | None = None):
-        """Make the module; ``trained``: parameters by name with their first values, such as ``{"viscosity": 0.1}``."""
+    def __init__(
+        self,
+        simulation: Simulation,
+        steps: int = 1,
+        trained: Values | None = None,
+        gradient: AdjointEstimator | None = None,
+    ):
+        """Make the module; ``trained``: parameters by name with their first values, such as ``{"viscosity": 0.1}``;
+        ``gradient`` as of `step`."""
         super().__init__()
-        layer = calls.steps_layer(simulation, steps)
-        self.simulation, self.steps = simulation, steps
+        layer = calls.steps_layer(simulation, steps, gradient)
+        self.simulation, self.steps, self.gradient = simulation, steps, gradient
         made = {name: _BRIDGE.array(f"parameter {name}", value, layer) for name, value in (trained or {}).items()}
         self.trained = torch.nn.ParameterDict({_key(name): torch.nn.Parameter(own) for name, own in made.items()})
         self._names = tuple(made)
@@ -112,7 +131,7 @@ class Steps(torch.nn.Module):
         for name in parameters or {}:
             if name in own:
                 raise InputError(f"parameter {name} is given, but must be left out, as the module has its own.")
-        return step(self.simulation, given, {**own, **(parameters or {})}, self.steps)
+        return step(self.simulation, given, {**own, **(parameters or {})}, self.steps, self.gradient)
 
 
 def _key(name: str) -> str:

@@ -163,7 +163,11 @@ class AdjointEstimator(ABC):
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """Return the loss and its gradient by a forward and a reverse pass; see `GradientEstimator`."""
         forward_pass = problem.forward_pass(parameters)
-        return Estimate(forward_pass.loss, forward_pass.back(self, observe))
+        return Estimate(forward_pass.loss, self.back(forward_pass, observe))
+
+    def back(self, forward_pass: ForwardPass, observe: Observer | None = None) -> Arrays:
+        """Return the gradient of a forward run's loss; see `ForwardPass.back`."""
+        return forward_pass.back(self, observe)
 
 
 class Filtered:

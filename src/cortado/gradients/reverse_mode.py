@@ -13,12 +13,12 @@ import warp as wp
 from cortado.arrays import as_number, is_whole
 from cortado.device.precision import TypesByName
 from cortado.errors import InputError, shown
-from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estimate, Filtered, checked_estimator
+from cortado.gradients.estimator import AdjointEstimator, Filtered, ForwardPass, checked_estimator
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum
 from cortado.particles.state import Parameters, State
 from cortado.rollout.rollout import AdjointStep, BackwardStep, Observer, Rollout
-from cortado.scene.parameter_values import Values
+from cortado.scene.parameter_values import Arrays
 from cortado.solvers.solver import Counts, ResumingAdjoint, Solver
 
 STRONGEST = 0.6
@@ -356,7 +356,8 @@ class AdjointViscosity(AdjointEstimator):
     limit: float = 4.0
     """Greatest vector of a particle, in root mean squares over all; infinite for none."""
     order: int = 1
-    """Order 1, or 2 for an extrapolation, which is not done as the base of another estimator."""
+    """Order 1, or 2 for an extrapolation by two passes over a whole run: not as the base of another estimator, nor with
+    respect to the first state, nor step by step."""
     base: AdjointEstimator = EXACT
     """The estimator whose adjoint is filtered."""
 
@@ -375,18 +376,20 @@ class AdjointViscosity(AdjointEstimator):
         return self.base.batches
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
+        """Return the backward step of the first order; raise `InputError` for another, which takes two passes."""
+        if self.order != 1:
+            raise InputError(f"order is {self.order}, but must be 1 where a gradient goes on to the state before.")
         step = self.base.derivative(rollout)
         return _ViscousStep(step, rollout, self) if self.coefficient > 0.0 else step
 
-    def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the loss and its gradient; ``observe`` is called with the adjoints of the smaller coefficient."""
-        forward_pass, once = problem.forward_pass(parameters), replace(self, order=1)
+    def back(self, forward_pass: ForwardPass, observe: Observer | None = None) -> Arrays:
+        """Return the gradient of a forward run's loss; ``observe`` is given the adjoints of the smaller coefficient."""
+        once = replace(self, order=1)
         gradient = forward_pass.back(once, observe)
-        if self.order == 2:
-            twice = replace(once, coefficient=2.0 * self.coefficient)
-            stronger = forward_pass.back(twice)
-            gradient = {name: 2.0 * weaker - stronger[name] for name, weaker in gradient.items()}
-        return Estimate(forward_pass.loss, gradient)
+        if self.order == 1:
+            return gradient
+        stronger = forward_pass.back(replace(once, coefficient=2.0 * self.coefficient))
+        return {name: 2.0 * weaker - stronger[name] for name, weaker in gradient.items()}
 
 
 class _ViscousStep(Filtered):

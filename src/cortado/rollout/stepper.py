@@ -9,7 +9,7 @@ from typing import Any, Protocol, cast, overload
 import numpy as np
 import warp as wp
 
-from cortado.arrays import check_steps
+from cortado.arrays import check_steps, require_methods
 from cortado.calls import Staying
 from cortado.device.memory import require
 from cortado.device.threads import Turn, in_turn
@@ -44,6 +44,51 @@ class Steppable(Simulated, Protocol):
     solver: Solver
 
 
+class ReverseEstimator(Protocol):
+    """Protocol of an estimator that goes back through a run step by step: a `cortado.gradients.AdjointEstimator`."""
+
+    @property
+    def batches(self) -> bool:
+        """True if it treats each scene of a batch by itself."""
+
+    def derivative(self, rollout: Rollout) -> BackwardStep:
+        """Return the backward step for one rollout."""
+
+
+class BackwardSteps:
+    """The backward steps of estimators for one rollout, each made once."""
+
+    def __init__(self, rollout: Rollout):
+        self._rollout, self._made = rollout, dict[ReverseEstimator | None, BackwardStep]()
+
+    def of(self, estimator: ReverseEstimator | None) -> BackwardStep:
+        """Return an estimator's backward step, the exact one without an estimator. Raises `InputError` for an estimator
+        whose settings may change, as its backward step would keep the first ones, and for one that may mix up the
+        scenes of a batch."""
+        solver = self._rollout.solver
+        if estimator is not None:
+            wanted = "an AdjointEstimator such as cortado.gradients.AdjointViscosity()"
+            require_methods("gradient", estimator, ("derivative",), wanted)
+            if solver.layout.batch is not None and not estimator.batches:
+                raise InputError(
+                    f"{type(estimator).__name__} is given a batch, but has no `batches = True`, which says that it "
+                    "treats each scene by itself."
+                )
+        try:
+            is_new = estimator not in self._made
+        except TypeError as error:
+            raise InputError(f"estimator has an {error}, but must be a dataclass(frozen=True) of numbers.") from None
+        if is_new:
+            parts = solver.gradient_memory(self._rollout.log)
+            require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
+            self._made[estimator] = (
+                AdjointStep(self._rollout, solver.adjoint(self._rollout.steps))
+                if estimator is None
+                else estimator.derivative(self._rollout)
+            )
+        return self._made[estimator]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class StepResidual(Staying):
     """The result of `Stepper.step` that `Stepper.vjp` and `Stepper.jvp` need, valid whatever steps follow."""
@@ -75,6 +120,7 @@ class Stepper:
         self._rows = DeviceRows(simulation, self._space)
         self.rollout = Rollout(simulation.solver, steps)
         """What takes the steps, with the parameters of the last ones."""
+        self._derivatives = BackwardSteps(self.rollout)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle or copy the stepper as its simulation and number of steps."""
@@ -143,9 +189,11 @@ class Stepper:
         return last, StepResidual(Residual(self.rollout), values, rows, place)
 
     @in_turn
-    def vjp(self, residual: StepResidual, state_bar: Values) -> tuple[dict[str, Any], dict[str, Any]]:
+    def vjp(
+        self, residual: StepResidual, state_bar: Values, gradient: ReverseEstimator | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return adjoints of the state before the steps and of the given parameters, from that of the state after them
-        (reverse mode).
+        (reverse mode), by the estimator ``gradient``, exact if left out: see `docs/gradients.md`.
 
         The adjoint of a state is a table of arrays, those of its fields by name and in their shapes, and of its
         ``time``, a number; what is left out is 0. Of a `DeviceState` it is taken and returned as arrays on the device;
@@ -155,20 +203,21 @@ class Stepper:
         other shapes.
         """
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
+        adjoint = self._derivatives.of(gradient)
         times = place.write("state_bar", state_bar, self._bar)
         values = residual.values
         residual.evaluation.bring_back()
-        first = rollout.backward(self._adjoint, {rollout.steps: self._bar})
-        found = self._adjoint.parameters()
+        first = rollout.backward(adjoint, {rollout.steps: self._bar})
+        found = adjoint.parameters()
         earlier = space.time_adjoints(rollout, values, found)
         before = (earlier[0] if self._simulation.batch is None else earlier) + times
-        gradient = space.gradient(rollout, values, first, found, elsewhere=residual.rows)
-        if "time_step" in gradient:  # a longer step ends later
-            gradient["time_step"] = gradient["time_step"] + rollout.steps * times
+        own = space.gradient(rollout, values, first, found, elsewhere=residual.rows)
+        if "time_step" in own:  # a longer step ends later
+            own["time_step"] = own["time_step"] + rollout.steps * times
         lost = of_lost(rollout, self._bar, times)
         time_bar = without_lost(lost, {STATE_TIME: before})
         rows = self._rows.adjoints(residual.rows, found, lost)
-        return {**place.read(first, lost), **time_bar}, {**without_lost(lost, gradient), **rows}
+        return {**place.read(first, lost), **time_bar}, {**without_lost(lost, own), **rows}
 
     @in_turn
     def jvp(self, residual: StepResidual, state_dot: Values, parameter_dots: Values | None = None) -> dict[str, Any]:
@@ -207,12 +256,6 @@ class Stepper:
     @cached_property
     def _dots(self) -> tuple[State, Parameters]:
         return self.rollout.solver.new_state(), self.rollout.solver.new_parameters(self.rollout.steps)
-
-    @cached_property
-    def _adjoint(self) -> BackwardStep:
-        solver = self.rollout.solver
-        require(solver.gradient_memory(self.rollout.log), "take a larger spacing", solver.device)
-        return AdjointStep(self.rollout, solver.adjoint(self.rollout.steps))
 
     def _begin(
         self,
@@ -296,12 +339,17 @@ class Stepping:
         return self.stepper(check_steps(steps)).advance(state, parameters)
 
     def vjp(
-        self, state: Given | DeviceState, parameters: Values | None, state_bar: Values, steps: int = 1
+        self,
+        state: Given | DeviceState,
+        parameters: Values | None,
+        state_bar: Values,
+        steps: int = 1,
+        gradient: ReverseEstimator | None = None,
     ) -> tuple[dict[str, Any], Arrays]:
         """Return the adjoints of ``state`` and of ``parameters`` from that of the state after ``steps`` steps (reverse
         mode); see `Stepper.vjp`, which takes the steps once for several adjoints."""
         stepper = self.stepper(check_steps(steps))
-        return stepper.vjp(stepper.step(state, parameters)[1], state_bar)
+        return stepper.vjp(stepper.step(state, parameters)[1], state_bar, gradient)
 
     def jvp(
         self,

@@ -2,14 +2,14 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from cortado.arrays import as_precise_numbers, require_table, whole_number
 from cortado.errors import InputError, shown
-from cortado.gradients import GradientEstimator
+from cortado.gradients import AdjointEstimator, GradientEstimator
+from cortado.gradients.estimator import checked_reverse
 from cortado.optimisation.layers.functions import LOSS, PICTURE, READING, Measure, Picture, Steps, Value
 from cortado.optimisation.layers.layer import PARAMETER, STATE, Layer, Named, check_state, kept_or_made, named, part
 from cortado.problem import Problem
@@ -59,13 +59,15 @@ class Bridge(ABC):
         return {name: self.stack([one[name] for one in states]) for name in state}
 
 
-def steps_layer(simulation: Simulation, steps: int) -> Steps:
-    """Return the layer of ``steps`` steps of a simulation; layers of the last few numbers of steps are kept."""
+def steps_layer(simulation: Simulation, steps: int, gradient: AdjointEstimator | None = None) -> Steps:
+    """Return the layer of ``steps`` steps of a simulation; the last few layers are kept."""
     if not isinstance(simulation, Simulation):
         raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
     steps = whole_number("steps", steps, 1)
-    layers: dict[int, Steps] = simulation.__dict__.setdefault("_layers", {})
-    return kept_or_made(layers, steps, partial(Steps, simulation), KEPT)
+    layers: dict[Any, Steps] = simulation.__dict__.setdefault("_layers", {})
+    if gradient is not None:
+        checked_reverse(gradient)
+    return kept_or_made(layers, (steps, gradient), lambda key: Steps(simulation, *key), KEPT)
 
 
 def state(bridge: Bridge, simulation: Simulation, given: Given | DeviceState, parameters: Values | None) -> Any:
@@ -88,19 +90,32 @@ def restart_state(
         return simulation.on_host(layer.states.state(arrays, own))
 
 
-def step(bridge: Bridge, simulation: Simulation, given: Table, parameters: Table | None, steps: int) -> dict[str, Any]:
+def step(
+    bridge: Bridge,
+    simulation: Simulation,
+    given: Table,
+    parameters: Table | None,
+    steps: int,
+    gradient: AdjointEstimator | None,
+) -> dict[str, Any]:
     """Return the state after ``steps`` steps from a given one."""
-    return part(_applied(bridge, steps_layer(simulation, steps), given, parameters), STATE)
+    return part(_applied(bridge, steps_layer(simulation, steps, gradient), given, parameters), STATE)
 
 
 def rollout(
-    bridge: Bridge, simulation: Simulation, given: Table, parameters: Table | None, steps: int, record_every: int
+    bridge: Bridge,
+    simulation: Simulation,
+    given: Table,
+    parameters: Table | None,
+    steps: int,
+    record_every: int,
+    gradient: AdjointEstimator | None,
 ) -> dict[str, Any]:
     """Return the states after every ``record_every`` steps, the first one included, along a first axis."""
     steps, every = whole_number("steps", steps, 1), whole_number("record_every", record_every, 1)
     if steps % every:
         raise InputError(f"record_every is {every}, but must divide the {steps} steps.")
-    layer, count = steps_layer(simulation, every), steps // every
+    layer, count = steps_layer(simulation, every, gradient), steps // every
     table = _table("parameters", parameters)
     arrays = {name: bridge.array(PARAMETER + name, value, layer) for name, value in table.items()}
     if simulation.batch is not None and any(name in simulation.known.over_time for name in arrays):

@@ -10,7 +10,7 @@ from cortado.arrays import check_steps
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import InputError, MissingDerivativeError, shown
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator
-from cortado.gradients.estimator import checked_estimator
+from cortado.gradients.estimator import checked_estimator, checked_reverse
 from cortado.losses.loss import Snapshot, adjoint_on_device
 from cortado.optimisation.layers.layer import (
     LAST_STEP,
@@ -78,8 +78,11 @@ class OfSimulation(Layer):
 class Steps(OfSimulation):
     """A layer that takes a number of steps of a simulation, from a state to a later one."""
 
-    def __init__(self, simulation: Simulation, steps: int, each: bool = False):
-        self._steps = check_steps(steps)
+    def __init__(
+        self, simulation: Simulation, steps: int, gradient: AdjointEstimator | None = None, each: bool = False
+    ):
+        """Prepare the layer; reverse mode goes by the estimator ``gradient``, exactly if it is left out."""
+        self._steps, self._gradient = check_steps(steps), None if gradient is None else checked_reverse(gradient)
         super().__init__(simulation, steps, each)
         self.kept_bytes = min(steps * self._state_size, MEMORY_BUDGET)
 
@@ -104,7 +107,7 @@ class Steps(OfSimulation):
 
     @in_turn
     def pull(self, residual: StepResidual, bars: Named) -> Named:
-        before, found = self._stepper.vjp(residual, self._derivatives(bars))
+        before, found = self._stepper.vjp(residual, self._derivatives(bars), self._gradient)
         return {**self._named(before), **self._parameters.adjoints(found, residual.values)}
 
     @in_turn
@@ -112,7 +115,9 @@ class Steps(OfSimulation):
         return self._named(self._stepper.jvp(residual, self._derivatives(dots), self._parameters.on_device(dots)))
 
     def many(self, size: int) -> Layer:
-        return Steps(self._simulation.batch_of(size), self._steps, each=True)
+        if self._gradient is not None and not self._gradient.batches:
+            return OneByOne(self, size)
+        return Steps(self._simulation.batch_of(size), self._steps, self._gradient, each=True)
 
     def _derivatives(self, given: Named) -> dict[str, Any]:
         """Return derivatives with respect to a state in the form that a stepper takes."""
@@ -150,7 +155,7 @@ class Evaluation:
                 last = {LAST_STEP: np.zeros(np.shape(self.loss))}  # by which the steps were chosen: see docs/steps.md
                 self._found = {**named(PARAMETER, found), **named(STATE, state | last)}
             else:
-                self._found = named(PARAMETER, self._run.back(self._estimator))
+                self._found = named(PARAMETER, self._estimator.back(self._run))
             self._run = None  # and the states that it keeps
         return self._found
 
