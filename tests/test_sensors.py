@@ -13,6 +13,7 @@ from cortado.discretise.smoothing import KERNELS
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series
 from cortado.losses.distances import SensorMatch
+from cortado.runs.quantity_values import QuantityEvaluator
 from cortado.runs.sensor import Readings, as_csv, from_csv, value_of
 from cortado.scene.shape_tables import NoContainer
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
@@ -542,6 +543,21 @@ def test_other_names_of_sensors_come_back_from_the_table(name, tmp_path):
     (tmp_path / "sensors.csv").write_text(as_csv({name: read}))
     (found,) = from_csv(tmp_path / "sensors.csv").items()
     assert found[0] == name and found[1]["height"].tolist() == [1.0, 2.0]
+
+
+def test_sensors_that_need_a_step_share_it(monkeypatch):
+    solve, solved = QuantityEvaluator._solve, []
+    monkeypatch.setattr(QuantityEvaluator, "_solve", lambda self, *a: solved.append(a) or solve(self, *a))
+    sensors = {"probe": PressureProbe([0.2, 0.1]), "walls": WallForce(), "gauge": WaveGauge([0.2, 0.0])}
+    simulation, alone = cortado.Simulation(plane()), {}
+    for name, sensor in sensors.items():
+        alone |= simulation.run(5, sensors={name: sensor}).sensors
+    assert len(solved) == 2 * 6
+    solved.clear()
+    together = simulation.run(5, sensors=sensors).sensors
+    assert len(solved) == 6 + 1  # of the first state the probe asks before anybody knows of the walls
+    for name, one in alone.items():
+        assert one.values.tobytes() == together[name].values.tobytes(), name
 
 
 def test_describe_counts_what_sensors_cost(monkeypatch):

@@ -64,6 +64,8 @@ class Watch:
         self._recorder = Recorder(rollout, record, evaluator, simulation.dimension)
         self._log = SensorLog(of_scene | dict(sensors or {}), simulation.dimension)
         self._rollout, self._dimension, self._evaluator = rollout, simulation.dimension, evaluator
+        self._quantities = set[str]()
+        """Those that sensors read of a state."""
         self._colours = np.array([phase.colour for phase in simulation.scene.phase])
         self.names = self._recorder.names
         """Of the quantities that are recorded."""
@@ -75,7 +77,7 @@ class Watch:
     def step(self, step: int, state: State) -> None:
         """Make the sensors read a state after so many steps; it is called for every state in its turn."""
         if self._log.sensors:
-            moment = Moment.of(self._rollout, step, state, self._evaluator)
+            moment = Moment.of(self._rollout, step, state, self._evaluator, self._quantities)
             self._log.read(Snapshot(state, self._dimension, self._colours, moment))
 
     def known(self, readings: Mapping[str, Readings]) -> float:

@@ -44,24 +44,36 @@ class Moment:
     """The step of a run whose parameters these are, or the number of steps: after the last one."""
     evaluator: Callable[[], "QuantityEvaluator"]
     """Makes the object that computes quantities."""
+    wanted: set[str] = field(default_factory=set)
+    """Quantities that were asked for, also of other moments of a run that share this set: those that need a step are
+    computed by one."""
     _values: Arrays = field(default_factory=dict)
 
     @classmethod
-    def of(cls, rollout: Rollout, step: int, state: State, evaluator: Callable[[], "QuantityEvaluator"]) -> "Moment":
+    def of(
+        cls,
+        rollout: Rollout,
+        step: int,
+        state: State,
+        evaluator: Callable[[], "QuantityEvaluator"],
+        wanted: set[str] | None = None,
+    ) -> "Moment":
         """Take a state of a rollout's present evaluation, after ``step`` steps. After the last one the parameters are
         as `row_of` says."""
         parameters = row_of(rollout, rollout.parameters.written, step)
         size = rollout.step_sizes.of_step(min(step, max(rollout.steps - 1, 0)))
         if size is not None:
             parameters["time_step"] = size
-        return cls(state, parameters, rollout.substeps, step, evaluator)
+        return cls(state, parameters, rollout.substeps, step, evaluator, set() if wanted is None else wanted)
 
     def value(self, name: str) -> NDArray:
         """Return a quantity of the state, float64, read-only, of a batch with a first axis for the scenes."""
         if name not in self._values:
-            found = self.evaluator().values([name], self)[name]
-            found.flags.writeable = False
-            self._values[name] = found
+            self.wanted.add(name)
+            names = filter(_needs_the_step, self.wanted) if _needs_the_step(name) else [name]
+            for own, found in self.evaluator().values(names, self).items():
+                found.flags.writeable = False
+                self._values[own] = found
         return self._values[name]
 
     def adjoint(self, bars: Mapping[str, NDArray]) -> tuple[Arrays, Arrays]:
@@ -85,9 +97,9 @@ class StepWithin(PressureAdjoint, Protocol):
     bar: Adjoints
 
 
-def _need_the_step(names: Iterable[str]) -> bool:
-    """Test whether quantities need the step after the state to be solved, and not its neighbours alone."""
-    return any(name in OF_PRESSURE or is_load(name) for name in names)
+def _needs_the_step(name: str) -> bool:
+    """Test whether a quantity needs the step after the state to be solved, and not its neighbours alone."""
+    return name in OF_PRESSURE or is_load(name)
 
 
 class QuantityEvaluator:
@@ -145,7 +157,7 @@ class QuantityEvaluator:
         as `Moment` has them but with an axis for the scenes."""
         wanted, solver = self._checked(bars), self._solver
         at, sums = self._begin(wanted, moment, replay=True)
-        solved = _need_the_step(wanted)
+        solved = any(map(_needs_the_step, wanted))
         adjoint = self._pressure_adjoint if solved else self._field_adjoint
         adjoint.begin()
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
@@ -191,7 +203,7 @@ class QuantityEvaluator:
         rollout.initial.assign(moment.state)
         rollout.parameters.set(moment.parameters)
         rollout.substeps = moment.substeps
-        if _need_the_step(names):
+        if any(map(_needs_the_step, names)):
             context, pressures = self._solve(names, replay)
         else:
             context, pressures = self._look_around(moment.substeps), None
@@ -230,7 +242,7 @@ class QuantityEvaluator:
     ) -> tuple[ParticleTangent | PressureTangent, Pressures | None]:
         """Return the tangent of the sorted particles, and of their pressures."""
         solver, parameters = self._solver, self._rollout.parameters
-        if not _need_the_step(names):
+        if not any(map(_needs_the_step, names)):
             own = ParticleTangent(solver, along)
             own.sort(solver.context(parameters), state_dot)
             return own, None
