@@ -1,5 +1,6 @@
 """Many scenes in one launch: each has the bits of its single run, whatever the others do."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,13 +26,12 @@ def random_gravity(size: float, batch: int, rows: int, dimension: int = 3) -> np
     return size * RANDOM.standard_normal((batch, rows, dimension)) - 9.0 * np.eye(dimension)[1]
 
 
+PULL = {"gravity": [0.0, -9.81], "surface_tension": 0.5}
+CURVED = {"forces": PULL, "solver": {"kind": "projection", "time_step": 0.0021}}
+
+
 def tension(**changes: Any) -> Any:
-    return scenes.plane(forces={"gravity": [0.0, -9.81], "surface_tension": 0.5, "viscosity": "pairwise"}, **changes)
-
-
-def curved_tension() -> Any:
-    forces = {"gravity": [0.0, -9.81], "surface_tension": 0.5}
-    return scenes.plane(forces=forces, solver={"kind": "projection", "time_step": 0.0021})
+    return scenes.plane(**{"forces": {**PULL, "viscosity": "pairwise"}, **changes})
 
 
 def layers() -> Any:
@@ -57,7 +57,7 @@ CASES: dict[str, tuple[Any, dict[str, Any], dict[str, Any]]] = {
         {"gravity": np.tile([0.0, -9.0, 0.0], (STEPS, 1))},
     ),
     "tension": (tension, {"surface_tension": RANDOM.uniform(0.1, 1.0, 3)}, {"gravity": [0.0, -9.0]}),
-    "tension by curvature": (curved_tension, {"surface_tension": RANDOM.uniform(0.1, 1.0, 3)}, {}),
+    "tension by curvature": (partial(tension, **CURVED), {"surface_tension": RANDOM.uniform(0.1, 1.0, 3)}, {}),
     "bodies": (touching, {"raft.density": np.array([300.0, 700.0])}, {}),
     "rotor": (lambda: beside(ROTOR), {"gravity": random_gravity(2.0, 2, 1, 2)}, {}),
     "tilt": (scenes.scene, {"tilt": RANDOM.uniform(-20.0, 20.0, (3, STEPS, 2))}, {}),
@@ -272,7 +272,8 @@ def test_estimators_that_run_batches_are_given_single_scenes():
 def test_ensembles_run_in_batches_with_the_same_bits(estimator, monkeypatch):
     problem = Problem(Simulation(scenes.scene(solver=FREE)), STEPS, CentreOfMass(np.full(3, 0.1)))
     given, sizes = {"gravity": [0.5, -9.0, 0.0], "viscosity": 0.1}, []
-    monkeypatch.setattr(Simulation, "batch_of", _noted(sizes, Simulation.batch_of))
+    own = Simulation.batch_of
+    monkeypatch.setattr(Simulation, "batch_of", lambda made, size: sizes.append(size) or own(made, size))
     found = problem.estimate(given, estimator)
     assert sizes, "no batch was made"
     monkeypatch.setattr(Problem, "room", lambda *_: 1)
@@ -280,14 +281,6 @@ def test_ensembles_run_in_batches_with_the_same_bits(estimator, monkeypatch):
     for name in given:
         np.testing.assert_array_equal(found.gradient[name], wanted.gradient[name])
         np.testing.assert_array_equal(found.standard_error[name], wanted.standard_error[name])
-
-
-def _noted(sizes: list[int], method: Any) -> Any:
-    def batch_of(simulation: Simulation, size: int) -> Simulation:
-        sizes.append(size)
-        return method(simulation, size)
-
-    return batch_of
 
 
 class Normalised(gradients.Filtered):

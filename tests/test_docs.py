@@ -249,13 +249,8 @@ def test_an_example_of_a_scene_is_one(model, example, tmp_path):
     file.write_text(replaced(scene_page.WHOLE, example))
     scene = load_scene(file)
     (table, given) = list(tomllib.loads(example).items())[-1]
-    assert getattr(scene, table) != getattr(load_scene_of_the_page(tmp_path), table) or given["shape"] == "none"
-
-
-def load_scene_of_the_page(folder: Path) -> Scene:
-    file = folder / "whole.toml"
     file.write_text(scene_page.WHOLE)
-    return load_scene(file)
+    assert getattr(scene, table) != getattr(load_scene(file), table) or given["shape"] == "none"
 
 
 @pytest.mark.parametrize("model, example", task_page.examples().items())

@@ -41,16 +41,12 @@ def problem_of(name):
     return Problem(simulation, STEPS, Motion(simulation))
 
 
-def swaying(outlet):
-    """A path of the opening (steps, d) that begins at its place at rest."""
-    time = np.arange(STEPS)[:, None] / STEPS
-    return outlet + 0.02 * np.sin(time * np.arange(2.0, 2.0 + len(outlet)))
-
-
 def point_of(problem, over_time=True):
     simulation, random = problem.simulation, np.random.default_rng(3)
     own = simulation.parameters()
-    path = swaying(own["nozzle_path"]) if over_time else own["nozzle_path"] + 0.003
+    path, time = own["nozzle_path"] + 0.003, np.arange(STEPS)[:, None] / STEPS
+    if over_time:  # from its place at rest
+        path = own["nozzle_path"] + 0.02 * np.sin(time * np.arange(2.0, 2.0 + len(own["nozzle_path"])))
     x = own["initial_positions"]
     own |= {"nozzle_path": path, "initial_positions": x + 0.001 * random.standard_normal(x.shape)}
     own["initial_velocities"] = own["initial_velocities"] + 0.1 * random.standard_normal(x.shape)

@@ -58,10 +58,6 @@ def test_a_device_a_pipe_or_a_link_under_a_name_that_can_be_guessed_is_not_repla
     assert len({unfinished(tmp_path / "a") for _ in range(100)}) == 100
 
 
-def a_pipe(path):
-    os.mkfifo(path)
-
-
 def a_socket(path):
     with socket.socket(socket.AF_UNIX) as made:
         made.bind(str(path))
@@ -76,7 +72,7 @@ def a_large_file(path):
     "make, words",
     [
         (lambda path: path.mkdir(), "it is a directory, but must be a regular file"),
-        (a_pipe, "it is a pipe, but must be a regular file"),
+        (os.mkfifo, "it is a pipe, but must be a regular file"),
         (a_socket, "it is a socket, but must be a regular file"),
         (lambda path: path.symlink_to("/dev/zero"), "it is a device, but must be a regular file"),
         (lambda path: path.symlink_to(path), "symbolic links"),

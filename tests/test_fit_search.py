@@ -50,9 +50,7 @@ def problem(start, bounds=None, seed=0, wrong=0.0, **settings):
 def the_least(made):
     """Where SciPy's method of trust regions ends."""
 
-    def residuals(u):
-        return (made.residuals(u)[0] / SIZE).ravel()
-
+    residuals = lambda u: (made.residuals(u)[0] / SIZE).ravel()  # noqa: E731
     return least_squares(residuals, made.coordinates.start, xtol=1e-14, ftol=1e-14, gtol=None).x
 
 
@@ -182,10 +180,6 @@ def rough(u):
     return 0.03 * u * TIMES + 0.001 * np.sin(90.0 * u + 3.0 * TIMES)
 
 
-def flat(u):
-    return 1e-4 * u * TIMES
-
-
 def test_a_start_in_a_wrong_valley_is_left_and_a_good_one_costs_no_more():
     made = Formula(behind_a_wall, 2.0)
     alone = cortado.fit(made, {"viscosity": 0.1}, starts=1)
@@ -246,7 +240,7 @@ def test_where_tangents_hold_they_stay():
 
 
 def test_what_is_hardly_told_is_a_doubt():
-    found = cortado.fit(Formula(flat, 3.0), {"viscosity": 1.0}, starts=1)
+    found = cortado.fit(Formula(lambda u: 1e-4 * u * TIMES, 3.0), {"viscosity": 1.0}, starts=1)
     assert any("hardly tells viscosity" in one for one in found.doubts)
 
 

@@ -23,7 +23,20 @@ from cortado.sph.parts import Adjoints, Shares
 from cortado.sph.surface_tension import normal_kernels, surface_tension_kernels
 from cortado.sph.walls import wall_slope_term
 from scenes import plane_of_three, splash
-from test_kernels import CPU, DISCRETISATION, FLOAT64, N, Operation, by_input, cloud, clouds, dotted, launch, zeros
+from test_kernels import (
+    CPU,
+    DISCRETISATION,
+    FLOAT64,
+    Family,
+    N,
+    Operation,
+    by_input,
+    cloud,
+    clouds,
+    dotted,
+    launch,
+    zeros,
+)
 
 VECTORS = np.zeros((N, 3))
 
@@ -44,7 +57,6 @@ class SurfaceTension(Operation):
     def __init__(self, cloud):
         super().__init__(cloud)
         self.normal, self.force = normal_kernels(DISCRETISATION), surface_tension_kernels(DISCRETISATION)
-        self.start["acceleration_in"] = self.start.pop("acceleration")
         self.start["surface_tension"] = np.array([1.4])
         self.given = {"s": self.s, "inverse": 0.4, "scale": 0.7}
 
@@ -80,7 +92,6 @@ class CurvatureTension(Operation):
         self.kernels = curvature_kernels(DISCRETISATION, d)
         made = DISCRETISATION, d, f"surface_curvature_{d}d"
         self.tangents, self.adjoints = curvature_tangents(*made), curvature_adjoints(*made)
-        self.start["acceleration_in"] = self.start.pop("acceleration")
         self.start["surface_tension"] = np.array([1.4])
         self.given = {"s": self.s, "spacing": 0.3, "depth": 0.4, "per_width": 2.2}
         kinds = {**entries(FLOAT64), "r": wp.vec3d}
@@ -113,44 +124,19 @@ class CurvatureTension(Operation):
         return shares_of(found, bars)
 
 
-class Circulation(Operation):
-    inputs, outputs = ("x", "v"), ("circulation",)
+class Circulation(Family):
+    inputs, outputs, own, kernels = ("x", "v"), ("circulation",), ("x", "v"), circulation_kernels(DISCRETISATION)
+
+
+class WallSlope(Family):
+    inputs, outputs, kernels = ("x",), ("total",), wall_slope_term(DISCRETISATION).kernels
 
     def __init__(self, cloud):
         super().__init__(cloud)
-        self.kernels = circulation_kernels(DISCRETISATION)
-
-    def forward(self, values):
-        return launch(self.kernels.forward, s=self.s, **values, circulation=VECTORS)
-
-    def tangent(self, values, dots):
-        found = launch(self.kernels.tangent, s=self.s, **values, **dotted(dots), circulation_dot=VECTORS)
-        return {"circulation": found["circulation_dot"]}
+        self.given |= {"solid": ALL_WALLS, "constants": DISCRETISATION.precision.pair(0.0, 0.0)}
 
     def adjoint(self, values, bars):
-        bar = {"circulation_bar": bars["circulation"], **zeros("x_bar", "v_bar")}
-        found = launch(self.kernels.adjoint, s=self.s, **values, **bar)
-        return {"x": found["x_bar"], "v": found["v_bar"]}
-
-
-class WallSlope(Operation):
-    inputs, outputs = ("x",), ("total",)
-
-    def __init__(self, cloud):
-        super().__init__(cloud)
-        self.kernels = wall_slope_term(DISCRETISATION).kernels
-        self.given = {"s": self.s, "solid": ALL_WALLS, "constants": DISCRETISATION.precision.pair(0.0, 0.0)}
-
-    def forward(self, values):
-        return launch(self.kernels.forward, **self.given, **values, total=VECTORS)
-
-    def tangent(self, values, dots):
-        found = launch(self.kernels.tangent, **self.given, **values, **dotted(dots), total_dot=VECTORS)
-        return {"total": found["total_dot"]}
-
-    def adjoint(self, values, bars):
-        found = launch(self.kernels.adjoint, **self.given, **values, slope_bar=bars["total"], **zeros("x_bar"))
-        return {"x": found["x_bar"]}
+        return super().adjoint(values, bars, slope_bar=bars["total"])
 
 
 def swirl(x, v, t, rate, centre):
@@ -163,36 +149,22 @@ def spring(x_ij, v_ij, t, k, rest):
     return (k * (r - rest) * wp.cos(t)) * x_ij - v_ij
 
 
-class OfOneFunction(Operation):
+class OfOneFunction(Family):
     """theta is the time, a number, and one more parameter."""
 
     inputs, outputs = ("x", "v", "theta", "acceleration_in"), ("acceleration",)
-    passed = ("acceleration_in",)
+    passed, own = ("acceleration_in",), ("x", "v")
     force = Body(swirl, rate=1.3, centre=[0.2, 0.4, 0.1])
     theta = (0.3, 1.3, 0.2, 0.4, 0.1)
-    own = ("x", "v")
 
     def __init__(self, cloud):
         super().__init__(cloud)
         self.kernels = self.force.kernels(DISCRETISATION, 3)
-        self.start["acceleration_in"] = self.start.pop("acceleration")
         self.start["theta"] = np.array([self.theta])
 
-    def forward(self, values):
-        return launch(self.kernels.forward, s=self.s, **values, acceleration=VECTORS)
-
-    def tangent(self, values, dots):
-        found = launch(self.kernels.tangent, s=self.s, **values, **dotted(dots), acceleration_dot=VECTORS)
-        return {"acceleration": found["acceleration_dot"]}
-
     def adjoint(self, values, bars):
-        bar = {"acceleration_bar": bars["acceleration"], "theta_bar": np.zeros((N, len(self.theta)))}
-        found = launch(self.kernels.adjoint, s=self.s, **values, **bar, **zeros(*(f"{name}_bar" for name in self.own)))
-        return {
-            **{name: found[f"{name}_bar"] for name in self.own},
-            "theta": found["theta_bar"].sum(axis=0, keepdims=True),
-            "acceleration_in": bars["acceleration"],
-        }
+        found = super().adjoint(values, bars, theta_bar=np.zeros((N, len(self.theta))))
+        return {**found, "theta": found["theta_bar"].sum(axis=0, keepdims=True)}
 
 
 class PairOfOneFunction(OfOneFunction):

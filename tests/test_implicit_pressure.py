@@ -1,7 +1,5 @@
 """The implicit adjoint of the projection's pressure: what it equals at convergence, what it costs, what it refuses."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 
@@ -66,11 +64,6 @@ def test_without_its_solve_it_would_be_far_off():
     assert distances("plane", 600, unsolved)["initial_velocities"] > 100.0 * 1e-5
 
 
-def noted(found, reserve, counts):
-    found.append(counts[0])
-    reserve(counts)
-
-
 def test_its_work_does_not_depend_on_the_iterations(monkeypatch):
     counts, launch = [0], KernelLauncher.__call__
 
@@ -84,9 +77,9 @@ def test_its_work_does_not_depend_on_the_iterations(monkeypatch):
             problem = problem_of("plane", iterations, steps=2)
             at = point_of(problem.simulation)
             problem.value(at)
-            backward = problem.simulation.solver.reserve
-            reserved = []
-            monkeypatch.setattr(problem.simulation.solver, "reserve", partial(noted, reserved, backward))
+            reserved, backward = [], problem.simulation.solver.reserve
+            noted = lambda counts, own=backward, found=reserved: found.append(counts[0]) or own(counts)  # noqa: E731
+            monkeypatch.setattr(problem.simulation.solver, "reserve", noted)
             counts.append(0)
             problem.value_and_gradient(at, estimator)
             assert max(reserved) == (iterations if estimator == gradients.Exact() else 0)

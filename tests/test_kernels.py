@@ -184,6 +184,8 @@ class Operation:
             "time_step": np.array([0.2]),
             "gravity": cloud.vectors(3, n=4),
         }
+        if "acceleration_in" in self.inputs:
+            self.start["acceleration_in"] = self.start.pop("acceleration")
 
     def directions(self, seed: int, names: Sequence[str] | None = None) -> Values:
         """A random tangent, 0 but for ``names``."""
@@ -213,34 +215,48 @@ def zeros(*names: str) -> Values:
     return {name: np.zeros((N, 3) if name in vectors else N) for name in names}
 
 
-class Density(Operation):
-    inputs, outputs = ("x",), ("n",)
+class Family(Operation):
+    """Kernels of one quantity: its formula, tangent and adjoint, which take what is ``given`` besides inputs."""
+
+    kernels: Any = None
+    own: Sequence[str] = ("x",)
+    """Inputs of particles that the adjoint adds to."""
+    vectors = True
+    """Whether the quantity is one, or a number."""
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.given: dict[str, Any] = {"s": self.s}
+        (self.name,), self.empty = self.outputs, np.zeros((N, 3) if self.vectors else N)
 
     def forward(self, values):
-        return launch(Kernels.density.forward, s=self.s, **{**values, "n": np.zeros(N)})
+        return launch(self.kernels.forward, **{**self.given, **values, self.name: self.empty})
+
+    def recorded(self, values):
+        """What the tangent and the adjoint know."""
+        return {**self.given, **values}
 
     def tangent(self, values, dots):
-        return {"n": launch(Kernels.density.tangent, s=self.s, **values, **dotted(dots), n_dot=np.zeros(N))["n_dot"]}
+        given = {**self.recorded(values), **dotted(dots), f"{self.name}_dot": self.empty}
+        return {self.name: launch(self.kernels.tangent, **given)[f"{self.name}_dot"]}
 
-    def adjoint(self, values, bars):
-        found = launch(Kernels.density.adjoint, s=self.s, **values, n_bar=bars["n"], **zeros("x_bar"))
-        return {"x": found["x_bar"]}
+    def adjoint(self, values, bars, **more):
+        """With the adjoints of what is given ``more``, as the kernel leaves them."""
+        given = {**self.recorded(values), f"{self.name}_bar": bars[self.name], **more}
+        found = launch(self.kernels.adjoint, **given, **zeros(*(f"{name}_bar" for name in self.own)))
+        handed = {"acceleration_in": bars["acceleration"]} if "acceleration_in" in self.passed else {}
+        return {**{name: found[f"{name}_bar"] for name in self.own}, **handed, **{name: found[name] for name in more}}
 
 
-class WallYield(Operation):
-    inputs, outputs = ("x",), ("y",)
+class Density(Family):
+    inputs, outputs, vectors, kernels = ("x",), ("n",), False, Kernels.density
 
-    def forward(self, values):
-        return launch(Kernels.walls.forward, s=self.s, **{**values, "y": np.zeros(N)})
 
-    def tangent(self, values, dots):
-        values = {**values, "y": self.forward(values)["y"]}
-        return {"y": launch(Kernels.walls.tangent, s=self.s, **values, **dotted(dots), y_dot=np.zeros(N))["y_dot"]}
+class WallYield(Family):
+    inputs, outputs, vectors, kernels = ("x",), ("y",), False, Kernels.walls
 
-    def adjoint(self, values, bars):
-        values = {**values, "y": self.forward(values)["y"]}
-        given = {**values, "y_bar": bars["y"], "slope_bar": np.zeros((N, 3)), **zeros("x_bar")}
-        return {"x": launch(Kernels.walls.adjoint, s=self.s, **given)["x_bar"]}
+    def recorded(self, values):
+        return {**super().recorded(values), "y": self.forward(values)["y"], "slope_bar": np.zeros((N, 3))}
 
 
 class DensityRatio(Operation):
@@ -267,28 +283,13 @@ class DensityRatio(Operation):
         return {"x": found["x_bar"], "m": found["m_bar"], "wall_y": bar["y_bar"]}
 
 
-class Viscosity(Operation):
+class Viscosity(Family):
     inputs, outputs = ("x", "v", "n", "m", "mu", "acceleration_in"), ("acceleration",)
-    passed = ("acceleration_in",)
-    kernels: Any = None
+    passed, own = ("acceleration_in",), ("x", "v", "n", "m", "mu")
 
     def __init__(self, cloud):
         super().__init__(cloud)
-        self.start["acceleration_in"] = self.start.pop("acceleration")
-        self.given = {"s": self.s, "kappa": 10.0}
-
-    def forward(self, values):
-        return launch(self.kernels.forward, **self.given, **values, acceleration=np.zeros((N, 3)))
-
-    def tangent(self, values, dots):
-        found = launch(self.kernels.tangent, **self.given, **values, **dotted(dots), acceleration_dot=np.zeros((N, 3)))
-        return {"acceleration": found["acceleration_dot"]}
-
-    def adjoint(self, values, bars):
-        given = {**self.given, **values, "acceleration_bar": bars["acceleration"]}
-        names = ("x", "v", "n", "m", "mu")
-        found = launch(self.kernels.adjoint, **given, **zeros(*(f"{name}_bar" for name in names)))
-        return {**{name: found[f"{name}_bar"] for name in names}, "acceleration_in": bars["acceleration"]}
+        self.given["kappa"] = 10.0
 
 
 class Pairwise(Viscosity):
@@ -364,10 +365,6 @@ class StressWithoutSlip(Stress):
 class GravityTable(Operation):
     inputs, outputs = ("gravity", "acceleration_in"), ("acceleration",)
     step = np.array([2], dtype=np.int32)
-
-    def __init__(self, cloud):
-        super().__init__(cloud)
-        self.start["acceleration_in"] = self.start.pop("acceleration")
 
     def forward(self, values):
         return launch(Kernels.gravity.forward, **values, step=self.step, acceleration=np.zeros((N, 3)))

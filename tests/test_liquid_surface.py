@@ -16,7 +16,7 @@ from cortado.pictures.tracing import liquid_surface as liquid_module
 from cortado.pictures.tracing.liquid_surface import Surface, liquid_surface
 from cortado.pictures.tracing.near_particles import Particles
 from cortado.pictures.tracing.surface_net import Neighbours, smoothed
-from scenes import scene
+from scenes import box, scene
 
 SPACING = 0.1
 
@@ -117,22 +117,17 @@ def resting(shape, container):
         place = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.5 * size[0]}
         fluid, held = {**place, "height": size[1]}, {**place, "height": 2.0 * size[1]}
     else:
-        fluid = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": size.tolist()}
         wide = {"pool": [1.0, 2.0, 1.0], "dam": [2.0, 2.0, 1.0]}[container]
-        held = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": (size * wide).tolist()}
+        fluid, held = (box([0.0, 0.0, 0.0], (size * times).tolist()) for times in (1.0, np.array(wide)))
     return scene(discretisation={"spacing": SPACING}, fluid=[{**fluid, "phase": "water"}], container=held)
 
 
 @pytest.mark.parametrize(
     "shape, container",
     [
-        ((10, 5, 10), "pool"),
-        ((20, 20, 20), "pool"),
-        ((8, 8, 8), "dam"),
-        ((13, 13, 13), "dam"),
-        ((20, 20, 20), "dam"),
-        ((11, 11, 11), "cylinder"),
-        ((13, 13, 13), "cylinder"),
+        *((shape, "pool") for shape in ((10, 5, 10), (20, 20, 20))),
+        *(((n, n, n), "dam") for n in (8, 13, 20)),
+        *(((n, n, n), "cylinder") for n in (11, 13)),
     ],
 )
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
@@ -178,8 +173,7 @@ FLUIDS = {
 @pytest.mark.parametrize("fluid", FLUIDS)
 def test_exported_surfaces_enclose_the_volume_of_the_fluid(fluid):
     positions = FLUIDS[fluid] - 2.0
-    box = {"shape": "box", "lower": [-9.0, -9.0, -9.0], "upper": [9.0, 9.0, 9.0]}
-    stage = stage_of(scene(discretisation={"spacing": SPACING}, container=box), positions)
+    stage = stage_of(scene(discretisation={"spacing": SPACING}, container=box([-9.0] * 3, [9.0] * 3)), positions)
     found = contained_liquid(stage, positions, np.ones_like(positions))
     mesh, wanted = mesh_of(found), SPACING**3
     assert mesh.volume == pytest.approx(len(positions) * wanted, rel=0.01)

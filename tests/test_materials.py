@@ -14,6 +14,7 @@ from cortado.pictures.tracing.near_particles import Particles
 from cortado.pictures.tracing.space import State, environment_of
 from cortado.pictures.tracing.wetting import particles_of
 from cortado.scene.appearance import FINISHES, LIQUIDS
+from scenes import box
 
 DARK = (0.06, 0.06, 0.06)
 FRONT = {"camera": [0.03, 0.03, 0.5], "look_at": [0.03, 0.03, 0.01], "field_of_view": 12.0}
@@ -22,20 +23,16 @@ FRONT = {"camera": [0.03, 0.03, 0.5], "look_at": [0.03, 0.03, 0.01], "field_of_v
 def scene_of(*materials, depth=0.02, picture=None, container=None, **tables):
     """A tank with fluid that is so deep [m] in the direction of the view, or several side by side."""
     count = len(materials)
-    phases = [
-        {"name": f"p{k}", "rest_density": 1000.0, "viscosity": 0.01, "material": name}
-        for k, name in enumerate(materials)
-    ]
-    bodies = [
-        {"shape": "box", "lower": [0.06 * k / count, 0.0, 0.0], "upper": [0.06 * (k + 1) / count, 0.06, depth]}
-        for k in range(count)
-    ]
+    water = {"rest_density": 1000.0, "viscosity": 0.01}
+    phases = [{**water, "name": f"p{k}", "material": name} for k, name in enumerate(materials)]
+    ends = [(0.06 * k / count, 0.06 * (k + 1) / count) for k in range(count)]
+    bodies = [box([x, 0.0, 0.0], [to, 0.06, depth], phase=f"p{k}") for k, (x, to) in enumerate(ends)]
     given = {
         "dimension": 3,
         "discretisation": {"spacing": 0.01},
         "phase": phases,
-        "fluid": [{**body, "phase": f"p{k}"} for k, body in enumerate(bodies)],
-        "container": {"shape": "box", "lower": [0.0] * 3, "upper": [0.06, 0.12, depth], **(container or {})},
+        "fluid": bodies,
+        "container": {**box([0.0] * 3, [0.06, 0.12, depth]), **(container or {})},
         "solver": {"kind": "pcisph", "time_step": 0.001},
         "picture": {"width": 64, "height": 64, "floor": False, "background": DARK, **FRONT, **(picture or {})},
     }
