@@ -110,7 +110,6 @@ def lists(
         if capacity == 400:  # else the list may have been cut
             assert (rows[i, own[i] : fluid_count[i]] == i).all(), "a list is filled up with the particle itself"
             assert fluid_count[i] % UNROLL == 0 <= fluid_count[i] - own[i] < UNROLL
-        assert (fluid_count[i] % UNROLL == 0 and 0 <= fluid_count[i] - own[i] < UNROLL) or capacity < 400
         near_walls[order[i]] = wall_names[rows[i, fluid_count[i] : count[i]]]
     return Found(search, grid, order, fluid, near_walls, search.needed, rows, count)
 

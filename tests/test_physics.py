@@ -141,10 +141,3 @@ def test_a_lost_particle_ends_the_run():
     with pytest.raises(DivergedError) as caught:
         rollout.forward()
     assert (caught.value.step, caught.value.particle) == (1, 17)
-
-
-def test_frames_and_records():
-    trajectory = Simulation(splash()).run(steps=10, record_every=4)
-    np.testing.assert_array_equal(trajectory.steps, [0, 4, 8, 10])
-    assert trajectory.positions.shape == (4, 125, 3)
-    np.testing.assert_array_equal(trajectory.iterations, np.full(10, 5))

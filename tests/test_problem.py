@@ -85,7 +85,8 @@ def test_a_run_under_parameters_ends_where_the_loss_looks(simulation, problem):
     point = {"gravity": [1.0, -5.0, 0.0], "initial_velocities": simulation.velocities + 0.1, "time_step": 0.002}
     trajectory = problem.run(point, record_every=25)
     np.testing.assert_array_equal(trajectory.steps, [0, 25, 50, 60])
-    assert trajectory.times[-1] == pytest.approx(0.12)
+    assert trajectory.times[-1] == pytest.approx(0.12) and trajectory.positions.shape == (4, 125, 3)
+    np.testing.assert_array_equal(trajectory.iterations, np.full(60, 5))
     np.testing.assert_array_equal(trajectory.positions[-1], problem.end(point).positions)
 
 

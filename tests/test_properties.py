@@ -1,4 +1,5 @@
-"""Properties that hold for any cloud, any scene and any cut of the work, on examples that Hypothesis draws."""
+"""Properties that hold for any cloud, any scene and any cut of the work, on examples that Hypothesis draws; that lists
+of neighbours do is in test_neighbours.py."""
 
 from functools import cache
 from itertools import pairwise
@@ -15,8 +16,6 @@ import test_kernels
 from cortado import Problem, Scene, Simulation
 from cortado.losses import CentreOfMass, FinalPositions, Frames
 from scenes import jet, plane, plane_of_three
-from test_neighbours import REACH, lists
-from test_neighbours import cloud as uniform_cloud
 from test_ranges import Weighed, set_parts
 
 STEPS = 7
@@ -60,26 +59,6 @@ def evaluation(problem: Problem, point: dict[str, Any]) -> dict[str, bytes]:
     loss, gradient = problem.value_and_gradient(point)
     assert all(np.any(bar) for bar in gradient.values())
     return bits({"loss": loss, **gradient})
-
-
-@examples(60)
-@given(
-    seed=seeds,
-    particles=st.integers(1, 150),
-    periodic=st.lists(st.booleans(), min_size=2, max_size=3),
-    reaches=st.lists(st.floats(2.1, 7.0), min_size=3, max_size=3),
-    walls=st.integers(0, 40),
-)
-def test_lists_are_those_of_a_kd_tree(seed, particles, periodic, reaches, walls):
-    size = REACH * np.array(reaches[: len(periodic)])
-    period = size * periodic
-    fluid, wall = (uniform_cloud(n, len(size), size, seed + k) for k, n in enumerate((particles, walls)))
-    found = lists(fluid, period, wall)
-    for listed, others in ((found.fluid, fluid), (found.walls, wall)):
-        near = cKDTree(others, boxsize=period).query_ball_point(fluid, REACH) if len(others) else [[]] * particles
-        for i in range(particles):
-            itself = {i} if others is fluid else set()
-            assert sorted(listed[i]) == sorted(set(near[i]) - itself), f"particle {i}"
 
 
 @pytest.mark.parametrize("operation", OPERATIONS, ids=lambda operation: operation.__name__)

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from base64 import b64decode
+from functools import reduce
 from html import unescape
 from importlib.util import find_spec
 from io import BytesIO
@@ -45,16 +46,7 @@ def by_import(name):
             if not module.startswith(error.name):
                 raise
             continue
-        for part in parts[end:]:
-            found = getattr(found, part)
-        return found
-
-
-def by_attribute(name):
-    found = cortado
-    for part in name.split(".")[1:]:
-        found = getattr(found, part)
-    return found
+        return reduce(getattr, parts[end:], found)
 
 
 def without_what_imports_leave(monkeypatch):
@@ -93,7 +85,7 @@ def test_what_documents_name_is_there_as_an_attribute_and_to_import(monkeypatch)
     imported = {name: by_import(name) for name in sorted(NAMED)}
     without_what_imports_leave(monkeypatch)
     for name, found in imported.items():
-        assert by_attribute(name) == found, name
+        assert reduce(getattr, name.split(".")[1:], cortado) == found, name
 
 
 def test_the_renderer_of_the_documents_is_there():
@@ -185,15 +177,12 @@ def test_what_an_estimator_says(problem):
     assert smoothed.endswith(", gradient of gravity (2,), with its standard error)")
 
 
-def test_a_certificate_is_a_table(certificate):
+def test_a_certificate_is_a_table_and_the_same_text_in_a_notebook(certificate, monkeypatch):
     assert repr(certificate) == "Certificate(64 particles, 4 steps, right, horizon 4, use gradients.Exact())"
     assert re.search(r"│ gravity +│ \d\.\d{3}e-\d\d +│ right +│", str(certificate))
     assert "array(" not in repr(certificate.consistency) and "array(" not in repr(certificate.horizons)
     html = certificate._repr_html_()
     assert html.startswith("<pre>") and html.endswith("</pre>") and "│ gravity" in html
-
-
-def test_a_certificate_is_the_same_text_in_a_notebook(certificate, monkeypatch):
     text = str(certificate)
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     assert str(certificate) == text and "adjoint" in text.splitlines()[2]
@@ -263,14 +252,11 @@ def test_a_first_guess_that_diverges_has_no_picture(result, monkeypatch):
     assert len(pictures(result._repr_html_())) == 1
 
 
-def test_a_notebook_plays_a_trajectory(trajectory):
+def test_a_notebook_plays_a_trajectory_and_nothing_of_none(trajectory):
     (page,) = re.findall(r'<iframe srcdoc="([^"]*)"', trajectory._repr_html_())
     data = json.loads(unescape(page).partition('"application/json">')[2].partition("</script>")[0])
     assert len(data["times"]) == len(trajectory) and data["particles"] == 64
     assert data["radius"] == pytest.approx(0.56 * 0.05, rel=0.3)
-
-
-def test_a_trajectory_of_nothing_has_no_picture(trajectory):
     assert trajectory[:0]._repr_html_() == "<pre>Trajectory(0 frames of 64 particles)</pre>"
 
 

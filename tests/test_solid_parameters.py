@@ -305,16 +305,6 @@ def test_a_run_that_goes_on_keeps_the_size():
     np.testing.assert_array_equal(density[-1], simulation.quantity("density", first.last_state))
 
 
-def steady_of(scene):
-    """How fast all solids of a scene go, by the names of parameters, with the time step, and a direction there."""
-    random, d = np.random.default_rng(0), scene.dimension
-    point, along = {"time_step": np.array(scene.solver.time_step)}, {"time_step": np.array(1e-3)}
-    for name in (table.name for table in scene.solid):
-        for rate, shape in ((f"{name}.velocity", (d,)), (f"{name}.angular_velocity", () if d == 2 else (3,))):
-            point[rate], along[rate] = random.normal(size=shape), random.normal(size=shape)
-    return point, along
-
-
 PROPELLER = {key: PADDLE[key] for key in ("name", "shape", "start", "end", "radius", "rotation", "motion")}
 PROPELLER["velocity"] = [0.1, 0.0, 0.2]
 
@@ -328,7 +318,13 @@ PROPELLER["velocity"] = [0.1, 0.0, 0.2]
     ids=["plane, projection", "plane, pcisph", "space, projection", "space, pcisph"],
 )
 def test_steady_motion_has_derivatives(scene):
-    check(problem_of(scene), *steady_of(scene))
+    """With respect to how fast all solids go, and to the time step."""
+    random, d = np.random.default_rng(0), scene.dimension
+    point, along = {"time_step": np.array(scene.solver.time_step)}, {"time_step": np.array(1e-3)}
+    for name in (table.name for table in scene.solid):
+        for rate, shape in ((f"{name}.velocity", (d,)), (f"{name}.angular_velocity", () if d == 2 else (3,))):
+            point[rate], along[rate] = random.normal(size=shape), random.normal(size=shape)
+    check(problem_of(scene), point, along)
 
 
 def test_a_velocity_is_that_of_a_scene_that_says_so():
