@@ -41,12 +41,17 @@ def test_a_full_disk_is_told_from_a_wrong_path(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == []
 
 
-def test_a_link_under_the_temporary_name_is_not_followed(tmp_path, monkeypatch):
+def test_links_in_place_of_a_temporary_file_or_of_a_lock_are_not_followed(tmp_path, monkeypatch):
     (tmp_path / "precious").write_text("mine")
     monkeypatch.setattr(cortado.files.disk.secrets, "token_hex", lambda count: "guessed")
     unfinished(tmp_path / "a").symlink_to(tmp_path / "precious")
     with pytest.raises(InputError, match="cannot be written"):
         write_atomically(tmp_path / "a", "theirs")
+    assert (tmp_path / "precious").read_text() == "mine"
+    (tmp_path / "precious").write_text("mine")
+    (tmp_path / LOCK).symlink_to(tmp_path / "precious")
+    with pytest.raises(InputError, match="cannot be written"), locked(tmp_path):
+        pass
     assert (tmp_path / "precious").read_text() == "mine"
 
 
@@ -126,13 +131,21 @@ def test_a_second_process_is_refused_until_the_first_has_ended(tmp_path):
     assert os.listdir(folder) == []
 
 
-def test_the_lock_ends_with_the_block(tmp_path):
+def test_the_lock_ends_with_the_block_and_without_locks_a_folder_is_written_too(tmp_path, monkeypatch):
     with locked(tmp_path):
         with pytest.raises(InputError, match=f"process {os.getpid()}"), locked(tmp_path):
             pass
         assert os.listdir(tmp_path) == [LOCK]
     with locked(tmp_path):
         pass
+
+    def unknown(*arguments):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", unknown)
+    with locked(tmp_path):
+        pass
+    assert os.listdir(tmp_path) == []
 
 
 def test_a_lock_that_its_owner_removed_is_not_taken_for_one(tmp_path, monkeypatch):
@@ -148,24 +161,6 @@ def test_a_lock_that_its_owner_removed_is_not_taken_for_one(tmp_path, monkeypatc
     monkeypatch.setattr(fcntl, "flock", slow)
     with locked(tmp_path), pytest.raises(InputError, match="is being written"), locked(tmp_path):
         pass
-
-
-def test_without_locks_a_folder_is_written_all_the_same(tmp_path, monkeypatch):
-    def unknown(*arguments):
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr(fcntl, "flock", unknown)
-    with locked(tmp_path):
-        pass
-    assert os.listdir(tmp_path) == []
-
-
-def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path):
-    (tmp_path / "precious").write_text("mine")
-    (tmp_path / LOCK).symlink_to(tmp_path / "precious")
-    with pytest.raises(InputError, match="cannot be written"), locked(tmp_path):
-        pass
-    assert (tmp_path / "precious").read_text() == "mine"
 
 
 def test_a_lock_on_windows_is_one_byte_that_others_need_not_read(tmp_path, monkeypatch):

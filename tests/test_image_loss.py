@@ -133,7 +133,7 @@ def test_float32_is_near_float64():
         assert np.linalg.norm(gradient[key] - array) < 5e-3 * np.linalg.norm(array), key
 
 
-def test_a_target_cannot_be_changed_behind_the_back():
+def test_a_target_cannot_be_changed_behind_the_back_and_has_the_size_of_the_pictures():
     _, renderer = case("plane")
     target = target_of(renderer)
     loss = losses.Image(renderer, target)
@@ -141,6 +141,19 @@ def test_a_target_cannot_be_changed_behind_the_back():
     assert loss.target.max() > 0.9
     with pytest.raises(ValueError, match="read-only"):
         loss.target[0] = 1.0
+    _, renderer = case("plane")
+    light = "but must be linear light from 0 to 1, as"
+    for target, wanted in [
+        (np.zeros((16, 21, 3)), r"shape \(16, 21, 3\), but must have that of the renderer's .*, \(16, 20, 3\)\.$"),
+        (np.zeros((16, 20)), r"shape \(16, 20\), but must be a picture \(rows, columns, 3\)\.$"),
+        (np.full((16, 20, 3), np.nan), r"not finite, but must be made of finite numbers\.$"),
+        ("heart", r"^target is 'heart', but must be a number or an array"),
+        (np.full((16, 20, 3), 200.0), f"a value of 200, {light} that of cortado"),
+        (np.full((16, 20, 3), -5.0), f"a value of -5, {light} that of cortado"),
+        (np.ones((16, 20, 3), np.uint8), f"made of whole numbers, {light}"),
+    ]:
+        with pytest.raises(InputError, match=wanted):
+            losses.Image(renderer, target)
 
 
 def test_fingerprints_tell_targets_distances_and_grids_apart():
@@ -164,22 +177,6 @@ def test_fingerprints_tell_targets_distances_and_grids_apart():
         for upper, cell in (([1.0, 1.0, 1.0], 0.1), ([1.0, 1.0, 1.0], 0.05), ([1.0, 2.0, 1.0], 0.1))
     ]
     assert len({renderer.fingerprint for renderer in grids}) == 3
-
-
-def test_a_target_of_another_size_is_a_sentence():
-    _, renderer = case("plane")
-    light = "but must be linear light from 0 to 1, as"
-    for target, wanted in [
-        (np.zeros((16, 21, 3)), r"shape \(16, 21, 3\), but must have that of the renderer's .*, \(16, 20, 3\)\.$"),
-        (np.zeros((16, 20)), r"shape \(16, 20\), but must be a picture \(rows, columns, 3\)\.$"),
-        (np.full((16, 20, 3), np.nan), r"not finite, but must be made of finite numbers\.$"),
-        ("heart", r"^target is 'heart', but must be a number or an array"),
-        (np.full((16, 20, 3), 200.0), f"a value of 200, {light} that of cortado"),
-        (np.full((16, 20, 3), -5.0), f"a value of -5, {light} that of cortado"),
-        (np.ones((16, 20, 3), np.uint8), f"made of whole numbers, {light}"),
-    ]:
-        with pytest.raises(InputError, match=wanted):
-            losses.Image(renderer, target)
 
 
 @pytest.mark.parametrize("distance", ["pyramid", Pyramid, 3.0])

@@ -35,12 +35,14 @@ PREDICT = integration_kernels(FLOAT64, False).predict
 NAMES = ("particles", "time_step", "x", "v", "acceleration", "x_star", "v_star")
 
 
-def test_arguments_come_in_the_order_of_the_kernel_and_of_groups():
+def test_arguments_come_in_the_order_of_the_kernel_and_of_groups_and_a_misspelt_one_is_named():
     given = {name: name.upper() for name in reversed(NAMES)}
     assert bound(PREDICT, (), given, Bundles()) == [name.upper() for name in NAMES]
     first, second = {"x": 1, "v": 2, "other": 0}, {"x": 10, "v": 20, "time_step": 30, "x_star": 40, "v_star": 50}
     found = bound(PREDICT, (first, second), {"v": 3, "acceleration": 4, "particles": 60}, Bundles())
     assert found == [60, 30, 1, 3, 4, 40, 50]
+    with pytest.raises(TypeError, match="has no argument 'xstar'; it has particles, time_step, x, v, acc"):
+        bound(PREDICT, (), {**dict.fromkeys(NAMES, 0), "xstar": 0}, Bundles())
 
 
 @pytest.mark.parametrize("missing", NAMES)
@@ -53,11 +55,6 @@ def test_a_missing_argument_is_named(missing):
     told = r"'x_star' of .* is missing; .*; known are v_star, particles, time_step, x, v, xstar, acc"
     with pytest.raises(TypeError, match=told):
         bound(PREDICT, groups, {"v_star": 0}, Bundles())
-
-
-def test_a_misspelt_argument_is_named():
-    with pytest.raises(TypeError, match="has no argument 'xstar'; it has particles, time_step, x, v, acc"):
-        bound(PREDICT, (), {**dict.fromkeys(NAMES, 0), "xstar": 0}, Bundles())
 
 
 @pytest.mark.parametrize("by", ["launch", "launcher"])

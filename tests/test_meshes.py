@@ -532,9 +532,18 @@ def test_a_bad_mesh_is_a_sentence_that_says_which_where_and_what_to_do(tmp_path,
     assert repr(path) in str(caught.value)
 
 
-def test_vertices_that_are_not_finite_are_a_sentence(tmp_path):
+def test_vertices_that_are_not_finite_and_files_that_cannot_be_meant_are_sentences(tmp_path):
     with one_sentence(r"1 vertex with coordinates that are not finite.* number \d+"):
         read(written(tmp_path, not_a_number(), "nan.ply"))
+    (tmp_path / "a.step").write_text("")
+    (tmp_path / "line.obj").write_text("v 0 0 0\nv 1 0 0\nl 1 2\n")
+    for call, name, trouble in [
+        (read, "a.step", "does not end in one of .stl, "),
+        (read, "none.stl", "No such file"),
+        (read_triangles, "line.obj", "points or lines, but no triangles"),
+    ]:
+        with one_sentence(trouble):
+            call(str(tmp_path / name))
 
 
 def test_without_a_container_a_mesh_is_held_against_the_spacing(tmp_path):
@@ -580,18 +589,6 @@ def test_files_that_are_cut_off_are_a_sentence(tmp_path, cut):
         (tmp_path / f"cut_{name}").write_bytes(content[: int(cut * len(content))])
         with one_sentence("may be damaged"):
             read(str(tmp_path / f"cut_{name}"))
-
-
-def test_files_that_cannot_be_meant_are_a_sentence(tmp_path):
-    (tmp_path / "a.step").write_text("")
-    (tmp_path / "line.obj").write_text("v 0 0 0\nv 1 0 0\nl 1 2\n")
-    for call, name, trouble in [
-        (read, "a.step", "does not end in one of .stl, "),
-        (read, "none.stl", "No such file"),
-        (read_triangles, "line.obj", "points or lines, but no triangles"),
-    ]:
-        with one_sentence(trouble):
-            call(str(tmp_path / name))
 
 
 # ---- a large one -------------------------------------------------------------------------------------------------
