@@ -232,11 +232,6 @@ class PlaneStage:
         """Return the longer side of the contents [m]."""
         return float((self.upper - self.lower).max())
 
-    @property
-    def _wall(self) -> float:
-        """Return the thickness of drawn walls [m]."""
-        return 0.010 * self._size
-
     def _shadow(self) -> Points:
         """Return how much darker (rows, columns) the paper is behind the container and tanks."""
         tanks = [0.28 * self._below(shown) for shown, _ in self._tanks]
@@ -279,7 +274,7 @@ class PlaneStage:
 
     def _walls(self, distance: Points, part: Points | float, colour: Points) -> Layer:
         """Return the layer of walls, by the distance [m] of pixels from their inner side; ``part`` of them is there."""
-        wall = self._wall
+        wall = 0.01 * self._size
         band = np.clip(distance / self.pixel + 0.5, 0.0, 1.0) * np.clip((wall - distance) / self.pixel + 0.5, 0.0, 1.0)
         shine = 1.0 - 0.35 * np.clip(distance / wall, 0.0, 1.0)
         opacity = 0.85 * (band * part)[..., None]

@@ -105,11 +105,9 @@ def _same(one: Any, other: Any) -> bool:
     if not isinstance(one, CodeType) or not isinstance(other, CodeType):
         return type(one) is type(other) and repr(one) == repr(other)
     found, wanted = _instructions(one), _instructions(other)
-    return one.co_varnames == other.co_varnames and len(found) == len(wanted) and all(map(_alike, found, wanted))
-
-
-def _alike(one: tuple[str, Any], other: tuple[str, Any]) -> bool:
-    return one[0] == other[0] and _same(one[1], other[1])
+    if one.co_varnames != other.co_varnames or len(found) != len(wanted):
+        return False
+    return all(a == b and _same(x, y) for (a, x), (b, y) in zip(found, wanted, strict=True))
 
 
 def _instructions(code: CodeType) -> list[tuple[str, Any]]:
@@ -211,7 +209,7 @@ class DerivativeCheck(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_For(self, node: ast.For) -> None:
-        ends = node.iter.args if isinstance(node.iter, ast.Call) and _is_range(node.iter.func) else []
+        ends = node.iter.args if isinstance(node.iter, ast.Call) and ast.unparse(node.iter.func) == "range" else []
         numbers = [end.value for end in ends if isinstance(end, ast.Constant) and isinstance(end.value, int)]
         if not ends or len(numbers) < len(ends) or len(range(*numbers)) > wp.config.max_unroll:
             self._refuse(node)
@@ -259,10 +257,6 @@ def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
         if isinstance(scope.get(node.id), (list, tuple, dict, str, np.ndarray)):
             found = f"{what} has the name {node.id}, which is a {type(scope[node.id]).__name__} outside of it"
             raise InputError(f"{found}, but must take a number or a vector: make it a parameter of the function.")
-
-
-def _is_range(node: ast.expr) -> bool:
-    return isinstance(node, ast.Name) and node.id == "range"
 
 
 def counts_of(function: ast.FunctionDef) -> list[str]:

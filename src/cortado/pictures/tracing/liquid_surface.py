@@ -72,7 +72,8 @@ def spheres(positions: Points, colours: Points, spacing: float) -> Surface:
 def _sphere(levels: int) -> tuple[Points, np.ndarray]:
     """Make corners (k, 3) and triangles of a unit sphere: an octahedron with each triangle cut into four repeatedly."""
     corners = [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
-    triangles = [(a, b, c) if s > 0 else (a, c, b) for a, b, c, s in _octants()]
+    octants = ((i, 2 + j, 4 + k, (i + j + k) % 2) for i in (0, 1) for j in (0, 1) for k in (0, 1))
+    triangles = [(a, c, b) if turned else (a, b, c) for a, b, c, turned in octants]
     for _ in range(levels):
         middles: dict[tuple[int, int], int] = {}
 
@@ -91,11 +92,6 @@ def _sphere(levels: int) -> tuple[Points, np.ndarray]:
             for four in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
         ]
     return np.array(corners), np.array(triangles)
-
-
-def _octants() -> list[tuple[int, int, int, int]]:
-    """Return the three corners of each face of an octahedron, and the sign of the way round."""
-    return [(i, 2 + j, 4 + k, (-1) ** (i + j + k)) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
 
 
 REACH = 3.0
