@@ -150,7 +150,7 @@ def test_fluid_is_neither_compressed_nor_torn_along_a_seam(name):
     scene = scene_of(2, fluids, container).replaced(f"discretisation.kernel={kernel}", "discretisation.support=2.0")
     with unwarned():
         discrete = discretise(scene)
-    sample, found = discrete.fluid, densities(scene, discrete)
+    sample, found = discrete.fluid, densities(discrete)
     assert found.max() < 1.03
     assert found[np.abs(sample.positions - place).max(axis=1) < 2.0 * SPACING].min() > 0.97
     assert sum(sample.sizes) == len(found) and 0.985 < len(found) * SPACING**2 / sum(sample.asked) < 1.003
