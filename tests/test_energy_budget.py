@@ -13,7 +13,7 @@ from reference_projection import Projection
 from scenes import OIL, box, plane, plane_of_three, scene, two_layers
 from still_fluids import still_water
 from test_moving_solids import ROTOR
-from test_quantities import Weighted, cubic_spline
+from test_quantities import Weighted, around
 from test_solid_parameters import SCENES, STEPS, check, point_of
 
 SUPPORTS = {"cubic_spline": 2.0, "wendland_c2": 2.6}
@@ -171,7 +171,7 @@ def test_pressures_are_sums_over_all_pairs_and_walls(name):
     L = np.empty((len(x), d, d))
     L[solver.search.order.numpy()[: len(x)]] = solver.around["L"].numpy()[:, :d, :d]
     T = (second["pressure_impulse"] / 0.002)[:, None, None] * L
-    (_, g), (_, wall_g) = cubic_spline(simulation, x)
+    (_, g), (_, wall_g) = around(simulation, x)
     apart = x[:, None] - x[None]
     pairs = -0.5 * volume * np.einsum("ijk,ijkl,ijl->i", apart, T[:, None] + T[None], g)
     weights, places, feet = (solver.search.walls[f"wall_{of}"].numpy() for of in ("weights", "positions", "feet"))
