@@ -37,6 +37,7 @@ from cortado.runs.quantity_values import Moment, QuantityEvaluator
 from cortado.runs.recording import recorded
 from cortado.runs.sensor import Sensor
 from cortado.runs.trajectory import Frame, Trajectory
+from cortado.runs.waiting import Waiting
 from cortado.scene.discrete_scene import check_distance, discretise
 from cortado.scene.parameter_values import OVER_TIME, scene_values
 from cortado.scene.quantity_names import check_readable
@@ -232,14 +233,23 @@ class Simulation(Stepping):
         steps, frames, looks = [0], [self.frame(rollout.initial)], [watch.frame(0, rollout.initial)]
         watch.step(0, rollout.initial)
 
-        def keep(step: int, state: State) -> None:
-            if step % record_every == 0 or rollout.is_last(step):
+        def is_frame(step: int) -> bool:
+            return step % record_every == 0 or rollout.is_last(step)
+
+        def look(step: int, state: State) -> None:
+            if is_frame(step):
                 steps.append(step)
                 frames.append(self.frame(state))
                 looks.append(watch.frame(step, state))
             watch.step(step, state)
 
-        rollout.forward(keep, keep=False)
+        def keep(step: int, state: State) -> None:
+            if watch.reads or is_frame(step):
+                waiting.keep(step, state)
+
+        waiting = Waiting(look, rollout.initial)
+        rollout.forward(keep, keep=False, meanwhile=waiting.look)
+        waiting.look()
         unread = ["the sensors of the scene are not read in a batch."] if self.batch and self.scene.sensor else []
         for sentence in (*trouble(rollout, self.scene), *unread):
             warn(sentence)

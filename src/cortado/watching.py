@@ -74,9 +74,14 @@ class Watch:
         """Return the recorded quantities of a state after so many steps, by name."""
         return self._recorder(step, state)
 
+    @property
+    def reads(self) -> bool:
+        """True if there is a sensor, which reads every state."""
+        return bool(self._log.sensors)
+
     def step(self, step: int, state: State) -> None:
         """Make the sensors read a state after so many steps; it is called for every state in its turn."""
-        if self._log.sensors:
+        if self.reads:
             moment = Moment.of(self._rollout, step, state, self._evaluator, self._quantities)
             self._log.read(Snapshot(state, self._dimension, self._colours, moment))
 

@@ -5,7 +5,7 @@ neighbour lists were long enough (if not, they grow and the chunk is repeated) a
 of steps, or a step back or along, is a captured graph on a GPU, and on a CPU where launches take one thread.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import count
 from typing import Protocol
@@ -23,9 +23,9 @@ from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Parameters, State, StateSeries
 from cortado.rollout.checkpoints import MEMORY_BUDGET, Checkpoints, Progress, checkpoint_interval
+from cortado.rollout.divergence import diverged
 from cortado.rollout.step_sizes import StepSizes
 from cortado.scene.restart import Clock, Origin
-from cortado.solvers.containment import Lost, shut_in
 from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepTangent
 
 Observer = Callable[[int, State], None]
@@ -164,9 +164,12 @@ class Rollout(Staying):
         self.progress, self.evaluation = Progress(), next(self._evaluations)
 
     @in_turn
-    def forward(self, observe: Observer | None = None, keep: bool = True) -> State:
+    def forward(
+        self, observe: Observer | None = None, keep: bool = True, meanwhile: Callable[[], None] | None = None
+    ) -> State:
         """Run all steps, or those up to the end of its time, and return the last state, which the next run overwrites.
-        ``observe`` is given every state; ``keep`` checkpoints for a way back. Raises `DivergedError` after the good
+        ``observe`` is given every state; ``keep`` checkpoints for a way back; ``meanwhile`` is called while a GPU takes
+        the next steps. Raises `DivergedError` after the good
         states were observed; a batch goes on without the scenes that have ``lost`` a particle."""
         self._kept = self._run = -1
         self._spare += self._checkpoints.release()
@@ -183,6 +186,8 @@ class Rollout(Staying):
                 last = step + self._length(self.steps - step)
                 self._buffer.assign(state)  # which may be one of the states that steps overwrite
                 chunk = self._advance(step, last)
+                if meanwhile is not None:
+                    meanwhile()
                 while self.solver.make_room() or self.step_sizes.again(step, last):
                     self._forget_stale_graphs()
                     self.solver.reset(step)
@@ -420,31 +425,3 @@ class Residual:
             self.rollout.begin_evaluation()
             write_back()
             self.rollout.pending.add(self)
-
-
-AROUND = 6.0
-"""Distance, in spacings, around a lost particle's last position within which causes are sought."""
-
-
-def diverged(solver: Solver, member: int, lost: Lost, known: Sequence[State], advice: str) -> DivergedError:
-    """Return the error for a scene of a batch that lost a particle, given at least two states up to the failed step,
-    and advice."""
-    containment, particles = solver.containment, solver.layout.particles
-    spacing, d = containment.walled.spacing, containment.walled.dimension
-    own = slice(member * particles, (member + 1) * particles)
-    first, was, after = (known[k].positions.numpy()[own, :d] for k in (0, -2, -1))
-    if not np.isfinite(was[lost.particle]).all():
-        where = "had been lost in steps before these"
-        return DivergedError(lost.step + 1, lost.particle, "begin that scene anew", where, lost.others)
-    position, places = after[lost.particle], np.concatenate([first, was])
-    if not lost.others:
-        places = places[np.linalg.norm(places - was[lost.particle], axis=1) < AROUND * spacing]
-    if narrow := shut_in(containment, member, places):
-        advice = f"{narrow}, or {advice}"
-    return DivergedError(
-        step=lost.step + 1,
-        particle=lost.particle,
-        advice=f"{advice}, or float64 for fluid that flies that far" if containment.is_imprecise(position) else advice,
-        where=containment.where(position),
-        others=lost.others,
-    )
