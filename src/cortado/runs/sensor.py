@@ -123,13 +123,17 @@ class Seen:
         a particle from it [m], which weigh the same; a particle is one point if they are left out."""
         shifts = np.zeros((1, at.dimension)) if parts is None else parts
         seen, widest = across(shifts), reach + float(np.linalg.norm(across(shifts), axis=1).max())
-        ways = at.lattice.domain.ways(at["positions"], in_dimension("position", place, at.dimension), widest, across)
+        in_dimension("position", place, at.dimension)
+        positions, domain, numbers = at["positions"], at.lattice.domain, np.arange(len(at["positions"]))
+        if not any(domain.lengths):  # most particles are far away
+            rough = (positions - place) @ across(np.eye(at.dimension))
+            numbers = np.flatnonzero(np.einsum("ij,ij->i", rough, rough) < (1.0 + 1e-9) * widest**2)
         images = []
-        for way in ways:
+        for way in domain.ways(positions[numbers], place, widest, across):
             close = np.flatnonzero(np.linalg.norm(way, axis=1) < widest)
             for shift in seen:
                 own = way[close] + shift
-                images.append(Image(close, own, Weights.of(np.linalg.norm(own, axis=1) / reach)))
+                images.append(Image(numbers[close], own, Weights.of(np.linalg.norm(own, axis=1) / reach)))
         return cls(images, len(at["positions"]), len(shifts), reach)
 
     @property
