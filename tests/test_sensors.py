@@ -15,6 +15,7 @@ from cortado.losses import Series
 from cortado.losses.distances import SensorMatch
 from cortado.runs.quantity_values import QuantityEvaluator
 from cortado.runs.sensor import Readings, as_csv, from_csv, value_of
+from cortado.runs.waiting import Table
 from cortado.scene.shape_tables import NoContainer
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
 from cortado.watching import Watch
@@ -558,6 +559,29 @@ def test_sensors_that_need_a_step_share_it(monkeypatch):
     assert len(solved) == 6 + 1  # of the first state the probe asks before anybody knows of the walls
     for name, one in alone.items():
         assert one.values.tobytes() == together[name].values.tobytes(), name
+
+
+def test_frames_and_readings_do_not_depend_on_how_long_states_wait(monkeypatch):
+    simulation, sensors = cortado.Simulation(plane()), {"gauge": WaveGauge([0.2, 0.0])}
+    wanted = simulation.run(21, record_every=2, sensors=sensors, record=["density"])
+    singles = [simulation.run(n) for n in (2, 20)]
+    monkeypatch.setattr("cortado.runs.waiting.MOST", 1)
+    found = simulation.run(21, record_every=2, sensors=sensors, record=["density"])
+    assert wanted.steps.tolist() == [*range(0, 21, 2), 21]
+    for n, single in zip((1, 10), singles, strict=True):
+        assert wanted.positions[n].tobytes() == single.positions[-1].tobytes()
+    for name in ("positions", "velocities", "times"):
+        assert getattr(found, name).tobytes() == getattr(wanted, name).tobytes()
+    assert found.quantities["density"].tobytes() == wanted.quantities["density"].tobytes()
+    assert found.sensors["gauge"].values.tobytes() == wanted.sensors["gauge"].values.tobytes()
+
+
+def test_a_table_grows():
+    table = Table(2)
+    for k in range(5):
+        table.add({"x": np.full((3, 2), k, dtype=np.float32)})
+    (found,) = table.arrays().values()
+    assert found.dtype == np.float32 and found[:, 2, 1].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
 
 
 def test_describe_counts_what_sensors_cost(monkeypatch):

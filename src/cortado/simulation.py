@@ -37,7 +37,7 @@ from cortado.runs.quantity_values import Moment, QuantityEvaluator
 from cortado.runs.recording import recorded
 from cortado.runs.sensor import Sensor
 from cortado.runs.trajectory import Frame, Trajectory
-from cortado.runs.waiting import Waiting
+from cortado.runs.waiting import Table, Waiting
 from cortado.scene.discrete_scene import check_distance, discretise
 from cortado.scene.parameter_values import OVER_TIME, scene_values
 from cortado.scene.quantity_names import check_readable
@@ -230,7 +230,13 @@ class Simulation(Stepping):
         parts = frame_parts(expected_frames(rollout, record_every), numbers, self.precision.bytes)
         require(parts, "take a larger record_every or fewer steps")
         watch = Watch(self, rollout, record, sensors)
-        steps, frames, looks = [0], [self.frame(rollout.initial)], [watch.frame(0, rollout.initial)]
+        steps, frames = list[int](), Table(expected_frames(rollout, record_every))
+
+        def record_frame(step: int, state: State) -> None:
+            steps.append(step)
+            frames.add({**state.views(self.dimension, self._changing), **watch.frame(step, state)})
+
+        record_frame(0, rollout.initial)
         watch.step(0, rollout.initial)
 
         def is_frame(step: int) -> bool:
@@ -238,9 +244,7 @@ class Simulation(Stepping):
 
         def look(step: int, state: State) -> None:
             if is_frame(step):
-                steps.append(step)
-                frames.append(self.frame(state))
-                looks.append(watch.frame(step, state))
+                record_frame(step, state)
             watch.step(step, state)
 
         def keep(step: int, state: State) -> None:
@@ -253,14 +257,19 @@ class Simulation(Stepping):
         unread = ["the sensors of the scene are not read in a batch."] if self.batch and self.scene.sensor else []
         for sentence in (*trouble(rollout, self.scene), *unread):
             warn(sentence)
-        fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
-        own = {name: np.array([one[name] for one in looks]) for name in watch.names}
+        fields = frames.arrays()
+        own = {name: fields.pop(name) for name in watch.names}
         found = recorded(rollout, self.scene, np.array(steps), fields, self.constants(rollout), own)
         return replace(found, sensors=watch.readings()) if isinstance(found, Trajectory) else found  # type: ignore[return-value]  # of a batch
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
         """Return the fields of a state that a trajectory records, as steps change them."""
-        return state.numpy(self.dimension, only=[field.name for field in state.fields if not field.is_constant])
+        return state.numpy(self.dimension, self._changing)
+
+    @property
+    def _changing(self) -> list[str]:
+        """Names of the fields of a state that steps change."""
+        return [field.name for field in self.initial.fields if not field.is_constant]
 
     def numbers_in_frame(self, components: int) -> int:
         """Return the greatest number of numbers that `frame` records, for vectors with so many components."""

@@ -90,7 +90,7 @@ class Snapshot:
         return moment_of(self).evaluator().container
 
     def _field(self, name: str) -> np.ndarray:
-        return _read_only(self.state.numpy(self.dimension, only=[name])[name])
+        return _read_only(self.state.views(self.dimension, only=[name])[name])
 
     def _quantity(self, name: str) -> np.ndarray:
         return moment_of(self).value(name)

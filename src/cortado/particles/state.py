@@ -242,12 +242,14 @@ class State(Arrays):
     def numpy(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """Copy every field, or only those of some names, to new arrays by name: vectors (n, dimension), numbers (n,),
         fractions (n, phases), in a batch (batch, n, ...)."""
-        names = set(self.names if only is None else only)
+        return {name: array.copy() for name, array in self.views(dimension, only).items()}
+
+    def views(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+        """Return fields as `numpy` does, of a state on the host as views of its arrays."""
+        names, lead = set(self.names if only is None else only), () if self.batch is None else (self.batch, -1)
         arrays = {f: self[f.name].numpy() for f in self.fields if f.name in names}
-        found = {f.name: (a[:, :dimension] if f.entry is Entry.VECTOR else a).copy() for f, a in arrays.items()}
-        if self.batch is None:
-            return found
-        return {name: a.reshape(self.batch, -1, *a.shape[1:]) for name, a in found.items()}
+        narrow = {f.name: a[:, :dimension] if f.entry is Entry.VECTOR else a for f, a in arrays.items()}
+        return {name: a.reshape(*lead, *a.shape[1:]) if lead else a for name, a in narrow.items()}
 
 
 class StateSeries:

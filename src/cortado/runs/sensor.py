@@ -126,7 +126,10 @@ class Seen:
         in_dimension("position", place, at.dimension)
         positions, domain, numbers = at["positions"], at.lattice.domain, np.arange(len(at["positions"]))
         if not any(domain.lengths):  # most particles are far away
-            rough = (positions - place) @ across(np.eye(at.dimension))
+            axes = across(np.eye(at.dimension))
+            axes = axes[:, axes.any(axis=0)]
+            rough = positions @ axes
+            rough -= place @ axes
             numbers = np.flatnonzero(np.einsum("ij,ij->i", rough, rough) < (1.0 + 1e-9) * widest**2)
         images = []
         for way in domain.ways(positions[numbers], place, widest, across):

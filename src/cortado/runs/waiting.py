@@ -1,8 +1,11 @@
-"""States that were copied off the device, and wait to be looked at while a GPU takes the next steps."""
+"""States that were copied off the device, and wait to be looked at while a GPU takes the next steps; and tables of what
+is recorded of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from cortado.particles.state import State
 
@@ -45,6 +48,30 @@ class Waiting:
         numbers, self._numbers = self._numbers, []
         for number, copy in zip(numbers, self._copies, strict=False):
             self._look(number, copy)
+
+
+class Table:
+    """Arrays by name, one row for each record. They are allocated at once: memory of each row alone costs more than to
+    copy it."""
+
+    def __init__(self, expected: int):
+        self._rows, self._count, self._arrays = expected, 0, dict[str, NDArray]()
+
+    def add(self, record: Mapping[str, NDArray]) -> None:
+        """Copy a record to the next row."""
+        if self._count == self._rows:
+            self._rows *= 2
+            self._arrays = {name: np.concatenate([own, np.empty_like(own)]) for name, own in self._arrays.items()}
+        for name, value in record.items():
+            if name not in self._arrays:
+                self._arrays[name] = np.empty((self._rows, *value.shape), dtype=value.dtype)
+            self._arrays[name][self._count] = value
+        self._count += 1
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Return the arrays (records, ...) by name; without their memory for more than one further record."""
+        own = {name: array[: self._count] for name, array in self._arrays.items()}
+        return own if self._count >= self._rows - 1 else {name: array.copy() for name, array in own.items()}
 
 
 def _empty(array: wp.array) -> wp.array:
