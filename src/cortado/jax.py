@@ -58,7 +58,7 @@ def step(
     of these steps. Reverse mode goes back by the estimator ``gradient``, such as `gradients.AdjointViscosity`, exactly
     if it is left out; forward mode is exact. Exact derivatives of chained steps grow by a constant factor a step, which
     after some hundred steps drowns what is sought: see `docs/long_horizons.md`. Raises
-    `InputError` for what does not fit, and `DivergedError` when a particle is lost; within a compiled program, where
+    `InputError` for what does not fit, and `DivergedError` when a particle is lost. Within a compiled program, where
     values are known only as it runs, JAX raises an error of its own with the same sentence.
     """
     return calls.step(_BRIDGE, simulation, given, parameters, steps, gradient)

@@ -376,7 +376,7 @@ def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
     """Return directions scaled such that each parameter's changes the loss by as much as the weakest, or up to twice
     that.
 
-    Along their sum an error in one parameter's adjoint is not hidden by a parameter that changes the loss far more; and
+    Along their sum an error in one parameter's adjoint is not hidden by a parameter that changes the loss far more. And
     as no two change it by the same, wrong signs of two of them do not cancel.
     """
     changes = {name: abs(float((gradient[name] * along).sum())) for name, along in directions.items()}

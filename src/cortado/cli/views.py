@@ -95,8 +95,8 @@ class RecordedView:
     def replace(
         self, trajectory: Trajectory, controls: Mapping[str, Any] | None = None, pulls: Sequence[np.ndarray] = ()
     ) -> None:
-        """Show another run of the same scene and number of frames, made under ``controls``. ``pulls`` (frames, n, d) of
-        its own loss; without them the loss is the height of the centre of mass."""
+        """Show another run of the same scene and number of frames, made under ``controls``. ``pulls`` (frames, n, d)
+        are the derivatives of its loss; without them the loss is the height of the centre of mass."""
         self.trajectory, self._controls, self._pulls = trajectory, controls or {}, pulls
         self.show(self.slider.value)
 
@@ -206,7 +206,7 @@ class LiveView:
         self.window.show(Shown(state["positions"], colours, quantities, pull))
 
     def _gravity(self) -> np.ndarray:
-        """Return gravity (d,) as the sliders are."""
+        """Return gravity (d,) as the sliders set it."""
         return np.array([slider.value for slider in self.gravity])
 
     def _controls(self) -> dict[str, np.ndarray]:
@@ -393,7 +393,7 @@ class TaskView:
 
 
 def _written(values: np.ndarray) -> list[str]:
-    """Write numbers in words, 0 for round-off; nothing for one that is not a number."""
+    """Write a number in words, 0 for round-off; nothing for a value that is not a number."""
     least = 1e-9 * np.abs(values).max()
     return ["" if np.isnan(a) else f"{a if abs(a) > least else 0.0:.4g}" for a in values.ravel()]
 

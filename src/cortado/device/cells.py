@@ -174,7 +174,7 @@ class CellSort:
     """A sort of a fixed number of particles by scene and by cell, on one device and without a host read.
 
     On a GPU the work grows with the square of how many particles are in one cell. The fill of the neighbour lists
-    compares the same pairs and more, so that it takes longer still; and particles that are so far away that they cannot
+    compares the same pairs and more, so that it takes longer still. And particles that are so far away that they cannot
     be neighbours, which may be all of an exploded scene, are spread over all cells. On a CPU, which counts particles in
     the given order, they arrive in their cells in that order, and need no rank.
     """

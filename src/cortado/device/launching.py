@@ -196,7 +196,7 @@ class KernelLauncher:
     """A launcher of kernels with one thread a particle on one device, with arguments by name (see `bound`).
 
     On a CPU Warp launches in one thread. A kernel whose first argument is the neighbourhood ``s`` is cut into ranges of
-    particles there, several for each core where there are many, and a core that has done one takes the next: such a
+    particles there, several for each core where there are many, and a core that has done one takes the next. Such a
     kernel works on particle ``s.first + wp.tid()``, and not on a number of threads of its own.
     The sums are gathers, so that the bits do not depend on the cut, or on who took what.
     """

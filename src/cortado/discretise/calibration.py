@@ -127,9 +127,9 @@ def laplacian_rate(kernel: SmoothingKernel, spacing: float, support: float, dime
 def pairwise_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """Return the greatest eigenvalue [1 / m2] on the lattice of the pairwise viscous force on velocities,
 
-    2 (d + 2) V sum_j F_ij x_ij x_ij^T / |x_ij|^2 (v_i - v_j):
+    2 (d + 2) V sum_j F_ij x_ij x_ij^T / |x_ij|^2 (v_i - v_j).
 
-    in a wave of compression it is about three times that of the Laplacian.
+    In a wave of compression it is about three times that of the Laplacian.
     """
     offsets, _, volume = _filled(kernel, spacing, support, dimension)
     squares = (offsets**2).sum(axis=1)

@@ -243,7 +243,7 @@ def _within_triangle(triangle: Points, points: Points) -> tuple[Which, Points]:
 
 def _pieces(segments: Points, lower: float, upper: float) -> Points:
     """Return triangles (n, 3, 2), counterclockwise, between segments (s, 2, 2) in columns from one place to another
-    along the first axis: a new one begins where a segment begins or ends, or where two cross."""
+    along the first axis. A new one begins where a segment begins or ends, or where two cross."""
     order = np.argsort(segments[:, :, 0], axis=1)[..., None]
     (start, below), (end, above) = np.moveaxis(np.take_along_axis(segments, order, axis=1), (1, 2), (0, 1))
     leans = end > start
@@ -361,7 +361,7 @@ class Mesh(Solid):
         """Return points spread over the triangles at equal intervals of area, for `Solid.own_feet`.
 
         Along the triangles, in an order in which those near each other in space follow one another, a point stands at
-        equal intervals of the area; in a triangle that has several, these are a sequence of low discrepancy (Roberts
+        equal intervals of the area. In a triangle that has several, these are a sequence of low discrepancy (Roberts
         2018, R2), folded into it.
         """
         order = np.concatenate([part[tree.order] for part, tree in zip(self._numbers, self._trees, strict=True)])

@@ -180,7 +180,7 @@ def _directions(angles: Points, ways: Numbers) -> int:
 
 def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
     """Return the pairs (m / 2, 2) of triangles around an edge (m,) that bound the same solid wedge: one at which it
-    begins and the next at which one ``ends`` (m,); where two lie on each other, one ends before one begins."""
+    begins and the next at which one ``ends`` (m,). Where two lie on each other, one ends before one begins."""
     turned = np.mod(angles - angles[np.argmin(ends)] + 0.5 * SAME_WAY, 2.0 * np.pi)
     order = np.lexsort((~ends, np.floor(turned / SAME_WAY)))
     begun, ended, pairs = list[int](), list[int](), []

@@ -52,9 +52,9 @@ class PointsAround:
         return np.asarray(self._looked(particles, blind)["sums"])
 
     def lists(self, particles: Points, blind: Which) -> tuple[Int32s, Int32s, Int32s]:
-        """Return neighbour lists of the first n points, at ``particles`` (n, d) [m], each with the points of higher
-        numbers within the reach: where the list of each begins (n,) and ends (n,), and numbers of points, with gaps
-        between the lists."""
+        """Return neighbour lists of the first n points, at ``particles`` (n, d) [m]: where each list begins (n,) and
+        ends (n,), and the numbers of neighbours, with gaps between lists. A list holds only points of higher numbers
+        within the reach."""
         room = len(lattice_offsets(self.lattice.spacing, self.reach, self.lattice.dimension))
         while True:
             starts = (room * np.arange(len(particles) + 1)).astype(np.int32)
@@ -203,7 +203,7 @@ class Relaxation:
         self._given = {"around": around.on_cpu, "free": free, "starts": starts, "ends": ends, "listed": listed}
 
     def relaxed(self) -> Points:
-        """Return particles (n, d) [m] after `ROUNDS` of least squares for the free ones, or fewer."""
+        """Return particles (n, d) [m] after at most `ROUNDS` steps of least squares that move the free particles."""
         spacing, places = self._around.lattice.spacing, self._around.in_space[: len(self._free)]
         first, dimension = places.copy(), self._around.points.shape[1]
         for _ in range(ROUNDS):

@@ -110,7 +110,7 @@ class Region:
         return np.sqrt(squares)
 
     def escaped(self, before: Points, after: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which particles went through a wall from ``before`` (n, d) [m] to ``after`` (n, d) [m]: over the
+        """Test (n,) which particles went through a wall from ``before`` (n, d) [m] to ``after`` (n, d) [m]. Over the
         rim of an open cup they may go, and one that was outside already has not gone through."""
         through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
         return np.asarray(through & self.is_below_rim(before) & self.is_below_rim(after))

@@ -101,7 +101,7 @@ def block_between(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
 def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
     """Return points ``lower + (i + 1/2) spacing`` of a box whose sides are whole cells; lower and upper (d,) [m]. In
     another box they are stretched along some axes and narrowed along others, by `MOST_STRETCHED` at most, to be as many
-    as its volume holds, within `EXCESS`; where no lattice has both, they are those whose cells lie within."""
+    as its volume holds, within `EXCESS`. Where no lattice has both, they are those whose cells lie within."""
     first, last = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cells, plain = (last - first) / spacing, block_between(lower, upper, spacing)
     if (np.abs(cells - np.rint(cells)) <= ROUND_OFF).all() or not plain.counts.all():
@@ -151,7 +151,7 @@ def across(direction: ArrayLike) -> Points:
 
 def whole_origin(points: Points) -> Points:
     """Return an origin (d,) [m] near the middle of points (n, d) [m] that are far from the origin beside how far they
-    spread, and 0 of all others: whole multiples of a power of two, so that taking it off rounds nothing."""
+    spread, and 0 of all others. Whole multiples of a power of two, so that taking it off rounds nothing."""
     lower, upper = points.min(axis=0), points.max(axis=0)
     step = 2.0 ** np.ceil(np.log2(max((upper - lower).max(), np.finfo(np.float64).tiny)))
     return np.asarray(step * np.round((0.5 * lower + 0.5 * upper) / step))

@@ -129,7 +129,7 @@ class Moments:
 
 def enclosed_moments(corners: Points, weights: Points) -> Moments:
     """Return the moments of a body that edges (k, 2, 2) or triangles (k, 3, 3) [m] enclose, counterclockwise as seen
-    from outside and each with a weight (k,), by integrals over the surface (Mirtich 1996): they are bases of cones
+    from outside and each with a weight (k,), by integrals over the surface (Mirtich 1996). They are bases of cones
     about a place near by."""
     d = corners.shape[1]
     origin = whole_origin(corners.reshape(-1, d))
@@ -144,7 +144,7 @@ def enclosed_moments(corners: Points, weights: Points) -> Moments:
 
 def revolved_moments(edges: Points, axis: int) -> Moments:
     """Return the moments of a solid of revolution about an axis of space, by the edges (k, 2, 2) [m] of its profile on
-    one side of the axis, distance from it and height, counterclockwise; those on the axis may be left out."""
+    one side of the axis, distance from it and height, counterclockwise. Those on the axis may be left out."""
     height = edges[..., 1].mean()
     start, end = edges[:, 0], edges[:, 1]
     x, y = np.moveaxis(start[:, None] + NODES[:, None] * (end - start)[:, None], 2, 0)
@@ -199,7 +199,7 @@ class Solid(ABC):
 
     def own_feet(self, fine: float) -> tuple[Points, Points] | None:
         """Return points of the surface (n, d) [m], each for an area of fine^(d - 1) [m^(d - 1)], and unit vectors (n,
-        d) outwards; None of a solid that has no quicker way to them than a lattice around it."""
+        d) outwards. None of a solid that has no quicker way to them than a lattice around it."""
         return None
 
     def outward(self, points: Points) -> Points:

@@ -66,7 +66,7 @@ def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoi
     """Choose points about a spacing [m] apart from points (n, d) [m] ``fine`` [m] apart on a surface.
 
     First as many as can be so that no two are too near each other; then each is moved to the middle of what is nearest
-    to it (Lloyd 1982), and to a candidate; then any that are too near another are left out, and gaps are filled.
+    to it (Lloyd 1982), and to a candidate. Then any that are too near another are left out, and gaps are filled.
     """
     dimension = candidates.shape[1]
     if not len(candidates):

@@ -116,7 +116,7 @@ class OverParticles:
         return (at.scenes * at.per,)
 
     def _over(self, at: StepEnd) -> float:
-        """Return the divisor of the sum."""
+        """Return the number that the sum over particles is divided by."""
         return 1.0
 
     def _arguments(self, at: StepEnd) -> dict[str, Any]:

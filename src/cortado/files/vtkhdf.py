@@ -30,7 +30,7 @@ class TrajectoryWriter:
     """A writer of a trajectory's frames to one VTKHDF file; a context manager.
 
     The file appears at `path` with its first frame, or with those that are `kept`, and can be opened, by ParaView too,
-    while it grows: frames that are not written yet, or never were as the run ended early, have no particles there.
+    while it grows. Frames that are not written yet, or never were as the run ended early, have no particles there.
 
     Args:
         path: the file, replaced when it exists.
@@ -235,7 +235,7 @@ def read(path: str | Path) -> dict[str, Any]:
 
     Returns:
         times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s],
-        under its own name every scalar field (frames, n); by name others, further arrays of every frame, constants,
+        under its own name every scalar field (frames, n). By name others, further arrays of every frame, constants,
         what holds for the whole run, and diagnostics, (steps,) each; origin, a text; and marks, None or two numbers.
 
     Raises:

@@ -333,7 +333,7 @@ class Guided(Ensemble):
 
         g = sum_k D_k p_k,   D_k = mean over samples of (L(u + r_k p_k) - L(u - r_k p_k)) / (2 r_k),   r_k = sqrt(N_k),
 
-    where N_k is how many numbers of part k are not 0; first positions are perturbed in the same way on both sides. So g
+    where N_k is how many numbers of part k are not 0. First positions are perturbed in the same way on both sides. So g
     is the projection of the smoothed gradient on the span of the parts (guided evolution strategies, Maheswaranathan
     et al. 2019, without their search outside of the span).
 

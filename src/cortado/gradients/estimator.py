@@ -153,7 +153,7 @@ class AdjointEstimator(ABC):
 
     @property
     def batches(self) -> bool:
-        """True if it treats each scene of a batch by itself; a user's own has to say so."""
+        """True if the estimator treats each scene of a batch by itself; a user's class overrides it to say so."""
         return False
 
     @abstractmethod

@@ -334,7 +334,7 @@ class AdjointViscosity(AdjointEstimator):
     The adjoint grows where the forward flow strains, and as fast; so one coefficient serves all flows, and where the
     flow is calm nothing is damped.
 
-    Then each vector of a is limited to ``limit`` root mean squares over all particles: now and then the adjoint of a
+    Then each vector of a is limited to ``limit`` root mean squares over all particles. Now and then the adjoint of a
     few particles grows faster than the average can spread it, and would dominate the rest. Where nothing strains
     there is no limit either.
 

@@ -343,7 +343,7 @@ class Series(Frames):
 
     def __init__(self, sensor: Sensor, times: Any, values: Any, time_step: float, every: int = 1, scale: Any = 1.0):
         """Set the series: ``times`` (m,) [s], rising; ``values`` (m,) or (m, k), a number for each column of the
-        sensor, NaN for one that does not count; ``time_step`` of the problem [s]; ``every``: take only every so many
+        sensor, NaN for one that does not count. ``time_step`` of the problem [s]; ``every``: take only every so many
         steps into account; ``scale``: what a difference is divided by, a number or (k,)."""
         moments, series = read_only("times", times), as_numbers("values", values)
         series = series[:, None] if series.ndim == 1 else series

@@ -65,7 +65,7 @@ class Snapshot:
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return a field of the state by its name, such as "velocities", or a quantity of its particles, such as
-        "density" or "pressure", or the load on a solid, such as "rotor.load" (see `docs/sensors.md`); float64,
+        "density" or "pressure", or the load on a solid, such as "rotor.load" (see `docs/sensors.md`). Float64,
         read-only. Raises `InputError` for any other name."""
         if name in ADJOINT_FIELDS:
             return getattr(self, name)

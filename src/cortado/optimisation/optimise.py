@@ -276,7 +276,7 @@ def optimise(
             that `LineSearch` tries are in the checkpoint alone.
 
     Where the run of an evaluation diverges, or a parameter is out of its range, the step there is refused: Adam and
-    gradient descent go half of the way instead, or a quarter, and so on, and keep to shorter steps from then on; the
+    gradient descent go half of the way instead, or a quarter, and so on, and keep to shorter steps from then on. The
     line searches take shorter trials. `Result.refused` counts such evaluations, `Result.message` says so, and the
     checkpoint has them. `Result.left_out` counts runs that averages over ensembles left out for the same reasons, of
     which the first time alone is warned.

@@ -47,7 +47,7 @@ class Adam:
 
     A step changes a component by at most about its learning rate, whatever the size of the gradient. Bounds
     are kept by projection after each update. Where a step leads to a run that diverges, it is halved until it does not,
-    at most 10 times, and the learning rate with it for all that follow; the means begin anew, as they would lead there
+    at most 10 times, and the learning rate with it for all that follow. The means begin anew, as they would lead there
     again. There is no test of convergence: all the iterations are made.
 
     Source: D. P. Kingma and J. Ba, "Adam: a method for stochastic optimization", ICLR 2015, Algorithm 1.
@@ -140,7 +140,7 @@ class LBFGS:
     unit of the loss.
 
     Where a trial leads to a run that diverges, the line search is told the loss and the slope there of the parabola
-    that has those of the last iterate, and rises where its slope promised to fall: its next trial is then about a
+    that has those of the last iterate, and rises where its slope promised to fall. Its next trial is then about a
     quarter as long, and the approximate Hessian knows nothing of it.
 
     Its sums over components are BLAS's: beyond some 10^4 components their last bits, and with them resuming
@@ -271,7 +271,7 @@ class LineSearch:
     """Descent along the gradient, as far as the best of several lengths that are tried in one launch.
 
     For losses that are rough, and for gradients that have the right direction and not the right size, such as those of
-    long runs: a search steps over dents that are narrower than its trials, and never to where the run diverges or
+    long runs. A search steps over dents that are narrower than its trials, and never to where the run diverges or
     parameters are out of their range. A trial is a run without a gradient, and all trials of an update are one batch.
 
     Formula: with g the gradient times the scale, and unit(a) = a over its root mean square,

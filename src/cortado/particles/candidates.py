@@ -46,8 +46,8 @@ def append_function(discretisation: Discretisation) -> Any:
 
 @cache
 def scan_types(discretisation: Discretisation) -> TypesByName:
-    """Return the types of what the functions of a scan are given, by name: numbers are whole, ``x_i`` is where particle
-    i is, and ``positions`` (n,) are those of all particles."""
+    """Return by argument name the Warp types of the functions that search cells for neighbours: ``x_i`` is the position
+    of particle i, ``positions`` (n,) are those of all particles, numbers are integers."""
     _, vector, neighbourhood = discretisation.types
     names = {wp.array(dtype=vector): "positions", cell_grid_type(discretisation.precision): "grid", wp.vec3i: "c"}
     return TypesByName(int, {vector: "x", neighbourhood: "s", **names})
@@ -55,8 +55,8 @@ def scan_types(discretisation: Discretisation) -> TypesByName:
 
 @cache
 def scan_by_bits(discretisation: Discretisation) -> Any:
-    """Make the Warp function for one lane that appends particles first ... last - 1 within reach; ``own`` is left
-    out."""
+    """Make the Warp function for one lane that appends particles first ... last - 1 within reach, without particle
+    ``own``."""
     separation = pair_functions(discretisation).separation
     load = loads(discretisation.precision, discretisation.taped).vector
 
@@ -122,8 +122,8 @@ def scan_by_lanes(discretisation: Discretisation) -> Any:
 
 
 def scan_around(discretisation: Discretisation) -> Any:
-    """Make the Warp function that appends the particles within reach in the cells around cell c of a scene whose cells
-    begin at layer ``bottom``; ``own`` is left out."""
+    """Make the Warp function that appends the particles within reach in the cells around cell c, without particle
+    ``own``. The cells of the scene begin at layer ``bottom``."""
     return (scan_at_once if discretisation.lanes >= LEAST_AT_ONCE else scan_by_rows)(discretisation)
 
 

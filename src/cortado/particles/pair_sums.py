@@ -95,11 +95,11 @@ class Term:
         return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in known}
 
     def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j") -> str:
-        """Return the text of its arguments, given the texts of a neighbour's entries and of its number."""
+        """Return the term's arguments as source text, given the texts of a neighbour's entries and of its number."""
         return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j, **OF_WALLS})
 
     def seen_from_j(self, of_j: Mapping[str, str]) -> str:
-        """Return the text of its arguments with the particles exchanged."""
+        """Return the term's arguments as source text, with particle and neighbour exchanged."""
         return self._arguments("-_x_ij", of_j.__getitem__, own_entry, {"i": "_j", "j": "i"})
 
     def _arguments(
@@ -125,7 +125,7 @@ def array_of(parameter: str) -> str:
 
 
 def own_entry(array: str) -> str:
-    """Return the text of a particle's own entry of an array."""
+    """Return the variable of generated source that holds particle i's entry of an array."""
     return f"_{array}_i"
 
 
@@ -226,7 +226,7 @@ def summed(
     scope: Types,
     module: Any,
 ) -> Any:
-    """Make the Warp function ``name(i, *arrays, *others, s)`` that returns the totals of loops, of these types."""
+    """Make the Warp function ``name(i, *arrays, *others, s)`` that runs loops and returns sums of types ``results``."""
     results = tuple(results)
     for kind in results:
         if kind is not d.precision.real and not _is_vector_of(d.precision.real, kind):
@@ -270,12 +270,12 @@ def scope_of(d: Discretisation) -> dict[str, Any]:
 
 
 def zero(kind: Any, d: Discretisation) -> str:
-    """Return the text of a zero of a type."""
+    """Return the source text of a zero of a type."""
     return "_real(0.0)" if kind is d.precision.real else f"{type_name(kind, d)}()"
 
 
 def type_name(kind: Any, d: Discretisation) -> str:
-    """Return the name of a type in the text of a loop."""
+    """Return the name that a type has in the source text of a loop."""
     known = {d.precision.real: "_real", d.precision.vector: "_vector"}
     return known.get(kind) or f"_vector_{len(kind())}"
 

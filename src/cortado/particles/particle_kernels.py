@@ -167,10 +167,10 @@ def sum_kernels(
     written: Collection[str] = (),
     **renamed: str,
 ) -> Kernels:
-    """Make the three kernels of one sum, each in its own of the Warp ``modules``, given the sum with its tangent and
-    its adjoint, as `cortado.particles.pair_sums` notes them. It is of ``result`` = ``before`` + ``times`` the sum /
-    ``per``, where ``before`` is an array, and the others are texts, all of which may be left out. Adjoints are added to
-    those of arrays and of scenes, but for those of arrays that are ``written``."""
+    """Make the kernels of a sum over neighbours, of its tangent and of its adjoint, each in its own of the Warp
+    ``modules``; ``sums`` are the three as `cortado.particles.pair_sums` notes them. The first computes ``result`` =
+    ``before`` + ``times`` sum / ``per``: ``before`` is an array, the others are source texts, and all may be left out.
+    Adjoints of inputs are added to, but those of arrays that are ``written`` are overwritten."""
     total, tangent, adjoint = sums
     told = {**renamed, **dotted(renamed)}
     known = [*total.arrays, *(name for name in total.others if name not in numbers)][: len(adjoint.results)]

@@ -178,7 +178,7 @@ class State(Arrays):
     of its derivatives.
 
     Every state has ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s] and ``mass_fractions`` (n,) of
-    as many numbers as there are phases [-], in the scene's order of particles; in a batch of scenes one scene stands
+    as many numbers as there are phases [-], in the scene's order of particles. In a batch of scenes one scene stands
     behind the other.
     """
 

@@ -235,7 +235,7 @@ class Exported:
 
     @property
     def in_words(self) -> str:
-        """Say how far surfaces of frames that were made are from the volume of the fluid; empty where they are near."""
+        """Say how far the volumes within the exported surfaces are from the fluid's; empty where they are close."""
         if _unlike(self._held) <= UNLIKE:
             return ""
         time, held, whole = self._held

@@ -55,7 +55,7 @@ def painter_on(stage: PlaneStage | Stage, device: Any = "cpu") -> PlanePainter |
 
 
 def stage_of(scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
-    """Return the stage around the fluid of a scene, which will be at positions (n, d) or (frames, n, d) [m]; ``poses``
+    """Return the stage around the fluid of a scene, which will be at positions (n, d) or (frames, n, d) [m]. ``poses``
     are scenes with the solids where they will be, so that the picture has these, too."""
     return (PlaneStage if scene.dimension == 2 else Stage).of(scene, positions, poses)
 

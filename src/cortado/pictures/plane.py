@@ -179,8 +179,8 @@ class PlaneStage:
 
     @cached_property
     def shown(self) -> Points:
-        """Return the part (rows, columns) of each pixel in which fluid is drawn, if it is there: in opaque solids, too,
-        which are drawn over it."""
+        """Return the part (rows, columns) of each pixel where fluid is drawn. Opaque solids count too, as they are
+        drawn over the fluid later."""
         return self.free if any(shown.transparency > 0.0 for shown, _ in self._bodies) else self._room
 
     @cached_property
@@ -304,7 +304,7 @@ class PlanePainter:
         return own._drawn(np.asarray(positions, dtype=np.float64), np.asarray(colours, dtype=np.float64))
 
     def _drawn(self, positions: Points, colours: Points) -> Points:
-        """Draw the picture with the solids where the stage has them."""
+        """Draw particles of fluid, in these colours, with the solids where the stage has them."""
         stage, (cover, colour) = self.stage, self._fluid(positions, colours)
         body, width = np.where(stage.free > 0.5, cover, 1.0), stage.gloss_width
         fluid = glossy(body, colour, width) if stage.picture.shaded else colour

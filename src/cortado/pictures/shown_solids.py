@@ -187,7 +187,7 @@ def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points,
     """Cut triangles (t, 3) of vertices (v, 3) [m] into smaller ones, and return the parent (p,) of each.
 
     Every side has a power of two of equal parts, as many as it needs to have none longer than ``longest`` [m], so that
-    triangles beside each other fit; other sides of the parts are at most the square root of 2 longer.
+    triangles beside each other fit. Other sides of the parts are at most the square root of 2 longer.
     """
     parts = _parts(lengths_of(vertices, sides_of(corners)), longest).reshape(-1, 3)
     thin = (parts.min(axis=1) == 1) & (np.sort(parts, axis=1)[:, 1] > 1)

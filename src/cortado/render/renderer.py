@@ -44,7 +44,7 @@ class RenderAdjoint:
 class Renderer:
     """A renderer of a fixed number of particles into pictures of one view, on one device; pictures are linear RGB.
 
-    They are smooth functions of positions, fractions and colours, and piecewise smooth ones of the camera's pose: where
+    They are smooth functions of positions, fractions and colours, and piecewise smooth ones of the camera's pose. Where
     samples lie on faces between cells of the colour field, as those of a view along an axis may, the derivative with
     respect to the pose is one-sided.
     """

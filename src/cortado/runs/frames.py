@@ -97,10 +97,10 @@ def frame_writer(
     expected: int | None = None,
     kept: int = 1,
 ) -> vtkhdf.TrajectoryWriter:
-    """Open a file with room for frames at ``times`` (frames,) [s] with the fields of the first and ``quantities`` of
-    these names, of particles of an origin. It has room for notes on ``steps`` steps too, with the names and types of
-    ``diagnostics``. ``marks``: when frames are due, where times choose them. The disk must have room for all frames, or
-    for as many as are ``expected``. A file of that name is replaced once it has all frames that are ``kept`` of it."""
+    """Open a trajectory file with room for frames at ``times`` (frames,) [s]. A frame has the fields that ``first``
+    has, and ``quantities`` of these names; a step, of which there are ``steps``, has the numbers of ``diagnostics``.
+    ``marks``: when frames are due, where times choose them. The disk must have room for all frames, or for ``expected``
+    ones. A file of that name is replaced once all of its first ``kept`` frames are written to the new one."""
     particles, dimension = first["positions"].shape[-2:]
     single = first["positions"].dtype == np.float32
     vectors = [name for name in quantities if len(QUANTITIES[name].shape(particles, dimension)) == 2]

@@ -192,12 +192,12 @@ def _in_space(vectors: NDArray[Any]) -> NDArray[Any]:
 
 @fixed
 class SolidLoad:
-    """A sensor of the force of the fluid on a solid, and of its torque about the solid's position:
+    """A sensor of the force of the fluid on a solid, and of its torque about the solid's middle c,
 
     F = sum_i f_i,   T = sum_i (x_i - c) x f_i,
 
-    over all particles, where -f_i is the mass of particle i times the acceleration that the walls of the solid give it
-    in the step that begins at the state, by pressure and, without slip, by viscosity; c is where the middle of the
+    over all particles. Here -f_i is the mass of particle i times the acceleration that the walls of the solid give it
+    in the step that begins at the state, by pressure and, without slip, by viscosity. c is where the middle of the
     solid is at the end of that step, as its walls are. So the solid gets what momentum the fluid loses to it. Contact,
     gravity and buoyancy in air are not in it, nor forces of one's own between fluid and walls.
     """
@@ -243,7 +243,7 @@ def sensors_of(scene: Scene) -> dict[str, Sensor]:
 
 def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_]:
     """Test (n,) which points (n, d) [m] no way leads to from particles (m, d) [m] through cells half a spacing wide, in
-    a container without periods and emitters: solids at rest are in the way, moving ones are not."""
+    a container without periods and emitters. Solids at rest are in the way, moving ones are not."""
     from scipy.ndimage import label
 
     nowhere, ends = np.zeros(len(points), dtype=bool), scene.container.extent()

@@ -264,7 +264,7 @@ class RunFolder:
             return False
 
     def _complete(self, noted: Mapping[str, Any], scene_json: str) -> None:
-        """Write the files of a run's first moment, the mark before anything else."""
+        """Write the files that a run folder has from the start, first environment.json, which marks it as one."""
         write_atomically(self.environment, json.dumps(noted, indent=2) + "\n")
         write_atomically(self.scene, scene_json)
         self.figures.mkdir(exist_ok=True)

@@ -287,7 +287,7 @@ class SensorLog:
         self._rows = [{name: readings[name].values[k] for name in self.sensors} for k in range(steps + 1)]
 
     def _value(self, name: str, sensor: Sensor, at: Reading) -> NDArray[Any]:
-        """Return a reading; NaN where the step after the state loses a particle: the run says so where it takes it."""
+        """Return a reading; NaN where the next step loses a particle, for which the run raises the error itself."""
         try:
             return value_of(sensor, at)
         except DivergedError:

@@ -69,20 +69,20 @@ class Standing:
 
     @classmethod
     def of(cls, table: SolidTable, d: int, at: Reading | None = None) -> "Standing":
-        """Take a solid in a state, which one that stays does not need."""
+        """Place a solid at its pose in the state ``at``; a solid at rest needs no state."""
         if at is None or not table.moves:
             return cls(table.own_solid(), table.middle(), table.turn(d), 1.0, None)
         pose = Pose.of(table.name, table.motion == "free", at)
         return cls(table.own_solid(), pose.position, pose.rotation[:d, :d], pose.scale, pose)
 
     def local(self, points: NDArray[Any], domain: Domain) -> NDArray[Any]:
-        """Return the places r (n, d) of points (n, d) [m], or of those of their images that are nearest to its
-        middle."""
+        """Return the places (n, d) in the solid's frame of points (n, d) [m], taking of each point the periodic image
+        nearest to the solid's middle."""
         return np.asarray(domain.shortest(points - self.middle) @ self.turn / self.scale)
 
     def reach(self, up: NDArray[Any], foot: NDArray[Any]) -> tuple[float, float]:
-        """Return how high it goes above a foot (d,) along ``up`` (d,), and how far from its middle [m], infinite if it
-        has no end."""
+        """Return how high the solid goes above a foot (d,) along ``up`` (d,), and how far from its middle [m], infinite
+        if it has no end."""
         ends = self.scale * corners(*self.own.extent())
         high = float(((self.middle - foot) @ up) + (ends @ self.turn.T @ up).max())
         return high, float(np.linalg.norm(ends, axis=1).max()) if self.own.is_bounded else np.inf
@@ -187,8 +187,8 @@ class Column:
         return ends, filled[ends]
 
     def level(self, depth: float) -> tuple[float, NDArray[Any], float]:
-        """Return how high above its floor fluid stands that has a depth where there are no solids [m]; which part
-        (levels,) of each level's solids adds to it; and its derivative with respect to the depth."""
+        """Return the height above the column's floor of fluid that has ``depth`` [m] where no solids are. Also return
+        the part (levels,) of each level's solids that adds to it, and its derivative with respect to the depth."""
         (ends, filled), step, levels = self._ends, self.axis.step, np.arange(len(self.room))
         low = max(int(np.searchsorted(filled, depth, side="right")) - 1, 0)
         if low == len(ends) - 1:  # above all solids
@@ -199,7 +199,7 @@ class Column:
         return step * (ends[low] + part * (ends[low + 1] - ends[low])), below, float(slope)
 
     def solid_bars(self, depth: float, bar: float, domain: Domain) -> dict[str, NDArray[Any]]:
-        """Turn the derivative with respect to the level of a depth [m] into those of fields of solids that move."""
+        """Turn the derivative with respect to the level at a depth [m] into derivatives by fields of moving solids."""
         _, below, slope = self.level(depth)
         shares, found = bar * slope * below, dict[str, NDArray[Any]]()
         for one, far in self.solids:
@@ -230,8 +230,8 @@ def column_of(axis: Axis, at: Reading) -> Column | None:
 
 @lru_cache(maxsize=64)
 def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
-    """Return the part (c,) of each place of a column within a container whose sides are along it; None where all are,
-    and for containers with other sides."""
+    """Return the part (c,) of the cell around each point of a gauge's column that is within a container with sides
+    along the column; None where all of it is, or where the sides are not along it."""
     up, foot = np.array(axis.up), np.array(axis.foot)
     region, periods = container.region(len(up)), container.periods(len(up))[1]
     along = np.abs(up) > 1.0 - 1e-12
@@ -263,15 +263,15 @@ class WaveGauge:
     h = floor + sum_i V w_i,   w_i = w(r_i / radius) with the integral 1,
 
     where r_i is the horizontal distance and V the volume of a particle, spacing^d. Solids take their part of the room,
-    where they are in each step: above one that stands on the floor, hangs in the fluid or reaches through its surface h
+    where they are in each step. Above one that stands on the floor, hangs in the fluid or reaches through its surface h
     is the level of the surface. Fluid that is in the air counts too, as if it lay on
     the rest, also on a solid with air below. What is behind the sides of a container that stand along ``up`` is none of
     the column.
     """
 
     def __init__(self, position: Any, floor: float = 0.0, radius: float | None = None, up: Any = None):
-        """Place a gauge at ``position`` (d,) [m], of which the component along ``up`` does not matter; ``floor``: from
-        where on the column is filled, along ``up`` [m]; ``radius`` [m], two support radii of the scene's smoothing
+        """Place a gauge at ``position`` (d,) [m], of which the component along ``up`` does not matter. ``floor``: from
+        where on the column is filled, along ``up`` [m]. ``radius`` [m], two support radii of the scene's smoothing
         kernel, but at least five spacings, if left out; ``up`` (d,), +y if left out."""
         self.position, self.floor = point("position", position), float(floor)
         self.radius = None if radius is None else positive("radius", radius)
@@ -297,8 +297,8 @@ class WaveGauge:
         return bars | {"positions": around.pulled(bar[0] * column.level(depth)[2] * scale)}
 
     def _seen(self, at: Reading) -> tuple[Column | None, float, Seen]:
-        """Return its column where solids are in it, V over the cross-section that the container leaves, and the
-        particles by their horizontal ways (n, d): in more parts where a column has sides."""
+        """Return the column where solids are in it, the volume of a particle over the column's cross-section, and the
+        particles' horizontal distances as vectors (n, d): of parts of particles where the column has sides."""
         reach, across = reach_of(self.radius, at), at.dimension - 1
         axis = Axis.of(at, self.position, self.floor, self.up, reach)
         column, inside = column_of(axis, at), cut_by(axis, at.container)

@@ -265,7 +265,7 @@ class Keyframes(CameraPath):
 
 @public
 class Follow(CameraPath):
-    """A camera path beside a solid, whose middle is the picture's, as far off as the camera is at home."""
+    """A camera path that moves with a solid and looks at its middle, from a fixed direction and distance."""
 
     kind: Literal["follow"] = "follow"
     """Name of the path."""

@@ -67,7 +67,7 @@ def guarded(
 
 
 class PackageMaker:
-    """A part that a package makes of a table, as `Simulation` takes it; objects that it makes are guarded too."""
+    """A wrapper of a solver or force that an installed package makes: errors raised in it name the package."""
 
     def __init__(self, part: Any, kind: str, package: str):
         """Guard a part: ``kind`` is the name that the package gives it, ``package`` the package's name in messages."""

@@ -48,7 +48,7 @@ class Tilt:
     rest e_0.
 
     The unit vectors e_k are the axes other than the one that gravity at rest is most nearly along, in their order, made
-    perpendicular to it and to each other: where it is along -y, gravity leans towards x by a_1 and towards z by a_2.
+    perpendicular to it and to each other. Where it is along -y, gravity leans towards x by a_1 and towards z by a_2.
     The map is smooth, at rest as well (it is the exponential map of the sphere), and there and back for |a| < 180.
     """
 

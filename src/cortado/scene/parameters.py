@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 
 class Axis(Enum):
-    """The things for each of which a parameter has a value."""
+    """What a parameter has a separate value for: nothing, each phase, each step or each particle."""
 
     SCALAR = "one number"
     PHASE = "each phase"
@@ -167,7 +167,7 @@ def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
 def _optional(
     name: str, unit: str, meaning: str, force: str, longest_step: Limit = lambda scene, values: inf
 ) -> Parameter:
-    """Make the parameter of a number of at least 0 in the table [forces] of a scene, which switches a force on:
+    """Make the parameter of a number of at least 0 in the table [forces] of a scene, which switches a force on.
     ``force`` is the module that makes it, ``longest_step`` the largest time step at which it is likely to be stable."""
     return Parameter(
         name,

@@ -39,8 +39,8 @@ class StepLog(Protocol):
         """Hold the notes that another log of the same solver and length has read."""
 
     def seek(self, step: int) -> Counts:
-        """Prepare the solver's loops to repeat a step that was read, from 0, and return their counts. Of a batch these
-        are the counts of the scene that went round most often."""
+        """Return the numbers of iterations that a step of the run took, and prepare the solver's loops to repeat it;
+        steps count from 0. In a batch the scene with the most iterations sets the numbers."""
 
 
 class StepTangent(Protocol):
@@ -54,7 +54,7 @@ class StepAdjoint(Protocol):
     """The adjoint of steps that a solver has replayed (reverse mode)."""
 
     def begin(self) -> None:
-        """Forget the adjoints of the parameters of an earlier way back."""
+        """Set the adjoints of the parameters to 0, before a backward pass."""
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """Replace the adjoint of the replayed step's result by that of its state."""

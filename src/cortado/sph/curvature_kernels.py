@@ -38,7 +38,7 @@ from cortado.sph.moment_functions import matrix_type, moment_functions
 
 
 def entries(precision: Precision) -> dict[str, Any]:
-    """Return names and types of the arrays that surface tension by curvature keeps of particles, with c = w kappa."""
+    """Return names and types of the arrays of particles that surface tension by curvature keeps, with c = w kappa."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     vectors, matrices, numbers = dict.fromkeys("gqe", vector), dict.fromkeys("BD", matrix), dict.fromkeys("zwcab", real)
     return {**vectors, **matrices, **numbers}

@@ -38,7 +38,7 @@ class PackingKernels:
 
 @cache
 def packing_kernels(precision: Precision, taped: bool) -> PackingKernels:
-    """Make the kernels that pack parameters (members, steps) into theta; constant ones are (members, 1)."""
+    """Make the kernels that pack parameters (members, steps) into the vector theta; constant ones are (members, 1)."""
     real, vector = precision.real, precision.vector
     forward, backward = integration_module(precision, True, taped), integration_module(precision, False)
 
@@ -101,7 +101,7 @@ class Packed:
         return self._pack(step, parameters_dot, self._flat_dot, self._theta_dot)
 
     def collect(self, step: StepContext, bar: Adjoints) -> None:
-        """Add up the particles' `shares` of theta's adjoint into the adjoints of the parameters."""
+        """Add up the particles' shares in the adjoint of theta, the packed parameters, into parameters' adjoints."""
         if self._sum is None:
             return
         total = self._sum(self.shares)

@@ -95,8 +95,8 @@ FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_nam
 
 @cache
 def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
-    """Make the kernels of one moving solid in 2 or 3 dimensions, with a thread for each scene: of its poses before and
-    after a step, and of its state at the end, whose adjoint stands where that of the state before is written."""
+    """Make kernels of one moving solid in 2 or 3 dimensions, with a thread for each scene: one computes its poses
+    before and after a step, the other its state at the end. Adjoints of the two states share their arrays."""
     real, vector, matrix, of = precision.real, precision.vector, matrix_of(precision), rotations(precision, dimension)
     angle, rotation = of.angle, of.rotation
 
@@ -150,7 +150,7 @@ class MovingSolids:
 
 
 class MovingSolidsPart(Part):
-    """The part of a step that puts walls where they are at its end: its own, and those of parts that come before it."""
+    """The part of a step that puts the walls of moving solids where they are at its end, also those of other parts."""
 
     def __init__(self, made_of: MovingSolids, layout: Layout):
         self.made_of, self.layout = made_of, layout

@@ -177,28 +177,28 @@ class PartTangent:
     """The tangent of a part of a step, for forward mode."""
 
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Apply the tangent of `Part.begin` to that of the state before the step; ``dot`` has those of parameters."""
+        """Apply the tangent of `Part.begin` to the state's tangent before the step; ``dot`` has the parameters'."""
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Apply the tangents of `Part.sort` and `Part.settle`, from that of the state before the step; ``dot`` has
-        those of the sorted particles."""
+        """Apply the tangents of `Part.sort` and `Part.settle`, given the tangent ``state_dot`` of the state before the
+        step; ``dot`` has those of the sorted particles."""
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         """Apply the tangent of `Part.end`: ``state_dot`` has the tangents of positions and velocities at the end of the
-        step, and becomes that of the state there."""
+        step, and becomes the tangent of the whole state there."""
 
 
 class PartAdjoint:
     """The adjoint of a part of a step, for reverse mode."""
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
-        """Apply the adjoint of a part with a `Part.target`: return the adjoint of the positions and velocities that it
-        found, from that of those it left. It adds to ``bar``; sorted particles have no adjoints yet."""
+        """Apply the adjoint of a part with a `Part.target`: turn the adjoint of positions and velocities after the part
+        into the adjoint before it, which is returned. It adds to ``bar``; sorted particles have no adjoints yet."""
         return moved_bar
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Apply the adjoints of `Part.settle` and `Part.sort`, and of the sorted particles in `Part.end`: ``state_bar``
-        has the adjoint of the part's fields after the step, and becomes that of those before it."""
+        """Apply the adjoints of `Part.settle` and `Part.sort`, and of the sorted particles in `Part.end`. ``state_bar``
+        has the adjoint of the part's fields after the step, which is replaced by the adjoint before it."""
 
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         """Apply the adjoint of `Part.begin`, after all others; a part without fields changed there needs none."""

@@ -336,7 +336,7 @@ class ImplicitViscousStress(ViscousStress):
         self._after = after
 
     def _find_end(self, step: StepContext) -> None:
-        """Write the velocities u = v + dt a' at the end of the step, with their A and T."""
+        """Write the velocities u = v + dt a' at the end of the step, and their velocity sum A and stress T."""
         step.launch(self._implicit.predict, acceleration=self._after, u=self._u)
         step.launch(self._pull, *self._known(), v=self._u)
 

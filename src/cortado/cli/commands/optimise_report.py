@@ -88,7 +88,7 @@ def distance(estimate: ArrayLike, true: ArrayLike) -> float:
 
 
 def worst_in_words(made: Setup, name: str, estimate: np.ndarray, error: float) -> str:
-    """Name the number of a few that is farther off than twice the error of all of them together, and how far; empty
+    """Name the number of a few that is farther off than twice the error of all of them together, and how far. Empty
     where none is, or where the true ones are not known or 0."""
     true, names = made.true_parameter(name), component_names(made.task, name, estimate)
     if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):

@@ -176,9 +176,9 @@ def explained(
     columns: Sequence[np.ndarray],
     is_doubted: bool = False,
 ) -> Explained | None:
-    """Estimate the size of a cause by one step of Gauss and Newton; ``columns`` (frames, m, causes) of each part tell
-    by how much predictions change. None where it is within the noise, or cannot be told from the parameters. Residuals
-    that are doubted already are no noise: then the part that a cause explains counts."""
+    """Estimate the size of a possible cause of residuals by one Gauss-Newton step; ``columns`` (frames, m, causes): the
+    derivatives of each part's predictions. None where the size is within the noise, or cannot be told from the
+    parameters. With ``is_doubted`` the residuals are no noise: then the part that a cause explains counts."""
     from scipy.stats import f as fisher
 
     count = columns[0].shape[-1]

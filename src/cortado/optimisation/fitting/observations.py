@@ -178,10 +178,10 @@ class Video:
         calibrate: tuple[str, ...] | list[str] = (),
         clock: float = 0.0,
     ):
-        """Take a ``renderer`` such as `Simulation.renderer` makes, with the camera where it was aimed; ``times``
+        """Take a ``renderer`` such as `Simulation.renderer` makes, with the camera where it was aimed. ``times``
         (frames,) [s] after the start of the run; ``frames`` (frames, rows, columns, 3) linear light from 0 to 1, as
-        `cortado.pictures.read_picture` reads it; ``mask`` (rows, columns), true where pixels count; ``noise``, standard
-        deviation of a number of a frame, if it is known; ``calibrate``, what of the view is searched beside the
+        `cortado.pictures.read_picture` reads it. ``mask`` (rows, columns), true where pixels count; ``noise``, standard
+        deviation of a number of a frame, if it is known. ``calibrate``, what of the view is searched beside the
         parameters: "translation", "rotation", "field_of_view" or "width", "extinction", and "start", the ``clock`` [s]
         that is added to the times."""
         require_methods("renderer", renderer, ("render", "tangent", "seen_by"), "a renderer such as of a Simulation")
@@ -251,8 +251,8 @@ class SensorSeries:
         clock: float = 0.0,
     ):
         """Take a ``sensor`` of `cortado.sensors`; ``times`` (frames,) [s] after the start of the run; ``values``
-        (frames,) or (frames, k) in the sensor's units, NaN for what does not count; ``dimension`` of the scene;
-        ``columns``, the names of the k numbers of the sensor that were measured, all of them if left out; ``noise``,
+        (frames,) or (frames, k) in the sensor's units, NaN for what does not count. ``dimension`` of the scene;
+        ``columns``, the names of the k numbers of the sensor that were measured, all of them if left out. ``noise``,
         their standard deviation, if it is known; ``clock`` [s], what is added to the times, which
         ``calibrate=["start"]`` searches."""
         self.start = only_a_clock(calibrate, clock)

@@ -220,7 +220,7 @@ def _differences(
 ) -> tuple[Linearised, list[Linearised]]:
     """Return a point with differences along the axes as its Jacobian, and the points that were run for them.
 
-    Of the differences to both sides and of that across the one in which least changes is taken: the point itself may
+    Of the differences to both sides and of that across the one in which least changes is taken. The point itself may
     lie on a kink, or in a hole that is far narrower than the bars."""
     tried, columns = list[Linearised](), list[list[np.ndarray]]()
     for axis in axes.T:

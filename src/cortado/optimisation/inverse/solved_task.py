@@ -79,7 +79,7 @@ class KnotValues:
 
 
 def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndarray]) -> dict[str, KnotValues]:
-    """Return by name the knots of parameters that were searched by knots; ``coordinates`` of the search give values."""
+    """Return by name the parameters that were searched as values at knots in time, which ``coordinates`` has."""
     step = float(estimate.get("time_step", made.task.scene.solver.time_step))
     found = {}
     for name, bijector in made.search.coordinates.items():

@@ -85,8 +85,8 @@ RESIDUALS = Residuals()
 
 
 def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tuple[Named, NDArray[np.int32]]:
-    """Return a layer's results, mapped over ``entries`` entries along a first axis; and, to ``keep``, the tickets
-    (entries, 2) of its residual, or (2,), else 0."""
+    """Return a layer's results, mapped over ``entries`` entries along a first axis; and the tickets (entries, 2) or
+    (2,) of its residual if that is to be kept (``keep``), else 0."""
     own = layer if entries is None else layer.batched(entries)
     found, residual = own.evaluate(given, keep)
     number = RESIDUALS.put((own, entries, residual)) if keep else 0
@@ -97,11 +97,11 @@ def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tup
 def derivative(
     way: Way, layer: Layer, entries: int | None, tickets: NDArray[np.int32], given: Named, others: Named
 ) -> Named:
-    """Push tangents ``others`` of the arrays ``given`` to a layer forward, or pull adjoints of its results back, by the
-    tickets of its residual.
+    """Push tangents ``others`` of the arrays ``given`` to a layer forward, or pull adjoints of its results back, with
+    the residual that the tickets stand for.
 
-    Mapped over so many entries, of a layer that was mapped over these, over a part of them, as where it is
-    differentiated along several directions, or not at all."""
+    JAX may have mapped the derivative over ``entries`` entries. If it mapped the layer over fewer or none, there are
+    several derivatives of each application, such as directions."""
     numbers, places = tickets.reshape(-1, TICKET).T
     last = way == "pull"
     kept = RESIDUALS.get(int(numbers[0]), last) if (numbers == numbers[0]).all() else None
@@ -143,7 +143,7 @@ def _results(*avals: Any, layer: Layer, sizes: Sizes, keep: bool = False, **othe
 
 
 def _of_given(number: Any, *avals: Any, names: Names, along: Names, **others: Any) -> list[Any]:
-    """Return the abstract shapes and types of some of the given arrays."""
+    """Return the shapes and types, as JAX traces them, of those given arrays that ``along`` names."""
     each = dict(zip(names, avals, strict=False))
     return [jax.core.ShapedArray(each[name].shape, each[name].dtype) for name in along]
 
@@ -294,8 +294,8 @@ def _jax_array(found: Array, wanted: Any) -> Any:
 
 
 class ForeignFunction:
-    """A function of arrays that a compiled program calls, for as long as the program holds this, and some time longer:
-    JAX lets go of a program that still runs."""
+    """A Python function of arrays that a compiled program calls. It lives some time longer than the program: JAX lets
+    go of a program that still runs."""
 
     def __init__(self, function: Callable[[list[Array]], Sequence[Array]]):
         self._number = next(_NUMBERS)

@@ -103,8 +103,8 @@ class Evaluate(torch.autograd.Function):
 
 
 class _Linear(torch.autograd.Function):
-    """A derivative of a layer as a function of PyTorch, without derivatives of its own. Its tensors are those of the
-    layer, and the adjoints or the tangents behind them."""
+    """A derivative of a layer as a function of PyTorch, without derivatives of its own. It is given the layer's
+    tensors, followed by adjoints or tangents."""
 
     @staticmethod
     def of(call: Call, tensors: Tensors, given: Tensors) -> Tensors:
@@ -124,8 +124,8 @@ class _Linear(torch.autograd.Function):
 
 
 def _mapped(function: Any) -> Callable[..., tuple[Tensors, Any]]:
-    """Return the `vmap` of a derivative: that of the mapped application where its tensors are mapped too, and else
-    several derivatives of the one application."""
+    """Make the `vmap` rule of a layer's derivative: one derivative of the layer mapped over the batch if its inputs are
+    mapped, else one derivative of the same layer for each entry."""
 
     def vmap(info: Any, in_dims: Sequence[int | None], call: Call, *tensors: Any) -> tuple[Tensors, Any]:
         size, count = info.batch_size, len(call.names)

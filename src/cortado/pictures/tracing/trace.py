@@ -67,9 +67,9 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
         clearness: wp.float32,
         light: Vec3s,
     ):
-        """Compute the light that falls on each of the points of a surface with normals: from all around, as far as
-        neither other fluid nor a solid is within ``reach`` [m], and from the lamp; ``clearness``: the part of it that
-        goes through fluid, from 0 to 1."""
+        """Compute the light on each point of a surface with normals: from the lamp, and from all directions in which
+        neither other fluid nor a solid is within ``reach`` [m]. ``clearness``, 0 to 1: the part of the light that goes
+        through fluid."""
         i = first + wp.tid()
         n = normals[i]
         p = points[i] + s.nearest * n

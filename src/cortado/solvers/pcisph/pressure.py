@@ -49,7 +49,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     @wp.kernel(module=discretisation.module(True, "pcisph"))
     @typed.arrays
     def pressure(s, k: int, rounds, stiffness: real, time_step, n, m, rho_0, y, x_star, p_in, p_out, c, error):
-        """Write p_out = max(p_in + delta y (m n* - rho_0), 0), with n* of positions ``x_star``, and c = p_out / n^2;
+        """Write p_out = max(p_in + delta y (m n* - rho_0), 0), with n* of positions ``x_star``, and c = p_out / n^2.
         ``error`` gets the compression (rho* - rho_0)+ / rho_0 twice, for a sum and a maximum."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
@@ -102,7 +102,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     def pressure_adjoint(
         s, k: int, rounds, time_step, m, v, x_star, v_star, r, x_bar, v_bar, time_step_bar, scaled_bar
     ):
-        """Add to adjoints of positions, velocities and time step the part by r, the adjoint of n*."""
+        """Add to adjoints of positions, velocities and time step, given r, the adjoint of the predicted density n*."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:
@@ -151,7 +151,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     def adjoin_pressure(
         i: int, stiffness: real, dt: real, volume: real, divergence: real, work: real, at: values, bar: adjoints
     ) -> real:
-        """Add to the adjoints of a pressure correction's inputs; return r, the adjoint of n*."""
+        """Add to the adjoints of a pressure correction's inputs; return r, the adjoint of the predicted density n*."""
         n_i = at.n[i]
         m_i = at.m[i]
         p_i = at.p_out[i]
@@ -239,8 +239,8 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     def pressure_force_adjoint(
         s, k: int, rounds, stiffness: real, time_step, x, at: values, c, scaled_bar, x_bar, n_bar, bar: adjoints, r
     ):
-        """Turn ``scaled_bar``, the adjoint of the pressure acceleration over m, into those of c, p and (r) of n*; every
-        sum is a gather."""
+        """Compute the adjoints of c, of the pressure p, and, as r, of the density n*, from ``scaled_bar``, the adjoint
+        of the pressure acceleration over m. Every sum is a gather."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:

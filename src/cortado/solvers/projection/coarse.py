@@ -53,7 +53,7 @@ class Coarse:
         bodies: Bodies | None,
         endless: bool,
     ):
-        """Allocate a correction for particles with a ``spacing`` [m] and free ``bodies``, none if ``endless``."""
+        """Allocate for particles with a ``spacing`` [m] and free ``bodies``; an ``endless`` scene needs nothing."""
         self.endless = endless
         precision, device = layout.precision, layout.device
         real, vector = precision.real, precision.vector

@@ -75,7 +75,7 @@ def coarse_sums(discretisation: Discretisation) -> Kernels:
 
 @cache
 def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the coarse push h and N in 2 or 3 dimensions; the kernel of T comes first in each."""
+    """Make the kernels of h and N, which give the force of a coarse pressure on particles, in 2 or 3 dimensions."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     sums, packed = coarse_sums(discretisation), symmetric(precision)
