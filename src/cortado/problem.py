@@ -368,7 +368,7 @@ class Problem:
     def fingerprint(self) -> str:
         """Text that identifies the problem by words and checksums: steps, precision, scene, first positions (which may
         be in a file), free energy (by its name, curvature and code), forces and solver of one's own, ``fingerprint`` of
-        the loss, or the code of a function; for any other loss only its type is known."""
+        the loss, or the code of a function. For any other loss only its type is known."""
         return _fingerprint(self.simulation, self.steps, self.loss, self._states)
 
     def iterations(self) -> np.ndarray:

@@ -166,7 +166,7 @@ class Horizon(ShortRepr):
 
     @property
     def measured(self) -> int:
-        """Last sample step at which the exact derivative is useful, as it is at the one before; 0 for none."""
+        """Last sample step at which, and at the one before, the exact derivative is useful; 0 for none."""
         good = self.meaningful
         there = np.flatnonzero(good & np.append(good[:1], good[:-1]))
         return int(self.sample_steps[there[-1]]) if there.size else 0

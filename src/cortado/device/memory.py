@@ -45,7 +45,7 @@ def step_parts(steps: int, real: int) -> dict[str, float]:
 
 
 def frame_parts(frames: int, numbers: int, real: int) -> dict[str, float]:
-    """Return the memory [bytes] of frames with so many numbers each."""
+    """Return the memory [bytes] of ``frames`` frames with ``numbers`` numbers each."""
     return {f"{frames:.3g} frames": frames * (_FRAME + float(numbers) * real)}
 
 

@@ -51,7 +51,7 @@ class Payload:
 
 @dataclass(frozen=True)
 class Lacking:
-    """The answer of a worker that was sent no content and does not have the function."""
+    """The answer of a worker process that does not have the called function yet and was not sent it."""
 
 
 @dataclass(frozen=True)

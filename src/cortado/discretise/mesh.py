@@ -166,8 +166,8 @@ def outer_surface(
     corners: Points, pairs: Numbers, holds: Callable[[Points], Which], reach: float
 ) -> tuple[Points, Points]:
     """Return the surface of a union of closed parts, in pieces (n, 3, 3) [m] of their triangles, cut where parts meet,
-    with the weight (n,) of each in integrals over the surface: 0 where both sides of it are inside or outside, less
-    than 1 where several triangles lie on each other.
+    and their weights (n,) in integrals over the surface. The weight is 0 where both sides of a piece are inside or
+    outside, less than 1 where several triangles lie on each other.
 
     Args:
         corners: (k, 3, 3) of all triangles, counterclockwise as seen from outside [m].
@@ -194,8 +194,8 @@ def outer_surface(
 
 
 def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]:
-    """Cut a triangle (3, 3) into pieces (n, 3, 3), none of which others (m, 3, 3) cross, and count the triangles (n,),
-    itself included, that lie no further from the middle of each than ``reach``."""
+    """Cut a triangle (3, 3) into pieces (n, 3, 3) that no others (m, 3, 3) cross. Also count for each piece the
+    triangles (n,), itself included, that lie no further from its middle than ``reach``."""
     side, normal = corners[1] - corners[0], np.cross(corners[1] - corners[0], corners[2] - corners[0])
     if not normal.any():
         return np.zeros((0, 3, 3)), np.zeros(0)

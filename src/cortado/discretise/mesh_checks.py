@@ -196,9 +196,8 @@ def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
 def parts_of(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, crossings: Numbers, some: Numbers, beside: Points
 ) -> tuple[tuple[Numbers, ...], int | None, int | None]:
-    """Sort bodies that overlap into parts within each of which none do: the triangles of each part, none if the mesh is
-    one part that does not cross itself; a triangle at which a body crosses itself, and one of a body inside another, or
-    None.
+    """Sort triangles into parts within each of which no bodies overlap; no parts if the mesh is one that does not cross
+    itself. Also return a triangle at which a body crosses itself, and one of a body inside another, or None.
 
     Args:
         mesh: closed.

@@ -87,7 +87,7 @@ def _found(path: str, changed: int, size: int) -> FoundMesh:
 
 def read_triangles(path: str) -> tuple[Points, Numbers, float]:
     """Read the vertices (m, 3) and the triangles (k, 3), at least one, of all bodies of a file, where its scene puts
-    them, in its unit of length; and the step to which the file rounds coordinates, 0 if they are not float32. Raises
+    them, in its unit of length. Also return the step of rounded coordinates, 0 if they are not float32. Raises
     `InputError`."""
     rounding, is_single = 0.0, _is_single(path)
     vertices, triangles, count, others = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0, False

@@ -180,9 +180,9 @@ class Domain:
         return images, np.all((images >= lower) & (images < upper), axis=1)
 
     def ways(self, points: Points, place: Points, reach: float, seen: Callable[[Points], Points]) -> list[Points]:
-        """Return the ways (n, k) from a place (d,) to all images of points (n, d) within a reach [m], as ``seen`` shows
-        them: a linear function of ways (n, d), such as their part across a direction. Every array has one image of each
-        point.
+        """Return ``seen`` of the vectors from a place (d,) to all images of points (n, d) within a reach [m]: arrays
+        (n, k), each for one image of every point. ``seen`` is a linear function of vectors (n, d), such as their part
+        across a direction.
 
         Images that ``seen`` does not tell apart count once: as those within the period.
         """
@@ -249,7 +249,7 @@ class Room:
 
     def cell_shares(self, points: Points, spacing: float) -> Points:
         """Return the part (n,) of the cell, a spacing [m] wide, around each of the points (n, d) [m] that is within the
-        room; along the surfaces of solids the cell counts as turned with them."""
+        room. Along the surfaces of solids the cell counts as turned with them."""
         within = self.region.cell_shares(points, spacing)
         return within * np.clip(self.from_solids(points, 0.5 * spacing) / spacing + 0.5, 0.0, 1.0)
 

@@ -228,7 +228,7 @@ def apart(separations: Points, lengths: ArrayLike) -> Points:
 
 def _around(some: Points, others: Points, reach: float, lengths: Points) -> Numbers:
     """Return numbers of the ``others`` (m, d) [m] that are in the box around ``some`` (n, d) [m] and ``reach`` [m]
-    further; of all of them where there is a period, or nothing to be near to."""
+    further. Return all of them where there is a period, or nothing to be near to."""
     if lengths.any() or not len(some):
         return np.arange(len(others))
     beyond = reach * (1.0 + 1e-9)

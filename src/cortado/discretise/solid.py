@@ -182,7 +182,7 @@ class Solid(ABC):
 
     @abstractmethod
     def faces(self, fine: float) -> Faces:
-        """Return its surface in flat faces, some ``fine`` [m] wide where it is round."""
+        """Return the solid's surface in flat faces, some ``fine`` [m] wide where it is round."""
 
     def moments(self) -> Moments:
         """Return its volume, centroid and second moments, to round-off; solids that may move freely have them."""

@@ -368,7 +368,7 @@ class ExposedSurface:
 
     def _feet_of(self, points: Points, reach: Points, nearest: Numbers) -> Points:
         """Return the points (n, d) [m] of the surface, on a solid or where two of them meet, that are nearest to points
-        (n, d) [m] beneath it; ``nearest`` (n,) are the nearest of the fine points, ``reach`` (n,) [m] away."""
+        (n, d) [m] beneath it. ``nearest`` (n,) are the nearest of the fine points, ``reach`` (n,) [m] away."""
         fine = self.spacing / FINE
         found, owner = self.feet[nearest], self.owner[nearest]
         best, furthest = np.full(len(points), np.inf), float(reach.max(initial=0.0)) + fine

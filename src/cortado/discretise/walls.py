@@ -141,9 +141,9 @@ WHOLE = 1e-9
 def short_box(
     lower: Points, upper: Points, spacing: float, support: float
 ) -> tuple[Points, Callable[[Points], Points]]:
-    """Make a shorter box with wall particles of the same weights as a box between corners (d,) [m], as these repeat far
-    from edges and corners: its upper corner (d,) [m], and a function that takes points (n, d) [m] of the walls of the
-    long box to those of the shorter one.
+    """Shorten a box between corners (d,) [m] to one whose wall particles have the same weights, which repeat far from
+    edges and corners. Returns its upper corner (d,) [m], and a function that takes points (n, d) [m] of the walls of
+    the long box to those of the shorter one.
 
     Cells of a spacing [m], beside fluid with a support [m], are left out in the middle of long sides, of those that are
     a whole number of cells.

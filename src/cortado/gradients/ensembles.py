@@ -264,7 +264,7 @@ class EnsembleMean(Ensemble):
     forward run.
 
     Samples that diverge: they are left out with the other one of their antithetic pair, up to a quarter of all pairs,
-    so that what remains is as symmetric about the parameters as before; half a pair would shift the mean to its side.
+    so that what remains is as symmetric about the parameters as before. Half a pair would shift the mean to its side.
     """
 
     samples: int = 4

@@ -265,7 +265,7 @@ class ImplicitPressure(AdjointEstimator):
     iteration.
 
     Formula: an iteration k' = Phi(k, u) of the pressure k from the inputs u, velocities and positions, has the fixed
-    point k = Phi(k, u), and so the adjoint u^ = Phi_u^T l with (1 - Phi_k^T) l = k^, which conjugate gradients solve.
+    point k = Phi(k, u). So the adjoint is u^ = Phi_u^T l with (1 - Phi_k^T) l = k^, which conjugate gradients solve.
 
     Bias: none at the fixed point. After a few iterations the pressure is not there yet, and the gradient is that of a
     fluid with the same pressure that would be. The first guess of a step, the pressure of the last, has no adjoint. The
@@ -324,9 +324,9 @@ class AdjointViscosity(AdjointEstimator):
 
         a_i <- a_i + sum_j max(s_i, s_j) w_ij (a_j - a_i),    s_i = min(coefficient dt gamma_i, 0.6),
         gamma_i^2 = sum_j w_ij (v_i - v_j)^2 / ((x_i - x_j)^2 + 0.01 h^2),
-        w_ij = W_ij / max(S_i, S_j, W(h / 2)),                S_i = sum_j W_ij,
+        w_ij = W_ij / max(S_i, S_j, W(h / 2)),                S_i = sum_j W_ij.
 
-    with positions x and velocities v of the state that the adjoint belongs to. The weights are symmetric and add up to
+    Here x and v are positions and velocities in the state of the adjoint. The weights are symmetric and add up to
     0.6 at most: sum_i a_i is kept, the square norm does not grow.
 
     Why: what grows exponentially in an adjoint lives at the scale of particles, the response to a parameter at that of
@@ -346,8 +346,8 @@ class AdjointViscosity(AdjointEstimator):
     so that it is for means over several runs (`EnsembleMean`). Cost: ``order`` reverse passes, with three more sums
     over neighbours for each step.
 
-    Sources: Smagorinsky (1963) for a viscosity by the strain rate; Wang and Zaki (2026, arXiv 2606.25399) for an eddy
-    viscosity of the adjoint of turbulence; Ke, You and Wang (2026, arXiv 2602.14016) precondition the adjoint by its
+    Sources: Smagorinsky (1963) for a viscosity by the strain rate. Wang and Zaki (2026, arXiv 2606.25399) for an eddy
+    viscosity of the adjoint of turbulence. Ke, You and Wang (2026, arXiv 2602.14016) precondition the adjoint by its
     spectrum instead.
     """
 

@@ -193,7 +193,7 @@ class SolidPose:
 
     def __init__(self, name: str, position: Any = None, rotation: Any = None, length: float = 1.0):
         """Set the ``name`` of the solid; targets ``position`` (d,) of its middle [m] and ``rotation`` [rad], a vector
-        (3,) in 3-D and a number in 2-D, or one of them; ``length`` l [m], greater than 0."""
+        (3,) in 3-D and a number in 2-D, or one of them. ``length`` l [m], greater than 0."""
         if not isinstance(name, str):
             raise InputError(f"name is {shown(name)}, but must be the name of a solid.")
         if position is None and rotation is None:

@@ -103,7 +103,7 @@ class Promises:
     """A test of a search's gradients against its steps, from each evaluation and the step to it from the one before.
 
     The slopes of the loss along a step, at both of its ends, bound its change unless the slope has an extremum in
-    between: a loss that is as smooth as the steps are long keeps near to them. Steps along which the slope changes its
+    between. A loss that is as smooth as the steps are long keeps near to them. Steps along which the slope changes its
     sign tell nothing, as they may cross a valley.
     """
 

@@ -275,15 +275,15 @@ def optimise(
             The line search of L-BFGS may evaluate several times an iteration; all of them are recorded. The losses
             that `LineSearch` tries are in the checkpoint alone.
 
-    Where the run of an evaluation diverges, or a parameter is out of its range, the step there is refused: Adam and
+    Where the run of an evaluation diverges, or a parameter is out of its range, the step there is refused. Adam and
     gradient descent go half of the way instead, or a quarter, and so on, and keep to shorter steps from then on. The
     line searches take shorter trials. `Result.refused` counts such evaluations, `Result.message` says so, and the
     checkpoint has them. `Result.left_out` counts runs that averages over ensembles left out for the same reasons, of
     which the first time alone is warned.
 
-    Raises InputError for a start, bounds or settings that do not fit, and for a checkpoint of another run;
-    DivergedError if the start diverges, or a step that was halved ten times; ComputationError where such a step has a
-    parameter out of its range, or if the loss or its gradient is not finite; what came before is in the checkpoint.
+    Raises InputError for a start, bounds or settings that do not fit, and for a checkpoint of another run. Raises
+    DivergedError if the start diverges, or a step that was halved ten times. Raises ComputationError where such a step
+    has a parameter out of range, or if the loss or gradient is not finite. What came before is in the checkpoint.
     """
     if checkpoint is not None:
         checkpoint = as_path("checkpoint", checkpoint)

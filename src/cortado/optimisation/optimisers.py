@@ -278,7 +278,7 @@ class LineSearch:
 
         d_k = unit(momentum d_{k-1} - unit(g_k)),   x_{k+1} = the best of P(x_k + r_k s scale d_k),
 
-    over lengths s at even ratios from ``shortest`` to 1; P projects onto the bounds. The reach r is 1 at first, and
+    over lengths s at even ratios from ``shortest`` to 1. P projects onto the bounds. The reach r is 1 at first, and
     then `GROWTH` times the length that was best, at most 1. Where no trial lowers the loss, at the bottom of a dent or
     of the valley, an update still takes the best one, and the reach is 1 again, by which the search leaves dents. So
     the last iterate need not be the best. Where every trial diverges, x stays, the momentum is dropped, and the reach

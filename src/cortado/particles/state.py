@@ -161,8 +161,8 @@ def zeros(kinds: Mapping[str, tuple[Any, Any]], device: Any, requires_grad: bool
 class Fields(Arrays):
     """Sorted particles within a step. Also the type of tangents and adjoints.
 
-    ``x`` (n,) positions [m]; ``v`` (n,) velocities [m / s]; ``n`` (n,) number densities [-], 1 on the rest lattice;
-    ``m`` (n,) masses over the volume on the rest lattice [kg / m3], so that the density is m n; ``rho_0`` (n,) rest
+    ``x`` (n,) positions [m]; ``v`` (n,) velocities [m / s]; ``n`` (n,) number densities [-], 1 on the rest lattice.
+    ``m`` (n,) masses over the volume on the rest lattice [kg / m3], so that the density is m n. ``rho_0`` (n,) rest
     densities [kg / m3]; ``mu`` (n,) dynamic viscosities [Pa s].
     """
 

@@ -197,8 +197,8 @@ def simulation_page(simulation: Simulation) -> str:
 
 
 def trajectory_page(run: Trajectory) -> str:
-    """Return HTML of a trajectory: its repr, a `particle_view` in a frame of its own, where scripts run, with y up, and
-    below it a picture of the first, the middle and the last frame, coloured by speed."""
+    """Return HTML of a trajectory: its repr, and a `particle_view` in a frame of its own, where scripts run, with y up.
+    Below are pictures of the first, the middle and the last frame, coloured by speed."""
     if not len(run):
         return f"<pre>{escape(repr(run))}</pre>"
     domain = WITHOUT_PERIODS if run.scene is None else run.scene.container.domain(run.dimension)

@@ -254,7 +254,7 @@ class Film:
 
     @property
     def in_words(self) -> str:
-        """Return its pace and its notes, in words."""
+        """Return the pace and the notes of the film, in words."""
         return f"{self.pace}; {self.notes}" if self.notes else str(self.pace)
 
     def __str__(self) -> str:
@@ -287,8 +287,8 @@ def _whole(times: Sequence[float] | NDArray, rate: float) -> int:
 
 
 def _speed(span: float, count: int, easy: float) -> float:
-    """Return the speed of a film with at most ``count`` frames of a run that lasts ``span`` [s]: ``easy`` if they are
-    enough for that, or else the speed at which they are `USUAL` in a second."""
+    """Return the speed of a film with at most ``count`` frames of a run that lasts ``span`` [s]. It is ``easy`` if that
+    many are enough, or else the speed at which they are `USUAL` in a second."""
     if span <= 0.0:
         return 1.0
     room = max((count - 1) / USUAL, min(FEW, count / SLOWEST))

@@ -42,9 +42,9 @@ DEEP = 0.01
 class PressureProbe:
     """A sensor of the mean pressure of the particles around a point, those nearby weighing most:
 
-    p = sum_i p_i w_i / sum_i w_i,   w_i = w(r_i / radius),
+    p = sum_i p_i w_i / sum_i w_i,   w_i = w(r_i / radius).
 
-    where r_i is a particle's distance from the point. Without fluid within the radius it is 0.
+    Here r_i is a particle's distance from the point. Without fluid within the radius it is 0.
     """
 
     def __init__(self, position: Any, radius: float | None = None):

@@ -237,8 +237,8 @@ class WallLoads:
 @dataclass(frozen=True)
 class SolidLoadQuantity:
     """The quantity of force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i, with r_i from its middle at
-    the end of the step, where its walls are, to particle i; of viscosity as a stress to the surface beneath it, where
-    that acts. Each scene has F and T one behind the other, in the plane the component of T that stands on it."""
+    the end of the step, where its walls are, to particle i. For viscosity as a stress r_i leads to the surface beneath
+    the particle. Each scene has F and T one behind the other, in the plane the component of T that stands on it."""
 
     loads: WallLoads
     solver: ParticleSolver

@@ -349,7 +349,7 @@ class Recorder:
         return {name: self._value(name, moment).astype(real) for name in self.names}
 
     def _value(self, name: str, moment: Moment) -> NDArray:
-        """Return a quantity; NaN where the step after the state loses a particle: the run says so where it takes it."""
+        """Return a quantity; NaN where the next step loses a particle, for which the run raises the error itself."""
         try:
             return moment.value(name)
         except DivergedError:

@@ -51,13 +51,13 @@ class Sensor(Protocol):
     """A sensor that reads a few numbers of a state, and their derivatives."""
 
     def columns(self, dimension: int) -> dict[str, str]:
-        """Return the names of its numbers, with their units."""
+        """Return the names of the sensor's numbers, with their units."""
 
     def value(self, at: Reading) -> NDArray[Any]:
-        """Return its reading (k,) of a state, one number for each column."""
+        """Return the sensor's reading (k,) of a state, one number for each column."""
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Turn the adjoint (k,) of its reading into those of fields and quantities, by name."""
+        """Turn the adjoint (k,) of the sensor's reading into those of fields and quantities, by name."""
 
 
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}

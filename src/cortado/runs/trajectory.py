@@ -178,8 +178,8 @@ class Trajectory:
 
     def quantity(self, name: str) -> NDArray[Any]:
         """Return a quantity (frames, n) or (frames, n, k) of the particles, one that was recorded or the speed, or a
-        field of the states, which may have other axes behind the first; any other quantity `Simulation.quantity`
-        computes.
+        field of the states, which may have other axes behind the first. For any other use
+        `Simulation.quantity`.
 
         Raises:
             InputError: it was not recorded, or there is no such quantity.

@@ -230,8 +230,8 @@ def column_of(axis: Axis, at: Reading) -> Column | None:
 
 @lru_cache(maxsize=64)
 def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
-    """Return the part (c,) of the cell around each point of a gauge's column that is within a container with sides
-    along the column; None where all of it is, or where the sides are not along it."""
+    """Return the part (c,) of the cell around each point of a gauge's column that is within a container. None where all
+    of it is, or where the container's sides are not along the column."""
     up, foot = np.array(axis.up), np.array(axis.foot)
     region, periods = container.region(len(up)), container.periods(len(up))[1]
     along = np.abs(up) > 1.0 - 1e-12

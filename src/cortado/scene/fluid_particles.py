@@ -77,7 +77,7 @@ class CutBody:
 
     @cached_property
     def _held(self) -> float:
-        """Return its volume, as cells measure it [m^d]."""
+        """Return the body's volume, as cells measure it [m^d]."""
         return self.volume()
 
     @cached_property

@@ -112,7 +112,7 @@ class SolidTable(Coloured):
         return self.motion != "fixed" or self.surface_velocity is not None
 
     def middle(self) -> Points:
-        """Return its middle (d,) at the start [m]."""
+        """Return the middle (d,) of the solid at the start [m]."""
         return self.shape_about()[1] if self.position is None else np.array(self.position)
 
     @abstractmethod
@@ -128,8 +128,8 @@ class SolidTable(Coloured):
 
     @abstractmethod
     def thinnest(self, spacing: float) -> float:
-        """Return the thickness of its thinnest part [m]; infinite where that is not known, as of a mesh whose sheets
-        are all thicker than a few spacings [m]."""
+        """Return the thickness of the solid's thinnest part [m]; infinite where that is not known, as of a mesh whose
+        sheets are all thicker than a few spacings [m]."""
 
     def in_container(self, container: Container, path: FieldPath) -> Self:
         """Return this table, at a path, as it is in a container, which shapes without an end need to know."""

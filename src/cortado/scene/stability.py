@@ -162,14 +162,14 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     """Return several limits of the time step [s] by name, infinite where nothing is limited; h is the support radius.
 
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
-    the extent of fluid and solids if there is none (Monaghan 1992); an emitter has its speed, and fluid falls from its
+    the extent of fluid and solids if there is none (Monaghan 1992). An emitter has its speed, and fluid falls from its
     outlet.
 
     Solids: beside each of them fluid goes no further than 0.4 spacings in a step, nor than a quarter of its thickness.
     Its speed is that of a fall to the foot of the solid from where fluid is highest at the start, see `fall_to`.
 
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: a part of 2 rho / (mu l), the longest explicit step that a
-    lattice bears, where l is the greatest rate of the viscous force's form, see `VISCOUS_RATES`; of the most viscous
+    lattice bears, where l is the greatest rate of the viscous force's form, see `VISCOUS_RATES`. Of the most viscous
     and the lightest phase in use, as they may meet. It is about 0.023 h^2 rho / mu of the pairwise form with the cubic
     spline.
 

@@ -192,7 +192,7 @@ def lost_kernel(precision: Precision) -> Any:
         """Write to ``bad`` the first lost particle of each scene, in scene order, and to ``count`` the number of lost
         ones. After a bad step nothing is looked for.
 
-        Lost is what is not finite, too far away, of a mixture without a volume, or what went through a wall: it was
+        Lost is what is not finite, too far away, of a mixture without a volume, or what went through a wall. It was
         inside before the step and is outside after it, or it is in a solid then. Over the rim of an open cup fluid may
         go, and what a nozzle leads, so that it is not where it would be without one, passes walls with it. Such are
         only among the particles from ``first_waiting`` on, in scene order. ``x`` is the new state in that order; the

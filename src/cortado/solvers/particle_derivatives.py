@@ -94,7 +94,7 @@ class ParticleAdjoint:
         finalize(self, solver.launch.forget)
 
     def begin(self) -> None:
-        """Forget the adjoints of the parameters of an earlier way back."""
+        """Set the adjoints of the parameters to 0, before a backward pass."""
         self.bar.shares.clear()
         self.bar.parameters.clear()
         self.bar.solids.clear()

@@ -217,7 +217,7 @@ def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
 
 
 def check_truths(what: str, function: ast.FunctionDef) -> None:
-    """Raise `InputError` for ``and`` and ``or`` whose value is one of their numbers, as it is a truth in Warp."""
+    """Raise `InputError` for ``and`` and ``or`` used as numbers: Python returns an operand, and Warp a truth value."""
     tests: set[ast.AST] = set()
     for node in ast.walk(function):
         if isinstance(node, (ast.If, ast.IfExp, ast.While, ast.Assert)):

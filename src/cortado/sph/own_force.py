@@ -247,7 +247,7 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
 
 class Body(OwnForce):
     """A force on each particle: ``function(x, v, t, ...)`` returns its acceleration [m/s2], as gravity is one, from the
-    position [m], the velocity [m/s] and the time [s] of the particle; time may be left out."""
+    position [m], the velocity [m/s] and the time [s] of the particle. Time may be left out."""
 
     kind = "Body"
 
@@ -294,7 +294,7 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
 
 class Pair(OwnForce):
     """A force between neighbours: ``function(x_ij, v_ij, t, ...)`` returns the force [N], in 2-D per metre, on a
-    particle from a neighbour, from how far [m] and how fast [m/s] the particle is from it; time may be left out. It is
+    particle from a neighbour, from how far [m] and how fast [m/s] the particle is from it. Time may be left out. It is
     weighted with W(x_ij) / W(0), which is 1 at no distance and 0 at the support. Momentum is kept where
     f(-x, -v) = -f(x, v). Walls exert none."""
 
@@ -306,7 +306,7 @@ class Pair(OwnForce):
 
 class Rheology(OwnFunction):
     """A law of viscosity: ``function(shear_rate, viscosity, ...)`` returns the viscosity [Pa s] at a shear rate
-    sqrt(2 D : D) [1/s], where ``viscosity`` [Pa s] is that of the phase and D the symmetric velocity gradient. It takes
+    sqrt(2 D : D) [1/s]. Here ``viscosity`` [Pa s] is that of the phase and D the symmetric velocity gradient. It takes
     the place of the viscous force of a scene, whose viscosity is "stress"."""
 
     kind = "Rheology"

@@ -142,7 +142,7 @@ def stress_of_particle(precision: Precision, dimension: int, law: Law, module: A
 @cache
 def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
     """Make the Warp functions of the sums over neighbours of the diagonal of M, its entries yz, xz and xy, the rows of
-    A, and R, with walls without slip if fluid ``sticks``; the adjoint is from those of M, A and R to those of a
+    A, and R, with walls without slip if fluid ``sticks``. The adjoint is from those of M, A and R to those of a
     particle's x, v and mu."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)

@@ -76,9 +76,9 @@ class ScoreCovariance:
     """Number of independent frames, before they are whitened."""
 
     def degrees_of_freedom(self, inverse: np.ndarray, direction: np.ndarray) -> float:
-        """Return the degrees of freedom of Student's distribution for the error of a combination of parameters, whose
-        coefficients are the ``direction`` (p,), given N^-1 (Satterthwaite 1946); no more than there were independent
-        numbers to tell the correlation time from."""
+        """Return the degrees of freedom of Student's distribution for the error of a combination of parameters
+        (Satterthwaite 1946), with coefficients ``direction`` (p,), given N^-1. They are at most the number of
+        independent numbers from which the correlation time was told."""
         F, a = len(self.products.gram), inverse @ direction
         total, spread = _moments(np.einsum("p,fgpq,q->fg", a, self.products.S, a, optimize=True), F)
         return max(min(F * total / spread * (1.0 - self.lost), self.frames * self.samples), 1.0)

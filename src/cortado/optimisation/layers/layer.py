@@ -103,7 +103,7 @@ class Layer(ABC):
 
 @dataclass(frozen=True)
 class Lost:
-    """An evaluation among several of a layer that has no numbers."""
+    """One of several evaluations of a layer, which has no result, as its run diverged."""
 
     given: Shapes
     """Shapes of its arguments."""

@@ -315,8 +315,8 @@ def at_wall(s: Environment, surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.f
 
 @wp.func
 def behind_wall(surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, normal: wp.vec3):
-    """Find the hit of `at_wall` more quickly, by the triangle straight behind the wall, along its normal, outwards. It
-    is not found where that is not near, and where p is not within fluid."""
+    """Find the hit of `at_wall` more quickly, by the triangle of the surface straight behind the wall, along
+    ``normal``. There is no hit if the triangle is not near, or if p is outside the fluid."""
     met = SurfaceHit()
     met.found = False
     hit = wp.mesh_query_ray(surface.mesh, p, normal, surface.reach)

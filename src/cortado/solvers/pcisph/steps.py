@@ -279,7 +279,7 @@ class PcisphSteps(ParticleSolver):
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
         """Do all of a step before the pressure iterations: sort and measure the density (`sort`), write the relaxation
-        y, add up the explicit forces, gravity among them, and predict v* = v + dt a, x* = x + dt v*."""
+        y, add up the explicit forces, gravity among them. Then predict v* = v + dt a, x* = x + dt v*."""
         it, context = self.iterates, self.sort(state, parameters)
         with context.aside():
             self._relax(context)

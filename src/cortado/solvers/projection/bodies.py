@@ -89,7 +89,7 @@ class Bodies:
         return other
 
     def known(self, context: StepContext, held: Held) -> tuple[Named, ...]:
-        """What kernels know of a body."""
+        """Arguments of kernels that are about a body, by name."""
         own = held.known, held.shares, held.faster, held.whole, held.start.motion
         return *own, *held.body.known(context)
 

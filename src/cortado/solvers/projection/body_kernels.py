@@ -127,7 +127,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
     def pull_tangent(
         y_i: real, y_dot_i: real, gamma_of_i: vector, gamma_of_dot_i: vector, arm_i: vector, arm_dot_i: vector
     ) -> tuple[vector, vector]:
-        """Write the tangents of the momenta: each iteration does so, and the made kernel is slower."""
+        """Write the tangents of `pull`, by hand: each iteration computes them, and a made kernel is slower."""
         turn = wp.cross(arm_dot_i, gamma_of_i) + wp.cross(arm_i, gamma_of_dot_i)
         return y_dot_i * gamma_of_i + y_i * gamma_of_dot_i, y_dot_i * wp.cross(arm_i, gamma_of_i) + y_i * turn
 

@@ -50,8 +50,8 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
 
     @wp.struct
     class Place:
-        """A node: how many nodes finer levels have, how many its level has in all scenes, the shape of the level, the
-        number of the node among those of its level, that of the first one of its scene, and where it is."""
+        """A node: its number in its level, and where it is. Also how many nodes finer levels have, how many its level
+        has in all scenes, the number of its scene's first node, and the shape of the level."""
 
         start: int
         all: int

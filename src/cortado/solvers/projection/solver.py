@@ -120,7 +120,7 @@ class FixedPointAdjoint(ProjectionAdjoint):
     number of iterations. It is a `ResumingAdjoint`."""
 
     def __init__(self, solver: ProjectionSteps, steps: int, tolerance: float, most: int):
-        """Prepare the way back over ``steps`` steps; `Solver.implicit_adjoint` explains the arguments."""
+        """Prepare a backward pass over ``steps`` steps; `Solver.implicit_adjoint` explains the arguments."""
         super().__init__(solver, steps)
         layout, precision = solver.layout, solver.layout.precision
         self._own = fixed_point_kernels(solver.discretisation)
