@@ -576,6 +576,26 @@ def test_frames_and_readings_do_not_depend_on_how_long_states_wait(monkeypatch):
     assert found.sensors["gauge"].values.tobytes() == wanted.sensors["gauge"].values.tobytes()
 
 
+class Reference:
+    """A sensor of the mean of a field that no step changes."""
+
+    def columns(self, dimension):
+        return {"density": "kg/m3"}
+
+    def value(self, at):
+        return np.array([at["reference_density"].mean()])
+
+    def adjoint(self, at, bar):
+        return {}
+
+
+def test_a_later_run_reads_its_own_constants():
+    simulation = cortado.Simulation(plane())
+    for density in (1000.0, 800.0):
+        read = simulation.run(3, {"rest_density": density}, sensors={"own": Reference()}).sensors["own"]
+        assert read.values[:, 0] == pytest.approx(np.full(4, density))
+
+
 def test_a_table_grows():
     table = Table(2)
     for k in range(5):

@@ -251,7 +251,7 @@ class Simulation(Stepping):
             if watch.reads or is_frame(step):
                 waiting.keep(step, state)
 
-        waiting = Waiting(look, rollout.initial)
+        waiting = Waiting(look, rollout.initial, rollout.copies)
         rollout.forward(keep, keep=False, meanwhile=waiting.look)
         waiting.look()
         unread = ["the sensors of the scene are not read in a batch."] if self.batch and self.scene.sensor else []

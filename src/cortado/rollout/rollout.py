@@ -127,6 +127,8 @@ class Rollout(Staying):
         """The last one, with the tangents of the parameters that it was made for, and that of the present state."""
         self._generation, self._is_warm = -1, False
         self._forget_stale_graphs()
+        self.copies: list[State] = []
+        """Memory of the host for states that observers have yet to look at, kept from run to run."""
         self.goes_on = False
         """Whether the first state was given whole, so that it depends on no parameter."""
         self.evaluation = 0

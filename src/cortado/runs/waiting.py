@@ -17,12 +17,15 @@ class Waiting:
     """Copies of states in pinned memory of the host, in their order. It is filled as an observer of a forward run,
     and emptied by `look`, which the run calls while a GPU takes the next steps."""
 
-    def __init__(self, look: Callable[[int, State], None], first: State):
-        """Take the function that is to look at the number of a state and at its copy, which is overwritten later;
-        ``first`` is a state of the run."""
+    def __init__(self, look: Callable[[int, State], None], first: State, copies: list[State]):
+        """Take the function that is to look at the number of a state and at its copy, which is overwritten later.
+        ``first`` is a state of the run, and ``copies`` are those of earlier runs, which are used again."""
         self._look, self._device = look, first.positions.device
-        self._constant = {field.name: _copy(first[field.name]) for field in first.fields if field.is_constant}
-        self._numbers, self._copies = list[int](), list[State]()
+        names = [field.name for field in first.fields if field.is_constant]
+        self._constant = {name: copies[0][name] if copies else _empty(first[name]) for name in names}
+        for name, own in self._constant.items():
+            wp.copy(own, first[name])
+        self._numbers, self._copies = list[int](), copies
         self._is_ready = wp.Event(self._device) if self._device.is_cuda else None
         self._most = max(MOST // sum(array.capacity for array in first.arrays()), 1)
 
@@ -77,7 +80,3 @@ class Table:
 def _empty(array: wp.array) -> wp.array:
     """Allocate an array of the host, which a GPU can write to while the host goes on."""
     return wp.empty(array.shape, dtype=array.dtype, device="cpu", pinned=array.device.is_cuda)
-
-
-def _copy(array: wp.array) -> wp.array:
-    return wp.clone(array, device="cpu", requires_grad=False)
