@@ -189,7 +189,7 @@ class Spread(OverParticles):
 class Missed(OverParticles):
     """A reward term: the weighted sum of squared distances of particles to targets that change from step to step.
 
-    Targets go on beyond the end of a period, as positions do: a lap too many is a distance.
+    Along periodic axes positions and targets are not wrapped: a period too far is a distance.
     """
 
     kernel = "missed"

@@ -200,7 +200,7 @@ class Pages(io.RawIOBase):
         self._place = self._end = 0
 
     def save(self, file: Any) -> None:
-        """Write the file to one on disk, which stays sparse."""
+        """Write the pages to an open file on disk, which stays sparse."""
         file.truncate(self._end)
         for number, page in sorted(self._pages.items()):
             file.seek(number * _PAGE)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 
 class Axis(Enum):
-    """What a parameter has a separate value for: nothing, each phase, each step or each particle."""
+    """The kinds of entries that a parameter has values for: a single one, phases, steps or particles."""
 
     SCALAR = "one number"
     PHASE = "each phase"
@@ -110,7 +110,7 @@ class Parameter:
         return 0 if self.components is None else 1
 
     def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
-        """Return the shapes that its values may have, () for a number, where positions are (n, d)."""
+        """Return the shapes that the parameter's values may have, () for a number, where positions are (n, d)."""
         particles, dimension = positions
         own = () if self.components is None else (self.components(dimension, phases),)
         if self.axis is Axis.STEP:

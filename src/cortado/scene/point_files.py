@@ -160,7 +160,7 @@ def read_points(path: str, dimension: int) -> Points:
 
 @lru_cache(maxsize=4)
 def _read(path: str, dimension: int, changed: int, size: int) -> Points:
-    """Read a file once for each version, for which the time of its last change and its size stand."""
+    """Read a file, once for each version of it, which its time of change and its size identify."""
     array = _read_npy(path, size, dimension) if Path(path).suffix == ".npy" else _read_apart(path, size)
     if array.ndim == 2 and array.shape[1] == 3 and dimension == 2 and Path(path).suffix in READERS:
         array = array[:, :2]  # VTK knows no plane

@@ -214,13 +214,13 @@ class Touch(Protocol):
     """A search for what free bodies touch, once poses are known, which writes `FreeBody.given`."""
 
     def look(self, step: StepContext) -> None:
-        """Find what all bodies touch, and write the momenta that they get by it."""
+        """Find what all bodies touch, and write the momenta that contact gives them."""
 
     def tangent(self, changes: "Sequence[Changes]") -> Any:
-        """Return an object with a ``look(step, dot)`` that writes `Changes.given`."""
+        """Return the tangent of this search, whose ``look(step, dot)`` writes `Changes.given`."""
 
     def adjoint(self, changes: "Sequence[Changes]") -> Any:
-        """Return an object with a ``look(step, bar)`` that goes on from `Changes.given`."""
+        """Return the adjoint of this search, whose ``look(step, bar)`` goes on from `Changes.given`."""
 
 
 class FreeBody:

@@ -145,7 +145,7 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
 
 @cache
 def begin_adjoint_kernel(precision: Precision) -> Any:
-    """Make the kernel from the adjoint of the new state, in scene order, to that of its prediction."""
+    """Make the kernel that turns the adjoint of the new state, in scene order, into the prediction's."""
     real, vector = precision.real, precision.vector
     adjoin_new_state = new_state_adjoint(precision)
 

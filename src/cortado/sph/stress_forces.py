@@ -220,7 +220,7 @@ def stress_work(d: Discretisation) -> Any:
 
 
 def stress_couple_work(d: Discretisation) -> Any:
-    """Make the work of the couples y_ib x a_ib by which walls act on a particle from their surface, y_ib beneath it."""
+    """Make the Warp function of a wall's viscous couple on a particle, y_ib x a_ib, times its adjoint."""
     precision, fall, force = d.precision, contact_functions(d).fall, wp.func(stress_work(d))
     real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
 

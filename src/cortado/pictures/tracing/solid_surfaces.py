@@ -96,8 +96,8 @@ def cast(
     begin: wp.vec2i,
     thickness: Vec4s2d,
 ):
-    """Add to the four nodes of the floor around each part, seen along a slope, its colour times its thickness, and its
-    thickness; the less the higher it is, by ``fading`` [1/m]. ``begin`` is the first node that is there."""
+    """Add the shadow of each part of an object to the nearest four floor nodes along a slope: colour times thickness,
+    and thickness, faded with height by ``fading`` [1/m]. ``begin``: index of the first node."""
     i = wp.tid()
     height = places[i][1] - corner[1]
     x = (places[i][0] - height * slope[0] - corner[0]) / cell
@@ -117,7 +117,7 @@ def cast(
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def blur(first: wp.int32, across: wp.int32, weights: Floats, sharp: Vec4s2d, found: Vec4s2d):
-    """Blur thicknesses at nodes along one axis, or ``across``, along the other."""
+    """Blur thicknesses at nodes along one axis of the floor; with ``across`` along the other one."""
     n = first + wp.tid()
     i = n / sharp.shape[1]
     j = n % sharp.shape[1]
@@ -229,8 +229,8 @@ class FloorShadow:
         self._launch(darken, key.size, key=key, around=around, **how, begin=seen["begin"], light=self.light)
 
     def _reached(self, parts: Particles, slope: Points, around: int) -> tuple[list[int], tuple[int, int]]:
-        """Return the first node that the shadow of parts may reach, with ``around`` nodes more, and the number along
-        each side. Nodes elsewhere stay light, and take no time."""
+        """Return the first node of the floor that the shadow of an object may reach, with ``around`` nodes more, and
+        the number along each side. Nodes elsewhere stay light, and take no time."""
         lower, upper = (end - self.corner for end in parts.ends(self._launch))
         shifts = np.outer((0.0, lower[1], upper[1]), slope)
         first = np.floor((lower[::2] - shifts.max(axis=0)) / self.cell) - around
