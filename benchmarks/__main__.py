@@ -75,6 +75,25 @@ def environments(
 
 
 @command(app, answers=True)
+def watching(depth: int = 20, steps: int = 200, repeats: int = 3, device: str = "cpu", json: Flag = False) -> Work:
+    """Time runs with sensors and frames, and steps one by one, beside the same steps alone.
+
+    Args:
+        depth: Spacings in the depth of a tank in the plane, with 3.4 times its square of particles.
+        steps: Steps of a run.
+        repeats: The least of so many repeats counts.
+        device: "cpu", or "cuda:0" for the first GPU.
+        json: Print JSON for machines instead of a table.
+    """
+    require_at_least(4, depth, "--depth")
+    require_at_least(1, steps, "--steps")
+    require_at_least(1, repeats, "--repeats")
+    from benchmarks.bench.watching import bench_watching
+
+    return partial(bench_watching, depth, steps, repeats, device, json)
+
+
+@command(app, answers=True)
 def pictures(
     particles: tuple[int, ...] = (8000, 100_000),
     lines: int = 1080,

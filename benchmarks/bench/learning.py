@@ -28,13 +28,13 @@ def bench_environments(
     whole, bare = list[float](), list[float]()
     for action in actions:
         for work, times in ((envs.step, whole), (engine.advance, bare)):
-            times.append(_seconds(partial(work, action), device))
+            times.append(seconds(partial(work, action), device))
             if not np.isfinite(engine.observed()).all():  # a scene diverged
                 envs.reset()
     steps_of_particles = scenes * simulation.particles * engine.task.substeps
     around = environment()
     found: dict[str, Any] = {
-        "device": around["processor"] if wp.get_device(device).is_cpu else wp.get_device(device).name,
+        "device": device_name(device, around["processor"]),
         "task": task,
         "scenes": scenes,
         "particles": simulation.particles,
@@ -47,7 +47,13 @@ def bench_environments(
     return json.dumps(found, indent=2) if as_json else _as_text(found)
 
 
-def _seconds(work: Callable[[], Any], device: str) -> float:
+def device_name(device: str, processor: str) -> str:
+    """Return the name of a GPU, or the processor's."""
+    return processor if wp.get_device(device).is_cpu else str(wp.get_device(device).name)
+
+
+def seconds(work: Callable[[], Any], device: str) -> float:
+    """Return the wall-clock time of work, until the device has done it."""
     wp.synchronize_device(device)
     start = time.perf_counter()
     work()
