@@ -187,8 +187,16 @@ def _degenerate(precision: Precision, phases: int) -> MobilityFunctions:
     return MobilityFunctions(value=value, gradient=gradient)
 
 
-DOUBLE_WELL = FreeEnergy("double_well", lambda c: 0.5 * (c**2 * (1.0 - c) ** 2).sum(1), 1.0, _double_well)
-MISCIBLE = FreeEnergy("miscible", lambda c: 0.5 * (c**2).sum(1), 1.0, _miscible)
+def _double_well_value(c: np.ndarray) -> np.ndarray:  # a lambda would not be pickled
+    return np.asarray(0.5 * (c**2 * (1.0 - c) ** 2).sum(1))
+
+
+def _miscible_value(c: np.ndarray) -> np.ndarray:
+    return np.asarray(0.5 * (c**2).sum(1))
+
+
+DOUBLE_WELL = FreeEnergy("double_well", _double_well_value, curvature=1.0, functions=_double_well)
+MISCIBLE = FreeEnergy("miscible", _miscible_value, curvature=1.0, functions=_miscible)
 FREE_ENERGIES = {energy.name: energy for energy in (DOUBLE_WELL, MISCIBLE)}
 
 CONSTANT = Mobility("constant", lambda phases: 1.0, _constant)
