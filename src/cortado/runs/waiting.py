@@ -54,8 +54,8 @@ class Waiting:
 
 
 class Table:
-    """Arrays by name, one row for each record. They are allocated at once: memory of each row alone costs more than to
-    copy it."""
+    """Arrays by name, one row for each record. They are allocated at once, as to allocate each row by itself costs more
+    than to copy it."""
 
     def __init__(self, expected: int):
         self._rows, self._count, self._arrays = expected, 0, dict[str, NDArray]()
@@ -72,7 +72,7 @@ class Table:
         self._count += 1
 
     def arrays(self) -> dict[str, NDArray]:
-        """Return the arrays (records, ...) by name; without their memory for more than one further record."""
+        """Return the arrays (records, ...) by name. They hold memory for one further record at most."""
         own = {name: array[: self._count] for name, array in self._arrays.items()}
         return own if self._count >= self._rows - 1 else {name: array.copy() for name, array in own.items()}
 
