@@ -1,6 +1,7 @@
 """Cortado as a layer of JAX: derivatives in both modes, bits, compiled programs, maps, and bad uses in sentences."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -547,6 +548,14 @@ def test_bad_parameters_are_refused_in_a_sentence(layer, simulation, problem, na
     assert_refused(words, *uses_of_parameters(layer, simulation, problem, make))
 
 
+@dataclass
+class Changing(gradients.AdjointEstimator):
+    """An estimator whose settings may change."""
+
+    def derivative(self, rollout):
+        return gradients.Exact().derivative(rollout)
+
+
 def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, problem):
     """Those of tests/test_bad_uses.py aside."""
     state = layer.state(simulation)
@@ -568,6 +577,7 @@ def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, proble
         (lambda: layer.step(simulation, state, {"viscosity": single}), "parameter viscosity is float32, but must be"),
         (lambda: layer.rollout(simulation, state, steps=5, record_every=2), "record_every is 2, but must divide the 5"),
         (lambda: layer.step(simulation, state, gradient=gentle), "estimator is .*, but must be an AdjointEstimator"),
+        (lambda: layer.step(simulation, state, gradient=Changing()), "estimator has an unhashable type: 'Changing'"),
         (lambda: layer.value(problem, gentle)({}, state), "gradient is a RandomizedSmoothing, but must go back"),
         (lambda: layer.measure(simulation, "colour"), "quantity is 'colour', but must be one of density"),
         (lambda: layer.measure(Simulation(plane(), batch=2), "density"), "simulation is a batch of 2, but must be"),

@@ -227,10 +227,11 @@ class Simulation(Stepping):
         """Run a rollout forward and return its frames; warns and raises as `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
-        parts = frame_parts(expected_frames(rollout, record_every), numbers, self.precision.bytes)
+        expected = expected_frames(rollout, record_every)
+        parts = frame_parts(expected, numbers, self.precision.bytes)
         require(parts, "take a larger record_every or fewer steps")
         watch = Watch(self, rollout, record, sensors)
-        steps, frames = list[int](), Table(expected_frames(rollout, record_every))
+        steps, frames = list[int](), Table(expected)
 
         def record_frame(step: int, state: State) -> None:
             steps.append(step)

@@ -55,6 +55,15 @@ class ReverseEstimator(Protocol):
         """Return the backward step for one rollout."""
 
 
+def require_hash(estimator: Any) -> Any:
+    """Return an estimator by which something is kept; raise `InputError` for one whose settings may change."""
+    try:
+        hash(estimator)
+    except TypeError as error:
+        raise InputError(f"estimator has an {error}, but must be a dataclass(frozen=True) of numbers.") from None
+    return estimator
+
+
 class BackwardSteps:
     """The backward steps of estimators for one rollout, each made once."""
 
@@ -74,11 +83,7 @@ class BackwardSteps:
                     f"{type(estimator).__name__} is given a batch, but has no `batches = True`, which says that it "
                     "treats each scene by itself."
                 )
-        try:
-            is_new = estimator not in self._made
-        except TypeError as error:
-            raise InputError(f"estimator has an {error}, but must be a dataclass(frozen=True) of numbers.") from None
-        if is_new:
+        if require_hash(estimator) not in self._made:
             parts = solver.gradient_memory(self._rollout.log)
             require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
             self._made[estimator] = (

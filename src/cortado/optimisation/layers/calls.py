@@ -15,6 +15,7 @@ from cortado.optimisation.layers.layer import PARAMETER, STATE, Layer, Named, ch
 from cortado.problem import Problem
 from cortado.render import Renderer
 from cortado.rollout.device_states import DeviceState, Given
+from cortado.rollout.stepper import require_hash
 from cortado.runs.sensor import Sensor
 from cortado.scene.parameter_values import Values
 from cortado.scene.restart import RestartState
@@ -66,7 +67,7 @@ def steps_layer(simulation: Simulation, steps: int, gradient: AdjointEstimator |
     steps = whole_number("steps", steps, 1)
     layers: dict[Any, Steps] = simulation.__dict__.setdefault("_layers", {})
     if gradient is not None:
-        checked_reverse(gradient)
+        require_hash(checked_reverse(gradient))
     return kept_or_made(layers, (steps, gradient), lambda key: Steps(simulation, *key), KEPT)
 
 

@@ -10,7 +10,7 @@ from cortado.arrays import check_steps
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import InputError, MissingDerivativeError, shown
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator
-from cortado.gradients.estimator import checked_estimator, checked_reverse
+from cortado.gradients.estimator import checked_estimator
 from cortado.losses.loss import Snapshot, adjoint_on_device
 from cortado.optimisation.layers.layer import (
     LAST_STEP,
@@ -82,7 +82,7 @@ class Steps(OfSimulation):
         self, simulation: Simulation, steps: int, gradient: AdjointEstimator | None = None, each: bool = False
     ):
         """Prepare the layer; reverse mode goes by the estimator ``gradient``, exactly if it is left out."""
-        self._steps, self._gradient = check_steps(steps), None if gradient is None else checked_reverse(gradient)
+        self._steps, self._gradient = check_steps(steps), gradient
         super().__init__(simulation, steps, each)
         self.kept_bytes = min(steps * self._state_size, MEMORY_BUDGET)
 
