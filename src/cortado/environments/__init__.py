@@ -8,9 +8,10 @@ from typing import Any
 from cortado.calls import face
 from cortado.environments.catalogue import TASKS
 from cortado.environments.fluid_env import FluidEnv, FluidVectorEnv, Twin, gymnasium
+from cortado.environments.scenes import EnvState
 from cortado.environments.task import Task
 
-__all__ = ["FluidEnv", "FluidVectorEnv", "Task", "Twin", "make_vec"]
+__all__ = ["EnvState", "FluidEnv", "FluidVectorEnv", "Task", "Twin", "make_vec"]
 
 
 def make_vec(task: str | Task, num_envs: int = 1, **settings: Any) -> FluidVectorEnv:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import require_at_most, require_table, whole_number
-from cortado.calls import Staying
 from cortado.environments.catalogue import task_of
-from cortado.environments.task import SEEN, Scenes, Start, Task, checked_actions, split
+from cortado.environments.scenes import SEEN, EnvState, Scenes, Start
+from cortado.environments.task import Task, checked_actions, split
 from cortado.environments.terms import MinusReward
 from cortado.errors import InputError, LibraryMissingError, shown
 from cortado.files.image_encoding import to_srgb
@@ -22,29 +22,37 @@ from cortado.problem import Problem
 from cortado.runs.sensor import Sensor
 from cortado.runs.trajectory import Frame
 from cortado.scene.parameter_values import Arrays
-from cortado.simulation import Simulation
 
 
 class Twin:
     """A loss of actions (actions, a) for one episode, with its scene, start and goal: minus the sum of rewards. Actions
     beyond -1 to 1 are clipped, as in the environment, with derivative 0."""
 
-    def __init__(self, scenes: Scenes, number: int = 0, actions: int | None = None):
-        """Copy the present episode of scene ``number``; ``actions``: how many, by default those of a whole episode."""
-        task, simulation = scenes.task, scenes.simulation
-        count = whole_number("actions", task.horizon if actions is None else actions, 1)
-        require_at_most("actions", count, task.horizon)
+    def __init__(self, scenes: Scenes, number: int = 0, actions: int | None = None, state: EnvState | None = None):
+        """Copy the present episode of scene ``number`` from its start, or that of a saved ``state`` from there;
+        ``actions``: how many, by default those that are left of a whole episode."""
+        task, m = scenes.task, scenes.task.substeps
         require_at_most("number", whole_number("number", number, 0), len(scenes) - 1)
-        start = scenes.starts[number]
-        self._actuators, self._start = task.actuators, {"initial_positions": start.positions}
-        self.coordinates = {one.parameter: one.over(count, task.substeps, task.time_step) for one in task.actuators}
+        done, begun, restart = 0, [one.at_rest(1) for one in task.actuators], None
+        if state is not None:
+            each: Any = scenes.simulation.on_host(scenes.taken(state))
+            restart = each[number]
+            done, begun = int(state.step_number[number]), [now[[number]] for now in state.driven]
+        count = whole_number("actions", task.horizon - done if actions is None else actions, 1)
+        require_at_most("actions", count, task.horizon - done)
+        start = (scenes if state is None else state).starts[number]
+        self._actuators = task.actuators
+        self._start = {"initial_positions": start.positions} if state is None else {}
+        self.coordinates = {
+            one.parameter: one.over(count, m, task.time_step, now)
+            for one, now in zip(task.actuators, begun, strict=True)
+        }
         """From the actions of each actuator to the parameter that it drives."""
-        goal, m = start.goal[None], task.substeps
-        loss = Frames({k * m: MinusReward(scenes.reward, goal, k) for k in range(1, count + 1)})
-        single = Simulation(task.scene, simulation.device.alias, simulation.precision.name)
-        self.problem = Problem(single, count * m, loss)
+        goal = start.goal[None]
+        loss = Frames({k * m: MinusReward(scenes.reward, goal, done + k) for k in range(1, count + 1)})
+        self.problem = Problem(scenes.single, count * m, loss, state=restart)
         """The loss as one of the parameters of the scene."""
-        fixed: Any = FixedParameters(self.problem, self._start)
+        fixed: Any = FixedParameters(self.problem, self._start) if self._start else self.problem
         self.search = Transformed(fixed, self.coordinates)
         """The loss as one of the actions, named by `named`: what `cortado.optimise` takes."""
         self.shape = count, sum(len(one.axes) for one in task.actuators)
@@ -118,16 +126,17 @@ except ModuleNotFoundError as error:
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
 WIDTH, HEIGHT = 320, 200
 """Of pictures."""
+BEFORE = "before the first one"
+"""When a step is refused: no episode has begun."""
 Observation = NDArray[np.float32]
 Info = dict[str, Any]
 
 
-class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
+class FluidEnv(gymnasium.Env[Observation, NDArray]):
     """A Gymnasium environment of one scene, as `gymnasium.make("cortado/Carry-v0")` makes; see
     `docs/environments.md`."""
 
     metadata = METADATA
-    instead = "but gymnasium.make makes the same one elsewhere, and reset with the same seed begins the same episode"
 
     def __init__(
         self,
@@ -147,7 +156,9 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
         self.scenes = Scenes(task_of(task, size), 1, device, precision, particles, sensors)
         self.observation_space, actions = spaces(self.scenes)
         self.action_space, self._shape = actions, actions.shape
-        self._over = "before the first one"
+        self._over, self._counts = BEFORE, False
+        """Why no step is possible, if so; and whether the environment itself counts how long an episode may be, as
+        Gymnasium's wrapper cannot know how far a restored one was."""
         self._closed = False
 
     @property
@@ -156,11 +167,13 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
         return self.scenes.layout
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
-        """Begin an episode; equal seeds give equal bits. Raises `InputError` for any ``options``."""
-        if self._closed:
-            raise InputError("reset is called after close(), but must come before it.")
-        require_options(options)
+        """Begin an episode; equal seeds give equal bits. ``options={"state": state}`` goes back to a saved state, as
+        `restore` does, through wrappers that count steps. Raises `InputError` for other options."""
+        self._require_open("reset")
+        if (state := saved_option(options, seed)) is not None:
+            return self.restore(state), {}
         super().reset(seed=seed)
+        self._counts = self.spec is None
         self.scenes.begin({0: self.scenes.drawn(self.np_random)})
         self._over = ""
         self._observation = self.scenes.observed()[0]
@@ -178,7 +191,7 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
         rewards, lost = self.scenes.step(actions[None])
         if not lost:
             self._observation = self.scenes.observed()[0]
-        truncated = not lost and self.spec is None and bool(self.scenes.step_number[0] >= self.scenes.task.horizon)
+        truncated = not lost and self._counts and bool(self.scenes.step_number[0] >= self.scenes.task.horizon)
         self._over = "after the end of an episode" if lost or truncated else ""
         info = {"diverged": lost[0]} if lost else {}
         return self._observation.copy(), float(rewards[0]), bool(lost), truncated, info
@@ -191,16 +204,37 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
         """Return a picture (rows, columns, 3) of the scene."""
         return pictures(self.scenes)[0] if self.render_mode else None
 
-    def twin(self, actions: int | None = None) -> Twin:
-        """Return a differentiable copy of the present episode from its start, of so many ``actions``, by default
-        all."""
-        return Twin(self.scenes, 0, actions)
+    def save(self) -> EnvState:
+        """Return where the episode is, with the random generator, for `restore`: any number of times, and in other
+        environments of the same task. Raises `InputError` before the first `reset`."""
+        self._require_open("save")
+        if self._over == BEFORE:
+            raise InputError("save is called before the first reset(), but must come after it.")
+        random = self.np_random.bit_generator.state
+        return self.scenes.save(np.array([bool(self._over)]), self._observation[None], [random])
+
+    def restore(self, state: EnvState) -> Observation:
+        """Go back to a saved state, and return its observation. Raises `InputError` for a state of another task, batch
+        or scene."""
+        self._require_open("restore")
+        self.scenes.restore(state)
+        self.np_random.bit_generator.state = state.generators[0]
+        self._over, self._counts = "after the end of an episode" if state.over[0] else "", True
+        self._observation = state.observations[0].copy()
+        return self._observation.copy()
+
+    def twin(self, actions: int | None = None, state: EnvState | None = None) -> Twin:
+        """Return a differentiable copy of the present episode from its start, or of that of a saved ``state`` from
+        there, of so many ``actions``, by default all that are left."""
+        return Twin(self.scenes, 0, actions, state)
+
+    def _require_open(self, what: str) -> None:
+        if self._closed:
+            raise InputError(f"{what} is called after close(), but must come before it.")
 
 
-class FluidVectorEnv(Staying, VectorEnv):
+class FluidVectorEnv(VectorEnv):
     """A Gymnasium vector environment: a batch of scenes, each with the bits of the single one with its seed."""
-
-    instead = "but make_vec makes the same one elsewhere, and reset with the same seed begins the same episodes"
 
     def __init__(
         self,
@@ -246,10 +280,10 @@ class FluidVectorEnv(Staying, VectorEnv):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, Info]:
         """Begin all episodes, or those that ``options={"reset_mask": (num_envs,) bool}`` chooses. A number as ``seed``
-        gives environment b the seed + b."""
-        require_options(options, "reset_mask")
-        if self.closed:
-            raise InputError("reset is called after close(), but must come before it.")
+        gives environment b the seed + b. ``options={"state": state}`` goes back to a saved state, as `restore` does."""
+        self._require_open("reset")
+        if (state := saved_option(options, seed, "reset_mask")) is not None:
+            return self.restore(state), {}
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
         if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             wanted = f"an array ({self.num_envs},) of bool that is not False throughout"
@@ -273,8 +307,7 @@ class FluidVectorEnv(Staying, VectorEnv):
         """Advance all episodes by actions (num_envs, a); see `FluidEnv.step`. An episode that is over begins anew as
         the autoreset mode says. It does so in the next step, in the place of its action; in the same step, with what it
         ended with in ``infos["final_obs"]`` and ``infos["final_info"]``; or only by `reset`."""
-        if self.closed:
-            raise InputError("step is called after close(), but must come before it.")
+        self._require_open("step")
         actions = checked_actions("actions", actions, self._shape)
         if self._over.any() and self._mode is not AutoresetMode.NEXT_STEP:
             found = f"step is called after the end of the episode of environment {self._over.argmax()}"
@@ -305,9 +338,29 @@ class FluidVectorEnv(Staying, VectorEnv):
         """Return a picture (rows, columns, 3) of each scene."""
         return tuple(pictures(self.scenes)) if self.render_mode else None
 
-    def twin(self, number: int, actions: int | None = None) -> Twin:
+    def save(self) -> EnvState:
+        """Return where all episodes are, with the random generators; see `FluidEnv.save`. Some of them, in any order,
+        are ``state[[0, 0, 2]]``."""
+        self._require_open("save")
+        random = [one.bit_generator.state for one in self._generators]
+        return self.scenes.save(self._over, self._observations, random)
+
+    def restore(self, state: EnvState) -> Observation:
+        """Go back to a saved state of as many environments, and return its observations; see `FluidEnv.restore`."""
+        self._require_open("restore")
+        self.scenes.restore(state)
+        for generator, own in zip(self._generators, state.generators, strict=True):
+            generator.bit_generator.state = own
+        self._over, self._observations = state.over.copy(), state.observations.copy()
+        return self._observations.copy()
+
+    def twin(self, number: int, actions: int | None = None, state: EnvState | None = None) -> Twin:
         """Return a differentiable copy of the episode of one environment; see `FluidEnv.twin`."""
-        return Twin(self.scenes, number, actions)
+        return Twin(self.scenes, number, actions, state)
+
+    def _require_open(self, what: str) -> None:
+        if self.closed:
+            raise InputError(f"{what} is called after close(), but must come before it.")
 
     def _begin(self, which: NDArray) -> dict[int, Start]:
         """Begin new episodes in the environments that a mask (num_envs,) chooses, and return their starts."""
@@ -336,13 +389,18 @@ def checked_render_mode(mode: str | None) -> str | None:
     return mode
 
 
-def require_options(options: Any, *known: str) -> None:
-    """Raise `InputError` for options of a reset that are no table, or that have unknown names."""
-    require_table("options", options or {}, "{'reset_mask': array of bool}")
-    for name in options or {}:
+def saved_option(options: Any, seed: Any, *others: str) -> EnvState | None:
+    """Return the state among the options of a reset, if any. Raises `InputError` for options that are no table, that
+    have unknown names, and for a state beside anything else."""
+    require_table("options", options or {}, "{'state': state}")
+    found, known = options or {}, ("state", *others)
+    for name in found:
         if name not in known:
-            wanted = f"have {', '.join(known)} alone" if known else "be left out, as all is drawn from the seed"
-            raise InputError(f"options has {shown(name)}, but must {wanted}.")
+            raise InputError(f"options has {shown(name)}, but must have {' or '.join(known)} alone.")
+    if "state" in found and (seed is not None or len(found) > 1):
+        other = "seed" if seed is not None else others[0]
+        raise InputError(f"{other} is given, but must be left out beside a state, which has all that is drawn.")
+    return found.get("state")
 
 
 def pictures(scenes: Scenes) -> list[NDArray[np.uint8]]:

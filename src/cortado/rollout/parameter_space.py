@@ -24,6 +24,7 @@ from cortado.rollout.run_checks import (
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
 from cortado.rollout.step_bounds import ROOM, begin_choosing, counted_steps, expected_steps, greatest_step
 from cortado.rollout.step_sizes import ChosenSteps
+from cortado.scene.motions import Steady
 from cortado.scene.parameter_values import Arrays, Values, check_known, checked_value, entry, scene_values, stacked
 from cortado.scene.parameters import Role
 from cortado.scene.restart import Clock, RestartState
@@ -99,6 +100,12 @@ class ParameterSpace:
         it, else the value of `Simulation.parameters`."""
         found = {**scene_values(self._simulation, self._known), **self._one.scheduled({})}
         return {name: value for name, value in found.items() if self._known[name].role is not Role.CLOCK}
+
+    def depends_on_time(self, values: Arrays) -> bool:
+        """Test if parameters other than these change by the clock of a state, or the length of its next steps does."""
+        courses = self._one.courses(values).values()
+        still = [isinstance(course, Steady) and course.greatest() == 0.0 for course in courses]
+        return self._simulation.scene.solver.chooses or not all(still)
 
     def colours(self, values: Arrays) -> np.ndarray:
         """Return the colours (phases, 3) of the phases in one scene, given or the scene's."""

@@ -174,8 +174,11 @@ class Stepper:
         steps, ...), which are not checked: for controllers of many scenes. All that `advance` was given over time has
         to be among them."""
         place = DeviceStates(self._simulation)
-        place.follow(self.rollout, state)
-        self.rollout.parameters.set(rows)
+        if self._space.depends_on_time(rows):
+            place.begin(self._space, self.rollout, state, dict(rows), set())
+        else:
+            place.follow(self.rollout, state)
+            self.rollout.parameters.set(rows)
         return place.state(self.rollout, self._forward(keep=False), self.rollout.steps)
 
     @in_turn
