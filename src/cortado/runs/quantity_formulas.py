@@ -1,7 +1,7 @@
 """Quantities of the sorted particles of a step, with their tangents and adjoints.
 
-Sums over neighbours are kernels; what is done with the sum of each particle alone is NumPy in float64. n is the number
-density, m a particle's mass over its volume V on the rest lattice, p the pressure that it pushes walls with.
+Sums over neighbours and the forces on walls are kernels; other formulas of a particle are NumPy in float64. n is the
+number density, m a particle's mass over its volume V on the rest lattice, p the pressure that it pushes walls with.
 
 Vorticity is by summation over the fluid around a particle (Monaghan 1992):
 
@@ -30,10 +30,11 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import Named
 from cortado.device.modules import Kernels
+from cortado.device.reduction import add
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum
-from cortado.particles.particle_kernels import sum_kernels
+from cortado.particles.particle_kernels import pointwise_kernels, sum_kernels
 from cortado.particles.state import Fields, padded
 from cortado.particles.wall_terms import ALL_WALLS
 from cortado.scene.quantity_names import load_name
@@ -66,6 +67,21 @@ def circulation_kernels(discretisation: Discretisation) -> Kernels:
     return sum_kernels("circulation", modules, sums, "circulation", times="s.volume")
 
 
+@cache
+def wall_force_kernels(discretisation: Discretisation) -> Kernels:
+    """Make the kernels of the forces f of particles on walls, given the sums A as ``push`` and a as ``rub``."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+
+    def wall_force(
+        scale: real, power: real, cell: real, p_i: real, n_i: real, m_i: real, push_i: vector, rub_i: vector
+    ) -> vector:
+        return (scale * p_i / wp.pow(n_i, power)) * push_i - (cell * m_i) * rub_i
+
+    numbers, written, modules = ["scale", "power", "cell"], ["push", "rub"], discretisation.modules("wall_force")
+    make = pointwise_kernels
+    return make(discretisation.precision, modules, lambda _: wall_force, ["f"], numbers=numbers, written=written)
+
+
 def vectors(array: wp.array) -> NDArray:
     """Read an array of vectors from the device, (n, 3) in float64."""
     return np.asarray(array.numpy(), dtype=np.float64)
@@ -73,12 +89,12 @@ def vectors(array: wp.array) -> NDArray:
 
 @dataclass(frozen=True)
 class Pressures:
-    """The pressures of the sorted particles of a step, in float64, off the device: copies."""
+    """The pressures of the sorted particles of a step: copies."""
 
-    push: NDArray
-    """(n,) pressures with which they push walls [Pa]."""
+    push: wp.array
+    """(n,) pressures with which they push walls [Pa], on the device."""
     stress: NDArray | None
-    """(n,) pressures that a gauge would read [Pa]; None where nobody asks for them."""
+    """(n,) pressures that a gauge would read [Pa], float64; None where nobody asks for them."""
 
 
 @dataclass(frozen=True)
@@ -98,18 +114,18 @@ class Particles:
         return cls({name: fields[name].numpy().astype(np.float64) for name in "xvnm"}, pressures)
 
     @classmethod
-    def zeros(cls, particles: int, on_device: "OnDevice | None" = None) -> Self:
-        """Make fields and pressures of zeros."""
-        shapes = {"x": (3,), "v": (3,), "n": (), "m": ()}
+    def zeros(cls, push: wp.array, on_device: "OnDevice | None" = None) -> Self:
+        """Make fields and stresses of zeros, beside pressures ``push`` that are zeros."""
+        particles, shapes = len(push), {"x": (3,), "v": (3,), "n": (), "m": ()}
         fields = {name: np.zeros((particles, *shape)) for name, shape in shapes.items()}
-        return cls(fields, Pressures(np.zeros(particles), np.zeros(particles)), on_device)
+        return cls(fields, Pressures(push, np.zeros(particles)), on_device)
 
     def __getitem__(self, name: str) -> NDArray:
         return self.fields[name]
 
     @property
-    def push(self) -> NDArray:
-        """Return the pressures (n,) with which they push walls [Pa]."""
+    def push(self) -> wp.array:
+        """Return the pressures (n,) with which they push walls [Pa], on the device."""
         assert self.pressures is not None
         return self.pressures.push
 
@@ -164,74 +180,75 @@ class Sums:
         return wp.array(values, dtype=self._solver.discretisation.precision.vector, device=self._solver.device)
 
 
-@dataclass(frozen=True)
-class _Rubbing:
-    """The sums factor m_i sum a_i over forces of walls, (n, 3), such as viscous ones."""
-
-    actions: list[WallAction]
-    factor: float
-
-    def value(self, at: Particles, sums: Sums, solid: int) -> NDArray:
-        return self.factor * at["m"][:, None] * self._total(at, sums, solid)
-
-    def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents, solid: int) -> NDArray:
-        found = dot["m"][:, None] * self._total(at, sums, solid)
-        for action in self.actions:
-            found += at["m"][:, None] * vectors(action.tangent(sums.context, along, solid))
-        return self.factor * found
-
-    def adjoint(self, at: Particles, sums: Sums, own_bar: NDArray, bar: Particles, solid: int) -> None:
-        bar["m"][:] += self.factor * (own_bar * self._total(at, sums, solid)).sum(axis=1)
-        total_bar = sums.on_device(self.factor * at["m"][:, None] * own_bar)
-        for action in self.actions:
-            action.adjoint(sums.context, bar.within.bar, solid, total_bar, bar.within.v_star)
-
-    def _total(self, at: Particles, sums: Sums, solid: int) -> NDArray:
-        totals = (vectors(action.total(sums.context, solid)) for action in self.actions)
-        return sum(totals, np.zeros((len(at["m"]), 3)))
-
-
 class WallLoads:
-    """The forces of a solver's particles on walls, (n, 3) in float64. ``solid`` is the number of a solid's wall
-    particles, or `cortado.particles.wall_terms.ALL_WALLS`."""
+    """The forces of a solver's particles on walls [N], vectors (n,) on the device, which the next call overwrites.
+    ``solid`` is the number of a solid's wall particles, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def __init__(self, solver: ParticleSolver):
-        cell, self._power = solver.lattice.cell, solver.density_power
-        self._scale = cell * solver.lattice.volume
-        self._push = solver.wall_push()
+        self._solver, self._kernels, self.cell = solver, wall_force_kernels(solver.discretisation), solver.lattice.cell
+        power, scale = float(solver.density_power), self.cell * solver.lattice.volume
+        self._numbers = {"power": power, "scale": scale, "cell": self.cell}
+        self._push, self._rubs, self._twists = (
+            solver.wall_push(),
+            self._actions("wall_action"),
+            self._actions("wall_couple"),
+        )
+        self._vectors = {name: solver.vectors() for name in ("rub", "f", "twist", "rub_dot", "f_dot", "twist_dot")}
+        self._bars = {name: solver.vectors() for name in ("push_bar", "rub_bar")}
 
-        def of(name: str) -> list[WallAction]:
-            return [action for force in solver.forces if (action := getattr(force, name, None)) is not None]
+    def _actions(self, name: str) -> list[WallAction]:
+        return [action for force in self._solver.forces if (action := getattr(force, name, None)) is not None]
 
-        self._rubbing = _Rubbing(of("wall_action"), -cell)
-        self.couples = _Rubbing(of("wall_couple"), cell)
-        """What f_i that act beneath particles twist walls with [N m]."""
+    def forces(self, step: StepContext, p: wp.array, solid: int) -> wp.array:
+        """Return the forces f of particles on the walls of a solid."""
+        found, known = self._vectors["f"], {**self._sums(step, solid), "p": p}
+        step.launch(self._kernels.forward, known, self._numbers, f=found)
+        return found
 
-    def forces(self, at: Particles, sums: Sums, solid: int) -> NDArray:
-        """Return the forces f [N] of particles on the walls of a solid."""
-        pushed = self._strength(at)[:, None] * vectors(self._push.total(sums.context, solid))
-        return pushed + self._rubbing.value(at, sums, solid)
-
-    def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents, solid: int) -> NDArray:
+    def tangent(self, step: StepContext, p: wp.array, p_dot: wp.array, along: Tangents, solid: int) -> wp.array:
         """Return the tangent of the forces f of particles on the walls of a solid."""
-        strength_dot = self._scale / at["n"] ** self._power * (dot.push - self._power * at.push * dot["n"] / at["n"])
-        pushed = vectors(self._push.total(sums.context, solid))
-        pushed_dot = vectors(self._push.tangent(sums.context, along, solid))
-        found = strength_dot[:, None] * pushed + self._strength(at)[:, None] * pushed_dot
-        return found + self._rubbing.tangent(at, sums, dot, along, solid)
+        rub_dot = self._total("rub_dot", [action.tangent(step, along, solid) for action in self._rubs])
+        dots = {"push_dot": self._push.tangent(step, along, solid), "rub_dot": rub_dot, "p_dot": p_dot}
+        found, known = self._vectors["f_dot"], {**self._sums(step, solid), "p": p}
+        step.launch(self._kernels.tangent, known, dots, *along.named, self._numbers, f_dot=found)
+        return found
 
-    def adjoint(self, at: Particles, sums: Sums, forces_bar: NDArray, bar: Particles, solid: int) -> None:
+    def adjoint(self, step: StepContext, p: wp.array, f_bar: wp.array, bar: "Particles", solid: int) -> None:
         """Add to the adjoints of the particles by that of the forces f."""
-        step, strength = sums.context, self._strength(at)
-        strength_bar = (forces_bar * vectors(self._push.total(step, solid))).sum(axis=1)
-        bar.push[:] += strength_bar * self._scale / at["n"] ** self._power
-        bar["n"][:] -= self._power * strength_bar * strength / at["n"]
-        within = bar.within
-        self._push.adjoint(step, within.bar, solid, sums.on_device(strength[:, None] * forces_bar), within.v_star)
-        self._rubbing.adjoint(at, sums, forces_bar, bar, solid)
+        within, known = bar.within, {**self._sums(step, solid), "p": p}
+        bars = {**self._bars, "p_bar": bar.push}
+        step.launch(self._kernels.adjoint, known, bars, *within.bar.named, self._numbers, f_bar=f_bar)
+        self._push.adjoint(step, within.bar, solid, self._bars["push_bar"], within.v_star)
+        for action in self._rubs:
+            action.adjoint(step, within.bar, solid, self._bars["rub_bar"], within.v_star)
 
-    def _strength(self, at: Particles) -> NDArray:
-        return np.asarray(self._scale * at.push / at["n"] ** self._power)
+    def twists(self, step: StepContext, solid: int) -> wp.array:
+        """Return the sums of y x a over forces that act at x_i - y, by the walls of a solid; times m_i s^d they twist
+        it [N m]."""
+        return self._total("twist", [action.total(step, solid) for action in self._twists])
+
+    def twists_tangent(self, step: StepContext, along: Tangents, solid: int) -> wp.array:
+        """Return the tangent of `twists`."""
+        return self._total("twist_dot", [action.tangent(step, along, solid) for action in self._twists])
+
+    def twists_adjoint(self, step: StepContext, total_bar: wp.array, bar: "Particles", solid: int) -> None:
+        """Add to the adjoints of the particles by that of `twists`."""
+        for action in self._twists:
+            action.adjoint(step, bar.within.bar, solid, total_bar, bar.within.v_star)
+
+    def _sums(self, step: StepContext, solid: int) -> dict[str, wp.array]:
+        rub = self._total("rub", [action.total(step, solid) for action in self._rubs])
+        return {"push": self._push.total(step, solid), "rub": rub}
+
+    def _total(self, name: str, arrays: list[wp.array]) -> wp.array:
+        """Add up arrays; the sum of one is itself."""
+        if len(arrays) == 1:
+            return arrays[0]
+        total = self._vectors[name]
+        total.zero_()
+        for array in arrays:
+            add(array, total)
+        return total
 
 
 @dataclass(frozen=True)
@@ -246,32 +263,41 @@ class SolidLoadQuantity:
     dimension: int
 
     def value(self, at: Particles, sums: Sums) -> NDArray:
-        forces = self.loads.forces(at, sums, self.solid.number)
-        couples = self.loads.couples.value(at, sums, self.solid.number)
-        return self._joined(forces, np.cross(self._arms(at), forces) + couples)
+        forces = self._forces(at, sums)
+        return self._joined(forces, np.cross(self._arms(at), forces) + self._couples(at, sums))
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents) -> NDArray:
-        forces = self.loads.forces(at, sums, self.solid.number)
-        forces_dot = self.loads.tangent(at, sums, dot, along, self.solid.number)
+        number, cell, forces = self.solid.number, self.loads.cell, self._forces(at, sums)
+        forces_dot = vectors(self.loads.tangent(sums.context, at.push, dot.push, along, number))
         moving = self.solver.search.moving
         shift = self._each(None if moving is None else moving.after_dot.positions, np.zeros(3))
         turned = np.cross(dot["x"] - shift, forces) + np.cross(self._arms(at), forces_dot)
-        return self._joined(forces_dot, turned + self.loads.couples.tangent(at, sums, dot, along, self.solid.number))
+        turned += cell * dot["m"][:, None] * vectors(self.loads.twists(sums.context, number))
+        turned += cell * at["m"][:, None] * vectors(self.loads.twists_tangent(sums.context, along, number))
+        return self._joined(forces_dot, turned)
 
     def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
-        d, members, number = self.dimension, len(own), self.solid.number
+        d, members, number, context = self.dimension, len(own), self.solid.number, sums.context
         force_bar = padded(own[:, :d])
         torque_bar = own[:, d:] if d == 3 else np.pad(own[:, d:], ((0, 0), (2, 0)))
         force_bar, torque_bar = (self._for_each(array) for array in (force_bar, torque_bar))
-        pulled = np.cross(self.loads.forces(at, sums, number), torque_bar)
-        self.loads.adjoint(at, sums, force_bar + np.cross(torque_bar, self._arms(at)), bar, number)
-        self.loads.couples.adjoint(at, sums, torque_bar, bar, number)
+        pulled, cell = np.cross(self._forces(at, sums), torque_bar), self.loads.cell
+        whole_bar = sums.on_device(force_bar + np.cross(torque_bar, self._arms(at)))
+        self.loads.adjoint(context, at.push, whole_bar, bar, number)
+        bar["m"][:] += cell * (torque_bar * vectors(self.loads.twists(context, number))).sum(axis=1)
+        self.loads.twists_adjoint(context, sums.on_device(cell * at["m"][:, None] * torque_bar), bar, number)
         bar["x"][:] += pulled
         if number >= 0:
             layout = self.solver.layout
             total = -pulled.reshape(members, -1, 3).sum(axis=1)
             places = (wp.array(a, dtype=layout.precision.vector, device=layout.device) for a in (total, 0.0 * total))
             bar.within.bar.solids.add_whole(number, *places)
+
+    def _forces(self, at: Particles, sums: Sums) -> NDArray:
+        return vectors(self.loads.forces(sums.context, at.push, self.solid.number))
+
+    def _couples(self, at: Particles, sums: Sums) -> NDArray:
+        return self.loads.cell * at["m"][:, None] * vectors(self.loads.twists(sums.context, self.solid.number))
 
     def _arms(self, at: Particles) -> NDArray:
         """Return the arms (n, 3) [m] from the solid to particles, along a periodic axis the shorter way."""
@@ -394,13 +420,14 @@ class WallForceQuantity:
     dimension: int
 
     def value(self, at: Particles, sums: Sums) -> NDArray:
-        return self.loads.forces(at, sums, ALL_WALLS)[:, : self.dimension]
+        return vectors(self.loads.forces(sums.context, at.push, ALL_WALLS))[:, : self.dimension]
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents) -> NDArray:
-        return self.loads.tangent(at, sums, dot, along, ALL_WALLS)[:, : self.dimension]
+        found = self.loads.tangent(sums.context, at.push, dot.push, along, ALL_WALLS)
+        return vectors(found)[:, : self.dimension]
 
     def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
-        self.loads.adjoint(at, sums, padded(own), bar, ALL_WALLS)
+        self.loads.adjoint(sums.context, at.push, sums.on_device(padded(own)), bar, ALL_WALLS)
 
 
 def formulas(solver: ParticleSolver, dimension: int, circulation_factor: float) -> dict[str, QuantityFormula]:

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Protocol, cast
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from cortado.arrays import require_names
@@ -162,18 +163,17 @@ class QuantityEvaluator:
         adjoint.begin()
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
         on_device = OnDevice(replace(adjoint.bar, fields=fields), solver.vectors())
-        own = Particles.zeros(solver.layout.all_particles, on_device)
+        own = Particles.zeros(solver.numbers(), on_device)
         for name in wanted:
             self._formulas[name].adjoint(at, sums, self._sorted(name, bars[name]), own)
         for name, array in own.fields.items():
             fields[name].assign(fields[name].numpy() + array)
         state_bar = solver.new_state()
         if solved:
-            p_bar, stress_bar = solver.numbers(), solver.numbers() if STRESS in wanted else None
-            p_bar.assign(own.push)
+            stress_bar = solver.numbers() if STRESS in wanted else None
             if stress_bar is not None:
                 stress_bar.assign(own.stress)
-            within = WithinBar(fields, p_bar, stress_bar, on_device.v_star)
+            within = WithinBar(fields, own.push, stress_bar, on_device.v_star)
             self._pressure_adjoint.from_within(self._counts, within, state_bar, self._rollout.parameters)
         else:
             self._from_fields(fields, state_bar)
@@ -222,11 +222,12 @@ class QuantityEvaluator:
         """Take the step, and return it with its pressures as far as they are wanted."""
         solver, rollout = self._solver, self._rollout
         rollout.forward(keep=False)
-        found = solver.sorted_pressures()
+        found = solver.pressures()
         if found is None:
             raise InputError("This scene is computed without a pressure of particles, so that there is none to see.")
-        pushes = np.array(found, dtype=np.float64)  # a copy: a replay overwrites what was found
-        pressures = Pressures(pushes, np.array(solver.sorted_stresses(), dtype=np.float64) if STRESS in names else None)
+        stresses = solver.stresses() if STRESS in names else None
+        stress = None if stresses is None else stresses.numpy().astype(np.float64)
+        pressures = Pressures(wp.clone(found), stress)  # a copy: a replay overwrites what was found
         self._counts = rollout.log.seek(0)
         rounds = rollout.diagnostics[solver.loops[0].iterations_name][0]
         self._rounds = [int(k) for k in np.atleast_1d(rounds)]
@@ -249,7 +250,9 @@ class QuantityEvaluator:
         whole = cast(PressureTangent, solver.tangent(along))
         whole.step(self._counts, state_dot, parameters)
         stresses = np.array(whole.stresses(self._rounds), dtype=np.float64) if STRESS in names else None
-        return whole, Pressures(np.array(whole.pressures(self._rounds), dtype=np.float64), stresses)
+        pushes = solver.numbers()
+        pushes.assign(whole.pressures(self._rounds))
+        return whole, Pressures(pushes, stresses)
 
     def _from_fields(self, fields: Fields, state_bar: State) -> None:
         adjoint, context = self._field_adjoint, self._solver.context(self._rollout.parameters)

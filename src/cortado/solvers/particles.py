@@ -254,14 +254,14 @@ class ParticleSolver(Staying):
             self.sort(state, parameters)
         return self.in_scene_order(self.fields["m"].numpy() * self.fields["n"].numpy())
 
-    def sorted_pressures(self) -> NDArray | None:
+    def pressures(self) -> wp.array | None:
         """Return the pressures (n,) with which sorted particles push walls in the last `step` [Pa], unless one was
         replayed since; None of a solver or a scene without pressures."""
         return None
 
-    def sorted_stresses(self) -> NDArray | None:
+    def stresses(self) -> wp.array | None:
         """Return the pressures (n,) that a gauge would read at sorted particles [Pa]."""
-        return self.sorted_pressures()
+        return self.pressures()
 
     def in_scene_order(self, values: NDArray) -> NDArray:
         """Return (n,) numbers of sorted particles in the scene's order, of a batch one scene behind the other."""

@@ -32,7 +32,6 @@ from functools import cache
 from typing import Any
 
 import warp as wp
-from numpy.typing import NDArray
 
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, pair_functions
@@ -274,8 +273,8 @@ class PcisphSteps(ParticleSolver):
         it = self.iterates
         self.unsort(self.context(parameters), it.x_star[iterations], it.v_star[iterations], new_state)
 
-    def sorted_pressures(self) -> NDArray | None:
-        return None if self.limits is None else self.iterates.p[1].numpy()
+    def pressures(self) -> wp.array | None:
+        return None if self.limits is None else self.iterates.p[1]
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
         """Do all of a step before the pressure iterations: sort and measure the density (`sort`), write the relaxation

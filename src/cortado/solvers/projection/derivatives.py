@@ -12,7 +12,7 @@ from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse import CoarseAdjoint, CoarseTangent
-from cortado.solvers.projection.mean_stress import pressed_adjoint_kernel
+from cortado.solvers.projection.mean_stress import pressed_kernels
 from cortado.solvers.projection.steps import IMPULSE, KICK, ProjectionSteps
 from cortado.solvers.projection.surroundings import SurroundingsAdjoint, SurroundingsTangent
 from cortado.solvers.solver import Counts, WithinBar
@@ -167,7 +167,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         state_bar.clear()
         self._begin(state_bar, parameters)
         context, known = solver.context(parameters), self.bar.named
-        pressed, k = pressed_adjoint_kernel(solver.layout.precision), self._last(counts)["k"]
+        (_, pressed), k = pressed_kernels(solver.layout.precision), self._last(counts)["k"]
         context.launch(pressed, *known, impulse=k, p_bar=within.p, impulse_bar=self._k_bar)
         if within.stress is not None:
             at = {"k": k, "T": solver.pull, "k_bar": self._k_bar, "q_bar": solver.numbers()}

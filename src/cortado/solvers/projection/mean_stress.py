@@ -194,12 +194,16 @@ def _mirror_work(d: Discretisation) -> Any:
 
 
 @cache
-def pressed_adjoint_kernel(precision: Precision) -> Any:
-    """Make the kernel that turns the adjoint of a pressure k / dt into those of its impulse k and of dt."""
-    real = precision.real
+def pressed_kernels(precision: Precision) -> tuple[Any, Any]:
+    """Make the kernel of a pressure p = k / dt from its impulse k, and that of its adjoint."""
+    real, module = precision.real, integration_module(precision, False)
 
-    @particle_kernel(integration_module(precision, False), "+impulse_bar +time_step_bar")
+    @particle_kernel(module, "p")
+    def pressed(time_step: real, impulse_i: real) -> real:
+        return impulse_i / time_step
+
+    @particle_kernel(module, "+impulse_bar +time_step_bar")
     def pressed_adjoint(time_step: real, impulse_i: real, p_bar_i: real) -> tuple[real, real]:
         return p_bar_i / time_step, -impulse_i / (time_step * time_step) * p_bar_i
 
-    return pressed_adjoint
+    return pressed, pressed_adjoint

@@ -37,7 +37,6 @@ from functools import cache, cached_property, partial
 from typing import Any
 
 import warp as wp
-from numpy.typing import NDArray
 
 from cortado.device.grid import Grid
 from cortado.device.modules import Kernels
@@ -51,7 +50,7 @@ from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.coarse import Coarse
 from cortado.solvers.projection.effects import effect_functions, weights_type
 from cortado.solvers.projection.lattice import ProjectionConstants
-from cortado.solvers.projection.mean_stress import MeanStress
+from cortado.solvers.projection.mean_stress import MeanStress, pressed_kernels
 from cortado.solvers.projection.pressure import PressureKernels, beginning_kernels, pressure_kernels
 from cortado.solvers.projection.repair import RepairKernels, repair_kernels
 from cortado.solvers.projection.sums import VelocityKernels, velocity_kernels
@@ -271,7 +270,8 @@ class ProjectionSteps(ParticleSolver):
         return self.density.around
 
     def wall_push(self) -> ProjectionPush:
-        return ProjectionPush(self.discretisation, self.layout, self.constants, self.lattice.volume)
+        own = self.discretisation, self.layout, self.constants, self.lattice.volume
+        return ProjectionPush(*own, self.system.walled.dimension)
 
     @cached_property
     def relaxed(self) -> dict[str, float]:
@@ -319,16 +319,22 @@ class ProjectionSteps(ParticleSolver):
         iterations, repairs = counts
         self._finish(self.context(parameters), iterations, repairs, new_state)
 
-    def sorted_pressures(self) -> NDArray:
-        return self._over_time(self.iterates[0]["k"])
+    def pressures(self) -> wp.array:
+        return self._over_time(self.iterates[0]["k"], "push")
 
-    def sorted_stresses(self) -> NDArray:
+    def stresses(self) -> wp.array:
         at = {"k": self.iterates[0]["k"], "T": self.pull}
-        return self._over_time(self.mean_stress.impulses(self.context(self.parameters), self.around, at))
+        return self._over_time(self.mean_stress.impulses(self.context(self.parameters), self.around, at), "stress")
 
-    def _over_time(self, impulses: wp.array) -> NDArray:
-        found: NDArray = impulses.numpy() / self.parameters["time_step"].numpy().repeat(self.layout.particles)
+    def _over_time(self, impulses: wp.array, name: str) -> wp.array:
+        pressed, found = pressed_kernels(self.layout.precision)[0], self._pressures[name]
+        self.context(self.parameters).launch(pressed, impulse=impulses, p=found)
         return found
+
+    @cached_property
+    def _pressures(self) -> dict[str, wp.array]:
+        """Make arrays of pressures when they are first asked for, as runs do without."""
+        return {"push": self.numbers(), "stress": self.numbers()}
 
     @cached_property
     def mean_stress(self) -> MeanStress:

@@ -15,21 +15,21 @@ The pressure of a particle pushes the walls of one solid along gamma_s / V,
 
     gamma_s = normal_s + e (whole_s - normal_s)
 
-with the sums above over the wall particles of the solid, and e from those over all walls. Loads are read now and then,
-so that gamma_s is put together off the device, in float64.
+with the sums above over the wall particles of the solid, and e from those over all walls.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
+from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import wall_sum
+from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm, solid_kernel
 from cortado.solvers.projection.lattice import ProjectionConstants
@@ -190,62 +190,72 @@ def _work(d: Discretisation) -> Any:
     return beside_work
 
 
-@dataclass(frozen=True)
-class _Sums:
-    """The sums over the walls of one solid and over all walls, arrays (n, 3)."""
+@cache
+def push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
+    """Make the kernels of gamma_s / V from the sums over the walls of a solid and over all walls, all without V;
+    ``least`` is 0.05 a_0 / V^2."""
+    precision = discretisation.precision
+    real, vector = precision.real, precision.vector
 
-    normal: NDArray
-    whole: NDArray
-    all_normal: NDArray
-    all_whole: NDArray
+    def make(module: Any) -> Any:
+        edge = edge_functions(precision, dimension, module).edge
+
+        def push(least: real, normal_i: vector, whole_i: vector, all_normal_i: vector, all_whole_i: vector) -> vector:
+            return normal_i + edge(all_normal_i, all_whole_i, least) * (whole_i - normal_i)
+
+        return push
+
+    bars = ["normal", "whole", "all_normal", "all_whole"]
+    modules = discretisation.modules(f"projection_push_{dimension}d")
+    return pointwise_kernels(precision, modules, make, ["push"], numbers=["least"], written=bars)
 
 
 class ProjectionPush:
     """The sums along which pressures of the projection push walls: a `cortado.sph.walls.WallAction`."""
 
-    def __init__(self, discretisation: Discretisation, layout: Layout, constants: ProjectionConstants, volume: float):
+    def __init__(
+        self,
+        discretisation: Discretisation,
+        layout: Layout,
+        constants: ProjectionConstants,
+        volume: float,
+        dimension: int,
+    ):
         """Prepare the sums over walls, for a particle's ``volume`` at rest [m^d]."""
-        self._layout = layout
-        self._normal, self._whole = (WallSums(term(discretisation), layout) for term in (normal_term, wall_slope_term))
-        self._least = DIRECTION * constants.least_diagonal / volume**2
+        self._kernels, self._layout = push_kernels(discretisation, dimension), layout
+        terms = {"normal": normal_term(discretisation), "whole": wall_slope_term(discretisation)}
+        self._sums = {name: WallSums(term, layout) for name, term in terms.items()}
+        self._all_sums = {f"all_{name}": WallSums(term, layout) for name, term in terms.items()}
+        self._least = {"least": constants.least_diagonal / volume**2}
 
     def total(self, step: StepContext, solid: int) -> wp.array:
-        at = self._sums(step, solid)
-        return self._on_device(at.normal + self._edge(at)[0] * (at.whole - at.normal))
+        found = self._arrays["push"]
+        step.launch(self._kernels.forward, self._totals(step, solid), self._least, push=found)
+        return found
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
-        at, change = self._sums(step, solid), self._sums(step, solid, dot)
-        (e, by_normal, by_whole), off = self._edge(at), at.whole - at.normal
-        e_dot = ((by_normal * change.all_normal) + (by_whole * change.all_whole)).sum(axis=1, keepdims=True)
-        return self._on_device(change.normal + e * (change.whole - change.normal) + e_dot * off)
+        found = self._arrays["push_dot"]
+        dots = {f"{name}_dot": sums.tangent(step, dot, over) for name, sums, over in self._each(solid)}
+        step.launch(self._kernels.tangent, self._totals(step, solid), dots, self._least, push_dot=found)
+        return found
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
         """Add to the adjoints of positions and solids by that of the total; the adjoint of v* gets nothing."""
-        at, own = self._sums(step, solid), np.asarray(total_bar.numpy(), dtype=np.float64)
-        e, by_normal, by_whole = self._edge(at)
-        e_bar = (own * (at.whole - at.normal)).sum(axis=1, keepdims=True)
-        for sums, share, slope in ((self._normal, 1.0 - e, by_normal), (self._whole, e, by_whole)):
-            sums.adjoint(step, bar, solid, self._on_device(share * own), v_star_bar)
-            sums.adjoint(step, bar, ALL_WALLS, self._on_device(e_bar * slope), v_star_bar)
+        bars = self._arrays
+        step.launch(self._kernels.adjoint, self._totals(step, solid), self._least, bars, push_bar=total_bar)
+        for name, sums, over in self._each(solid):
+            sums.adjoint(step, bar, over, bars[f"{name}_bar"], v_star_bar)
 
-    def _sums(self, step: StepContext, solid: int, dot: Tangents | None = None) -> _Sums:
-        """Read the sums over the walls of a solid and over all walls, or their tangents along ``dot``."""
+    def _each(self, solid: int) -> Iterator[tuple[str, WallSums, int]]:
+        """Yield the name of each sum, the sum, and the solid over whose walls it is taken."""
+        for own, over in ((self._sums, solid), (self._all_sums, ALL_WALLS)):
+            yield from ((name, sums, over) for name, sums in own.items())
 
-        def found(sums: WallSums, over: int) -> NDArray:
-            array = sums.total(step, over) if dot is None else sums.tangent(step, dot, over)
-            return np.array(array.numpy(), dtype=np.float64)  # a copy: the next sum overwrites the array
+    def _totals(self, step: StepContext, solid: int) -> dict[str, wp.array]:
+        return {name: sums.total(step, over) for name, sums, over in self._each(solid)}
 
-        return _Sums(*(found(sums, over) for over in (solid, ALL_WALLS) for sums in (self._normal, self._whole)))
-
-    def _edge(self, at: _Sums) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the edge factor e (n, 1) and its gradients (n, 3) with respect to normal and whole of all walls."""
-        normal, whole = at.all_normal, at.all_whole
-        square = (whole**2).sum(axis=1, keepdims=True)
-        below = square + self._least
-        off = (square - (normal**2).sum(axis=1, keepdims=True)) / below
-        t = np.clip((off - EDGED[0]) / (EDGED[1] - EDGED[0]), 0.0, 1.0)
-        slope = 6.0 * t * (1.0 - t) / (EDGED[1] - EDGED[0])
-        return t * t * (3.0 - 2.0 * t), -2.0 * slope / below * normal, 2.0 * slope * (1.0 - off) / below * whole
-
-    def _on_device(self, array: NDArray) -> wp.array:
-        return wp.array(array, dtype=self._layout.precision.vector, device=self._layout.device)
+    @cached_property
+    def _arrays(self) -> dict[str, wp.array]:
+        """Make arrays when they are first asked for, as runs do without."""
+        names = "push", "push_dot", *(f"{name}_bar" for name, _, _ in self._each(ALL_WALLS))
+        return self._layout.arrays(**dict.fromkeys(names, self._layout.precision.vector))
