@@ -14,7 +14,8 @@ from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series
 from cortado.losses.distances import SensorMatch
 from cortado.runs.quantity_values import QuantityEvaluator
-from cortado.runs.sensor import Readings, as_csv, from_csv, value_of
+from cortado.runs.sensor import Readings, SensorLog, as_csv, from_csv, value_of
+from cortado.runs.step_reader import StepReader
 from cortado.runs.waiting import Table
 from cortado.scene.shape_tables import NoContainer
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
@@ -276,7 +277,7 @@ MISTAKES = [
     (lambda: Series(PROBE, [1.0, 0.0], [1.0, 1.0], 0.1), "times must be"),
     (lambda: read_by(sensors={"p": PressureProbe}), "sensors has"),
     (lambda: read_by(sensors={"p": PressureProbe([0.0] * 3)}), "position has 3 components"),
-    (lambda: read_by(batch=2, sensors=IN_THE_PLANE), "sensors is given, but must be left"),
+    (lambda: read_by(batch=2, sensors={"own": Reference()}), "sensors has Reference as 'own', but sensors of a batch"),
     (lambda: plane(sensor=[{"kind": "probe", "name": "a"}]), "kind"),
     (lambda: plane(sensor=2 * [{"kind": "wall_force", "name": "a"}]), "another name"),
     (lambda: plane(sensor=[{"kind": "wall_force", "name": "a", "lower": [0.0]}]), "2 components"),
@@ -316,13 +317,6 @@ def test_a_sensor_has_places_of_its_own_and_a_region_may_have_no_end():
     assert read["open"].values.tobytes() == read["left"].values.tobytes()
 
 
-def test_a_batch_that_does_not_read_the_sensors_of_its_scene_says_so():
-    made = plane(sensor=[{"name": "probe", "kind": "pressure_probe", "position": [0.2, 0.1]}])
-    with pytest.warns(CortadoWarning, match="the sensors of the scene are not read in a batch"):
-        cortado.Simulation(made, batch=2).run(1)
-    assert cortado.Simulation(made).run(1).sensors
-
-
 def test_a_series_in_a_batch_is_that_of_each_scene():
     loss = Series(PROBE, [0.0, 0.0084], [1.0, 200.0], 0.0021)
     viscosities, alone = [0.05, 0.5], cortado.Problem(cortado.Simulation(plane()), 4, loss)
@@ -352,16 +346,16 @@ def test_an_interruption_between_two_sensors_keeps_what_was_read(cortado_command
     (tmp_path / "scene.toml").write_text(TINY_SCENE + TABLES)
     run = ("run", "scene.toml", "--steps", "6", "--record-every", "2", "--no-pictures", "--out")
     assert cortado_command(*run, "whole")[0] == 0
-    reads = []
+    reads, read = [], SensorLog.read
 
-    def interrupted(sensor, at):
-        reads.append(sensor)
+    def interrupted(log, name, *a):
+        reads.append(name)
         if len(reads) == 10:  # the second sensor of the state after four steps
             raise KeyboardInterrupt
-        return value_of(sensor, at)
+        read(log, name, *a)
 
     with monkeypatch.context() as patch:
-        patch.setattr("cortado.runs.sensor.value_of", interrupted)
+        patch.setattr(SensorLog, "read", interrupted)
         code, _, err = cortado_command(*run, "stopped")
     assert code == 130 and "Interrupted; " in err and "Traceback" not in err
     assert len(list(csv.reader((tmp_path / "stopped" / "sensors.csv").open()))) == 5
@@ -553,10 +547,10 @@ def test_sensors_that_need_a_step_share_it(monkeypatch):
     simulation, alone = cortado.Simulation(plane()), {}
     for name, sensor in sensors.items():
         alone |= simulation.run(5, sensors={name: sensor}).sensors
-    assert len(solved) == 2 * 6
+    assert len(solved) == 2  # of the last state alone: of all others the run's own steps tell
     solved.clear()
     together = simulation.run(5, sensors=sensors).sensors
-    assert len(solved) == 6 + 1  # of the first state the probe asks before anybody knows of the walls
+    assert len(solved) == 1
     for name, one in alone.items():
         assert one.values.tobytes() == together[name].values.tobytes(), name
 
@@ -606,6 +600,6 @@ def test_a_table_grows():
 
 def test_describe_counts_what_sensors_cost(monkeypatch):
     read = []
-    monkeypatch.setattr(Watch, "step", lambda own, step, state: read.append(step))
+    monkeypatch.setattr(StepReader, "read", lambda own, step, end, first, later: read.extend(range(step, end)))
     steps, _ = measured_speed(cortado.Simulation(plane(sensor=[{"kind": "wall_force", "name": "walls"}])))
     assert len(read) >= 3 * steps

@@ -1,7 +1,6 @@
 """A scene on a device in a precision: the thing that runs."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from hashlib import sha256
 from math import isqrt, prod
 from os import PathLike
@@ -37,7 +36,7 @@ from cortado.runs.quantity_values import Moment, QuantityEvaluator
 from cortado.runs.recording import recorded
 from cortado.runs.sensor import Sensor
 from cortado.runs.trajectory import Frame, Trajectory
-from cortado.runs.waiting import Table, Waiting
+from cortado.runs.waiting import Table
 from cortado.scene.discrete_scene import check_distance, discretise
 from cortado.scene.parameter_values import OVER_TIME, scene_values
 from cortado.scene.quantity_names import check_readable
@@ -238,30 +237,15 @@ class Simulation(Stepping):
             frames.add({**state.views(self.dimension, self._changing), **watch.frame(step, state)})
 
         record_frame(0, rollout.initial)
-        watch.step(0, rollout.initial)
-
-        def is_frame(step: int) -> bool:
-            return step % record_every == 0 or rollout.is_last(step)
-
-        def look(step: int, state: State) -> None:
-            if is_frame(step):
-                record_frame(step, state)
-            watch.step(step, state)
-
-        def keep(step: int, state: State) -> None:
-            if watch.reads or is_frame(step):
-                waiting.keep(step, state)
-
-        waiting = Waiting(look, rollout.initial, rollout.copies)
-        rollout.forward(keep, keep=False, meanwhile=waiting.look)
-        waiting.look()
-        unread = ["the sensors of the scene are not read in a batch."] if self.batch and self.scene.sensor else []
-        for sentence in (*trouble(rollout, self.scene), *unread):
+        watch.first()
+        last = watch.run(lambda step: step % record_every == 0 or rollout.is_last(step), record_frame)
+        for sentence in trouble(rollout, self.scene):
             warn(sentence)
-        fields = frames.arrays()
+        fields, constants = frames.arrays(), self.constants(rollout)
         own = {name: fields.pop(name) for name in watch.names}
-        found = recorded(rollout, self.scene, np.array(steps), fields, self.constants(rollout), own)
-        return replace(found, sensors=watch.readings()) if isinstance(found, Trajectory) else found  # type: ignore[return-value]  # of a batch
+        watch.end(last)
+        found: Any = recorded(rollout, self.scene, np.array(steps), fields, constants, own, watch.readings)
+        return found
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
         """Return the fields of a state that a trajectory records, as steps change them."""

@@ -1,21 +1,24 @@
 """Looking at a run's states while it runs: quantities of recorded frames, and sensors in every step."""
 
-from collections.abc import Iterable, Mapping
-from functools import cache
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache, partial
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import require_table
-from cortado.errors import InputError
-from cortado.losses.loss import Snapshot
+from cortado.errors import DivergedError, InputError
+from cortado.losses.loss import Snapshot, SnapshotBatch
 from cortado.particles.state import State
-from cortado.rollout.rollout import Rollout
+from cortado.rollout.rollout import Observer, Rollout
 from cortado.rollout.stepper import Steppable
-from cortado.runs.probes import sensors_of, warn_of_places
+from cortado.runs.probes import sensors_of
 from cortado.runs.quantity_values import Moment, QuantityEvaluator, Recorder
-from cortado.runs.sensor import Readings, Sensor, SensorLog
+from cortado.runs.sensor import Readings, Sensor, SensorLog, value_of
+from cortado.runs.sensor_places import warn_of_places
+from cortado.runs.step_reader import StepReader
+from cortado.runs.waiting import Waiting
 from cortado.scene.parameter_values import Arrays
 
 
@@ -25,6 +28,9 @@ class Watched(Steppable, Protocol):
     @property
     def walls(self) -> NDArray:
         """Positions (b, d) of wall particles [m]."""
+
+    def evaluator(self) -> QuantityEvaluator:
+        """Return the evaluator of quantities that uses the arrays of the simulation."""
 
     def rollout(self, steps: int, controls: Mapping[str, Any] | None, state: Any) -> Rollout:
         """Return a rollout that is ready to go forward."""
@@ -37,8 +43,8 @@ class Watched(Steppable, Protocol):
 
 
 class Watch:
-    """An observer of one rollout that computes quantities and reads sensors, with the arrays of another solver of the
-    scene, as the rollout's own are at work."""
+    """An observer of one rollout that computes quantities and reads sensors: those that are sums over particles on the
+    device, where the run goes on meanwhile, and others with the arrays of another solver of the scene."""
 
     def __init__(
         self,
@@ -47,53 +53,116 @@ class Watch:
         record: Iterable[str] = (),
         sensors: Mapping[str, Sensor] | None = None,
     ):
-        """Prepare to record quantities, and to read ``sensors`` besides those of the scene, which a batch does not
-        read. Raises `InputError` for unknown quantities, and for sensors of a batch."""
+        """Prepare to record quantities, and to read ``sensors`` besides those of the scene. Raises `InputError` for
+        unknown quantities, and for a batch with sensors of one's own."""
         if sensors is not None:
             require_table("sensors", sensors, "{'probe': cortado.sensors.PressureProbe([0.1, 0.1])}")
-        if sensors and simulation.batch is not None:
-            raise InputError("sensors is given, but must be left out, as a batch reads none: read one scene's.")
 
         @cache
         def evaluator() -> QuantityEvaluator:
             own, batch = simulation, simulation.batch
             return (own.in_precision(own.precision.name) if batch is None else own.batch_of(batch)).evaluator()
 
-        of_scene = sensors_of(simulation.scene) if simulation.batch is None else {}
-        warn_of_places(simulation, of_scene | dict(sensors or {}))
+        known = sensors_of(simulation.scene) | dict(sensors or {})
+        warn_of_places(simulation, known)
         self._recorder = Recorder(rollout, record, evaluator, simulation.dimension)
-        self._log = SensorLog(of_scene | dict(sensors or {}), simulation.dimension)
-        self._rollout, self._dimension, self._evaluator = rollout, simulation.dimension, evaluator
-        self._quantities = set[str]()
+        self._logs = [SensorLog(known, simulation.dimension) for _ in range(simulation.batch or 1)]
+        """One for each scene."""
+        self._rollout, self._simulation, self._evaluator = rollout, simulation, evaluator
+        self._on_host = {name: one for name, one in known.items() if not hasattr(one, "summed")}
+        if self._on_host and simulation.batch is not None:
+            name, own = next(iter(self._on_host.items()))
+            wanted = "sensors of a batch must be those of cortado.sensors: read one scene's"
+            raise InputError(f"sensors has {type(own).__name__} as {name!r}, but {wanted}.")
+        summed: Any = {name: one for name, one in known.items() if name not in self._on_host}
+        self._reader = StepReader(simulation.evaluator(), rollout, summed) if summed else None
+        """What reads sensors on the device; None where it has none to read."""
+        self._quantities = set[str](() if self._reader is None else self._reader.quantities)
         """Those that sensors read of a state."""
         self._colours = np.array([phase.colour for phase in simulation.scene.phase])
         self.names = self._recorder.names
         """Of the quantities that are recorded."""
 
+    def run(
+        self,
+        is_frame: Callable[[int], bool],
+        record: Observer,
+        observe: Callable[[int], None] | None = None,
+    ) -> State:
+        """Run the rollout forward and return its last state. Sensors read every state; ``record`` is given those that are
+        frames, while a GPU takes the next steps; ``observe`` is called with the number of each. Raises
+        `DivergedError` after the good states were looked at."""
+
+        def look(step: int, state: State) -> None:
+            if is_frame(step):
+                record(step, state)
+            self._step(step, state)
+
+        def keep(step: int, state: State) -> None:
+            if self._on_host or is_frame(step):
+                waiting.keep(step, state)
+            if observe is not None:
+                observe(step)
+
+        def look_at_all() -> None:
+            waiting.look()
+            if self._reader is not None:
+                for row in self._reader.rows():
+                    self._logs[row.member].read(row.sensor, row.number, row.reading)
+
+        waiting = Waiting(look, self._rollout.initial, self._rollout.copies)
+        try:
+            last = self._rollout.forward(keep, keep=False, meanwhile=look_at_all, reader=self._reader)
+        except DivergedError:
+            look_at_all()
+            raise
+        look_at_all()
+        return last
+
+    def first(self) -> None:
+        """Let sensors of one's own read the first state, before the run."""
+        self._step(0, self._rollout.initial)
+
     def frame(self, step: int, state: State) -> Arrays:
         """Return the recorded quantities of a state after so many steps, by name."""
         return self._recorder(step, state)
 
-    @property
-    def reads(self) -> bool:
-        """True if there is a sensor, which reads every state."""
-        return bool(self._log.sensors)
+    def _step(self, step: int, state: State) -> None:
+        """Make the sensors of one's own read a state after so many steps."""
+        if self._on_host:
+            at: Any = self._snapshot(step, state, self._evaluator)
+            for name, sensor in self._on_host.items():
+                self._logs[0].read(name, step, partial(value_of, sensor, at))
 
-    def step(self, step: int, state: State) -> None:
-        """Make the sensors read a state after so many steps; it is called for every state in its turn."""
-        if self.reads:
-            moment = Moment.of(self._rollout, step, state, self._evaluator, self._quantities)
-            self._log.read(Snapshot(state, self._dimension, self._colours, moment))
+    def end(self, state: State) -> None:
+        """Make the sensors read the last state, after a run to its end, with the arrays of the simulation."""
+        if self._reader is None:
+            return
+        step = self._rollout.taken
+        at = self._snapshot(step, state, self._simulation.evaluator)
+        for member, log in enumerate(self._logs):
+            own = at if isinstance(at, Snapshot) else at[member]
+            for name, sensor in self._reader.sensors.items() if member not in self._rollout.lost else ():
+                log.read(name, step, partial(value_of, sensor, own))
+
+    def _snapshot(
+        self, step: int, state: State, evaluator: Callable[[], QuantityEvaluator]
+    ) -> Snapshot | SnapshotBatch:
+        moment = Moment.of(self._rollout, step, state, evaluator, self._quantities)
+        d, batch = self._simulation.dimension, self._simulation.batch
+        if batch is None:
+            return Snapshot(state, d, self._colours, moment)
+        return SnapshotBatch(state, d, np.array([self._colours] * batch), moment)
 
     def known(self, readings: Mapping[str, Readings]) -> float:
         """Return the last step of which an earlier process has left all readings; infinite without sensors."""
-        return self._log.known(readings)
+        return self._logs[0].known(readings)
 
     def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
         """Take over sensor readings by an earlier process of the first states, up to that after ``steps`` steps."""
-        self._log.go_on(steps, readings)
+        self._logs[0].go_on(steps, readings)
 
-    def readings(self) -> dict[str, Readings]:
-        """Return the readings of the sensors, by their names."""
-        clock, steps = self._rollout.clocks[0], np.arange(self._rollout.steps + 1)
-        return self._log.readings(clock.times(steps, float(self._rollout.time_steps[0])))
+    def readings(self, member: int = 0) -> dict[str, Readings]:
+        """Return the readings of the sensors of a scene, by their names."""
+        clock, steps = self._rollout.clocks[member], np.arange(self._rollout.steps + 1)
+        return self._logs[member].readings(clock.times(steps, float(self._rollout.time_steps[member])))

@@ -169,15 +169,21 @@ class Domain:
         """Return the images of points (n, d) [m] that are in a region between corners (d,) [m], or behind its lower
         corner where none is, and a mask (n,) of those in it. An end that is infinite is that of the period, if there is
         one; a region that is longer than the period is the period."""
+        start, lower, upper = self.ends(lower, upper)
+        lengths = np.array(self.lengths)
+        images = start + wrapped(points - start, lengths) if lengths.any() else points
+        images = np.where(lengths > 0.0, images, points)
+        return images, np.all((images >= lower) & (images < upper), axis=1)
+
+    def ends(self, lower: Points, upper: Points) -> tuple[Points, Points, Points]:
+        """Return where the images begin that `within` looks at, finite along periods, and the corners of its region
+        (d,) [m]."""
         begin, lengths = np.array(self.lower), np.array(self.lengths)
         start = np.where(np.isfinite(lower), lower, begin)
         end = np.where(np.isfinite(upper), upper, begin + lengths)
         whole = (lengths > 0.0) & (end - start >= lengths)
         start, end = np.where(whole, begin, start), np.where(whole, np.inf, end)
-        lower, upper = np.where(lengths > 0.0, start, lower), np.where(lengths > 0.0, end, upper)
-        images = start + wrapped(points - start, lengths) if lengths.any() else points
-        images = np.where(lengths > 0.0, images, points)
-        return images, np.all((images >= lower) & (images < upper), axis=1)
+        return start, np.where(lengths > 0.0, start, lower), np.where(lengths > 0.0, end, upper)
 
     def ways(self, points: Points, place: Points, reach: float, seen: Callable[[Points], Points]) -> list[Points]:
         """Return ``seen`` of the vectors from a place (d,) to all images of points (n, d) within a reach [m]: arrays
@@ -186,16 +192,23 @@ class Domain:
 
         Images that ``seen`` does not tell apart count once: as those within the period.
         """
+        steps, inverse, shifts = self.images(reach, seen)
+        way = seen(self.wrapped(points) - place)
+        if len(steps):
+            way = way - np.rint(way @ inverse) @ steps
+        return [way + shift for shift in shifts] if len(steps) else [way]
+
+    def images(self, reach: float, seen: Callable[[Points], Points]) -> tuple[Points, Points, Points]:
+        """Return the translations (m, k) [m] between the images that ``seen`` tells apart, their inverse (k, m), and
+        the shifts (i, k) [m] from the nearest image to all within a reach [m] of a place."""
         lengths = np.array(self.lengths)
-        if not lengths.any():
-            return [seen(points - place)]
-        way, steps = seen(self.wrapped(points) - place), _independent(seen(np.eye(len(lengths))), lengths)
+        steps = _independent(seen(np.eye(len(lengths))), lengths) if lengths.any() else np.zeros((0, 0))
         if not len(steps):
-            return [way]
+            return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((1, 1))
         inverse = np.linalg.pinv(steps)
-        way = way - np.rint(way @ inverse) @ steps
         most = np.floor(reach * np.linalg.norm(inverse, axis=0) + 0.5).astype(int)
-        return [way + np.array(turns) @ steps for turns in product(*(range(-k, k + 1) for k in most))]
+        turns = np.array(list(product(*(range(-k, k + 1) for k in most))), dtype=np.float64)
+        return steps, np.asarray(inverse, dtype=np.float64), turns @ steps
 
 
 WITHOUT_PERIODS = Domain((), ())

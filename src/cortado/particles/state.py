@@ -268,6 +268,10 @@ class StateSeries:
         arrays = {field.name: own.get(field.name, self._like[field.name]) for field in self._like.fields}
         return State(self._like.fields, arrays, self._like.batch)
 
+    def whole(self, name: str) -> wp.array:
+        """Return a field of all states, one behind the other, as an array."""
+        return self._whole.get(name, self._like[name])
+
     def like(self) -> Self:
         """Allocate a series of equal length, still to be written."""
         return type(self)(self._like, self._length)

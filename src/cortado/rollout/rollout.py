@@ -23,6 +23,7 @@ from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Parameters, State, StateSeries
 from cortado.rollout.checkpoints import MEMORY_BUDGET, Checkpoints, Progress, checkpoint_interval
+from cortado.rollout.chunk_reader import Beside, ChunkReader
 from cortado.rollout.divergence import diverged
 from cortado.rollout.step_sizes import StepSizes
 from cortado.scene.restart import Clock, Origin
@@ -125,10 +126,14 @@ class Rollout(Staying):
         """The states of the last chunk."""
         self._tangent: tuple[Parameters, StepTangent, State] | None = None
         """The last one, with the tangents of the parameters that it was made for, and that of the present state."""
-        self._generation, self._is_warm = -1, False
+        self._generation = -1
         self._forget_stale_graphs()
         self.copies: list[State] = []
         """Memory of the host for states that observers have yet to look at, kept from run to run."""
+        self.beside: dict[tuple[str, ...], Beside] = {}
+        """What was launched beside steps, by the names of what it computes, kept from run to run."""
+        self.longest_chunk = length
+        """Greatest number of steps in a chunk."""
         self.goes_on = False
         """Whether the first state was given whole, so that it depends on no parameter."""
         self.evaluation = 0
@@ -167,11 +172,15 @@ class Rollout(Staying):
 
     @in_turn
     def forward(
-        self, observe: Observer | None = None, keep: bool = True, meanwhile: Callable[[], None] | None = None
+        self,
+        observe: Observer | None = None,
+        keep: bool = True,
+        meanwhile: Callable[[], None] | None = None,
+        reader: ChunkReader | None = None,
     ) -> State:
         """Run all steps, or those up to the end of its time, and return the last state, which the next run overwrites.
         ``observe`` is given every state; ``keep`` checkpoints for a way back; ``meanwhile`` is called while a GPU takes
-        the next steps. Raises `DivergedError` after the good
+        the next steps; a ``reader`` reads states on the device. Raises `DivergedError` after the good
         states were observed; a batch goes on without the scenes that have ``lost`` a particle."""
         self._kept = self._run = -1
         self._spare += self._checkpoints.release()
@@ -187,13 +196,13 @@ class Rollout(Staying):
             while step < self.steps and not ended:
                 last = step + self._length(self.steps - step)
                 self._buffer.assign(state)  # which may be one of the states that steps overwrite
-                chunk = self._advance(step, last)
+                chunk = self._advance(step, last, reader)
                 if meanwhile is not None:
                     meanwhile()
                 while self.solver.make_room() or self.step_sizes.again(step, last):
                     self._forget_stale_graphs()
                     self.solver.reset(step)
-                    chunk = self._advance(step, last)
+                    chunk = self._advance(step, last, reader)
                 end, ended = self.step_sizes.read(step, last)
                 chunk = chunk[: end - step]
                 lost = {b: one for b, one in self.solver.containment.lost().items() if one.step < end}
@@ -201,6 +210,8 @@ class Rollout(Staying):
                     known = [self._buffer, *chunk[: lost[b].step + 1 - step]]
                     self.lost[b] = diverged(self.solver, b, lost[b], known, self.advice(b))
                 stops = bool(lost) and self.solver.layout.batch is None
+                if reader is not None:
+                    reader.read(step, lost[0].step + 1 if stops else end, self._buffer, self._series)
                 for number, new_state in enumerate(chunk[: lost[0].step - step] if stops else chunk, step + 1):
                     if observe is not None:
                         observe(number, new_state)
@@ -218,16 +229,18 @@ class Rollout(Staying):
             self._kept = self.evaluation
         return state
 
-    def _advance(self, first: int, last: int) -> list[State]:
+    def _advance(self, first: int, last: int, reader: ChunkReader | None) -> list[State]:
         """Take steps ``first`` to ``last`` from the buffered state, and return the states after them, which the next
         chunk overwrites."""
-        length = last - first
-        if not self._is_warm and self._device.is_cuda:
-            self._warm_up(first)
+        length, beside = last - first, None if reader is None else reader.beside
+        if self._device.is_cuda and beside not in self._warm:
+            self._warm_up(first, beside)
         self._begin_at(first)
-        if is_new := length not in self._chunks:
-            self._chunks[length] = CapturedGraph(partial(self._take, length), self.solver.launch, self._is_warm)
-        self._chunks[length]()
+        key = length, beside
+        if is_new := key not in self._chunks:
+            work = partial(self._take, length, beside)
+            self._chunks[key] = CapturedGraph(work, self.solver.launch, beside in self._warm)
+        self._chunks[key]()
         if is_new and (self.solver.step_number.numpy() != last).any():  # then no lost particle would be noticed
             name = type(self.solver).__name__
             raise InputError(
@@ -241,22 +254,24 @@ class Rollout(Staying):
         length = min(len(self._chunk), self.step_sizes.longest_chunk, left)
         return length if self.steps == self.room or length < left else 1 << (length.bit_length() - 1)
 
-    def _warm_up(self, first: int) -> None:
+    def _warm_up(self, first: int, beside: Beside | None) -> None:
         """Take one step by launches, as a capture must not load modules or allocate, and take it back."""
         self._begin_at(first)
-        self._take(1)
+        self._take(1, beside)
         is_short = self.solver.make_room()
         self._forget_stale_graphs()
         self.solver.reset(first)
         if is_short:
-            self._warm_up(first)
-        self._is_warm = True
+            self._warm_up(first, beside)
+        self._warm.add(beside)
 
-    def _take(self, length: int) -> None:
-        """Launch ``length`` steps from the buffered state."""
+    def _take(self, length: int, beside: Beside | None) -> None:
+        """Launch ``length`` steps from the buffered state, and what is launched beside each."""
         state = self._buffer
-        for new_state in self._chunk[:length]:
+        for number, new_state in enumerate(self._chunk[:length]):
             self.solver.step(state, new_state, self.parameters, self.log)
+            if beside is not None:
+                beside.launch(number, self.parameters)
             self.step_sizes.choose(new_state)
             state = new_state
 
@@ -264,9 +279,9 @@ class Rollout(Staying):
         """Drop captured graphs where this rollout or another has replaced arrays of the solver."""
         if self._generation == self.solver.generation:
             return
-        self._generation, self._is_warm = self.solver.generation, False
-        self._chunks: dict[int, CapturedGraph] = {}
-        """Graphs by their number of steps."""
+        self._generation, self._warm = self.solver.generation, set[Beside | None]()
+        self._chunks: dict[tuple[int, Beside | None], CapturedGraph] = {}
+        """Graphs by their number of steps, and what is launched beside them."""
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
         self._steps_along: dict[Counts, CapturedGraph] = {}
 

@@ -17,9 +17,21 @@ from cortado.device.threads import Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Fields, Parameters, State
 from cortado.rollout.rollout import Rollout
-from cortado.runs.quantity_formulas import OnDevice, Particles, Pressures, Sums, formulas
+from cortado.runs.quantity_formulas import (
+    Density,
+    OnDevice,
+    OnDeviceFormula,
+    Particles,
+    Pressure,
+    Pressures,
+    QuantityFormula,
+    SpeedQuantity,
+    Sums,
+    Vorticity,
+)
+from cortado.runs.wall_loads import SolidLoadQuantity, WallForceQuantity, WallLoads
 from cortado.scene.parameter_values import Arrays
-from cortado.scene.quantity_names import LOAD, QUANTITIES, check_quantity, is_load
+from cortado.scene.quantity_names import LOAD, QUANTITIES, check_quantity, is_load, load_name
 from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
@@ -112,7 +124,7 @@ class QuantityEvaluator:
         solver without particles."""
         if not isinstance(solver, ParticleSolver):
             raise InputError("The solver of this scene does not say what lies around its particles: no quantities.")
-        self._solver, self._dimension = solver, scene.dimension
+        self.solver, self.dimension = solver, scene.dimension
         self.lattice = solver.lattice
         """Constants of the lattice of particles at rest."""
         self.solids: tuple[SolidTable, ...] = scene.solid
@@ -127,7 +139,11 @@ class QuantityEvaluator:
     @property
     def turn(self) -> Turn:
         """Return the lock that a thread holds while it uses the solver."""
-        return self._solver.turn
+        return self.solver.turn
+
+    def within(self, names: Iterable[str]) -> dict[str, OnDeviceFormula]:
+        """Return by name the formulas of quantities that need a step, for steps of the solver that others take."""
+        return {name: cast(OnDeviceFormula, self._formulas[name]) for name in self._checked(names)}
 
     @in_turn
     def values(self, names: Iterable[str], moment: Moment) -> Arrays:
@@ -142,7 +158,7 @@ class QuantityEvaluator:
     ) -> Arrays:
         """Return tangents of quantities along those of the state, by fields, and of the parameters of the step, as
         `Moment` has them."""
-        wanted, solver = self._checked(names), self._solver
+        wanted, solver = self._checked(names), self.solver
         at, sums = self._begin(wanted, moment, replay=True)
         state_dot, along = solver.new_state(), solver.new_parameters(1)
         state_dot.set(dot)
@@ -156,7 +172,7 @@ class QuantityEvaluator:
     def adjoint(self, bars: Mapping[str, NDArray], moment: Moment) -> tuple[Arrays, Arrays]:
         """Turn adjoints of quantities, by name, into those of the state, by fields, and of the parameters of the step,
         as `Moment` has them but with an axis for the scenes."""
-        wanted, solver = self._checked(bars), self._solver
+        wanted, solver = self._checked(bars), self.solver
         at, sums = self._begin(wanted, moment, replay=True)
         solved = any(map(_needs_the_step, wanted))
         adjoint = self._pressure_adjoint if solved else self._field_adjoint
@@ -179,7 +195,7 @@ class QuantityEvaluator:
             self._from_fields(fields, state_bar)
         parameters = adjoint.collect()
         found = {name: parameters[name].numpy().astype(np.float64) for name in parameters.names}
-        state = state_bar.numpy(self._dimension)
+        state = state_bar.numpy(self.dimension)
         return {name: array.astype(np.float64) for name, array in state.items()}, found
 
     def _checked(self, names: Iterable[str]) -> list[str]:
@@ -189,7 +205,7 @@ class QuantityEvaluator:
             if not is_load(name):
                 check_quantity(name)
             elif name not in self._formulas:
-                solids = ", ".join(self._solver.system.solids) or "none"
+                solids = ", ".join(self.solver.system.solids) or "none"
                 raise InputError(f"{name!r} is of the solid {name.removesuffix(LOAD)!r}, but the scene has {solids}.")
         return wanted
 
@@ -207,10 +223,10 @@ class QuantityEvaluator:
             context, pressures = self._solve(names, replay)
         else:
             context, pressures = self._look_around(moment.substeps), None
-        return Particles.of(self._solver.fields, pressures), Sums(self._solver, context)
+        return Particles.of(self.solver.fields, pressures), Sums(self.solver, context)
 
     def _look_around(self, substeps: int) -> StepContext:
-        solver, rollout = self._solver, self._rollout
+        solver, rollout = self.solver, self._rollout
         solver.set_substeps(substeps)
         solver.reset()
         context = solver.sort(rollout.initial, rollout.parameters)
@@ -220,7 +236,7 @@ class QuantityEvaluator:
 
     def _solve(self, names: Iterable[str], replay: bool) -> tuple[StepContext, Pressures]:
         """Take the step, and return it with its pressures as far as they are wanted."""
-        solver, rollout = self._solver, self._rollout
+        solver, rollout = self.solver, self._rollout
         rollout.forward(keep=False)
         found = solver.pressures()
         if found is None:
@@ -242,7 +258,7 @@ class QuantityEvaluator:
         self, names: Iterable[str], state_dot: State, along: Parameters
     ) -> tuple[ParticleTangent | PressureTangent, Pressures | None]:
         """Return the tangent of the sorted particles, and of their pressures."""
-        solver, parameters = self._solver, self._rollout.parameters
+        solver, parameters = self.solver, self._rollout.parameters
         if not any(map(_needs_the_step, names)):
             own = ParticleTangent(solver, along)
             own.sort(solver.context(parameters), state_dot)
@@ -255,45 +271,61 @@ class QuantityEvaluator:
         return whole, Pressures(pushes, stresses)
 
     def _from_fields(self, fields: Fields, state_bar: State) -> None:
-        adjoint, context = self._field_adjoint, self._solver.context(self._rollout.parameters)
+        adjoint, context = self._field_adjoint, self.solver.context(self._rollout.parameters)
         adjoint.density.begin()
         adjoint.bar.fields.assign(fields)
         adjoint.mix(context, state_bar)
-        adjoint.sort(context, state_bar, **{f.name: adjoint.carried_bar[f.name] for f in self._solver.carried_fields})
+        adjoint.sort(context, state_bar, **{f.name: adjoint.carried_bar[f.name] for f in self.solver.carried_fields})
 
     @cached_property
     def _rollout(self) -> Rollout:
         """Make a rollout of one step."""
-        return Rollout(self._solver, 1)
+        return Rollout(self.solver, 1)
 
     @cached_property
     def _field_adjoint(self) -> ParticleAdjoint:
-        return ParticleAdjoint(self._solver, 1)
+        return ParticleAdjoint(self.solver, 1)
 
     @cached_property
     def _pressure_adjoint(self) -> "StepWithin":
-        return cast(StepWithin, self._solver.adjoint(1))
+        return cast(StepWithin, self.solver.adjoint(1))
 
     # ---- orders --------------------------------------------------------------------------------------------------
 
     @property
     def _order(self) -> NDArray:
-        return self._solver.search.order.numpy()[: self._solver.layout.all_particles]
+        return self.solver.search.order.numpy()[: self.solver.layout.all_particles]
 
     def _shown(self, name: str, values: NDArray) -> NDArray:
         """Return a quantity in the scene's order; loads on solids have none."""
         if is_load(name):
-            return values[0] if self._solver.layout.batch is None else values
+            return values[0] if self.solver.layout.batch is None else values
         found = np.empty(values.shape)
         found[self._order] = values
-        batch = self._solver.layout.batch
+        batch = self.solver.layout.batch
         return found if batch is None else found.reshape(batch, -1, *found.shape[1:])
 
     def _sorted(self, name: str, values: NDArray) -> NDArray:
         if is_load(name):
-            return np.asarray(values, dtype=np.float64).reshape(self._solver.layout.members, -1)
-        flat = values if self._solver.layout.batch is None else values.reshape(-1, *values.shape[2:])
+            return np.asarray(values, dtype=np.float64).reshape(self.solver.layout.members, -1)
+        flat = values if self.solver.layout.batch is None else values.reshape(-1, *values.shape[2:])
         return np.asarray(flat, dtype=np.float64)[self._order]
+
+
+def formulas(solver: ParticleSolver, dimension: int, circulation_factor: float) -> dict[str, QuantityFormula]:
+    """Make the formulas of a solver's particles, and of the loads on its solids, by their names."""
+    loads = WallLoads(solver)
+    return {
+        "density": Density(),
+        "pressure": Pressure(solver),
+        "speed": SpeedQuantity(),
+        "vorticity": Vorticity(circulation_factor, dimension),
+        "wall_force": WallForceQuantity(loads, dimension),
+        **{
+            load_name(name): SolidLoadQuantity(loads, solver, solid, dimension)
+            for name, solid in solver.system.solids.items()
+        },
+    }
 
 
 def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:

@@ -1,6 +1,6 @@
 """Which states of a run become frames, every so many steps or so many in a second, and the trajectories of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Any, Protocol, overload
@@ -12,6 +12,7 @@ from cortado.errors import DivergedError, InputError
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.step_bounds import expected_frames
 from cortado.runs.frames import Marks
+from cortado.runs.sensor import Readings
 from cortado.runs.solid_motion import solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameter_values import Arrays
@@ -163,10 +164,17 @@ class TrajectoryBatch(Sequence[Trajectory]):
 
 
 def recorded(
-    rollout: Rollout, scene: Scene, steps: np.ndarray, fields: Arrays, constants: Arrays, quantities: Arrays
+    rollout: Rollout,
+    scene: Scene,
+    steps: np.ndarray,
+    fields: Arrays,
+    constants: Arrays,
+    quantities: Arrays,
+    readings: Callable[[int], Mapping[str, Readings]],
 ) -> Trajectory | TrajectoryBatch:
     """Make the trajectory of a scene from fields (frames, ...) after numbers of steps (frames,), in a batch (frames,
-    batch, ...), and from the fields that no step changes, with ``quantities`` (frames, ...) of the same frames."""
+    batch, ...), and from the fields that no step changes. Beside them are ``quantities`` (frames, ...) of the same
+    frames, and ``readings`` of sensors by the number of the scene."""
 
     def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
         own = {name: array[kept][at] for name, array in fields.items()}
@@ -185,6 +193,7 @@ def recorded(
             substeps=rollout.substeps,
             origin=rollout.origins[number],
             quantities={name: array[kept][at] for name, array in quantities.items()},
+            sensors=readings(number),
         )
 
     batch = rollout.solver.layout.batch

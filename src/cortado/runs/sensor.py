@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import as_numbers, as_one_number, read_only, require_methods, unit
-from cortado.discretise.shapes import grid
 from cortado.errors import DivergedError, InputError, shown
 from cortado.files.disk import read_columns
 from cortado.scene.discrete_scene import Lattice
@@ -32,8 +31,8 @@ class Cut(Protocol):
         """Return the constants of the particles at rest, such as their volume and the axes along which they repeat."""
 
 
-class Reading(Cut, Protocol):
-    """A state as sensors see it: a `cortado.losses.Snapshot`."""
+class SensedScene(Cut, Protocol):
+    """A scene cut into particles, and what stands in it, as sensors prepare for it."""
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
@@ -42,6 +41,10 @@ class Reading(Cut, Protocol):
     @property
     def container(self) -> Container:
         """Return the container of the scene."""
+
+
+class Reading(SensedScene, Protocol):
+    """A state as sensors see it: a `cortado.losses.Snapshot`."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return a field of the state or a quantity of its particles, float64."""
@@ -60,117 +63,8 @@ class Sensor(Protocol):
         """Turn the adjoint (k,) of the sensor's reading into those of fields and quantities, by name."""
 
 
-ACROSS = {1: 1.5, 2: 7.0 / np.pi}
-"""Factor of w, over the reach to the number of dimensions, with which it has the integral 1."""
-LEAST_REACH = 5.0
-"""In spacings: with it the weights of a lattice add up to 1 within 0.1 %, wherever a plane or a column lies in it."""
-MOST_PARTS = 40
-"""Most parts along an axis: enough for a reach of half a spacing, and less is warned of."""
 TIME = "time [s]"
 """The first column of a table of readings."""
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights w(q) = (1 - q)^4 (1 + 4 q) of a distance q in units of a reach (Wendland 1995), 0 beyond."""
-
-    values: NDArray[Any]
-    """w"""
-    slopes: NDArray[Any]
-    """w'(q) / q"""
-
-    @classmethod
-    def of(cls, q: NDArray[Any]) -> "Weights":
-        """Compute the weights at distances (n,)."""
-        rest = np.clip(1.0 - q, 0.0, None)
-        return cls(rest**4 * (1.0 + 4.0 * q), -20.0 * rest**3)
-
-
-Across = Callable[[NDArray[Any]], NDArray[Any]]
-"""A sensor's view of ways (n, d): a linear function to ways (n, k)."""
-
-
-@dataclass(frozen=True)
-class Image:
-    """One image of all particles, or of all their parts in one place of their cells, that weigh something."""
-
-    near: NDArray[np.int_]
-    """(m,) numbers of the particles"""
-    ways: NDArray[Any]
-    """(m, k) ways from the place to them [m]"""
-    weights: Weights
-    """(m,) their weights"""
-
-
-@dataclass(frozen=True)
-class Seen:
-    """The particles around a place, along periodic axes with all of their images that are near."""
-
-    images: list[Image]
-    """Images of each of the parts of a particle, near the place."""
-    particles: int
-    """Number n of particles."""
-    parts: int
-    """Number of parts into which a particle is divided."""
-    reach: float
-    """Distance [m] from which on particles weigh nothing."""
-
-    @classmethod
-    def of(
-        cls, at: Reading, place: NDArray[Any], reach: float, across: Across, parts: NDArray[Any] | None = None
-    ) -> "Seen":
-        """Find particles around a place (d,) as ``across`` shows them. ``parts`` (m, d) are the places of the parts of
-        a particle from it [m], which weigh the same; a particle is one point if they are left out."""
-        shifts = np.zeros((1, at.dimension)) if parts is None else parts
-        seen, widest = across(shifts), reach + float(np.linalg.norm(across(shifts), axis=1).max())
-        in_dimension("position", place, at.dimension)
-        positions, domain, numbers = at["positions"], at.lattice.domain, np.arange(len(at["positions"]))
-        if not any(domain.lengths):  # most particles are far away
-            axes = across(np.eye(at.dimension))
-            axes = axes[:, axes.any(axis=0)]
-            rough = positions @ axes
-            rough -= place @ axes
-            numbers = np.flatnonzero(np.einsum("ij,ij->i", rough, rough) < (1.0 + 1e-9) * widest**2)
-        images = []
-        for way in domain.ways(positions[numbers], place, widest, across):
-            close = np.flatnonzero(np.linalg.norm(way, axis=1) < widest)
-            for shift in seen:
-                own = way[close] + shift
-                images.append(Image(numbers[close], own, Weights.of(np.linalg.norm(own, axis=1) / reach)))
-        return cls(images, len(at["positions"]), len(shifts), reach)
-
-    @property
-    def weights(self) -> NDArray[Any]:
-        """Return the weights (n,) of particles, the mean over their parts, summed over their images."""
-        found = np.zeros(self.particles)
-        for image in self.images:
-            found[image.near] += image.weights.values
-        return found / self.parts
-
-    def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
-        """Return the derivative (n, k) with respect to the ways, from that with respect to the weights, (n,)."""
-        each, found = np.broadcast_to(factors, self.particles), np.zeros((self.particles, self.images[0].ways.shape[1]))
-        for image in self.images:
-            found[image.near] += (each[image.near] * image.weights.slopes / self.reach**2)[:, None] * image.ways
-        return found / self.parts
-
-
-def reach_of(given: float | None, at: Cut) -> float:
-    """Return the distance [m] from a plane or an axis at which particles count: the given one, or else two support
-    radii, or five spacings where these are more."""
-    if given is not None:
-        return given
-    return max(2.0 * at.lattice.support, LEAST_REACH * at.lattice.cell ** (1.0 / at.dimension))
-
-
-def parts_of(reach: float, at: Reading, across: Across, axes: int) -> NDArray[Any]:
-    """Return the places (m, d) of parts of a particle from it [m]: evenly in its cell along ``axes`` axes, those that
-    are seen best, with `LEAST_REACH` of them to a reach, as then the weights of a lattice add up to 1."""
-    spacing = at.lattice.cell ** (1.0 / at.dimension)
-    count = min(int(np.ceil(LEAST_REACH * spacing / reach * (1.0 - 1e-9))), MOST_PARTS)
-    best = np.argsort(-np.linalg.norm(across(np.eye(at.dimension)), axis=1), kind="stable")[:axes]
-    along = spacing * ((np.arange(count) + 0.5) / count - 0.5)
-    return grid([along if axis in best else np.zeros(1) for axis in range(at.dimension)])
 
 
 def load_columns(dimension: int) -> dict[str, str]:
@@ -269,12 +163,17 @@ class SensorLog:
                 raise InputError(f"sensors has {shown(sensor)} as {name!r}, but must have a sensor of cortado.sensors.")
         self.sensors = dict(sensors)
         self._units = {name: dict(sensor.columns(dimension)) for name, sensor in self.sensors.items()}
-        self._rows: list[dict[str, NDArray[Any]]] = []
-        """One for each state that all sensors have read: an interruption leaves whole rows."""
+        self._rows: dict[str, list[NDArray[Any]]] = {name: [] for name in self.sensors}
+        """Readings (k,) of each sensor, state by state."""
 
-    def read(self, at: Reading) -> None:
-        """Let every sensor read a state."""
-        self._rows.append({name: self._value(name, sensor, at) for name, sensor in self.sensors.items()})
+    def read(self, name: str, number: int, reading: Callable[[], NDArray[Any]]) -> None:
+        """Note the reading (k,) of a sensor of a state by its number, unless it is known: NaN where the next step loses
+        a particle, for which the run raises the error itself."""
+        if number == len(self._rows[name]):
+            try:
+                self._rows[name].append(reading())
+            except DivergedError:
+                self._rows[name].append(np.full(len(self._units[name]), np.nan))
 
     def known(self, readings: Mapping[str, Readings]) -> float:
         """Return the last step of which there are all readings of these sensors; infinite without sensors."""
@@ -284,22 +183,13 @@ class SensorLog:
 
     def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
         """Take over the readings of the first state and after ``steps`` steps."""
-        self._rows = [{name: readings[name].values[k] for name in self.sensors} for k in range(steps + 1)]
-
-    def _value(self, name: str, sensor: Sensor, at: Reading) -> NDArray[Any]:
-        """Return a reading; NaN where the next step loses a particle, for which the run raises the error itself."""
-        try:
-            return value_of(sensor, at)
-        except DivergedError:
-            return np.full(len(self._units[name]), np.nan)
+        self._rows = {name: list(readings[name].values[: steps + 1]) for name in self.sensors}
 
     def readings(self, times: NDArray[Any]) -> dict[str, Readings]:
-        """Return the readings, at the first of these times [s]."""
-        found = {}
-        for name, units in self._units.items():
-            values = np.array([row[name] for row in self._rows]).reshape(len(self._rows), len(units))
-            found[name] = Readings(np.asarray(times)[: len(self._rows)], values, units)
-        return found
+        """Return the readings of all states that every sensor has read, at the first of these times [s]."""
+        count = min(map(len, self._rows.values()), default=0)
+        values = {name: np.array(rows[:count]).reshape(count, -1) for name, rows in self._rows.items()}
+        return {name: Readings(np.asarray(times)[:count], values[name], self._units[name]) for name in self.sensors}
 
 
 def as_csv(readings: Mapping[str, Readings]) -> str:

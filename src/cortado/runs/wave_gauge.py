@@ -24,18 +24,8 @@ from cortado.discretise.room import Domain
 from cortado.discretise.shapes import corners, grid
 from cortado.discretise.solid import Solid
 from cortado.particles.state import padded
-from cortado.runs.sensor import (
-    ACROSS,
-    Reading,
-    Seen,
-    Weights,
-    direction,
-    in_dimension,
-    parts_of,
-    point,
-    positive,
-    reach_of,
-)
+from cortado.runs.particle_sums import ACROSS, Around, Seen, WeightedSum, Weights, parts_of, reach_of
+from cortado.runs.sensor import Cut, Reading, SensedScene, direction, in_dimension, point, positive
 from cortado.scene.motions import Pose, position_name, scale_name
 from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
@@ -104,7 +94,7 @@ class Axis:
     """`FILM` [m]"""
 
     @classmethod
-    def of(cls, at: Reading, position: NDArray[Any], floor: float, up: NDArray[Any], reach: float) -> "Axis":
+    def of(cls, at: Cut, position: NDArray[Any], floor: float, up: NDArray[Any], reach: float) -> "Axis":
         """Make the axis of a gauge at a position, from its floor upwards."""
         in_dimension("position", position, at.dimension)
         spacing = at.lattice.cell ** (1.0 / at.dimension)
@@ -221,8 +211,6 @@ class Column:
 def column_of(axis: Axis, at: Reading) -> Column | None:
     """Return a column as solids stand in it in a state; None where none does."""
     tables, domain = at.solids, at.lattice.domain
-    if not tables:
-        return None
     if any(table.moves for table in tables):
         return Column.of(axis, [Standing.of(table, at.dimension, at) for table in tables], domain, at.container)
     return _at_rest(axis, tables, domain, at.container)
@@ -247,7 +235,9 @@ def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
 
 @lru_cache(maxsize=64)
 def _at_rest(axis: Axis, tables: tuple[SolidTable, ...], domain: Domain, container: Container) -> Column | None:
-    """Return a column with solids that stay, computed once."""
+    """Return a column with solids that stay, computed once; None where none is in it."""
+    if not tables:
+        return None
     return Column.of(axis, [Standing.of(table, len(axis.foot)) for table in tables], domain, container)
 
 
@@ -284,31 +274,40 @@ class WaveGauge:
         return {"height": "m"}
 
     def value(self, at: Reading) -> NDArray[Any]:
-        column, scale, around = self._seen(at)
-        depth = float(scale * around.weights.sum())
+        return self.reading(at, self.summed(at).on_host(at))
+
+    def summed(self, at: SensedScene) -> WeightedSum:
+        """Return the sum of weights of the horizontal distances of particles, as vectors (n, d). Where the column has
+        sides, or solids may come into it, particles have more parts."""
+        axis, across = self._axis(at), at.dimension - 1
+        whole = cut_by(axis, at.container) is None and not any(table.moves for table in at.solids)
+        whole = whole and _at_rest(axis, at.solids, at.lattice.domain, at.container) is None
+        parts = parts_of(axis.reach if whole else axis.reach / FINER, at, self._across, across)
+        return WeightedSum(Around(self.position, axis.reach, self._across, parts))
+
+    def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
+        """Return the height (1,) from the sum."""
+        axis = self._axis(at)
+        column, depth = column_of(axis, at), self._scale(axis, at) * float(found[0])
         return np.array([self.floor + (depth if column is None else column.level(depth)[0])])
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        column, scale, around = self._seen(at)
+        axis, around = self._axis(at), Seen.of(at, self.summed(at).around)
+        column, scale = column_of(axis, at), self._scale(axis, at)
         if column is None:
             return {"positions": around.pulled(bar[0] * scale)}
         depth = float(scale * around.weights.sum())
         bars = column.solid_bars(depth, bar[0], at.lattice.domain)
         return bars | {"positions": around.pulled(bar[0] * column.level(depth)[2] * scale)}
 
-    def _seen(self, at: Reading) -> tuple[Column | None, float, Seen]:
-        """Return the column where solids are in it, the volume of a particle over the column's cross-section, and the
-        particles' horizontal distances as vectors (n, d): of parts of particles where the column has sides."""
-        reach, across = reach_of(self.radius, at), at.dimension - 1
-        axis = Axis.of(at, self.position, self.floor, self.up, reach)
-        column, inside = column_of(axis, at), cut_by(axis, at.container)
-        scale = (
-            at.lattice.cell * ACROSS[across] / reach**across / (1.0 if inside is None else axis.places()[1] @ inside)
-        )
-        whole = column is None and inside is None
-        parts = parts_of(reach if whole else reach / FINER, at, self._across, across)
-        around = Seen.of(at, self.position, reach, self._across, parts)
-        return column, scale, around
+    def _axis(self, at: SensedScene) -> Axis:
+        return Axis.of(at, self.position, self.floor, self.up, reach_of(self.radius, at))
+
+    def _scale(self, axis: Axis, at: SensedScene) -> float:
+        """Return the volume of a particle over the column's cross-section [m]."""
+        across, inside = at.dimension - 1, cut_by(axis, at.container)
+        open_part = 1.0 if inside is None else float(axis.places()[1] @ inside)
+        return float(at.lattice.cell * ACROSS[across] / axis.reach**across / open_part)
 
     def _across(self, way: NDArray[Any]) -> NDArray[Any]:
         return np.asarray(way - (way @ self.up)[:, None] * self.up)

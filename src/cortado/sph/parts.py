@@ -279,7 +279,12 @@ class Carried:
         if values.keys() != set(self._arrays.names):
             raise TypeError(f"the step carries {', '.join(self._arrays.names)}, but was given {', '.join(values)}.")
         for name, a in values.items():
-            step.launch(_kernels(a).unsort, a=a, a_scene=state[name])
+            unsort(step, a, state[name])
+
+
+def unsort(step: StepContext, a: wp.array, a_scene: wp.array) -> None:
+    """Write the entries (n,) of sorted particles to an array in the scene's order."""
+    step.launch(_kernels(a).unsort, a=a, a_scene=a_scene)
 
 
 def _kernels(a: wp.array) -> OrderKernels:

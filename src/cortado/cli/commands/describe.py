@@ -5,6 +5,7 @@ import math
 import time
 from collections import Counter
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,11 +56,11 @@ def measured_speed(simulation: Simulation) -> tuple[int, float]:
     steps = FIRST_STEPS
     while True:
         rollout = simulation.rollout(steps)
-        watch = Watch(simulation, rollout).step if simulation.scene.sensor else None
+        run = partial(Watch(simulation, rollout).run, lambda _: False, lambda _, state: None)
         for _ in range(2):  # the first time compiles, the second captures graphs
-            rollout.forward(watch, keep=False)
+            run()
         begun = time.perf_counter()
-        rollout.forward(watch, keep=False)
+        run()
         wp.synchronize_device(simulation.device)
         seconds = (time.perf_counter() - begun) / steps
         if steps == MOST_STEPS or steps * seconds > 0.5 * ENOUGH:

@@ -124,26 +124,33 @@ class RunRecording:
             notes, done = Notes(self, writer), 0
             if self.kept is None:
                 append_frame(writer, first, rollout.clocks[0].steps, self.watch.frame(0, rollout.initial))
-                self.watch.step(0, rollout.initial)
+                self.watch.first()
             else:
                 self.kept.write_frames(writer)
                 done = done_of(rollout, rollout.progress.step, float(self.kept.times[-1]))
                 advance(done)
             size = float(rollout.time_steps[0])
 
-            def observe(step: int, state: State) -> None:
+            def time_of(step: int) -> float:
+                return float(rollout.clocks[0].times(np.array(step), size))
+
+            def is_frame(step: int) -> bool:
+                before, now = time_of(step - 1), time_of(step)
+                return self.frames.is_due(step, before - start, now - start) or rollout.is_last(step)
+
+            def record(step: int, state: State) -> None:
+                frame, number = self.simulation.frame(state), rollout.clocks[0].steps + step
+                append_frame(writer, frame, number, self.watch.frame(step, state), time_of(step))
+
+            def observe(step: int) -> None:
                 nonlocal done
-                before, now = (float(rollout.clocks[0].times(np.array(k), size)) for k in (step - 1, step))
-                if self.frames.is_due(step, before - start, now - start) or rollout.is_last(step):
-                    number = rollout.clocks[0].steps + step
-                    append_frame(writer, self.simulation.frame(state), number, self.watch.frame(step, state), now)
-                self.watch.step(step, state)
                 notes.now_and_then(step)
-                before, done = done, done_of(rollout, step, now)
+                before, done = done, done_of(rollout, step, time_of(step))
                 advance(done - before)
 
             try:
-                last = rollout.forward(observe, keep=False)
+                last = self.watch.run(is_frame, record, observe)
+                self.watch.end(last)
             finally:
                 notes.write()
                 self.folder.write_metrics(rollout.diagnostics)

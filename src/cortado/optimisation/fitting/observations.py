@@ -16,7 +16,8 @@ from cortado.errors import InputError, shown
 from cortado.losses import Snapshot
 from cortado.render import Renderer
 from cortado.render.views import Calibration
-from cortado.runs.sensor import Sensor, Weights, checked_sensor, value_of
+from cortado.runs.particle_sums import Weights
+from cortado.runs.sensor import Sensor, checked_sensor, value_of
 from cortado.scene.parameter_values import Arrays
 from cortado.simulation import Simulation
 

@@ -1,0 +1,218 @@
+"""Sums over particles that sensors read: with weights around a place, over a region, and loads on solids.
+
+They are NumPy in float64, on the host. In a run `cortado.runs.step_sums` computes them on the device.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.discretise.shapes import grid
+from cortado.runs.sensor import Cut, Reading, SensedScene, Sensor, in_dimension
+
+ACROSS = {1: 1.5, 2: 7.0 / np.pi}
+"""Factor of w, over the reach to the number of dimensions, with which it has the integral 1."""
+LEAST_REACH = 5.0
+"""In spacings: with it the weights of a lattice add up to 1 within 0.1 %, wherever a plane or a column lies in it."""
+MOST_PARTS = 40
+"""Most parts along an axis: enough for a reach of half a spacing, and less is warned of."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights w(q) = (1 - q)^4 (1 + 4 q) of a distance q in units of a reach (Wendland 1995), 0 beyond."""
+
+    values: NDArray[Any]
+    """w"""
+    slopes: NDArray[Any]
+    """w'(q) / q"""
+
+    @classmethod
+    def of(cls, q: NDArray[Any]) -> "Weights":
+        """Compute the weights at distances (n,)."""
+        rest = np.clip(1.0 - q, 0.0, None)
+        return cls(rest**4 * (1.0 + 4.0 * q), -20.0 * rest**3)
+
+
+Across = Callable[[NDArray[Any]], NDArray[Any]]
+"""A sensor's view of ways (n, d): a linear function to ways (n, k)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Around:
+    """A place, and how a sensor sees the particles around it."""
+
+    place: NDArray[Any]
+    """(d,) [m]"""
+    reach: float
+    """Distance [m] from which on particles weigh nothing."""
+    across: Across
+    parts: NDArray[Any] | None = None
+    """(m, d) places of the parts of a particle from it [m], which weigh the same; None for one point."""
+
+    def shifts(self) -> NDArray[Any]:
+        """Return the ways (m, k) from a particle to its parts, as they are seen."""
+        return self.across(np.zeros((1, len(self.place))) if self.parts is None else self.parts)
+
+
+@dataclass(frozen=True)
+class Image:
+    """One image of all particles, or of all their parts in one place of their cells, that weigh something."""
+
+    near: NDArray[np.int_]
+    """(m,) numbers of the particles"""
+    ways: NDArray[Any]
+    """(m, k) ways from the place to them [m]"""
+    weights: Weights
+    """(m,) their weights"""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The particles around a place, along periodic axes with all of their images that are near."""
+
+    images: list[Image]
+    """Images of each of the parts of a particle, near the place."""
+    particles: int
+    """Number n of particles."""
+    parts: int
+    """Number of parts into which a particle is divided."""
+    reach: float
+    """Distance [m] from which on particles weigh nothing."""
+
+    @classmethod
+    def of(cls, at: Reading, around: Around) -> "Seen":
+        """Find the particles of a state around a place."""
+        place, reach, across, shifts = around.place, around.reach, around.across, around.shifts()
+        widest = reach + float(np.linalg.norm(shifts, axis=1).max())
+        in_dimension("position", place, at.dimension)
+        positions, domain, numbers = at["positions"], at.lattice.domain, np.arange(len(at["positions"]))
+        if not any(domain.lengths):  # most particles are far away
+            axes = across(np.eye(at.dimension))
+            axes = axes[:, axes.any(axis=0)]
+            rough = positions @ axes
+            rough -= place @ axes
+            numbers = np.flatnonzero(np.einsum("ij,ij->i", rough, rough) < (1.0 + 1e-9) * widest**2)
+        images = []
+        for way in domain.ways(positions[numbers], place, widest, across):
+            close = np.flatnonzero(np.linalg.norm(way, axis=1) < widest)
+            for shift in shifts:
+                own = way[close] + shift
+                images.append(Image(numbers[close], own, Weights.of(np.linalg.norm(own, axis=1) / reach)))
+        return cls(images, len(at["positions"]), len(shifts), reach)
+
+    @property
+    def weights(self) -> NDArray[Any]:
+        """Return the weights (n,) of particles, the mean over their parts, summed over their images."""
+        found = np.zeros(self.particles)
+        for image in self.images:
+            found[image.near] += image.weights.values
+        return found / self.parts
+
+    def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
+        """Return the derivative (n, k) with respect to the ways, from that with respect to the weights, (n,)."""
+        each, found = np.broadcast_to(factors, self.particles), np.zeros((self.particles, self.images[0].ways.shape[1]))
+        for image in self.images:
+            found[image.near] += (each[image.near] * image.weights.slopes / self.reach**2)[:, None] * image.ways
+        return found / self.parts
+
+
+def reach_of(given: float | None, at: Cut) -> float:
+    """Return the distance [m] from a plane or an axis at which particles count: the given one, or else two support
+    radii, or five spacings where these are more."""
+    if given is not None:
+        return given
+    return max(2.0 * at.lattice.support, LEAST_REACH * at.lattice.cell ** (1.0 / at.dimension))
+
+
+def parts_of(reach: float, at: Cut, across: Across, axes: int) -> NDArray[Any]:
+    """Return the places (m, d) of parts of a particle from it [m]: evenly in its cell along ``axes`` axes, those that
+    are seen best, with `LEAST_REACH` of them to a reach, as then the weights of a lattice add up to 1."""
+    spacing = at.lattice.cell ** (1.0 / at.dimension)
+    count = min(int(np.ceil(LEAST_REACH * spacing / reach * (1.0 - 1e-9))), MOST_PARTS)
+    best = np.argsort(-np.linalg.norm(across(np.eye(at.dimension)), axis=1), kind="stable")[:axes]
+    along = spacing * ((np.arange(count) + 0.5) / count - 0.5)
+    return grid([along if axis in best else np.zeros(1) for axis in range(at.dimension)])
+
+
+class ParticleSum(Protocol):
+    """A sum over the particles of a state that a sensor reads."""
+
+    @property
+    def quantity(self) -> str | None:
+        """Return the name of the quantity of particles, or of the load, that the sum is of; None where it is of the
+        fields of a state."""
+
+    def on_host(self, at: Reading) -> NDArray[Any]:
+        """Compute the sum (6,) of a state; numbers that a sum does not have are 0."""
+
+
+class Summed(Sensor, Protocol):
+    """A sensor whose reading is a function of one sum over particles, besides the poses of solids."""
+
+    def summed(self, at: SensedScene) -> ParticleSum:
+        """Return the sum that the sensor reads in a scene."""
+
+    def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
+        """Return the sensor's reading (k,) from the sum (6,). Of fields it looks at the poses of solids alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedSum:
+    """The sums of w_i and of w_i q_i over the particles around a place, where q is a quantity, or else the velocity
+    ``along`` a direction (d,)."""
+
+    around: Around
+    quantity: str | None = None
+    along: NDArray[Any] | None = None
+
+    def on_host(self, at: Reading) -> NDArray[Any]:
+        weights, found = Seen.of(at, self.around).weights, np.zeros(6)
+        found[0] = weights.sum()
+        if self.quantity is not None or self.along is not None:
+            found[1] = (weights * self.values(at)).sum()
+        return found
+
+    def values(self, at: Reading) -> NDArray[Any]:
+        """Return q (n,)."""
+        return at["velocities"] @ self.along if self.quantity is None else at[self.quantity]
+
+
+@dataclass(frozen=True, eq=False)
+class RegionSum:
+    """The sums of f_i and of (x_i - about) x f_i over the particles of a region between corners (d,) [m], where f is
+    the quantity "wall_force"."""
+
+    lower: NDArray[Any]
+    upper: NDArray[Any]
+    about: NDArray[Any]
+    quantity: str = "wall_force"
+
+    def on_host(self, at: Reading) -> NDArray[Any]:
+        (arms, force), pad = self.chosen(at), (0, 3 - at.dimension)
+        arms, force = np.pad(arms, ((0, 0), pad)), np.pad(force, ((0, 0), pad))
+        return np.concatenate([force.sum(axis=0), np.cross(arms, force).sum(axis=0)])
+
+    def chosen(self, at: Reading) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the arms (n, d) of the particles, and their forces, 0 outside of the region."""
+        places, inside = at.lattice.domain.within(at["positions"], self.lower, self.upper)
+        return places - self.about, np.where(inside[:, None], at["wall_force"], 0.0)
+
+
+@dataclass(frozen=True)
+class LoadSum:
+    """The force and the torque on a solid, by the name of the load."""
+
+    quantity: str
+
+    def on_host(self, at: Reading) -> NDArray[Any]:
+        load, d = at[self.quantity], at.dimension
+        return np.concatenate([np.pad(load[:d], (0, 3 - d)), load[d:] if d == 3 else np.pad(load[d:], (2, 0))])
+
+
+def in_the_scene(found: NDArray[Any], dimension: int) -> NDArray[Any]:
+    """Return force and torque (..., 6) as a scene has them: in the plane two components and one."""
+    return found if dimension == 3 else found[..., [0, 1, 5]]

@@ -1,0 +1,137 @@
+"""Sensors of a run that are sums over particles, read on the device while the run goes on."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from cortado.particles.state import Entry, State, StateSeries
+from cortado.rollout.chunk_reader import Beside
+from cortado.rollout.rollout import Rollout
+from cortado.runs.particle_sums import Summed
+from cortado.runs.quantity_values import QuantityEvaluator
+from cortado.runs.step_sums import SIX, ChunkSums, StepQuantities
+from cortado.scene.parameters import Axis
+
+
+@dataclass(frozen=True)
+class Row:
+    """A sensor's reading of a state."""
+
+    sensor: str
+    number: int
+    """Number of the state."""
+    member: int
+    """Number of the scene in a batch, else 0."""
+    reading: Callable[[], NDArray[Any]]
+    """Makes the reading (k,) of the sensor."""
+
+
+class _Poses(Mapping[str, NDArray[Any]]):
+    """A state as sensors see it of which the poses of solids alone are known: a `cortado.runs.sensor.Reading`."""
+
+    def __init__(self, scene: QuantityEvaluator, fields: Mapping[str, NDArray[Any]]):
+        self.dimension, self.lattice, self._fields = scene.dimension, scene.lattice, fields
+        self.solids, self.container = scene.solids, scene.container
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self._fields[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fields)
+
+    def __len__(self) -> int:
+        return len(self._fields)
+
+
+class StepReader:
+    """A `cortado.rollout.chunk_reader.ChunkReader` of sensors. What it reads is copied to the host, where `rows` looks
+    at it while a GPU takes the next steps."""
+
+    def __init__(self, scene: QuantityEvaluator, rollout: Rollout, sensors: Mapping[str, Summed]):
+        """Prepare to read ``sensors`` by their names in the run of a rollout, whose solver the ``scene`` has too."""
+        self.sensors, self._scene, self._rollout = dict(sensors), scene, rollout
+        length, layout, first = rollout.longest_chunk, rollout.solver.layout, rollout.initial
+        summed = {name: one.summed(scene) for name, one in sensors.items()}
+        made = (ChunkSums(one, scene.lattice.domain, scene.solver, length) for one in summed.values())
+        self._sums = dict(zip(summed, made, strict=True))
+        self._needs_the_step = {name for name, one in summed.items() if one.quantity is not None}
+        self.quantities = tuple(sorted({one.quantity for one in summed.values() if one.quantity is not None}))
+        """Names of the quantities that are read."""
+        self._beside = self._kept()
+        moved = any(table.moves for table in scene.solids)
+        self._poses = [f for f in first.fields if f.axis is Axis.SCALAR and not f.is_constant] if moved else []
+        options = {"device": "cpu", "pinned": first.positions.device.is_cuda}
+        self._found = {name: wp.empty(length * layout.members, dtype=SIX, **options) for name in summed}
+        """Sums, state by state, on the host."""
+        sizes = {f.name: (first[f.name].dtype, layout.members) for f in self._poses}
+        self._first = {name: wp.empty(size, dtype=kind, **options) for name, (kind, size) in sizes.items()}
+        self._later = {name: wp.empty(length * size, dtype=kind, **options) for name, (kind, size) in sizes.items()}
+        """Poses of solids in the first state of a chunk, and in those behind it, on the host."""
+        self._is_ready = wp.Event(first.positions.device) if first.positions.device.is_cuda else None
+        self._step = self._count = 0
+        """The first state of the last chunk, and how many of its states wait to be looked at."""
+        self._rows = list[Row]()
+
+    def _kept(self) -> StepQuantities | None:
+        """Return what keeps the quantities of steps, made once for a rollout; None without any."""
+        kept, names = self._rollout.beside, self.quantities
+        if names and names not in kept:
+            kept[names] = StepQuantities(self._scene.within(names), self._scene.solver, self._rollout.longest_chunk)
+        found: Any = kept.get(names)
+        return found
+
+    @property
+    def beside(self) -> Beside | None:
+        return self._beside
+
+    def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
+        self._look()
+        self._step, self._count = step, end - step
+        rows, kept = self._count * (first.batch or 1), {} if self._beside is None else self._beside.kept
+        for name, sums in self._sums.items():
+            wp.copy(self._found[name], sums.launch(self._count, first, later, kept), count=rows)
+        for pose in self._poses:
+            wp.copy(self._first[pose.name], first[pose.name])
+            wp.copy(self._later[pose.name], later.whole(pose.name), count=rows)
+        if self._is_ready is not None:
+            first.positions.device.stream.record_event(self._is_ready)
+
+    def rows(self) -> list[Row]:
+        """Return the readings of all states that were read since the last call, state by state."""
+        self._look()
+        found, self._rows = self._rows, []
+        return found
+
+    def _look(self) -> None:
+        """Make rows of the sums of the last chunk."""
+        if self._is_ready is not None and self._count:
+            wp.synchronize_event(self._is_ready)
+        count, self._count = self._count, 0
+        sums = {name: array.numpy().reshape(-1, self._members, 6)[:count].copy() for name, array in self._found.items()}
+        lost = {member: error.step - 1 for member, error in self._rollout.lost.items()}
+        for k in range(count):
+            number = self._step + k
+            for member in (b for b in range(self._members) if number <= lost.get(b, number)):
+                at = _Poses(self._scene, self._poses_of(k, member))
+                for name, sensor in self.sensors.items():
+                    is_lost = number == lost.get(member) and name in self._needs_the_step
+                    found = np.full(6, np.nan) if is_lost else sums[name][k, member]
+                    self._rows.append(Row(name, number, member, partial(sensor.reading, at, found)))
+
+    @property
+    def _members(self) -> int:
+        return self._rollout.solver.layout.members
+
+    def _poses_of(self, k: int, member: int) -> dict[str, NDArray[Any]]:
+        """Return fields (1, ...) of solids in state k of the last chunk."""
+        found = {}
+        for pose in self._poses:
+            array, row = (self._first, 0) if k == 0 else (self._later, k - 1)
+            values = array[pose.name].numpy().astype(np.float64)[row * self._members + member][None]
+            found[pose.name] = values[:, : self._scene.dimension] if pose.entry is Entry.VECTOR else values
+        return found

@@ -1,0 +1,271 @@
+"""What sensors read of a run on its device: quantities of each step, which captured steps keep, and sums over particles
+(`cortado.runs.particle_sums`) of all states of a chunk, launched behind it, in float64 and a fixed order."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from math import isqrt
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from cortado.device.launching import launch
+from cortado.device.modules import kernel_module
+from cortado.device.precision import Precision
+from cortado.discretise.room import Domain
+from cortado.errors import InputError
+from cortado.particles.state import Parameters, State, StateSeries
+from cortado.runs.particle_sums import LoadSum, ParticleSum, RegionSum, WeightedSum
+from cortado.runs.quantity_formulas import OnDeviceFormula
+from cortado.runs.wall_loads import SIX
+from cortado.solvers.particles import ParticleSolver
+from cortado.sph.parts import unsort
+
+
+@wp.struct
+class _Around:
+    """A place and the view of a sensor, padded to three dimensions, as `Domain.ways` and `Weights` have them."""
+
+    place: wp.vec3d
+    lower: wp.vec3d
+    lengths: wp.vec3d
+    seen: wp.mat33d
+    turns: wp.mat33d
+    steps: wp.mat33d
+    reach: wp.float64
+    widest: wp.float64
+    share: wp.float64
+    along: wp.vec3d
+    offsets: wp.array(dtype=wp.vec3d)
+
+
+@wp.struct
+class _Region:
+    """A region, padded to three dimensions, as `Domain.within` has it."""
+
+    start: wp.vec3d
+    lengths: wp.vec3d
+    lower: wp.vec3d
+    upper: wp.vec3d
+    about: wp.vec3d
+
+
+@dataclass(frozen=True)
+class _Kernels:
+    """Kernels of partial sums over every so many particles of a scene in one state, and of the sum of these."""
+
+    weighted: Any
+    within: Any
+    join: Any
+
+
+@cache
+def _kernels(precision: Precision) -> _Kernels:
+    real, vector, six = precision.real, precision.vector, SIX
+    module = kernel_module(f"particle_sums_{precision.name}")
+
+    @wp.func(module=module)
+    def of_state(first: wp.array(dtype=vector), later: wp.array(dtype=vector), i: int, before: int) -> vector:
+        """Return entry i of the states of a chunk, the first of which is in an array of its own."""
+        if i < before:
+            return first[i]
+        return later[i - before]
+
+    @wp.func(module=module)
+    def doubled(x: vector) -> wp.vec3d:
+        return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
+
+    @wp.func(module=module)
+    def placed(x: vector, start: wp.vec3d, lengths: wp.vec3d) -> wp.vec3d:
+        """Return the image of a particle that is within the period from a start on."""
+        y = doubled(x)
+        for k in range(3):
+            if lengths[k] > wp.float64(0.0):
+                rest = y[k] - start[k]
+                rest = rest - wp.floor(rest / lengths[k]) * lengths[k]
+                y[k] = start[k] + wp.where(rest >= lengths[k], wp.float64(0.0), rest)
+        return y
+
+    @wp.func(module=module)
+    def weight(a: _Around, x: vector) -> wp.float64:
+        """Return the weight of a particle, the mean over its parts, summed over their images."""
+        way = a.seen * (placed(x, a.lower, a.lengths) - a.place)
+        turns = a.turns * way
+        way = way - a.steps * wp.vec3d(wp.rint(turns[0]), wp.rint(turns[1]), wp.rint(turns[2]))
+        total = wp.float64(0.0)
+        if wp.dot(way, way) < a.widest * a.widest:
+            for k in range(a.offsets.shape[0]):
+                q = wp.length(way + a.offsets[k]) / a.reach
+                if q < wp.float64(1.0):
+                    square = (wp.float64(1.0) - q) * (wp.float64(1.0) - q)
+                    total += square * square * (wp.float64(1.0) + wp.float64(4.0) * q)
+        return a.share * total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def weighted(
+        particles: int,
+        before: int,
+        stride: int,
+        a: _Around,
+        x_first: wp.array(dtype=vector),
+        x: wp.array(dtype=vector),
+        v_first: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        q: wp.array(dtype=real),
+        # out
+        partial: wp.array(dtype=six),
+    ):
+        row, total = wp.tid() // stride * particles, six()
+        for i in range(row + wp.tid() % stride, row + particles, stride):
+            w = weight(a, of_state(x_first, x, i, before))
+            if w > wp.float64(0.0):
+                value = wp.float64(0.0)
+                if q.shape[0] > 0:
+                    value = wp.float64(q[i])
+                else:
+                    value = wp.dot(doubled(of_state(v_first, v, i, before)), a.along)
+                total[0] = total[0] + w
+                total[1] = total[1] + w * value
+        partial[wp.tid()] = total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def within(
+        particles: int,
+        before: int,
+        stride: int,
+        a: _Region,
+        x_first: wp.array(dtype=vector),
+        x: wp.array(dtype=vector),
+        q: wp.array(dtype=vector),
+        # out
+        partial: wp.array(dtype=six),
+    ):
+        row, total = wp.tid() // stride * particles, six()
+        for i in range(row + wp.tid() % stride, row + particles, stride):
+            y = placed(of_state(x_first, x, i, before), a.start, a.lengths)
+            inside = bool(True)
+            for k in range(3):
+                inside = inside and y[k] >= a.lower[k] and y[k] < a.upper[k]
+            if inside:
+                f = doubled(q[i])
+                torque = wp.cross(y - a.about, f)
+                for k in range(3):
+                    total[k] = total[k] + f[k]
+                    total[k + 3] = total[k + 3] + torque[k]
+        partial[wp.tid()] = total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def join(stride: int, partial: wp.array(dtype=six), total: wp.array(dtype=six)):
+        found = six()
+        for t in range(stride):
+            found += partial[wp.tid() * stride + t]
+        total[wp.tid()] = found
+
+    return _Kernels(weighted, within, join)
+
+
+class StepQuantities:
+    """The quantities of particles and the loads on solids that every step of a chunk computes for the state at which it
+    begins; they are kept until the next chunk."""
+
+    def __init__(self, formulas: Mapping[str, OnDeviceFormula], solver: ParticleSolver, length: int):
+        """Make room for ``formulas`` by the names of their quantities in chunks of ``length`` steps."""
+        self._formulas, self._solver, self._length, self.kept = formulas, solver, length, dict[str, wp.array]()
+
+    def launch(self, step: int, parameters: Parameters) -> None:
+        """Launch the kernels for a step of the chunk that the solver has just taken, counted from 0."""
+        solver, context = self._solver, self._solver.context(parameters)
+        pressures = solver.pressures()
+        if pressures is None:
+            raise InputError("This scene is computed without a pressure of particles, so that there is none to see.")
+        for name, formula in self._formulas.items():
+            found = formula.on_device(context, pressures)
+            if name not in self.kept:
+                self.kept[name] = wp.zeros(self._length * len(found), dtype=found.dtype, device=found.device)
+            own = self.kept[name][step * len(found) : (step + 1) * len(found)]
+            if found.dtype is SIX:
+                launch(_copy_kernel(), len(found), found.device, given=found, own=own)
+            else:
+                unsort(context, found, own)
+
+
+class ChunkSums:
+    """The sums of one sensor over the particles of each state of a chunk of a run."""
+
+    def __init__(self, summed: ParticleSum, domain: Domain, solver: ParticleSolver, length: int):
+        """Prepare the sum in chunks of up to ``length`` steps; ``domain`` is the period of the scene."""
+        layout, self._summed = solver.layout, summed
+        self._scenes, self._particles, self._device = layout.members, layout.particles, solver.device
+        self._stride, self._kernels = isqrt(layout.particles - 1) + 1, _kernels(layout.precision)
+        self._none, rows = wp.empty(0, dtype=layout.precision.real, device=solver.device), length * layout.members
+        self._partial = wp.empty(rows * self._stride, dtype=SIX, device=solver.device)
+        self._total = wp.empty(rows, dtype=SIX, device=solver.device)
+        self._setting: Any = None
+        if isinstance(summed, WeightedSum):
+            self._setting = _around(summed, domain, solver.device)
+        elif isinstance(summed, RegionSum):
+            self._setting = _region(summed, domain)
+
+    def launch(self, count: int, first: State, later: StateSeries, kept: Mapping[str, wp.array]) -> wp.array:
+        """Launch the sums over the states at which ``count`` steps began, the ``first`` and those ``later``, with the
+        quantities that were ``kept``. Return them (at least count scenes,), which the next launch overwrites."""
+        summed = self._summed
+        if isinstance(summed, LoadSum):
+            return kept[summed.quantity]
+        rows = count * self._scenes
+        sizes = {"particles": self._particles, "before": self._scenes * self._particles, "stride": self._stride}
+        fields = {"x_first": first.positions, "x": later.whole("positions"), "a": self._setting}
+        kernel = self._kernels.within
+        if isinstance(summed, WeightedSum):
+            kernel = self._kernels.weighted
+            fields |= {"v_first": first.velocities, "v": later.whole("velocities")}
+        fields["q"] = self._none if summed.quantity is None else kept[summed.quantity]
+        launch(kernel, rows * self._stride, self._device, sizes, fields, partial=self._partial)
+        launch(self._kernels.join, rows, self._device, sizes, partial=self._partial, total=self._total)
+        return self._total
+
+
+def _around(summed: WeightedSum, domain: Domain, device: Any) -> Any:
+    """Return a place and the view of a sensor as kernels take them."""
+    around, found = summed.around, _Around()
+    d, shifts = len(around.place), around.shifts()
+    widest = around.reach + float(np.linalg.norm(shifts, axis=1).max())
+    steps, inverse, images = domain.images(widest, around.across)
+    offsets = (images[:, None] + shifts).reshape(-1, shifts.shape[1])
+    found.place, found.seen = wp.vec3d(*_wide(around.place)), wp.mat33d(*_square(around.across(np.eye(d)).T))
+    found.lower, found.lengths, _ = domain.vectors(wp.vec3d)
+    found.turns, found.steps = wp.mat33d(*_square(inverse.T)), wp.mat33d(*_square(steps.T))
+    found.reach, found.share = around.reach, 1.0 / len(shifts)
+    found.widest = float(np.linalg.norm(offsets, axis=1).max()) + around.reach
+    found.along = wp.vec3d(*_wide(np.zeros(d) if summed.along is None else summed.along))
+    found.offsets = wp.array(np.pad(offsets, ((0, 0), (0, 3 - offsets.shape[1]))), dtype=wp.vec3d, device=device)
+    return found
+
+
+def _region(summed: RegionSum, domain: Domain) -> Any:
+    """Return a region as kernels take it; along a third axis that is not there it has no end."""
+    found, (start, lower, upper) = _Region(), domain.ends(summed.lower, summed.upper)
+    found.start, found.about = wp.vec3d(*_wide(start)), wp.vec3d(*_wide(summed.about))
+    found.lower, found.upper = wp.vec3d(*_wide(lower, -np.inf)), wp.vec3d(*_wide(upper, np.inf))
+    found.lengths = domain.vectors(wp.vec3d)[1]
+    return found
+
+
+def _wide(values: NDArray[Any], rest: float = 0.0) -> NDArray[Any]:
+    return np.pad(np.asarray(values, dtype=np.float64), (0, 3 - len(values)), constant_values=rest)
+
+
+def _square(matrix: NDArray[Any]) -> NDArray[Any]:
+    """Return a matrix with zeros up to (3, 3), row by row."""
+    return np.pad(matrix, [(0, 3 - size) for size in matrix.shape]).ravel()
+
+
+@cache
+def _copy_kernel() -> Any:
+    @wp.kernel(module=kernel_module("step_sums_copy"), enable_backward=False)
+    def copy(given: wp.array(dtype=SIX), own: wp.array(dtype=SIX)):
+        own[wp.tid()] = given[wp.tid()]
+
+    return copy
