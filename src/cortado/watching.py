@@ -89,9 +89,11 @@ class Watch:
         record: Observer,
         observe: Callable[[int], None] | None = None,
     ) -> State:
-        """Run the rollout forward and return its last state. Sensors read every state; ``record`` is given those that are
-        frames, while a GPU takes the next steps; ``observe`` is called with the number of each. Raises
-        `DivergedError` after the good states were looked at."""
+        """Run the rollout forward and return its last state. Sensors read every state; ``record`` is given frames.
+
+        Both look at copies while a GPU takes the next steps; ``observe`` is called with the number of each before.
+        Raises `DivergedError` after the good states were looked at.
+        """
 
         def look(step: int, state: State) -> None:
             if is_frame(step):

@@ -1,0 +1,94 @@
+"""Sensors that are read on the device beside what they read of the same states on the host."""
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado.device.launching import CapturedGraph
+from cortado.errors import CortadoWarning
+from cortado.sensors import FlowRate, PressureProbe, SolidLoad, WallForce, WaveGauge
+from scenes import jet, plane, scene
+from test_free_bodies import RAFT
+from test_moving_solids import ROTOR
+from test_moving_solids import plane as pond
+from test_sensors import IN_SPACE, IN_THE_PLANE, ROUND_THE_EDGE, channel
+from test_time_steps import CHOSEN, SOLVERS, drop
+
+LOADED = {
+    "load": SolidLoad("rotor"),
+    "gauge": WaveGauge([0.5, 0.0]),
+    "walls": WallForce(),
+    "flow": FlowRate([0.5, 0.0], [1.0, 0.3]),
+}
+CASES = {
+    "plane": (plane, IN_THE_PLANE),
+    "projection": (lambda: plane(solver={"kind": "projection", "time_step": 0.002}), IN_THE_PLANE),
+    "space": (scene, IN_SPACE),
+    "period": (lambda: channel(2)[0].scene, ROUND_THE_EDGE[2]),
+    "periods": (lambda: channel(3)[0].scene, ROUND_THE_EDGE[3]),
+    "rotor": (lambda: pond(ROTOR), LOADED),
+    "raft": (lambda: pond(RAFT), {"load": SolidLoad("raft"), "gauge": WaveGauge([0.5, 0.0])}),
+    "chosen": (lambda: drop({**SOLVERS["projection"], **CHOSEN}), dict(list(IN_THE_PLANE.items())[:-1])),
+    "nozzle": (jet, {"gauge": WaveGauge([0.2, 0.0]), "flow": FlowRate([0.0, 0.2], [0.0, -1.0])}),
+}
+STEPS = 21
+
+
+class OnHost:
+    """A sensor of one's own that reads what another does."""
+
+    def __init__(self, sensor):
+        self.columns, self.value, self.adjoint = sensor.columns, sensor.value, sensor.adjoint
+
+
+def readings(run, name="values"):
+    return {sensor: own.values for sensor, own in run.sensors.items()}
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("name", CASES)
+def test_readings_are_those_of_the_same_states_on_the_host(name, precision):
+    make, sensors = CASES[name]
+    simulation = cortado.Simulation(make(), precision=precision)
+    found = simulation.run(STEPS, sensors=sensors)
+    wanted = simulation.run(STEPS, sensors={name: OnHost(sensor) for name, sensor in sensors.items()})
+    assert found.positions.tobytes() == wanted.positions.tobytes()
+    for sensor, own in found.sensors.items():
+        host = wanted.sensors[sensor].values
+        assert own.times.tobytes() == wanted.times.tobytes() and len(own.values) == STEPS + 1
+        np.testing.assert_allclose(own.values, host, rtol=0.0, atol=1e-13 * np.abs(host).max(), err_msg=sensor)
+        assert np.ptp(own.values[:, 0]) > 0.0, sensor
+
+
+@pytest.mark.parametrize("name", ["projection", "rotor"])
+def test_each_scene_of_a_batch_has_the_readings_of_its_own_run(name):
+    make, sensors = CASES[name]
+    gravities = np.array([[[0.0, -9.81]], [[3.0, -5.0]]])
+    batch = cortado.Simulation(make(), batch=2).run(STEPS, {"gravity": gravities}, sensors=sensors)
+    for gravity, together in zip(gravities, batch, strict=True):
+        alone = cortado.Simulation(make()).run(STEPS, {"gravity": gravity[0]}, sensors=sensors)
+        for sensor, values in readings(alone).items():
+            np.testing.assert_array_equal(together.sensors[sensor].values, values, sensor)
+
+
+def test_a_batch_reads_the_sensors_of_its_scene_and_until_a_particle_is_lost():
+    made = plane(sensor=[{"name": "walls", "kind": "wall_force"}])
+    wild = [[[0.0, -9.81]], [[3e5, -9e5]]]
+    with pytest.warns(CortadoWarning):
+        batch = cortado.Simulation(made, batch=2).run(STEPS, {"gravity": wild})
+    assert len(batch[0].sensors["walls"].values) == STEPS + 1
+    lost = batch[1].sensors["walls"].values
+    assert len(lost) == batch.lost[1].step and np.isnan(lost[-1]).all() and np.isfinite(lost[:-1]).all()
+
+
+def test_readings_change_no_bit_and_need_no_capture_in_later_runs(monkeypatch):
+    simulation, sensors = cortado.Simulation(plane()), {"probe": PressureProbe([0.2, 0.1]), "walls": WallForce()}
+    bare, first = simulation.run(STEPS), simulation.run(STEPS, sensors=sensors)
+    simulation.run(STEPS, sensors=sensors)
+    made, init = [], CapturedGraph.__init__
+    monkeypatch.setattr(CapturedGraph, "__init__", lambda *a: made.append(a) or init(*a))
+    again = simulation.run(STEPS, sensors=sensors)
+    assert not made
+    for name, values in readings(first).items():
+        assert values.tobytes() == readings(again)[name].tobytes()
+    assert bare.positions.tobytes() == first.positions.tobytes() == again.positions.tobytes()
