@@ -252,7 +252,10 @@ class ProjectionPush:
             yield from ((name, sums, over) for name, sums in own.items())
 
     def _totals(self, step: StepContext, solid: int) -> dict[str, wp.array]:
-        return {name: sums.total(step, over) for name, sums, over in self._each(solid)}
+        found = {name: sums.total(step, solid) for name, sums in self._sums.items()}
+        if solid == ALL_WALLS:
+            return found | {f"all_{name}": array for name, array in found.items()}
+        return found | {name: sums.total(step, ALL_WALLS) for name, sums in self._all_sums.items()}
 
     @cached_property
     def _arrays(self) -> dict[str, wp.array]:
