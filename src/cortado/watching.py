@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import require_table
-from cortado.errors import DivergedError, InputError
+from cortado.errors import InputError
 from cortado.losses.loss import Snapshot, SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.rollout import Observer, Rollout
@@ -92,7 +92,7 @@ class Watch:
         """Run the rollout forward and return its last state. Sensors read every state; ``record`` is given frames.
 
         Both look at copies while a GPU takes the next steps; ``observe`` is called with the number of each before.
-        Raises `DivergedError` after the good states were looked at.
+        Raises `DivergedError`. What was computed before that, or before an interrupt, was looked at.
         """
 
         def look(step: int, state: State) -> None:
@@ -115,10 +115,8 @@ class Watch:
         waiting = Waiting(look, self._rollout.initial, self._rollout.copies)
         try:
             last = self._rollout.forward(keep, keep=False, meanwhile=look_at_all, reader=self._reader)
-        except DivergedError:
+        finally:
             look_at_all()
-            raise
-        look_at_all()
         return last
 
     def first(self) -> None:
