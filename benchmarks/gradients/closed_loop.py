@@ -12,7 +12,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 import cortado.jax
 from cortado import Scene, Simulation, gradients
@@ -21,7 +20,11 @@ EVERY = 5
 """Steps between two actions."""
 WEIGHTS = (-0.5, -0.3, 0.1)
 SPREAD, SCATTER = 0.05, 0.01
-"""Standard deviations of the weights, and of first velocities [m/s]."""
+"""Standard deviations, in smoothing, of the weights and of first velocities [m/s]."""
+APART, STIRRED = 0.15, 0.05
+"""Standard deviations of the weights and of first velocities [m/s] of different seeds."""
+AT_ONCE = 16
+"""Policies in one batch."""
 
 
 def tank() -> Simulation:
@@ -58,38 +61,51 @@ def loss_of(simulation: Simulation, steps: int, gradient: Any) -> Any:
     return loss
 
 
-def smoothed(loss: Any, shape: tuple[int, ...], pairs: int, seed: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the gradient of the smoothed loss with respect to the weights, and its standard error."""
-    random, found = np.random.default_rng(seed), []
+def smoothed(loss: Any, weights: Any, first: Any, pairs: int, random: np.random.Generator) -> tuple[Any, Any]:
+    """Return the gradient of the smoothed loss with respect to the weights, and its standard error. The loss is that of
+    `AT_ONCE` policies in one batch."""
     changes = random.normal(0.0, SPREAD, (pairs, len(WEIGHTS)))
-    for change in changes:
-        scatter = jnp.asarray(random.normal(0.0, SCATTER, shape), dtype=jnp.float32)
-        ends = [float(loss(jnp.array(WEIGHTS) + sign * change, scatter)) for sign in (1.0, -1.0)]
-        found.append(0.5 * (ends[0] - ends[1]))
-    gradient, *_ = np.linalg.lstsq(changes, np.array(found), rcond=None)
-    rest = np.array(found) - changes @ gradient
+    policies = np.stack([weights + changes, weights - changes], axis=1).reshape(-1, AT_ONCE, len(WEIGHTS))
+    scatter = np.repeat(first + random.normal(0.0, SCATTER, (pairs, *first.shape)), 2, axis=0)
+    scattered = scatter.reshape(-1, AT_ONCE, *first.shape)
+    ends = [
+        loss(jnp.asarray(w, jnp.float32), jnp.asarray(v, jnp.float32)) for w, v in zip(policies, scattered, strict=True)
+    ]
+    found = 0.5 * np.subtract(*np.reshape(ends, (pairs, 2)).T)
+    gradient, *_ = np.linalg.lstsq(changes, found, rcond=None)
+    rest = found - changes @ gradient
     variance = (rest**2).sum() / (pairs - len(WEIGHTS))
     return gradient, np.sqrt(variance * np.diag(np.linalg.inv(changes.T @ changes)))
 
 
 def main() -> None:
-    """Print a row for each number of steps."""
+    """Print a row for each number of steps and each seed, and then the least and the median over seeds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, nargs="+", default=[100, 200, 400, 800])
-    parser.add_argument("--pairs", type=int, default=48, help="pairs of policies for the smoothed gradient")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--pairs", type=int, default=48, help=f"pairs of policies, a multiple of {AT_ONCE // 2}")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5], help="policies and first states")
     asked = parser.parse_args()
-    simulation, weights = tank(), jnp.array(WEIGHTS)
-    print("| steps | smoothed, its standard error | exact: cosine, size | `AdjointViscosity`: cosine, size |")
+    simulation, rows = tank(), []
+    print("| steps | seed | smoothed, its standard error | exact: cosine, size | `AdjointViscosity`: cosine, size |")
     for steps in asked.steps:
-        still = jnp.zeros(simulation.positions.shape, dtype=jnp.float32)
-        wanted, error = smoothed(jax.jit(loss_of(simulation, steps, None)), still.shape, asked.pairs, asked.seed)
-        row = f"| {steps} | {np.round(wanted, 3).tolist()}, {np.round(error, 3).tolist()} |"
-        for estimator in (None, gradients.AdjointViscosity()):
-            own = np.array(jax.jit(jax.grad(loss_of(simulation, steps, estimator)))(weights, still), dtype=np.float64)
-            size = np.linalg.norm(own) / np.linalg.norm(wanted)
-            row += f" {own @ wanted / np.linalg.norm(own) / np.linalg.norm(wanted):.2f}, {size:.3g} |"
-        print(row, flush=True)
+        value = jax.jit(jax.vmap(loss_of(simulation, steps, None)))
+        slopes = [jax.jit(jax.grad(loss_of(simulation, steps, own))) for own in (None, gradients.AdjointViscosity())]
+        cosines = []
+        for seed in asked.seeds:
+            random = np.random.default_rng(seed)
+            weights = np.array(WEIGHTS) + random.normal(0.0, APART, len(WEIGHTS))
+            first = random.normal(0.0, STIRRED, simulation.positions.shape)
+            wanted, error = smoothed(value, weights, first, asked.pairs, random)
+            at = jnp.asarray(weights, jnp.float32), jnp.asarray(first, jnp.float32)
+            own = [np.array(slope(*at), dtype=np.float64) for slope in slopes]
+            sizes = [np.linalg.norm(one) / np.linalg.norm(wanted) for one in own]
+            cosines.append([one @ wanted / np.linalg.norm(one) / np.linalg.norm(wanted) for one in own])
+            found = " | ".join(f"{cosine:.2f}, {size:.2g}" for cosine, size in zip(cosines[-1], sizes, strict=True))
+            noise = np.linalg.norm(error) / np.linalg.norm(wanted)
+            print(f"| {steps} | {seed} | {np.round(wanted, 2).tolist()}, {noise:.0%} | {found} |", flush=True)
+        each = zip(np.min(cosines, axis=0), np.median(cosines, axis=0), strict=True)
+        rows.append(f"| {steps} | " + " | ".join(f"{least:.2f}, {median:.2f}" for least, median in each) + " |")
+    print("\n| steps | exact: least cosine, median | `AdjointViscosity` |", *rows, sep="\n")
 
 
 if __name__ == "__main__":

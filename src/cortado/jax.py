@@ -11,6 +11,7 @@ from typing import Any
 from cortado.calls import face
 from cortado.gradients import AdjointEstimator, GradientEstimator
 from cortado.optimisation.layers import calls
+from cortado.optimisation.layers.loops import Loop, Smoothed
 from cortado.optimisation.layers.with_jax import JaxBridge, jax
 from cortado.problem import Problem
 from cortado.render import Renderer
@@ -19,7 +20,7 @@ from cortado.runs.sensor import Sensor
 from cortado.scene.parameter_values import Values
 from cortado.simulation import Simulation
 
-__all__ = ["measure", "picture", "restart_state", "rollout", "state", "step", "value"]
+__all__ = ["measure", "picture", "restart_state", "rollout", "smoothed", "state", "step", "value"]
 
 Arrays = Mapping[str, Any]
 """Arrays by name."""
@@ -56,10 +57,11 @@ def step(
 
     ``parameters`` are any of those of `Problem` but first values, arrays or numbers; one over time has a row for each
     of these steps. Reverse mode goes back by the estimator ``gradient``, such as `gradients.AdjointViscosity`, exactly
-    if it is left out; forward mode is exact. Exact derivatives of chained steps grow by a constant factor a step, which
-    after some hundred steps drowns what is sought: see `docs/long_horizons.md`. Raises
-    `InputError` for what does not fit, and `DivergedError` when a particle is lost. Within a compiled program, where
-    values are known only as it runs, JAX raises an error of its own with the same sentence.
+    if it is left out; forward mode is exact. Exact derivatives of chained steps are of use within the horizon that
+    `cortado gradients check` certifies, some hundred steps; beyond ten e-folds of growth a chain warns. A call costs
+    1.3 ms beside its steps on a CPU, 2.5 on a GPU: see `docs/layers.md`. Raises `InputError` for what does not fit, and
+    `DivergedError` when a particle is lost. Within a compiled program, where values are known only as it runs, JAX
+    raises an error of its own with the same sentence.
     """
     return calls.step(_BRIDGE, simulation, given, parameters, steps, gradient)
 
@@ -85,6 +87,25 @@ def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callab
     `gradients.Exact` by default, with the bits of `Problem.value_and_gradient`.
     """
     return calls.value(_BRIDGE, problem, gradient)
+
+
+def smoothed(
+    simulation: Simulation,
+    loss: Callable[..., Any],
+    estimator: GradientEstimator,
+    state: Arrays | None = None,
+) -> Smoothed:
+    """Return the loss of a closed loop smoothed over an ensemble, as a function of ``weights``, arrays by name.
+
+    Its value is the mean of the loss, and its gradient the smoothed one; its method ``estimate(weights)`` returns both
+    in an `Estimate`, with the standard error. ``loss(weights, state, gradient)`` returns a number, and hands
+    ``gradient`` on to `step` or `rollout`. The ``estimator`` says how to smooth, over which spread of the weights, in
+    their units, and which scatter of first positions. `gradients.EnsembleMean` has the mean gradient of scattered
+    loops, whose sizes `gradients.Guided` corrects by differences of the loss. Loops run as batches that are compiled.
+    They begin at ``state``, the scene's first one if left out. Raises `InputError` for what does not fit, and within a
+    program that is compiled.
+    """
+    return Smoothed(_BRIDGE, estimator, Loop(_BRIDGE, simulation, loss, state))
 
 
 def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "jax.Array"]:

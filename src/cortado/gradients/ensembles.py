@@ -248,7 +248,8 @@ class RandomizedSmoothing(Ensemble):
         found = found[counts > 0] * (numbers / counts[counts > 0, None])
         gradient, error = (ensemble.named(one / ensemble.spreads) for one in mean_and_error(found))
         left_out = 2 * int(np.count_nonzero(~kept))
-        return Estimate(at_them.loss, gradient, error, len(found) - 1, left_out)
+        mean = float(np.mean([one.loss for one in runs if one.diverged is None]))
+        return Estimate(at_them.loss, gradient, error, len(found) - 1, mean, left_out)
 
 
 @dataclass(frozen=True)
@@ -295,7 +296,8 @@ class EnsembleMean(Ensemble):
         checked = [checked_estimate(samples[k], ensemble.values) for k in np.flatnonzero(kept)]
         numbers = np.array([joined(one.gradient, ensemble.values) for one in checked])
         gradient, error = (ensemble.named(one) for one in self.combined(numbers))
-        return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1, len(samples) - len(checked))
+        mean = float(np.mean([one.loss for one in checked]))
+        return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1, mean, len(samples) - len(checked))
 
     def combined(self, gradients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the average (numbers,) of gradients (samples, numbers), and its standard error, from the means of
@@ -392,7 +394,7 @@ class Guided(Ensemble):
         gradient, error = (ensemble.named(one / ensemble.spreads) for one in (sizes @ along, np.hypot(*errors)))
         freedom = _freedom(errors, (len(pairs) - 1, surrogate.degrees_of_freedom))
         left_out = surrogate.left_out + len(runs) // self.differences * int(np.count_nonzero(~kept))
-        return Estimate(surrogate.loss, gradient, error, freedom, left_out)
+        return Estimate(surrogate.loss, gradient, error, freedom, surrogate.mean_loss, left_out)
 
     def _parts(self, ensemble: Sampler, gradient: Arrays, error: Arrays) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Return directions (numbers,) of length 1, in spreads: the gradient on one part of one parameter, 0 elsewhere;

@@ -30,6 +30,8 @@ class Estimate:
     """Standard error of every component of the gradient, where it is an average over samples."""
     degrees_of_freedom: float | None = None
     """Degrees of freedom of the standard error: independent samples less one; of `Guided` those of its two parts."""
+    mean_loss: float | None = None
+    """Mean of the loss over the ensemble that the gradient is averaged over."""
     left_out: int = 0
     """Number of an ensemble's runs left out of the average, as they or their partners diverged or are out of range."""
     diverged: Exception | None = None

@@ -15,6 +15,7 @@ from cortado.device.memory import require
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError, shown, warn
 from cortado.particles.state import Parameters, State
+from cortado.rollout.adjoint_growth import AdjointGrowth
 from cortado.rollout.device_states import (
     DeviceRows,
     DeviceState,
@@ -216,6 +217,8 @@ class Stepper:
         values = residual.values
         residual.evaluation.bring_back()
         first = rollout.backward(adjoint, {rollout.steps: self._bar})
+        if rollout.steps:
+            self._simulation.__dict__.setdefault("_growth", AdjointGrowth()).follow(rollout, self._bar, first)
         found = adjoint.parameters()
         earlier = space.time_adjoints(rollout, values, found)
         before = (earlier[0] if self._simulation.batch is None else earlier) + times

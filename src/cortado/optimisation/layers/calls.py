@@ -45,6 +45,15 @@ class Bridge(ABC):
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
         """Copy arrays of a layer to arrays of the other program."""
 
+    @abstractmethod
+    def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
+        """Return a function of many weights and first positions, along a first axis, whose results are the losses (k,)
+        and, with ``slope``, their gradients by name, else an empty table."""
+
+    @abstractmethod
+    def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
+        """Return the value that a function of numbers finds, as one with its gradient in reverse mode."""
+
     def numbers(self, what: str, value: Any) -> np.ndarray:
         """Copy an array to the host, in float64; raise `InputError` for anything else."""
         return as_precise_numbers(what, value)
@@ -75,7 +84,7 @@ def state(bridge: Bridge, simulation: Simulation, given: Given | DeviceState, pa
     """Return a state of Cortado's, the first one if left out, as a table of arrays of the other program."""
     layer = steps_layer(simulation, 1)
     with layer.turn:
-        first = simulation.on_device(given, parameters=dict(_table("parameters", parameters)))
+        first = simulation.on_device(given, parameters=dict(table_of("parameters", parameters)))
         return part(bridge.made(named(STATE, layer.states.arrays(first)), layer), STATE)
 
 
@@ -84,9 +93,11 @@ def restart_state(
 ) -> RestartState | tuple[RestartState, ...]:
     """Return a table of the other program's arrays as a state, from which Cortado can restart."""
     layer = steps_layer(simulation, 1)
-    arrays = {name: bridge.numbers(f"state {name}", value) for name, value in _table("state", given).items()}
+    arrays = {name: bridge.numbers(f"state {name}", value) for name, value in table_of("state", given).items()}
     check_state({name: array.shape for name, array in arrays.items()}, layer.states.shapes)
-    own = {name: bridge.numbers(f"parameter {name}", value) for name, value in _table("parameters", parameters).items()}
+    own = {
+        name: bridge.numbers(f"parameter {name}", value) for name, value in table_of("parameters", parameters).items()
+    }
     with layer.turn:
         return simulation.on_host(layer.states.state(arrays, own))
 
@@ -117,7 +128,7 @@ def rollout(
     if steps % every:
         raise InputError(f"record_every is {every}, but must divide the {steps} steps.")
     layer, count = steps_layer(simulation, every, gradient), steps // every
-    table = _table("parameters", parameters)
+    table = table_of("parameters", parameters)
     arrays = {name: bridge.array(PARAMETER + name, value, layer) for name, value in table.items()}
     if simulation.batch is not None and any(name in simulation.known.over_time for name in arrays):
         over_time = ", ".join(name for name in arrays if name in simulation.known.over_time)
@@ -129,7 +140,7 @@ def rollout(
             raise InputError(f"parameter {name} has {array.shape[0]} rows, but must have {steps}, one for each step.")
     pieces = {name: array.reshape((count, every, *array.shape[1:])) for name, array in rows.items()}
     others = {name: array for name, array in arrays.items() if name not in rows}
-    first = {name: bridge.array(STATE + name, value, layer) for name, value in _table("state", given).items()}
+    first = {name: bridge.array(STATE + name, value, layer) for name, value in table_of("state", given).items()}
 
     def advance(before: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
         return part(_applied(bridge, layer, before, {**others, **own}), STATE)
@@ -172,17 +183,18 @@ def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any, 
 
 
 def _applied(bridge: Bridge, layer: Layer, given: Table | None, parameters: Table | None) -> dict[str, Any]:
-    own, others = _table("state", given), _table("parameters", parameters)
+    own, others = table_of("state", given), table_of("parameters", parameters)
     arrays = {**named(STATE, own), **named(PARAMETER, others)}
     found = {name: bridge.array(name, value, layer) for name, value in arrays.items()}
     layer.check({name: tuple(array.shape) for name, array in found.items()})
     return bridge.apply(layer, found)
 
 
-def _table(what: str, given: Table | None) -> Table:
+def table_of(what: str, given: Table | None) -> Table:
     """Return a given table, an empty one if it was left out; raise `InputError` for anything but a table by names."""
     found = {} if given is None else given
-    require_table(what, found, "{'gravity': array}" if what == "parameters" else "{'positions': array, ...}")
+    likely = {"parameters": "{'gravity': array}", "weights": "{'bias': array}"}.get(what, "{'positions': array, ...}")
+    require_table(what, found, likely)
     for name in found:
         if not isinstance(name, str):
             raise InputError(f"{what} has the name {shown(name)}, but must have texts as names.")

@@ -11,7 +11,7 @@ Compiled programs call Python by Warp's foreign functions: on the memory of the 
 import inspect
 import sys
 from collections import OrderedDict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache, partial
 from itertools import count
@@ -276,6 +276,23 @@ class JaxBridge(Bridge):
 
         _, found = jax.lax.scan(body, state, rows, length=count)
         return {name: jnp.concatenate([state[name][None], own]) for name, own in found.items()}
+
+    def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
+        """Map the loss, or it with its gradient, by `jax.vmap` in a compiled program."""
+        return jax.jit(jax.vmap(jax.value_and_grad(loss) if slope else lambda *given: (loss(*given), {})))
+
+    def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
+        """Return the value with the gradient, by a rule of JAX; outside of compiled programs alone."""
+
+        def forward(given: Any) -> tuple[Any, Any]:
+            if any(isinstance(array, jax.core.Tracer) for array in given.values()):
+                raise InputError("weights are traced by jax.jit or jax.vmap, but must be arrays: the loss is compiled.")
+            value, gradient = found(given)
+            return jnp.asarray(value), {name: jnp.asarray(gradient[name], own.dtype) for name, own in given.items()}
+
+        smoothed = jax.custom_vjp(lambda given: forward(given)[0])
+        smoothed.defvjp(forward, lambda gradient, bar: ({name: bar * own for name, own in gradient.items()},))
+        return smoothed({name: jnp.asarray(array, float) for name, array in weights.items()})
 
 
 def _array(array: Any) -> Array:

@@ -1,6 +1,6 @@
 """Layers as functions of PyTorch's tensors: both modes of its automatic differentiation, and `torch.vmap`."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import prod
@@ -194,6 +194,20 @@ class TorchBridge(Bridge):
         """Copy arrays of a layer to tensors."""
         shapes = {name: tuple(array.shape) for name, array in found.items()}
         return {name: own.clone() for name, own in zip(shapes, _tensors(layer, found, shapes), strict=True)}
+
+    def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
+        """Map the loss, or it with its gradient, by `torch.vmap`."""
+        if not slope:
+            return torch.vmap(lambda *given: (loss(*given), {}))
+        mapped = torch.vmap(torch.func.grad_and_value(loss))
+        return lambda *given: mapped(*given)[::-1]
+
+    def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
+        """Return the value with the gradient, by terms that are 0."""
+        value, gradient = found(weights)
+        own = {name: array for name, array in weights.items() if isinstance(array, torch.Tensor)}
+        moved = (((array - array.detach()) * array.new_tensor(gradient[name])).sum() for name, array in own.items())
+        return sum(moved, torch.tensor(value))
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
         """Copy a tensor, or other numbers, to the host in float64."""
