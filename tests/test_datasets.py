@@ -1,6 +1,7 @@
 """Data sets of varied runs: what is drawn, the layout of LagrangeBench, derivatives, and going on after a kill."""
 
 import json
+import subprocess
 from contextlib import nullcontext
 from pathlib import Path
 from tomllib import loads
@@ -74,10 +75,19 @@ def test_values_are_even_in_their_range_or_in_its_logarithm():
     assert logarithms.std() == pytest.approx(4.0 * 12**-0.5, abs=0.05)
 
 
-def test_the_first_runs_train():
-    found = table(valid=0.1, test=0.2).split(20)
-    assert found == {"train": range(14), "valid": range(14, 16), "test": range(16, 20)}
-    assert table(valid=0.0, test=0.01).split(5) == {"train": range(4), "valid": range(4, 4), "test": range(4, 5)}
+@pytest.mark.parametrize(("valid", "test"), [(0.1, 0.1), (0.1, 0.2), (0.0, 0.01), (0.45, 0.45), (0.0, 0.0), (0.5, 0.3)])
+def test_the_purpose_of_a_run_does_not_depend_on_how_many_there_are(valid, test):
+    one = table(valid=valid, test=test)
+    parts = {"train": 1.0 - valid - test, "valid": valid, "test": test}
+    purposes = sum(part > 0.0 for part in parts.values())
+    most = one.split(300)
+    assert sorted(number for own in most.values() for number in own) == list(range(300))
+    for runs in range(purposes, 300):
+        found = one.split(runs)
+        for purpose, own in found.items():
+            assert own == [number for number in most[purpose] if number < runs]
+            assert abs(len(own) - parts[purpose] * runs) <= 2.0 and bool(own) == (parts[purpose] > 0.0)
+    assert [len(own) for own in table().split(100).values()] == [80, 10, 10]
 
 
 # ---- one run -----------------------------------------------------------------------------------------------------
@@ -111,11 +121,68 @@ def test_kinds_walls_and_statistics():
     assert found.arrays["particle_type"].tolist() == [0] * fluid + [1] * walls
     assert (np.ptp(found.arrays["position"][:, fluid:], axis=0) == 0.0).all()
     assert one_run(made, Sample(table(walls=False), 0)).arrays["position"].shape == (4, fluid, 2)
-    steps = np.diff(found.arrays["position"][:, :fluid].astype(float), axis=0).reshape(-1, 2)
+    found = one_run(simulation(), sample)
+    steps = np.diff(found.arrays["position"][:, :fluid], axis=0).reshape(-1, 2)
     count, total, squares = found.statistics["vel"]
     assert count == 3 * fluid
     np.testing.assert_allclose(total, steps.sum(axis=0), rtol=1e-6)
     np.testing.assert_allclose(squares, (steps**2).sum(axis=0), rtol=1e-6)
+
+
+def test_walls_of_solids_are_where_these_are_in_every_frame():
+    """Of one that turns along a path, one that falls freely, and one at rest."""
+    solids = """
+[[solid]]
+name = "paddle"
+shape = "box"
+lower = [0.55, 0.35]
+upper = [0.75, 0.65]
+motion = "path"
+times = [0.0, 0.24]
+positions = [[0.65, 0.5], [0.75, 0.55]]
+rotations = [[0.0], [0.6]]
+[[solid]]
+name = "raft"
+shape = "box"
+lower = [0.1, 0.6]
+upper = [0.3, 0.8]
+motion = "free"
+density = 500.0
+[[solid]]
+name = "post"
+shape = "box"
+lower = [0.8, 0.0]
+upper = [1.0, 0.2]
+"""
+    words = SCENE.replace('"pcisph"', '"projection"') + solids
+    made = Simulation(cortado.Scene(**loads(words)), precision="float64")
+    found = one_run(made, Sample(table(), 0)).arrays
+    kinds, places = found["particle_type"], found["position"]
+    assert {1, 2, 3} <= set(kinds.tolist())
+    for kind, name in ((2, "paddle"), (3, "raft")):
+        middle, angle = found[f"solids/{name}/position"], found[f"solids/{name}/rotation"]
+        assert np.ptp(middle[:, 1]) > 1e-4
+        c, s = np.cos(angle - angle[0]), np.sin(angle - angle[0])
+        for k in np.flatnonzero(kinds == kind):
+            x, y = (places[0, k] - middle[0]).T
+            turned = np.stack([c * x - s * y, s * x + c * y], axis=-1)
+            np.testing.assert_allclose(places[:, k], middle + turned, atol=1e-12)
+    assert np.ptp(found["solids/paddle/rotation"]) == pytest.approx(0.06, rel=1e-6)
+    assert (np.ptp(places[:, kinds == 1], axis=0) == 0.0).all()
+
+
+def test_positions_have_bounds_from_zero_on():
+    """Below them a run is refused; above them, as over the rim of a cup, they are as far as the fluid goes."""
+    origin, size, periods = datasets.bounds_of(simulation().scene)
+    np.testing.assert_allclose(origin, [-0.3, -0.3])
+    np.testing.assert_allclose(size, [1.6, 1.6])
+    assert not periods.any()
+    made = simulation()
+    walls = one_run(made, Sample(table(), 0)).arrays["position"][0, made.particles :]
+    assert walls.min() > 0.0 and (walls.max(axis=0) < size).all()
+    with pytest.raises(InputError, match=r"Particle 1 is 0.2 m below the bounds .* along axis 0 in frame 0"):
+        datasets._ends(np.array([[[0.1, 0.1], [-0.2, 0.1]]]))
+    assert datasets._ends(np.array([[[0.1, 2.0], [0.2, 0.1]]])) == {"upper": [0.2, 2.0]}
 
 
 def test_what_crosses_a_period_moves_the_shorter_way():
@@ -151,20 +218,21 @@ def test_a_data_set_has_the_layout_of_lagrangebench(file, tmp_path, cortado_comm
     train = arrays_of("data/train.h5")
     assert {name.split("/")[0] for name in train} == {"00000", "00001", "00002"}
     moved = []
-    for number in range(3):
-        kinds, positions = train[f"{number:05d}/particle_type"], train[f"{number:05d}/position"]
+    for k, number in enumerate([0, 3, 4]):
+        kinds, positions = train[f"{k:05d}/particle_type"], train[f"{k:05d}/position"]
         assert positions.shape == (4, len(kinds), 2) and positions.dtype == np.float32
-        assert train[f"{number:05d}/velocity"].shape == (4, (kinds == 0).sum(), 2)
+        assert train[f"{k:05d}/velocity"].shape == (4, (kinds == 0).sum(), 2)
         assert len(kinds) <= content["num_particles_max"]
         values = Sample(command._table(file, []), number).values
-        np.testing.assert_array_equal(train[f"{number:05d}/vary/fluid.0.upper"], values["fluid.0.upper"])
+        np.testing.assert_array_equal(train[f"{k:05d}/vary/fluid.0.upper"], values["fluid.0.upper"])
         moved.append(np.diff(positions[:, kinds == 0].astype(float), axis=0))
     velocities, accelerations = moved, [np.diff(one, axis=0) for one in moved]
     for name, parts in (("vel", velocities), ("acc", accelerations)):
         rows = np.concatenate([one.reshape(-1, 2) for one in parts])
         np.testing.assert_allclose(content[f"{name}_mean"], rows.mean(axis=0), atol=1e-8)
         np.testing.assert_allclose(content[f"{name}_std"], rows.std(axis=0), rtol=1e-4)
-    assert content["bounds"] == [[0.0, 1.0], [0.0, 1.0]] and content["periodic_boundary_conditions"] == [False, False]
+    assert content["periodic_boundary_conditions"] == [False, False] and np.allclose(content["origin"], [-0.3, -0.3])
+    np.testing.assert_allclose(content["bounds"], [[0.0, 1.6], [0.0, 1.6]])
     wanted = {"dim": 2, "dx": 0.1, "dt": 0.004, "write_every": 2, "num_trajs_train": 3, "sequence_length_train": 4}
     assert {key: content[key] for key in wanted} == wanted
     again = cortado_command("dataset", file, "--runs", 5, "--out", "data")
@@ -182,7 +250,7 @@ def quick(monkeypatch):
             raise others[sample.number]
         rows = np.full((4, 300, 2), float(sample.number))
         moments = [9, [1.0, 2.0], [3.0, 4.0]]
-        ends = {"lower": [0.0, 0.0], "upper": [1.0, 1.0], "particles": 300}
+        ends = {"upper": [1.0, 1.0], "particles": 300}
         arrays = {"position": rows, "particle_type": np.zeros(300)}
         return datasets.OneRun(arrays, {"vel": moments, "acc": moments, **ends})
 
@@ -194,13 +262,13 @@ def quick(monkeypatch):
 
 
 def test_runs_that_fail_are_left_out_and_said(file, cortado_command, quick):
-    quick.others[1] = DivergedError(3, 7, "take a smaller time step")
+    quick.others[3] = DivergedError(3, 7, "take a smaller time step")
     code, out, err = cortado_command("dataset", file, "--runs", 5, "--out", "data")
     assert code == 0 and "2 to train, 1 to validate, 1 to test" in out
-    assert "1 of 5 runs failed and are left out. The first is run 1: The simulation diverged in step 3" in err
+    assert "1 of 5 runs failed and are left out. The first is run 3: The simulation diverged in step 3" in err
     train = arrays_of("data/train.h5")
-    assert [train[f"0000{k}/position"][0, 0, 0] for k in range(2)] == [0.0, 2.0]
-    quick.others |= dict.fromkeys(range(3), InputError("no fluid fits."))
+    assert [train[f"0000{k}/position"][0, 0, 0] for k in range(2)] == [0.0, 4.0]
+    quick.others |= dict.fromkeys([0, 3, 4], InputError("no fluid fits."))
     code, _, err = cortado_command("dataset", file, "--runs", 5, "--out", "none")
     assert code == 1 and "No run of those for train could be computed. The first: no fluid fits." in err
 
@@ -214,7 +282,7 @@ def test_what_was_killed_goes_on(file, cortado_command, quick):
     quick.asked.clear()
     code, _, err = cortado_command("dataset", file, "--runs", 5, "--out", "data")
     assert code == 0 and quick.asked == [3, 4], err
-    assert [arrays_of(f"data/{name}.h5")["00000/position"][0, 0, 0] for name in ("train", "valid", "test")] == [0, 3, 4]
+    assert [arrays_of(f"data/{name}.h5")["00000/position"][0, 0, 0] for name in ("train", "valid", "test")] == [0, 1, 2]
 
 
 @pytest.mark.parametrize(("size", "there"), [(15_000, 0), (50_000, 5), (None, 5)])
@@ -260,17 +328,180 @@ def test_wrong_calls_are_sentences(file, change, words, cortado_command, quick):
 def test_a_folder_of_something_else_is_kept(file, tmp_path, cortado_command, quick):
     assert cortado_command("dataset", file, "--runs", 5, "--out", "data")[0] == 0
     for change, words in (
-        (("--runs", 6), "(runs is 5, not 6); choose another --out, as a data set does not grow"),
-        (("--runs", 5, "--set", "dataset.seed=1"), "(dataset.seed is 0, not 1)"),
-        (("--runs", 5, "--precision", "float64"), "(precision is 'float32', not 'float64')"),
-        (("--runs", 5, "--set", "phase.0.rest_density=900.0"), "(scene.phase.0.rest_density is "),
+        (("--runs", 4), "--runs is 4, but must be at least 5: data has as many"),
+        (
+            ("--runs", 9, "--set", "dataset.seed=1"),
+            "columns.toml: dataset.seed is 1, but must be 0, as in the data set",
+        ),
+        (("--runs", 5, "--precision", "float64"), "--precision is 'float64', but must be 'float32', as in"),
+        (("--runs", 5, "--set", "phase.0.rest_density=900.0"), "phase.0.rest_density is 900.0, but must be 1000.0, as"),
     ):
         code, _, err = cortado_command("dataset", file, *change, "--out", "data")
-        assert code == 2 and f"data holds another data set {words}" in err
+        assert code == 2 and words in err and err.count("\n") == 1
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").touch()
     code, _, err = cortado_command("dataset", file, "--out", "mine")
     assert code == 2 and "holds notes.txt, but no data set" in err
+
+
+# ---- growing -----------------------------------------------------------------------------------------------------
+
+
+def content_of(folder):
+    """All arrays and metadata of a data set, with the attributes of its runs."""
+    found = {"metadata": json.loads((Path(folder) / "metadata.json").read_text())}
+    for purpose in ("train", "valid", "test"):
+        found |= {f"{purpose}/{name}": one for name, one in arrays_of(f"{folder}/{purpose}.h5").items()}
+        with h5py.File(f"{folder}/{purpose}.h5") as whole:
+            found |= {f"{purpose}/{name}": dict(one.attrs) for name, one in whole.items()}
+    return found
+
+
+def assert_same(one, other):
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        if isinstance(value, np.ndarray):
+            assert value.dtype == other[name].dtype and value.tobytes() == other[name].tobytes(), name
+        else:
+            assert value == other[name], name
+
+
+def test_a_data_set_that_grows_is_the_one_made_at_once_and_keeps_its_runs(file, cortado_command, monkeypatch):
+    """Made with 5 runs and then 11, or with 11; of these runs one fails."""
+    asked, whole = [], one_run
+
+    def made(simulation, sample):
+        asked.append(sample.number)
+        if sample.number == 3:
+            raise DivergedError(3, 7, "take a smaller time step")
+        return whole(simulation, sample)
+
+    monkeypatch.setattr(command, "one_run", made)
+    assert cortado_command("dataset", file, "--runs", 5, "--out", "grown")[0] == 0
+    before = content_of("grown")
+    asked.clear()
+    code, out, err = cortado_command("dataset", file, "--runs", 11, "--out", "grown")
+    assert code == 0 and asked == list(range(5, 11)), err
+    assert "its first 5 runs are as they were" in out and "failed" not in err
+    after = content_of("grown")
+    assert_same(
+        {name: one for name, one in before.items() if name != "metadata"},
+        {name: after[name] for name in before if name != "metadata"},
+    )
+    assert cortado_command("dataset", file, "--runs", 11, "--out", "once")[0] == 0
+    assert_same(content_of("once"), after)
+    assert after["metadata"]["runs"] == 11 and list(after["metadata"]["failed"]) == ["3"]
+    counts = [after["metadata"][f"num_trajs_{purpose}"] for purpose in ("train", "valid", "test")]
+    assert counts == [6, 2, 2]
+
+
+def grown(cortado_command, file, runs=11):
+    return cortado_command("dataset", file, "--runs", runs, "--out", "data")
+
+
+@pytest.mark.parametrize("where", ["in a run", "as the files are put together", "between two files"])
+def test_growing_that_was_killed_goes_on(where, file, cortado_command, quick, monkeypatch):
+    assert grown(cortado_command, file, 5)[0] == 0
+    with monkeypatch.context() as patch:
+        if where == "in a run":
+            quick.others[7] = KeyboardInterrupt()
+        else:
+            owner, name = (Path, "replace") if where == "between two files" else (h5py.File, "copy")
+            calls, whole = [], getattr(owner, name)
+
+            def stop(*given):
+                calls.append(given)
+                if len(calls) == 2:
+                    raise KeyboardInterrupt
+                return whole(*given)
+
+            patch.setattr(owner, name, stop)
+        code, _, err = grown(cortado_command, file)
+    assert code == 130 and f"{7 if where == 'in a run' else 11} of 11 runs are finished" in err
+    quick.others.clear()
+    quick.asked.clear()
+    code, _, err = grown(cortado_command, file)
+    assert code == 0 and quick.asked == ([7, 8, 9, 10] if where == "in a run" else []), err
+    for purpose, numbers in command._table(file, []).split(11).items():
+        there = arrays_of(f"data/{purpose}.h5")
+        assert [there[f"{k:05d}/position"][0, 0, 0] for k in range(len(numbers))] == numbers
+    assert not [one for one in Path("data").iterdir() if one.suffix == ".tmp" or one.name == "runs"]
+
+
+@pytest.mark.parametrize("harm", ["cut", "gone", "empty", "metadata", "part"])
+def test_a_half_written_file_is_told_and_mended(harm, file, cortado_command, quick, monkeypatch):
+    assert grown(cortado_command, file, 5)[0] == 0
+    before = content_of("data")
+    path = Path("data/train.h5")
+    if harm == "part":
+        quick.others[7] = KeyboardInterrupt()
+        grown(cortado_command, file)
+        quick.others.clear()
+        path = Path("data/runs/00005.h5")
+    if harm == "metadata":
+        path = Path("data/metadata.json")
+    content = path.read_bytes()
+    path.unlink() if harm == "gone" else path.write_bytes(b"" if harm == "empty" else content[: len(content) // 2])
+    quick.asked.clear()
+    code, _, err = grown(cortado_command, file, 11 if harm == "part" else 5)
+    assert code == 0
+    assert quick.asked == {"metadata": [], "part": [5, 7, 8, 9, 10]}.get(harm, [0, 3, 4])
+    told = harm in ("cut", "empty", "part")
+    assert (f"{path.absolute()} was damaged" in err) == told == ("has been made anew" in err)
+    if harm != "part":
+        assert_same(content_of("data"), before)
+    assert "is complete already" in grown(cortado_command, file, 11 if harm == "part" else 5)[1]
+
+
+def test_a_disk_that_fills_as_a_data_set_grows_leaves_it_as_it_was(file, cortado_command, quick):
+    assert grown(cortado_command, file, 5)[0] == 0
+    before = content_of("data")
+    with largest_file(Path("data/train.h5").stat().st_size + 1000):
+        code, _, err = grown(cortado_command, file)
+    assert code == 1 and "free some space" in err and "11 of 11 runs are finished" in err
+    assert_same(content_of("data"), before)
+    quick.asked.clear()
+    assert grown(cortado_command, file)[0] == 0 and not quick.asked
+
+
+def test_a_file_of_the_scene_with_another_content_is_another_scene(tmp_path, monkeypatch, cortado_command, quick):
+    monkeypatch.chdir(tmp_path)
+    points = np.stack(np.meshgrid([0.15, 0.25], [0.15, 0.25]), axis=-1).reshape(-1, 2)
+    np.save("points.npy", points)
+    box = 'shape = "box", lower = [0.0, 0.0], upper = [0.4, 0.4]'
+    given = TABLE.replace('vary."fluid.0.upper" = [[0.3, 0.3], [0.5, 0.6]]', "")
+    Path("points.toml").write_text(SCENE.replace(box, 'shape = "points", file = "points.npy"') + given)
+    assert grown(cortado_command, "points.toml", 5)[0] == 0
+    np.save("points.npy", points + 0.01)
+    code, _, err = grown(cortado_command, "points.toml")
+    assert code == 2 and "points.toml: fluid.0.file content is '" in err and "choose another --out" in err
+
+
+LAGRANGEBENCH = Path(__file__).parents[1] / "build" / "lagrangebench" / "bin" / "python"
+
+
+@pytest.mark.parametrize("periodic", [False, True])
+def test_lagrangebench_reads_a_data_set_that_has_grown(periodic, file, cortado_command):
+    """Its windows, its searches for neighbours against all distances, its normalisation and its integrator."""
+    if not LAGRANGEBENCH.exists():
+        pytest.skip("LagrangeBench has no Python of its own")
+    if periodic:
+        words = SCENE.replace("upper = [1.0, 1.0] }", "upper = [1.0, 1.0], periodic = [true, false] }")
+        given = TABLE.replace("[[0.3, 0.3], [0.5, 0.6]]", "[[1.0, 0.3], [1.0, 0.6]]")
+        Path(file).write_text(words.replace("[solver]", "forces = { gravity = [20.0, -9.81] }\n[solver]") + given)
+    for runs in (3, 6):
+        code, _, err = cortado_command("dataset", file, "--runs", runs, "--out", "data", "--set", "dataset.steps=20")
+        assert code == 0, err
+    program = Path(__file__).with_name("lagrangebench_reader.py")
+    done = subprocess.run([LAGRANGEBENCH, program, "data"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["windows"] == {"train": 4 * 9, "valid": 3, "test": 3} and found["types"] == [0, 1]
+    assert found["wrong_pairs"] == {"jaxmd_vmap": 0, "jaxmd_scan": 0, "matscipy": 0}
+    for name in ("vel", "acc"):
+        np.testing.assert_allclose(found[name]["mean"], 0.0, atol=1e-4)
+        np.testing.assert_allclose(found[name]["std"], 1.0, atol=1e-4)
+    assert found["step_off"] < 1e-6
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ MODULES = modules()
 MOST_PACKAGES = 17
 MOST_LINES = 450
 ON_TOP = ("pictures", "environments", "cli", "__main__", "measured")
-ON_TOP += tuple(f"optimisation.{name}" for name in ("datasets", "fitting", "inverse", "sweep"))
+ON_TOP += tuple(f"optimisation.{name}" for name in ("dataset_files", "datasets", "fitting", "inverse", "sweep"))
 """Packages, and modules, that lie on top of the core; `cortado` itself has the names of all."""
 
 

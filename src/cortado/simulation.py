@@ -127,8 +127,8 @@ class Simulation(Stepping):
         check_own(self.known, self)
         self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
         self.smoothing = discrete.kernel
-        self.walls = discrete.walls.positions
-        """(b, d) wall particles [m]."""
+        self.walls, self.wall_solids = discrete.walls.positions, discrete.walls.solid
+        """(b, d) wall particles [m], and (b,) the solid of each, as `wall_numbers` has them; -1 for the container."""
         self.lattice, self.masses = discrete.lattice, discrete.masses
         """Constants of the lattice of particles at rest; masses of the fluid at the start, given and asked for [kg]."""
         self.free_particles = discrete.fluid.emitted.start

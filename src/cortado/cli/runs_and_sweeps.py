@@ -107,7 +107,7 @@ def dataset(
     workers: int | None = None,
 ) -> Work:
     """Compute many runs of a scene with varied values, to train learned simulators on; the same command goes on with
-    those that are missing.
+    those that are missing, and with more runs the data set grows.
 
     Args:
         file: A file with the table [dataset], which says what varies.

@@ -1,28 +1,25 @@
 """Data sets of runs with varied scenes, for learned simulators: the table [dataset], one run, and the files of all."""
 
-import io
 import json
-import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
 from cortado.discretise.shapes import wrapped
-from cortado.errors import ComputationError
-from cortado.files.disk import sentences, unfinished, write_atomically
+from cortado.errors import InputError
 from cortado.losses import FinalPositions
 from cortado.particles.state import State
 from cortado.problem import Problem
+from cortado.runs.solid_motion import SolidMotion
+from cortado.scene.motions import wall_numbers
 from cortado.scene.parameters import BY_NAME
 from cortado.scene.scene import Scene
-from cortado.scene.tables import Flag, Table, Text, count, field_error, quantity
+from cortado.scene.tables import Flag, Table, Text, count, field_error, quantity, rotation_matrix
 from cortado.simulation import Simulation
-from cortado.version import __version__
 
 PAIR = "a lower and an upper end of the same shape, each a number or a list of numbers"
 
@@ -71,7 +68,7 @@ class DatasetTable(Table):
     valid: Annotated[float, quantity(ge=0.0, le=0.9)] = 0.1
     """The part of the runs that is for validation."""
     test: Annotated[float, quantity(ge=0.0, le=0.9)] = 0.1
-    """The part of the runs that is for tests."""
+    """The part of the runs that is for tests. One run at least is for each purpose that has a part."""
     walls: Flag = True
     """Whether the particles of walls come behind those of fluid."""
     tangents: Annotated[int, count(0, 1_000)] = 0
@@ -98,11 +95,19 @@ class DatasetTable(Table):
                 raise field_error(("vary", key), self.vary[key][0], "above 0, as its logarithm is drawn")
         return self
 
-    def split(self, runs: int) -> dict[str, range]:
-        """The numbers of the runs for each purpose: the first ones train."""
-        valid, test = (max(round(part * runs), 1) if part else 0 for part in (self.valid, self.test))
-        train = runs - valid - test
-        return {"train": range(train), "valid": range(train, train + valid), "test": range(train + valid, runs)}
+    def split(self, runs: int) -> dict[str, list[int]]:
+        """Return the numbers of the runs for each purpose. The first runs go one to each purpose, and every further one
+        to that which lacks most, so that the purpose of a run does not depend on how many there are."""
+        parts = {"train": 1.0 - self.valid - self.test, "valid": self.valid, "test": self.test}
+        found: dict[str, list[int]] = {purpose: [] for purpose in parts}
+        for number in range(runs):
+
+            def lacks(purpose: str, runs: int = number + 1) -> tuple[bool, float]:
+                there = len(found[purpose])
+                return parts[purpose] > 0.0 and not there, parts[purpose] * runs - there
+
+            found[max(parts, key=lacks)].append(number)
+        return found
 
 
 class DatasetTables(Table):
@@ -160,8 +165,12 @@ class Sample:
         return np.random.default_rng([self.table.seed, self.number, *purpose])
 
 
-WALL, FLUID, MORE_FLUID = 1, 0, 4
-"""Types of particles in LagrangeBench: walls, fluid, and the first number that it leaves free, for further phases."""
+FLUID, WALL, MOVING_WALL, BODY, MORE_FLUID, KINDS = 0, 1, 2, 3, 4, 9
+"""Types of particles in LagrangeBench: fluid, walls, walls with a given motion, and bodies that move freely; the first
+number that it leaves free, for further phases; and how many types it has."""
+MARGIN = 3
+"""Spacings from the closed sides of the container to the bounds, as in LagrangeBench's own sets. No wall particle is as
+deep, and none sees one on the other side of the bounds, which LagrangeBench takes as periodic if one axis is."""
 
 
 @dataclass(frozen=True)
@@ -172,40 +181,70 @@ class OneRun:
     """Arrays by their names in the file."""
     statistics: dict[str, Any]
     """Statistics of the fluid: count, sum and sum of squares of each component of velocities and accelerations, in
-    metres a frame; the ends of all positions; and the number of particles with walls."""
+    metres a frame; the upper ends of all positions; and the number of particles with walls."""
 
 
 def one_run(simulation: Simulation, sample: Sample) -> OneRun:
     """Run a simulation from a sample's start, and differentiate it along random directions; raises `DivergedError` or
     `InputError`."""
     table, scene = sample.table, simulation.scene
-    spacing, d = scene.discretisation.spacing, simulation.dimension
-    start = sample.start(simulation.positions, simulation.velocities, spacing)
+    start = sample.start(simulation.positions, simulation.velocities, scene.discretisation.spacing)
     trajectory = simulation.run(table.steps, start, record_every=table.write_every)
-    origin, periods = (np.asarray(one, dtype=np.float64) for one in periods_of(scene))
+    origin, _, periods = bounds_of(scene)
     positions = np.asarray(trajectory.positions, dtype=np.float64)
-    walls = np.asarray(simulation.walls, dtype=np.float64) if table.walls else np.zeros((0, d))
-    every = np.concatenate([positions, np.broadcast_to(walls, (len(positions), *walls.shape))], axis=1)
+    walls, wall_kinds = _walls(simulation, trajectory.solids, len(positions) if table.walls else 0)
     phases = simulation.mass_fractions.argmax(axis=1)
     kinds = np.where(phases == 0, FLUID, MORE_FLUID - 1 + phases)
     real = simulation.precision.numpy
+    every = np.concatenate([positions, walls], axis=1) if table.walls else positions
+    places = wrapped(every - origin, periods)
     arrays = {
-        "position": wrapped(every - origin, periods).astype(real),
-        "particle_type": np.concatenate([kinds, np.full(len(walls), WALL)]).astype(np.int64),
+        "position": wrapped(places.astype(real), periods.astype(real)),  # as rounding may reach the period
+        "particle_type": np.concatenate([kinds, wall_kinds]).astype(np.int64),
         "velocity": np.asarray(trajectory.velocities, dtype=real),
         **{f"vary/{key}": np.array(value) for key, value in sample.values.items()},
     }
     for name, motion in trajectory.solids.items():
-        arrays |= {f"solids/{name}/position": motion.positions, f"solids/{name}/rotation": motion.rotations}
-    statistics = {**_statistics(positions, periods), "particles": every.shape[1]}
+        arrays |= {f"solids/{name}/position": motion.positions - origin, f"solids/{name}/rotation": motion.rotations}
+    statistics = {**_statistics(positions, periods), **_ends(places), "particles": every.shape[1]}
     return OneRun(arrays | _tangents(simulation, sample, start), statistics)
 
 
-def periods_of(scene: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower ends and the lengths (d,) [m] of the axes that are periodic, both 0 along others."""
-    ends, (_, lengths) = scene.container.extent(), scene.container.periods(scene.dimension)
-    lower = np.zeros(scene.dimension) if ends is None else np.asarray(ends[0], dtype=np.float64)
-    return np.where(lengths > 0.0, lower, 0.0), np.asarray(lengths, dtype=np.float64)
+def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where the bounds of a data set begin in the scene, how long they are, and the periods of its axes, 0 of
+    those without one, each (d,) [m]. Walls are within; raises `InputError` without a container."""
+    ends, (_, periods) = scene.container.extent(), scene.container.periods(scene.dimension)
+    if ends is None:
+        raise InputError("container.shape is 'none', but must be 'box' or 'cylinder', as a data set has bounds.")
+    room = np.where(periods > 0.0, 0.0, MARGIN * scene.discretisation.spacing)
+    return ends[0] - room, ends[1] - ends[0] + 2.0 * room, np.asarray(periods, dtype=np.float64)
+
+
+def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions (frames, b, d) [m] of wall particles and their types (b,), both empty for no frames."""
+    places = np.repeat(np.asarray(simulation.walls, dtype=np.float64)[None], frames, axis=0)
+    kinds = np.full(len(simulation.walls) if frames else 0, WALL)
+    numbers = wall_numbers(simulation.scene.solid)
+    for name, motion in motions.items() if frames else ():
+        own = simulation.wall_solids == numbers[name]
+        turns = [rotation_matrix(tuple(np.atleast_1d(turn))) for turn in motion.rotations]
+        beside = places[0, own] - motion.positions[0]
+        for frame, (middle, turn) in enumerate(zip(motion.positions, turns, strict=True)):
+            places[frame, own] = middle + beside @ (turn @ turns[0].T).T
+        kinds[own] = MOVING_WALL if motion.velocities is None else BODY
+    return places, kinds
+
+
+def _ends(places: np.ndarray) -> dict[str, list[float]]:
+    """Return the upper ends (d,) [m] of positions within the bounds (frames, n, d); raise `InputError` if one is below
+    their lower ends."""
+    if places.min() < 0.0:
+        frame, particle, axis = np.unravel_index(places.argmin(), places.shape)
+        raise InputError(
+            f"Particle {particle} is {-places.min():.3g} m below the bounds of the data set along axis {axis} in frame "
+            f"{frame}, but must be within: they begin {MARGIN} spacings outside of the container."
+        )
+    return {"upper": places.max(axis=(0, 1)).tolist()}
 
 
 def _statistics(positions: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
@@ -216,8 +255,7 @@ def _statistics(positions: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
     for name, values in (("vel", moved), ("acc", np.diff(moved, axis=0))):
         rows = values.reshape(-1, positions.shape[2])
         found[name] = [len(rows), rows.sum(axis=0).tolist(), (rows**2).sum(axis=0).tolist()]
-    ends = positions.reshape(-1, positions.shape[2])
-    return {**found, "lower": ends.min(axis=0).tolist(), "upper": ends.max(axis=0).tolist()}
+    return found
 
 
 def _tangents(simulation: Simulation, sample: Sample, start: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -246,132 +284,3 @@ def _tangents(simulation: Simulation, sample: Sample, start: dict[str, np.ndarra
             found[name].append(direction[name])
     to = {"initial_positions": "position_direction", "initial_velocities": "velocity_direction"}
     return {f"tangent/{to.get(name, name)}": np.array(values, dtype=real) for name, values in found.items()}
-
-
-METADATA, PARTS = "metadata.json", "runs"
-"""Names of the file that is written last, and of the folder that has the runs until then."""
-REACH = 1.45
-"""In spacings: the connectivity radius of a learned simulator, as in LagrangeBench's data sets."""
-SPARE = 1.02
-"""Free space on the disk that is asked for, relative to the size of all runs."""
-
-
-class Parts:
-    """The finished runs of a data set that is not complete."""
-
-    def __init__(self, out: Path):
-        self.folder = out / PARTS
-
-    def save(self, number: int, run: OneRun) -> None:
-        """Write a run to its file, whole or not at all; HDF5 does it in memory, as a full disk may kill it."""
-        import h5py
-
-        content = io.BytesIO()
-        with h5py.File(content, "w") as file:
-            for name, array in run.arrays.items():
-                file[f"run/{name}"] = array
-        self._mark(number, {"statistics": run.statistics}, content.getvalue())
-
-    def save_failure(self, number: int, why: str) -> None:
-        """Note that a run failed, and why."""
-        self._mark(number, {"failure": why})
-
-    def note(self, number: int) -> dict[str, Any] | None:
-        """Return the statistics of a run, or its failure; None while it is not finished."""
-        path = self.path(number, "json")
-        return json.loads(path.read_text()) if path.exists() else None
-
-    def path(self, number: int, ending: str = "h5") -> Path:
-        """Return the path of a run's file, or with another ``ending`` that of its note."""
-        return self.folder / f"{number:05d}.{ending}"
-
-    def _mark(self, number: int, note: Mapping[str, Any], content: bytes | None = None) -> None:
-        with sentences(self.folder):
-            self.folder.mkdir(exist_ok=True)
-        if content is not None:
-            write_atomically(self.path(number), content)
-        write_atomically(self.path(number, "json"), json.dumps(note))
-
-
-def assemble(out: Path, split: Mapping[str, Sequence[int]]) -> None:
-    """Write one file for each purpose of ``split`` with the runs of its numbers, counted from 0 in each; raises
-    `ComputationError` where the disk has no room, and leaves the runs as they are."""
-    import h5py
-
-    parts = Parts(out)
-    with sentences(out):
-        needed = SPARE * sum(parts.path(number).stat().st_size for own in split.values() for number in own)
-        free = shutil.disk_usage(out).free
-        if free < needed:
-            raise ComputationError(
-                f"{out} needs {needed / 1e9:.3g} GB to put its runs together, but the disk has {free / 1e9:.3g} GB "
-                "left; free some space, and give the same command again."
-            )
-        for purpose, numbers in split.items():
-            path = out / f"{purpose}.h5"
-            temporary = unfinished(path)
-            try:
-                with h5py.File(temporary, "w") as whole:
-                    for k, number in enumerate(numbers):
-                        with h5py.File(parts.path(number), "r") as part:
-                            whole.copy(part["run"], f"{k:05d}")
-                temporary.replace(path)
-            except RuntimeError as problem:  # so HDF5 says that the disk refused
-                raise ComputationError(
-                    f"{path} cannot be written, as the disk refuses; free some space, and give the same command again."
-                ) from problem
-            finally:
-                temporary.unlink(missing_ok=True)
-
-
-def remove_parts(out: Path) -> None:
-    """Remove the single runs, once they are in the files of the data set."""
-    shutil.rmtree(out / PARTS, ignore_errors=True)
-
-
-def metadata(
-    scene: Scene, table: DatasetTable, split: Mapping[str, Sequence[int]], notes: Mapping[int, Any], most: int
-) -> dict[str, Any]:
-    """Return the metadata that LagrangeBench reads of a data set, and its origin; ``notes`` by the number of each run,
-    ``most`` the particles of the largest one."""
-    frames, (origin, periods) = table.steps // table.write_every + 1, periods_of(scene)
-    train = [notes[number]["statistics"] for number in split["train"]]
-    ends = scene.container.extent()
-    if ends is None:
-        every = [note["statistics"] for note in notes.values()]
-        ends = tuple(pick([one[key] for one in every], axis=0) for key, pick in (("lower", np.min), ("upper", np.max)))
-    time_step = scene.solver.fixed_time_step("a data set")
-    moments = {f"{name}_{what}": value for name in ("vel", "acc") for what, value in _moments(train, name).items()}
-    gravity = {} if "forces.gravity" in table.vary else {"g_ext": list(scene.forces.gravity)}
-    return {
-        "case": scene.name,
-        "solver": f"Cortado {__version__}, {scene.solver.kind}",
-        "dim": scene.dimension,
-        "dx": scene.discretisation.spacing,
-        "dt": time_step,
-        "t_end": table.steps * time_step,
-        "write_every": table.write_every,
-        "num_particles_max": most,
-        "periodic_boundary_conditions": (periods > 0.0).tolist(),
-        "bounds": np.transpose([ends[0] - origin, ends[1] - origin]).tolist(),
-        "origin": origin.tolist(),
-        "default_connectivity_radius": REACH * scene.discretisation.spacing,
-        **gravity,
-        "seed": table.seed,
-        "vary": dict(table.vary),
-        **{f"sequence_length_{purpose}": frames for purpose in split},
-        **{f"num_trajs_{purpose}": len(numbers) for purpose, numbers in split.items()},
-        **moments,
-    }
-
-
-def _moments(train: Sequence[Mapping[str, Any]], name: str) -> dict[str, list[float]]:
-    """Return the mean and the standard deviation (d,) of a statistic over all training runs."""
-    counts, sums, squares = (np.sum([np.asarray(one[name][k]) for one in train], axis=0) for k in range(3))
-    mean = sums / np.maximum(counts, 1)
-    return {"mean": mean.tolist(), "std": np.sqrt(np.maximum(squares / np.maximum(counts, 1) - mean**2, 0.0)).tolist()}
-
-
-def write_metadata(out: Path, content: Mapping[str, Any]) -> None:
-    """Write the metadata, which mark a data set as complete."""
-    write_atomically(out / METADATA, json.dumps(content, indent=2) + "\n")

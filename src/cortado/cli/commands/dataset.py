@@ -2,9 +2,10 @@
 
 import json
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +23,15 @@ from cortado.errors import (
 from cortado.files.disk import LOCK, UNFINISHED, locked, sentences, write_atomically
 from cortado.files.interruption import keeping
 from cortado.files.terminal import track, untracked
+from cortado.optimisation.dataset_files import PARTS, DatasetFolder, metadata
 from cortado.optimisation.datasets import (
-    METADATA,
+    KINDS,
+    MORE_FLUID,
     DatasetTable,
     DatasetTables,
-    Parts,
     Sample,
-    assemble,
-    metadata,
+    bounds_of,
     one_run,
-    remove_parts,
-    write_metadata,
 )
 from cortado.pictures.side_by_side import differences
 from cortado.runs.run_folder import read_json
@@ -45,7 +44,8 @@ from cortado.version import __version__
 from cortado.words import counted
 
 ASKED = "dataset.json"
-"""The file with the choices of a data set, by which the same command goes on with it, and another one does not."""
+"""The file with the choices of a data set, by which the same command goes on with it, and another one does not. The
+number of runs is none of them."""
 MOST_RUNS = 100_000
 
 
@@ -69,65 +69,68 @@ class Member:
     def __call__(self, number: int) -> tuple[bool, list[str]]:
         """Compute a run and write it; return True if there is one, and its warnings."""
         require_shared(self.out, "the scene and the folder of a data set")
-        parts = Parts(self.out)
+        folder = DatasetFolder(self.out)
         with warnings.catch_warnings(record=True) as caught, untracked():
             warnings.simplefilter("always", CortadoWarning)
             try:
                 simulation = Simulation(self.scene(number), self.device, self.precision)
                 found = one_run(simulation, Sample(self.table, number))
             except (DivergedError, SceneError, InputError) as error:
-                parts.save_failure(number, str(error))
+                folder.save_failure(number, str(error))
                 return False, []
-        parts.save(number, found)
+        folder.save(number, found)
         return True, [str(one.message) for one in caught if issubclass(one.category, CortadoWarning)]
 
 
 def make_dataset(
     file: Path, runs: int, out: Path, overrides: list[str], device: str, precision: str, where: Where
 ) -> str:
-    """Compute the missing runs of a data set and put all together; return a sentence that says where they are. Raise
-    `ComputationError` where the disk is full, and where a purpose is left without a run."""
+    """Compute the missing runs of a data set, new or there already, and put all together; return a sentence that says
+    where they are. Raise `ComputationError` where the disk is full, and where a purpose is left without a run."""
     table = _table(file, overrides)
     of_scene = [one for one in overrides if one not in overrides_of(overrides, ("dataset",))]
     member = Member(file.absolute(), tuple(of_scene), table, out.absolute(), device, precision)
     split = table.split(_checked_runs(runs, table))
-    asked = _asked(member, runs)
+    asked = _asked(member)
     if out.suffix in (".h5", ".hdf5"):
         raise InputError(f"--out is {out}, but must be a folder, for the files train.h5, valid.h5 and test.h5.")
-    parts, absolute = Parts(member.out), member.out
     with locked(out):
-        for left_behind in absolute.glob(UNFINISHED):  # by a process that was killed
-            left_behind.unlink(missing_ok=True)
-        if _is_complete(absolute, asked):
-            remove_parts(absolute)
-            return f"The data set in {absolute} is complete already: {_sizes(read_json(absolute / METADATA))}."
-        left = [number for number in range(runs) if parts.note(number) is None]
+        _claim(file, member.out, asked)
+        folder = DatasetFolder(member.out)
+        before, known = folder.size, folder.metadata.get("failed", {})
+        if runs < before:
+            raise InputError(f"--runs is {runs}, but must be at least {before}: {out} has as many, and keeps them.")
+        left = [number for number in range(runs) if number not in folder.runs and number not in folder.failures]
 
         def kept() -> str:
-            there = sum(parts.note(number) is not None for number in range(runs))
-            return (
-                f"{there} of {counted(runs, 'run')} are finished, in {absolute}; the same command goes on with the rest"
-            )
+            now = DatasetFolder(member.out)
+            there = sum(number in now.runs or number in now.failures for number in range(runs))
+            said = f"{there} of {counted(runs, 'run')} are finished, in {member.out}"
+            return f"{said}; the same command goes on with the rest"
 
         told: dict[int, list[str]] = {}
+        failed: list[int] = []
 
         def note(k: int, result: tuple[bool, list[str]]) -> None:
             there, told[left[k]] = result
             failed.extend([left[k]] * (not there))
             advance(failed=len(failed))
 
-        failed: list[int] = []
         with (
             (where if left else HERE).executor(device, len(left)) as executor,
             _saying(kept),
             track(len(left), "data set") as advance,
         ):
             executor.map(member, left, note)
-        there, notes, failures = _finished(parts, split)
         with _saying(kept):
-            sizes = _put_together(member, there, notes)
-    _warn(told, failures, runs)
-    return f"The data set is in {absolute}: {sizes}."
+            content = _put_together(member, split, runs)
+    for path, why in folder.damaged.items():
+        warn(f"{path} was damaged ({why}) and has been made anew; {counted(len(left), 'run')} had to be computed.")
+    _warn(told, {int(one): why for one, why in content["failed"].items() if one not in known}, runs)
+    if not left and not folder.damaged:
+        return f"The data set in {member.out} is complete already: {_sizes(content)}."
+    grown = f"; its first {before} runs are as they were" if 0 < before < runs and not folder.damaged else ""
+    return f"The data set is in {member.out}: {_sizes(content)}{grown}."
 
 
 @contextmanager
@@ -140,29 +143,20 @@ def _saying(kept: Callable[[], str]) -> Iterator[None]:
         raise ComputationError(f"{str(error).rstrip('.')}. {kept()}.") from error
 
 
-def _finished(parts: Parts, split: Mapping[str, range]) -> tuple[dict[str, list[int]], dict[int, Any], dict[int, str]]:
-    """Return the numbers of the finished runs for each purpose, the note on each, and why others failed; raise
-    `ComputationError` where a purpose has none."""
-    notes = {number: parts.note(number) or {} for own in split.values() for number in own}
-    failures = {number: note["failure"] for number, note in notes.items() if "failure" in note}
-    there = {purpose: [number for number in own if number not in failures] for purpose, own in split.items()}
-    for purpose, numbers in there.items():
-        if split[purpose] and not numbers:
-            first = next(failures[number] for number in split[purpose])
+def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int) -> dict[str, Any]:
+    """Write the files of the data set from its finished runs, and return the metadata; raise `ComputationError` where a
+    purpose has no run."""
+    folder = DatasetFolder(member.out)
+    there = {purpose: [number for number in own if number in folder.runs] for purpose, own in split.items()}
+    for purpose, numbers in split.items():
+        if numbers and not there[purpose]:
+            first = folder.failures[numbers[0]]
             raise ComputationError(f"No run of those for {purpose} could be computed. The first: {first}")
-    return there, {number: note for number, note in notes.items() if number not in failures}, failures
-
-
-def _put_together(member: Member, there: Mapping[str, list[int]], notes: Mapping[int, Any]) -> str:
-    """Write the files of the data set, from runs by purpose and their notes; return their sizes in words."""
-    out = member.out
-    assemble(out, there)
+    folder.assemble(there)
     with unwarned():
-        most = max(note["statistics"]["particles"] for note in notes.values())
-        content = metadata(member.scene(min(notes)), member.table, there, notes, most)
-    write_metadata(out, content)
-    remove_parts(out)
-    return _sizes(content)
+        content = metadata(member.scene(there["train"][0]), member.table, there, folder, runs)
+    folder.write_metadata(content)
+    return content
 
 
 def _table(file: Path, overrides: list[str]) -> DatasetTable:
@@ -188,7 +182,7 @@ def _checked_runs(runs: int, table: DatasetTable) -> int:
     return runs
 
 
-def _asked(member: Member, runs: int) -> dict[str, Any]:
+def _asked(member: Member) -> dict[str, Any]:
     """Return the choices of a data set. The first scene and those with the ends of all ranges are read, so that a
     mistake is found before anything is computed. Raise `SceneError`."""
     table = member.table
@@ -203,9 +197,22 @@ def _asked(member: Member, runs: int) -> dict[str, Any]:
     for key in table.vary:
         if key in ("solver.time_step", "dimension", "discretisation.spacing") or key.startswith("container."):
             raise InputError(f"vary has {key}, which must be the same in all runs of a data set.")
-    scene_json = json.loads(_scene(member).to_json())
-    numbers = {"runs": runs, "precision": member.precision, "cortado": __version__}
-    return {"scene": scene_json, "dataset": table.model_dump(mode="json"), **numbers}
+    scene = _scene(member)
+    bounds_of(scene)
+    if len(scene.phase) > (most := KINDS - MORE_FLUID + 1):
+        raise InputError(f"The scene has {len(scene.phase)} phases, but a data set has types for at most {most}.")
+    asked = {"scene": json.loads(scene.to_json()), "dataset": table.model_dump(mode="json")}
+    _put_digests(asked["scene"])
+    return {**asked, "--precision": member.precision, "cortado": __version__}
+
+
+def _put_digests(table: Any) -> None:
+    """Put a digest of the content beside the name of each file in the tables of a scene, such as one with a mesh."""
+    for value in list(table.values()) if isinstance(table, dict) else table:
+        if isinstance(value, dict | list):
+            _put_digests(value)
+    if isinstance(table, dict) and "file" in table:
+        table["file content"] = sha256(Path(table["file"]).read_bytes()).hexdigest()
 
 
 def _are_one(member: Member, *overrides: list[str]) -> bool:
@@ -224,26 +231,24 @@ def _scene(member: Member) -> Scene:
         return load_scene(member.file, member.overrides)
 
 
-def _is_complete(out: Path, asked: Mapping[str, Any]) -> bool:
-    """Test whether the data set is complete; note the choices in a new folder; raise `InputError` for another
-    folder."""
+def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
+    """Note the choices of a data set in a new folder, and remove what a killed process left half-written; raise
+    `InputError` for a folder of something else."""
     note = out / ASKED
+    for left_behind in [*out.glob(UNFINISHED), *(out / PARTS).glob(UNFINISHED)]:
+        left_behind.unlink(missing_ok=True)
     if note.exists():
-        if other := differences(read_json(note), json.loads(json.dumps(asked))):
-            unlike = "; ".join(f"{key} is {shown(there)}, not {shown(now)}" for key, (there, now) in other.items())
-            grows = (
-                ", as a data set does not grow: how many runs there are says which are for tests"
-                if "runs" in other
-                else ""
-            )
-            raise InputError(f"{out} holds another data set ({unlike}); choose another --out{grows}.")
-        return (out / METADATA).exists()
+        there = read_json(note)
+        if other := differences(there, json.loads(json.dumps(asked))):
+            own = {key.removeprefix("scene."): pair for key, pair in other.items()}
+            unlike = "; ".join(f"{key} is {shown(now)}, but must be {shown(old)}" for key, (old, now) in own.items())
+            raise InputError(f"{file}: {unlike}, as in the data set that {out} holds; choose another --out.")
+        return
     with sentences(out):
         others = [one.name for one in out.iterdir() if one.name != LOCK]
     if others:
         raise InputError(f"{out} holds {others[0]}, but no data set; choose another --out.")
     write_atomically(note, json.dumps(asked, indent=2) + "\n")
-    return False
 
 
 def _sizes(content: Mapping[str, Any]) -> str:
