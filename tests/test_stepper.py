@@ -497,3 +497,20 @@ def test_directions_and_residuals_that_do_not_fit_are_sentences():
         with pytest.raises(InputError, match=words):
             call()
     assert np.abs(simulation.jvp(state, {}, {}, {"mobility": 1.0}, steps=2)["mass_fractions"]).max() > 0.0
+
+
+def test_steps_that_begin_as_the_last_ones_have_the_bits_of_steps_that_begin_anew():
+    """Also where other parameters, and ways back, come between them."""
+    given = [{"gravity": [k - 2.0, -9.0 - k]} for k in range(4)]
+    given += [{"viscosity": 0.5}, given[0], {"gravity": [0.0, -9.81]}, {}, {"gravity": [[1.0, -9.81]]}, {}]
+    simulation = Simulation(plane())
+    state, host = simulation.on_device(), simulation.state()
+    kept = None
+    for k, parameters in enumerate(given):
+        state, host = simulation.step(state, parameters), Simulation(plane()).step(host, parameters)
+        for name, own in host.fields.items():
+            assert state[name].numpy()[..., : own.shape[-1]].tobytes() == own.tobytes(), (parameters, name)
+        if kept is not None and k > 6:
+            simulation.stepper(1).vjp(kept, {"positions": state["positions"]})
+        if k == 5:
+            _, kept = simulation.stepper(1).step(state, {"gravity": [3.0, 1.0], "viscosity": 0.1})

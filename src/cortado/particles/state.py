@@ -212,9 +212,10 @@ class State(Arrays):
         new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
         return type(self)(self.fields, new, self.batch)
 
-    def copy(self) -> Self:
-        """Copy this state to arrays of its own."""
-        own = {name: wp.clone(self[name], requires_grad=False) for name in self.names}
+    def copy(self, earlier: Self | None = None) -> Self:
+        """Copy this state to arrays of its own; an ``earlier`` state of the run gives those that no step changes."""
+        kept = {} if earlier is None else {f.name: earlier[f.name] for f in self.fields if f.is_constant}
+        own = {name: kept[name] if name in kept else wp.clone(self[name], requires_grad=False) for name in self.names}
         return type(self)(self.fields, own, self.batch)
 
     def member(self, number: int) -> Self:

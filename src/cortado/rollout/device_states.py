@@ -69,7 +69,7 @@ class HostStates:
         space.check_restarts(states, values)
         space.begin(rollout, values, varied, states)
 
-    def state(self, rollout: Rollout, state: State, steps: int) -> Any:
+    def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> Any:
         """Return the state of a rollout after ``steps`` steps as read-only restart states; a lost scene of a batch has
         NaN in all fields."""
         scenes = zip(clocks_after(rollout, steps), rollout.origins, strict=True)
@@ -198,8 +198,9 @@ class DeviceStates(HostStates):
         rollout.initial.assign(state.arrays)
         rollout.step_sizes.begin_at(rollout.initial)
 
-    def state(self, rollout: Rollout, state: State, steps: int) -> DeviceState:
-        """Return the state of a rollout after ``steps`` steps as a `DeviceState` with arrays of its own."""
+    def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> DeviceState:
+        """Return the state of a rollout after ``steps`` steps as a `DeviceState` with arrays of its own. It shares
+        those that no step changes with the `DeviceState` at which the rollout has ``begun``."""
         made: dict[tuple[int, int], RestartState] = {}
         """One for all scenes of a clock and an origin: a batch has hundreds."""
         keys = []
@@ -208,7 +209,8 @@ class DeviceStates(HostStates):
             if keys[-1] not in made:
                 made[keys[-1]] = RestartState({}, clock, origin)
         self._simulation.judged_states.update(made.values())
-        own = _without_lost(dict.fromkeys(rollout.lost, np.nan), state.copy())
+        shares = isinstance(begun, DeviceState) and not rollout.lost
+        own = _without_lost(dict.fromkeys(rollout.lost, np.nan), state.copy(begun.arrays if shares else None))
         return DeviceState(own, tuple(made[key] for key in keys))
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:

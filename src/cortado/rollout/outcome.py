@@ -21,12 +21,13 @@ SAME = 1e-6
 
 def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
     """Yield warnings on the last forward run of a rollout: pressure, divergence, a dry emitter, lost scenes."""
-    converged = rollout.diagnostics["converged"]
+    noted = rollout.diagnostics
+    converged = noted["converged"]
     if not converged.all():
         yield not_converged_sentence(converged, scene)
-    if torn := divergence_sentence(rollout.diagnostics, scene):
+    if torn := divergence_sentence(noted, scene):
         yield torn
-    solves = rollout.diagnostics.get(Solve.name, np.zeros(0))
+    solves = noted.get(Solve.name, np.zeros(0))
     if missed := np.count_nonzero(solves >= Solve.most):
         found = f"the viscosity did not converge in {missed} of {solves.size} steps, in which it took {Solve.most}"
         yield f"{found} iterations: try a smaller time step."

@@ -2,6 +2,7 @@
 a run takes with them."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,8 @@ SAME = 1e-9
 """Relative tolerance within which a time counts as reached."""
 STATE_TIME = "time"
 """Name of the time of a state in tables of derivatives by field."""
+_VARIED = frozenset({"mobility", "viscosity"})
+"""Parameters for which it counts whether a derivative is wanted."""
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
 """Names of parameters on which the number of explicit diffusion substeps depends."""
 
@@ -51,6 +54,8 @@ class ParameterSpace:
         self._first_positions = FirstPositions(simulation)
         self._told: set[str] = set()
         """What was warned of: limits of stability by their names, and sentences."""
+        self._begun: tuple[Rollout, int, Arrays, frozenset[str]] | None = None
+        """How a rollout began last: in which evaluation, with which values, and which are varied."""
         self._judged: Arrays | None = None
         """The last values that make sense: a step after another often has the same ones."""
 
@@ -127,6 +132,15 @@ class ParameterSpace:
         diffusion even where it is 0. ``states`` replace the scene's first one, with their fields or ``arrays``.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
+        if arrays is not None and self._goes_on(rollout, values, varied, states):
+            rollout.begin_evaluation()
+            rollout.clocks = [state.clock for state in states]
+            rollout.initial.assign(arrays)
+            if "gravity" in members[0]:
+                rows = max(self._steps, 1), simulation.dimension
+                rollout.parameters.set({"gravity": np.stack([np.broadcast_to(m["gravity"], rows) for m in members])})
+            self._keep(rollout, values, varied, members)
+            return
         sought = parameter_sentence(simulation.scene) if "viscosity" in varied else None
         self._warn(sought)
         rollout.begin_evaluation()
@@ -153,12 +167,6 @@ class ParameterSpace:
         origins = [origin_of(simulation, one["rest_density"]) for one in chosen]
         shared = {one: one for one in origins}  # one object where they are equal: a batch has hundreds
         rollout.origins = [shared[one] for one in origins] * (len(rollout.clocks) // len(origins))
-        each = members * (len(rollout.clocks) // len(members))
-
-        def advice(member: int) -> str:
-            return divergence_advice(simulation.scene, each[member], float(rollout.time_steps[member]))
-
-        rollout.advice = advice
         rollout.parameters.set(stacked(chosen))
         if not simulation.scene.solver.chooses:
             self._warn(dry_sentence(simulation.scene, rollout))
@@ -170,8 +178,39 @@ class ParameterSpace:
             )
         several = len(simulation.scene.phase) > 1
         rollout.substeps = max(*substeps, 1) if "mobility" in varied and several else max(substeps)
+        each = self._keep(rollout, values, varied, members)
         if simulation.scene.solver.chooses:
             begin_choosing(rollout, simulation.scene, self._one, each)
+
+    def _keep(self, rollout: Rollout, values: Arrays, varied: Iterable[str], members: list[Arrays]) -> list[Arrays]:
+        """Note how a rollout has begun, and return the values of each scene."""
+        each, scene = members * (len(rollout.clocks) // len(members)), self._simulation.scene
+        rollout.advice = lambda member: divergence_advice(scene, each[member], float(rollout.time_steps[member]))
+        own = {name: value.copy() for name, value in values.items()}
+        self._begun = rollout, rollout.evaluation, own, _VARIED.intersection(varied)
+        return each
+
+    def _goes_on(self, rollout: Rollout, values: Arrays, varied: Iterable[str], states: Sequence[RestartState]) -> bool:
+        """Test if nothing but the state and gravity is other than when the rollout began last, as in most chains of
+        steps, so that nothing else has to be written and judged again."""
+        if self._begun is None or self._begun[:2] != (rollout, rollout.evaluation) or not self._is_still:
+            return False
+        _, _, last, others = self._begun
+        return (
+            rollout.goes_on
+            and last.keys() == values.keys()
+            and all(name == "gravity" or np.array_equal(value, last[name]) for name, value in values.items())
+            and ("gravity" not in values or values["gravity"].shape == last["gravity"].shape)
+            and others == _VARIED.intersection(varied)
+            and [state.origin for state in states] == rollout.origins
+        )
+
+    @cached_property
+    def _is_still(self) -> bool:
+        """Tell if nothing of the scene changes by the clock, moves by itself or comes in."""
+        scene, courses = self._simulation.scene, self._simulation.known.courses
+        changes = scene.schedule.courses or courses or scene.solver.chooses
+        return not (changes or scene.emitter or any(table.moves for table in scene.solid))
 
     def _warn(self, sentence: str | None) -> None:
         """Give a warning sentence unless this space has given it before."""

@@ -167,7 +167,7 @@ class Stepper:
         """
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows)
-        return place.state(self.rollout, self._forward(keep=False), self.rollout.steps)
+        return place.state(self.rollout, self._forward(keep=False), self.rollout.steps, state)
 
     @in_turn
     def follow(self, state: DeviceState, rows: Arrays) -> DeviceState:
@@ -180,7 +180,7 @@ class Stepper:
         else:
             place.follow(self.rollout, state)
             self.rollout.parameters.set(rows)
-        return place.state(self.rollout, self._forward(keep=False), self.rollout.steps)
+        return place.state(self.rollout, self._forward(keep=False), self.rollout.steps, state)
 
     @in_turn
     def step(
@@ -194,7 +194,7 @@ class Stepper:
         """
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows, {*values, *self._space.checked_names("along", along)})
-        last = place.state(self.rollout, self._forward(keep=True), self.rollout.steps)
+        last = place.state(self.rollout, self._forward(keep=True), self.rollout.steps, state)
         return last, StepResidual(Residual(self.rollout), values, rows, place)
 
     @in_turn

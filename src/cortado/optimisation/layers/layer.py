@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from hashlib import blake2b
 from typing import Any, TypeVar
 
@@ -233,7 +234,7 @@ class NamedStates:
         self._known: OrderedDict[bytes, tuple[Origin, ...]] = OrderedDict()
         """States that were judged, or that steps led to, by checksum: whose particles they are of."""
 
-    @property
+    @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shapes of all arrays of a state, by name."""
         simulation = self._simulation
@@ -294,15 +295,18 @@ class NamedStates:
 
     def narrowed(self, found: Named) -> dict[str, Array]:
         """Return fields whose three-component vectors are cut to the scene's components."""
-        each = {field.name: field.entry for field in self._simulation.initial.fields}
-        narrow = {name: self._narrow(name, found[name]) for name in each}
-        wide = {name for name, entry in each.items() if entry is Entry.DOUBLE}
+        narrow = {name: self._narrow(name, found[name]) for name in self._entries}
+        wide = {name for name, entry in self._entries.items() if entry is Entry.DOUBLE}
         return {name: on_host(array) if name in wide else array.contiguous() for name, array in narrow.items()}
+
+    @cached_property
+    def _entries(self) -> dict[str, Entry]:
+        """Return what the entries of each field are."""
+        return {field.name: field.entry for field in self._simulation.initial.fields}
 
     def _narrow(self, name: str, whole: wp.array) -> wp.array:
         """Return a view of a field's numbers, of vectors with the scene's components."""
-        field = next(field for field in self._simulation.initial.fields if field.name == name)
-        if field.entry is not Entry.VECTOR or self._simulation.dimension == 3:
+        if self._entries[name] is not Entry.VECTOR or self._simulation.dimension == 3:
             return whole
         return whole[:, :, :2] if whole.ndim == 3 else whole[:, :2]
 
