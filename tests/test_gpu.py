@@ -14,6 +14,7 @@ from cortado.pictures.painter import painter
 from cortado.scene.motions import told
 from scenes import HONEY, box, plane, plane_of_three, scene, splash, thrown, two_layers
 from test_neighbours import CLOUDS, check_same, lists
+from test_step_reader import CASES as READ
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
 
@@ -296,3 +297,17 @@ def test_a_picture_is_that_of_the_cpu(made):
     one, other = (painter(made, positions[None], device).image(positions, colours) for device in ("cpu", "cuda:0"))
     assert one.std() > 0.02
     assert np.mean((one - other) ** 2) < 1e-5  # 50 dB
+
+
+@pytest.mark.parametrize("batch", [None, 2])
+@pytest.mark.parametrize("name", READ)
+def test_sensors_read_what_they_read_on_a_cpu(name, batch):
+    """From the first run on, and from captured graphs."""
+    make, sensors = READ[name]
+    runs = [Simulation(make(), device, "float64", batch=batch) for device in ("cpu", "cuda:0")]
+    wanted, *found = (one.run(70, sensors=sensors) for one in (runs[0], runs[1], runs[1]))
+    for run in found:
+        for host, own in zip((wanted,) if batch is None else wanted, (run,) if batch is None else run, strict=True):
+            for sensor, read in own.sensors.items():
+                scale = np.abs(host.sensors[sensor].values).max()
+                np.testing.assert_allclose(read.values, host.sensors[sensor].values, atol=1e-8 * scale, err_msg=sensor)
