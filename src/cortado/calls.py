@@ -73,21 +73,21 @@ def told(function: F) -> F:
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
         try:
-            bound = takes.bind(*arguments, **named)
-        except TypeError as problem:
-            makes = function.__name__ == "__init__"
-            name = type(arguments[0]).__name__ if makes else function.__qualname__
-            given = [*list(takes.parameters)[: len(arguments)], *named]
-            lacking = [one for one in needed if one not in given]
-            found = f"is given no {lacking[0]}" if lacking else f"is called in a wrong way ({problem})"
-            written = [("**" if p.kind is Parameter.VAR_KEYWORD else "") + n for n, p in takes.parameters.items()]
-            wanted = ", ".join(one for one in written if one != "self")
-            raise InputError(f"{name} {found}, but must be called as {name}({wanted}).") from None
-        try:
             return function(*arguments, **named)
         except CortadoError:
             raise
         except Exception as problem:
+            try:
+                bound = takes.bind(*arguments, **named)
+            except TypeError as misuse:
+                makes = function.__name__ == "__init__"
+                name = type(arguments[0]).__name__ if makes else function.__qualname__
+                given = [*list(takes.parameters)[: len(arguments)], *named]
+                lacking = [one for one in needed if one not in given]
+                found = f"is given no {lacking[0]}" if lacking else f"is called in a wrong way ({misuse})"
+                written = [("**" if p.kind is Parameter.VAR_KEYWORD else "") + n for n, p in takes.parameters.items()]
+                wanted = ", ".join(one for one in written if one != "self")
+                raise InputError(f"{name} {found}, but must be called as {name}({wanted}).") from None
             if sentence := _misfit(function, bound):
                 raise InputError(sentence) from problem
             raise

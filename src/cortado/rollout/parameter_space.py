@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from cortado.arrays import as_numbers, as_one_number, check_steps
 from cortado.device.threads import WARP
@@ -56,6 +57,8 @@ class ParameterSpace:
         """What was warned of: limits of stability by their names, and sentences."""
         self._begun: tuple[Rollout, int, Arrays, frozenset[str]] | None = None
         """How a rollout began last: in which evaluation, with which values, and which are varied."""
+        self._constants: dict[str, wp.array] = {}
+        """Arrays that no step changes of the device state at which it began."""
         self._judged: Arrays | None = None
         """The last values that make sense: a step after another often has the same ones."""
 
@@ -135,11 +138,13 @@ class ParameterSpace:
         if arrays is not None and self._goes_on(rollout, values, varied, states):
             rollout.begin_evaluation()
             rollout.clocks = [state.clock for state in states]
-            rollout.initial.assign(arrays)
+            for name in arrays.names:
+                if arrays[name] is not self._constants.get(name):
+                    wp.copy(rollout.initial[name], arrays[name])
             if "gravity" in members[0]:
                 rows = max(self._steps, 1), simulation.dimension
                 rollout.parameters.set({"gravity": np.stack([np.broadcast_to(m["gravity"], rows) for m in members])})
-            self._keep(rollout, values, varied, members)
+            self._keep(rollout, values, varied, members, arrays)
             return
         sought = parameter_sentence(simulation.scene) if "viscosity" in varied else None
         self._warn(sought)
@@ -178,16 +183,25 @@ class ParameterSpace:
             )
         several = len(simulation.scene.phase) > 1
         rollout.substeps = max(*substeps, 1) if "mobility" in varied and several else max(substeps)
-        each = self._keep(rollout, values, varied, members)
+        each = self._keep(rollout, values, varied, members, arrays)
         if simulation.scene.solver.chooses:
             begin_choosing(rollout, simulation.scene, self._one, each)
 
-    def _keep(self, rollout: Rollout, values: Arrays, varied: Iterable[str], members: list[Arrays]) -> list[Arrays]:
+    def _keep(
+        self,
+        rollout: Rollout,
+        values: Arrays,
+        varied: Iterable[str],
+        members: list[Arrays],
+        arrays: State | None,
+    ) -> list[Arrays]:
         """Note how a rollout has begun, and return the values of each scene."""
         each, scene = members * (len(rollout.clocks) // len(members)), self._simulation.scene
         rollout.advice = lambda member: divergence_advice(scene, each[member], float(rollout.time_steps[member]))
         own = {name: value.copy() for name, value in values.items()}
         self._begun = rollout, rollout.evaluation, own, _VARIED.intersection(varied)
+        fields = () if arrays is None else arrays.fields
+        self._constants = {f.name: arrays[f.name] for f in fields if f.is_constant} if arrays is not None else {}
         return each
 
     def _goes_on(self, rollout: Rollout, values: Arrays, varied: Iterable[str], states: Sequence[RestartState]) -> bool:

@@ -119,6 +119,8 @@ class Rollout(Staying):
         self._spare: list[StateSeries] = []
         """Those of earlier runs that nobody will come back to, for the next run that keeps states."""
         self._buffer, self._bar = self.initial.following(), self.initial.like()
+        self._input = self._buffer
+        """The state at which a chunk begins: the first one where all steps are in one chunk."""
         kind = "cpu" if self._device.is_cpu else "cuda"
         length = max(min(CHUNK[kind], FILLED[kind] // max(solver.layout.all_particles, 1), steps), 1)
         self._series = StateSeries(self.initial, length)
@@ -195,7 +197,11 @@ class Rollout(Staying):
         try:
             while step < self.steps and not ended:
                 last = step + self._length(self.steps - step)
-                self._buffer.assign(state)  # which may be one of the states that steps overwrite
+                self._input = (
+                    self.initial if self.room <= self.longest_chunk and state is self.initial else self._buffer
+                )
+                if self._input is self._buffer:
+                    self._buffer.assign(state)  # which may be one of the states that steps overwrite
                 chunk = self._advance(step, last, reader)
                 if meanwhile is not None:
                     meanwhile()
@@ -207,11 +213,11 @@ class Rollout(Staying):
                 chunk = chunk[: end - step]
                 lost = {b: one for b, one in self.solver.containment.lost().items() if one.step < end}
                 for b in lost.keys() - self.lost.keys():
-                    known = [self._buffer, *chunk[: lost[b].step + 1 - step]]
+                    known = [self._input, *chunk[: lost[b].step + 1 - step]]
                     self.lost[b] = diverged(self.solver, b, lost[b], known, self.advice(b))
                 stops = bool(lost) and self.solver.layout.batch is None
                 if reader is not None:
-                    reader.read(step, lost[0].step + 1 if stops else end, self._buffer, self._series)
+                    reader.read(step, lost[0].step + 1 if stops else end, self._input, self._series)
                 for number, new_state in enumerate(chunk[: lost[0].step - step] if stops else chunk, step + 1):
                     if observe is not None:
                         observe(number, new_state)
@@ -230,13 +236,13 @@ class Rollout(Staying):
         return state
 
     def _advance(self, first: int, last: int, reader: ChunkReader | None) -> list[State]:
-        """Take steps ``first`` to ``last`` from the buffered state, and return the states after them, which the next
+        """Take steps ``first`` to ``last`` from the input state, and return the states after them, which the next
         chunk overwrites."""
         length, beside = last - first, None if reader is None else reader.beside
         if self._device.is_cuda and beside not in self._warm:
             self._warm_up(first, beside)
         self._begin_at(first)
-        key = length, beside
+        key = length, beside, self._input is self._buffer
         if is_new := key not in self._chunks:
             work = partial(self._take, length, beside)
             self._chunks[key] = CapturedGraph(work, self.solver.launch, beside in self._warm)
@@ -266,8 +272,8 @@ class Rollout(Staying):
         self._warm.add(beside)
 
     def _take(self, length: int, beside: Beside | None) -> None:
-        """Launch ``length`` steps from the buffered state, and what is launched beside each."""
-        state = self._buffer
+        """Launch ``length`` steps from the input state, and what is launched beside each."""
+        state = self._input
         for number, new_state in enumerate(self._chunk[:length]):
             self.solver.step(state, new_state, self.parameters, self.log)
             if beside is not None:
@@ -280,8 +286,8 @@ class Rollout(Staying):
         if self._generation == self.solver.generation:
             return
         self._generation, self._warm = self.solver.generation, set[Beside | None]()
-        self._chunks: dict[tuple[int, Beside | None], CapturedGraph] = {}
-        """Graphs by their number of steps, and what is launched beside them."""
+        self._chunks: dict[tuple[int, Beside | None, bool], CapturedGraph] = {}
+        """Graphs by their number of steps, what is launched beside them, and whether they begin with the buffer."""
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
         self._steps_along: dict[Counts, CapturedGraph] = {}
 
