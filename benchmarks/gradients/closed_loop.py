@@ -27,7 +27,7 @@ AT_ONCE = 16
 """Policies in one batch."""
 
 
-def tank() -> Simulation:
+def tank(device: str = "cpu") -> Simulation:
     """Make the simulation."""
     return Simulation(
         Scene.model_validate(
@@ -39,7 +39,8 @@ def tank() -> Simulation:
                 "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.6]},
                 "solver": {"kind": "projection", "time_step": 0.002},
             }
-        )
+        ),
+        device,
     )
 
 
@@ -84,8 +85,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs="+", default=[100, 200, 400, 800])
     parser.add_argument("--pairs", type=int, default=48, help=f"pairs of policies, a multiple of {AT_ONCE // 2}")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5], help="policies and first states")
+    parser.add_argument("--device", default="cpu")
     asked = parser.parse_args()
-    simulation, rows = tank(), []
+    simulation, rows = tank(asked.device), []
     print("| steps | seed | smoothed, its standard error | exact: cosine, size | `AdjointViscosity`: cosine, size |")
     for steps in asked.steps:
         value = jax.jit(jax.vmap(loss_of(simulation, steps, None)))

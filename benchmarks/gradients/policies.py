@@ -1,0 +1,314 @@
+"""``python -m benchmarks.gradients.policies``: policies trained in closed loop, with gradients and without.
+
+A network looks at the fluid of the tasks Carry and Splash before every action and is to bring in as much reward as it
+can, over 800 steps. It is trained by Adam on the gradients of `cortado.jax.step`, exact and by `AdjointViscosity`, and
+by the cross-entropy method (CEM) on values alone, all with the same number of simulated steps. A gradient counts as
+many steps as it takes time: it is timed at the start against values of the same episodes. Episodes differ in their
+first positions, by 2 % of a spacing. What is shown is the mean reward of an action in four test episodes, which nobody
+trains with and which do not count.
+
+    python -m benchmarks.gradients.policies --task carry --seeds 1 --steps 200 --budget 20000    # small, minutes
+    python -m benchmarks.gradients.policies --task carry --device cuda:0                         # seeds in one batch
+    python -m benchmarks.gradients.policies --task carry --processes 15                          # a core each
+"""
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from numpy.typing import NDArray
+
+import cortado.jax
+from cortado import Simulation, gradients
+from cortado.environments.catalogue import Carry, Letter, Splash
+from cortado.environments.task import Actuator, Task
+from cortado.pictures.plots import PALETTE, drawing
+
+HIDDEN = 8
+METHODS = {"AdjointViscosity": gradients.AdjointViscosity(), "Exact": None, "CEM": None}
+TASKS = {"carry": Carry(), "splash": Splash()}
+JITTER, TESTS, CHECKS = 0.02, 4, 10
+"""Of first positions [spacings]; test episodes; how often they are run."""
+RATE, CLIP, EPISODES = 0.03, 1.0, 2
+"""Of Adam; greatest norm of a gradient; episodes of a gradient."""
+POPULATION, ELITE, WIDTH, NARROWEST = 20, 5, 0.5, 0.05
+"""Of CEM: policies of a generation, how many of them lead, first and least standard deviation of the weights."""
+Row = dict[str, Any]
+
+
+class Driven:
+    """An actuator in JAX: the parameter over the steps of an action, linear in its state and the action."""
+
+    def __init__(self, actuator: Actuator, steps: int, time_step: float):
+        a = len(actuator.axes)
+        now = np.zeros((4, 2, a))
+        now[1, 0] = now[2, 1] = 1.0
+        after, rows = actuator.advance(now, np.arange(4)[:, None] // 3 * np.ones((4, a)), steps, time_step)
+        self._actuator, self._base, self._after = actuator, jnp.asarray(rows[0], jnp.float32), jnp.asarray(after[1:])
+        self._rows = jnp.asarray(rows[1:] - rows[0], jnp.float32)
+
+    def __call__(self, now: Any, u: Any) -> tuple[Any, Any]:
+        """Return the state (2, a) after an action (a,), and the parameter (steps, d) or (steps,)."""
+        given, one = (now[0], now[1], u), self._actuator
+        after = sum(own * x for own, x in zip(self._after, given, strict=True))
+        wide = given if one.is_number else [jnp.zeros(len(one.rest)).at[jnp.array(one.axes)].set(x) for x in given]
+        return after, self._base + sum(own * x for own, x in zip(self._rows, wide, strict=True))
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A task in closed loop: minus the mean reward of its actions as a function of a policy's weights."""
+
+    task: Task
+    simulation: Simulation
+    actions: int
+
+    @property
+    def steps(self) -> int:
+        """Steps of the simulation in an episode."""
+        return self.actions * self.task.substeps
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Numbers that the policy sees, and that it says."""
+        return 8 + 3 * self._axes, self._axes
+
+    @property
+    def _axes(self) -> int:
+        return sum(len(one.axes) for one in self.task.actuators)
+
+    def weights(self, seed: int) -> NDArray[Any]:
+        """Draw the weights (w,) of a first policy, which does little."""
+        (seen, said), random = self.sizes, np.random.default_rng(seed)
+        inner, outer = random.normal(0.0, 1.0 / np.sqrt(seen), (seen, HIDDEN)), random.normal(0.0, 0.1, (HIDDEN, said))
+        return np.concatenate([inner.ravel(), np.zeros(HIDDEN), outer.ravel(), np.zeros(said)])
+
+    def starts(self, random: np.random.Generator, count: int) -> NDArray[Any]:
+        """Draw first positions (count, n, 2)."""
+        x = self.simulation.positions
+        return x + JITTER * self.task.spacing * random.standard_normal((count, *x.shape))
+
+    def loss(self, estimator: Any) -> Callable[[Any, Any], Any]:
+        """Return the loss of weights (w,) and first positions (n, 2), differentiable by an estimator."""
+        task, simulation, first = self.task, self.simulation, cortado.jax.state(self.simulation)
+        driven = [Driven(one, task.substeps, task.time_step) for one in task.actuators]
+        (seen, said), rewarded = self.sizes, REWARDS[task.name](task, simulation)
+
+        def loss(weights: Any, positions: Any) -> Any:
+            cuts = np.cumsum([seen * HIDDEN, HIDDEN, HIDDEN * said])
+            inner, bias, outer, last = jnp.split(weights, cuts)
+
+            def act(carried: Any, number: Any) -> tuple[Any, Any]:
+                state, now = carried
+                x, v = state["positions"], state["velocities"]
+                fluid = [x.mean(0) - middle, 0.3 * v.mean(0), 5.0 * x.std(0), v.std(0)]
+                own = [own.ravel() for own in now]
+                known = jnp.concatenate([*fluid, *own, jnp.full(said, number / self.actions)])
+                u = jnp.tanh(jnp.tanh(known @ inner.reshape(seen, HIDDEN) + bias) @ outer.reshape(HIDDEN, said) + last)
+                parts, after, rows = jnp.split(u, splits), [], {}
+                for one, actuator, was, part in zip(driven, task.actuators, now, parts, strict=True):
+                    later, rows[actuator.parameter] = one(was, part)
+                    after.append(later)
+                state = cortado.jax.step(simulation, state, rows, task.substeps, estimator)
+                return (state, after), rewarded(state)
+
+            splits = np.cumsum([len(one.axes) for one in task.actuators])[:-1].tolist()
+            middle = jnp.asarray(simulation.positions.mean(0), jnp.float32)
+            rest = [jnp.zeros((2, len(one.axes))) for one in task.actuators]
+            begun = {**first, "positions": positions}, rest
+            _, found = jax.lax.scan(act, begun, jnp.arange(self.actions, dtype=jnp.float32))
+            return -found.mean()
+
+        return loss
+
+
+def share(x: Any, lower: Any, upper: Any, width: float) -> Any:
+    """Return the share of particles (n, 2) in boxes (boxes, 2), as `cortado.environments.terms.Share` counts them."""
+    way = x[:, None] - jnp.clip(x[:, None], jnp.asarray(lower, x.dtype), jnp.asarray(upper, x.dtype))
+    return (1.0 / (1.0 + (way**2).sum(-1).min(-1) / width**2)).mean()
+
+
+def carried(task: Carry, simulation: Simulation) -> Callable[[Any], Any]:
+    """Return the reward of Carry, whose goal is in the middle of all goals."""
+    goal, middle = float(np.mean(task.goals)), simulation.scene.solid[0].middle()
+    lower, upper = -middle, np.array([task.width, task.height]) - middle
+
+    def reward(state: Any) -> Any:
+        place, turn = state["cup.position"][0], state["cup.turn"][0]
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        own = (state["positions"] - place) @ jnp.array([[cos, -sin], [sin, cos]])
+        return -jnp.abs(place[0] - goal) - 10.0 + 10.0 * share(own, lower[None], upper[None], task.coarse_spacing)
+
+    return reward
+
+
+def splashed(task: Splash, simulation: Simulation) -> Callable[[Any], Any]:
+    """Return the reward of Splash, whose goal is in the middle of all goals."""
+    (lower,), (upper,) = Letter(task.half)(np.mean(task.goals, axis=0)[None])
+    return lambda state: share(state["positions"], lower, upper, task.coarse_spacing)
+
+
+REWARDS: dict[str, Any] = {"Carry": carried, "Splash": splashed}
+
+
+@dataclass(frozen=True)
+class Job:
+    """The training of the policies of some seeds at once, by one method."""
+
+    task: str
+    method: str
+    seeds: tuple[int, ...]
+    steps: int
+    budget: int
+    device: str
+
+    def run(self) -> list[Row]:
+        """Return a row for each seed: rewards of test episodes over the number of simulated steps."""
+        task = TASKS[self.task]
+        loop = Loop(task, Simulation(task.scene, self.device, "float32"), max(self.steps // task.substeps, 1))
+        value = jax.jit(jax.vmap(loop.loss(None)))
+        tests = loop.starts(np.random.default_rng(0), TESTS)
+        weights = np.stack([loop.weights(seed) for seed in self.seeds])
+        random, history, taken = np.random.default_rng(self.seeds), [], 0.0
+
+        def check(weights: NDArray[Any]) -> None:
+            found = self._each(value, np.repeat(weights, TESTS, axis=0), np.tile(tests, (len(weights), 1, 1)))
+            history.append((taken, -found.reshape(len(weights), TESTS).mean(1)))
+            print(f"{self.task} {self.method} {self.seeds}: {taken:,.0f} {np.round(history[-1][1], 4)}", flush=True)
+
+        check(weights)
+        update, cost = (self._cem if self.method == "CEM" else self._adam)(loop, value, weights, random)
+        while taken + cost <= self.budget:
+            weights = update()
+            taken += cost
+            if taken >= len(history) * self.budget / CHECKS or taken + cost > self.budget:
+                check(weights)
+        own = {"task": self.task, "method": self.method, "cost": cost, "steps": [at for at, _ in history]}
+        return [
+            {**own, "seed": seed, "rewards": [float(r[b]) for _, r in history]} for b, seed in enumerate(self.seeds)
+        ]
+
+    def _each(self, function: Any, weights: NDArray[Any], starts: NDArray[Any]) -> NDArray[Any]:
+        """Return losses of policies and starts, one after the other or in one batch; of lost episodes the worst."""
+        found = np.asarray(function(jnp.asarray(weights, jnp.float32), jnp.asarray(starts, jnp.float32)))
+        return np.where(np.isfinite(found), found, -TASKS[self.task].lowest)
+
+    def _adam(self, loop: Loop, value: Any, weights: NDArray[Any], random: Any) -> tuple[Callable[[], Any], float]:
+        mapped, seeds = jax.vmap(loop.loss(METHODS[self.method])), len(weights)
+        slope = jax.jit(jax.grad(lambda w, x: mapped(jnp.repeat(w, EPISODES, axis=0), x).sum() / EPISODES))
+        optimiser = optax.chain(optax.clip_by_global_norm(CLIP), optax.adam(RATE))
+        memory = [optimiser.init(jnp.asarray(own)) for own in weights]
+        x = jnp.asarray(loop.starts(random, seeds * EPISODES), jnp.float32)
+        w = jnp.asarray(weights, jnp.float32)
+        longer = seconds(self.device, slope, w, x) / seconds(self.device, value, jnp.repeat(w, EPISODES, axis=0), x)
+        now = weights
+
+        def update() -> NDArray[Any]:
+            nonlocal now
+            starts = jnp.asarray(loop.starts(random, seeds * EPISODES), jnp.float32)
+            found = np.nan_to_num(np.asarray(slope(jnp.asarray(now, jnp.float32), starts)), posinf=0.0, neginf=0.0)
+            for b, own in enumerate(found):
+                change, memory[b] = optimiser.update(jnp.asarray(own, jnp.float32), memory[b])
+                now = np.where(np.arange(seeds)[:, None] == b, now + np.asarray(change), now)
+            return now
+
+        return update, EPISODES * loop.steps * longer
+
+    def _cem(self, loop: Loop, value: Any, weights: NDArray[Any], random: Any) -> tuple[Callable[[], Any], float]:
+        mean, width = weights, np.full(weights.shape, WIDTH)
+
+        def update() -> NDArray[Any]:
+            nonlocal mean, width
+            drawn = mean[:, None] + width[:, None] * random.standard_normal((len(mean), POPULATION, mean.shape[1]))
+            starts = np.repeat(loop.starts(random, len(mean)), POPULATION, axis=0)
+            losses = self._each(value, drawn.reshape(-1, mean.shape[1]), starts).reshape(len(mean), POPULATION)
+            best = np.take_along_axis(drawn, np.argsort(losses, axis=1)[:, :ELITE, None], axis=1)
+            mean, width = best.mean(1), np.maximum(best.std(1), NARROWEST)
+            return mean
+
+        return update, float(POPULATION * loop.steps)
+
+
+def seconds(device: str, function: Any, *given: Any) -> float:
+    """Return how long a call takes, of the processor or on a GPU: the shorter one of two, after the first."""
+    ends = []
+    for _ in range(3):
+        function(*given).block_until_ready()
+        ends.append(time.process_time() if device == "cpu" else time.perf_counter())
+    return float(np.diff(ends).min())
+
+
+def draw(rows: list[Row], path: Path) -> None:
+    """Draw the rewards of all seeds, and their median, over simulated steps, a panel for each task."""
+    names = list(dict.fromkeys(row["task"] for row in rows))
+    with drawing(path, 4.6 * len(names), 4.0) as figure:
+        for panel, name in zip(np.atleast_1d(figure.subplots(1, len(names))), names, strict=True):
+            for colour, method in zip(PALETTE, METHODS, strict=False):
+                own = [row for row in rows if (row["task"], row["method"]) == (name, method)]
+                for row in own:
+                    panel.plot(row["steps"], row["rewards"], color=colour, alpha=0.3, linewidth=0.8)
+                if own:
+                    at = np.linspace(0.0, min(row["steps"][-1] for row in own), 50)
+                    each = [np.interp(at, row["steps"], row["rewards"]) for row in own]
+                    panel.plot(at, np.median(each, axis=0), color=colour, linewidth=2.0, label=method)
+            panel.set(title=name, xlabel="simulated steps", ylabel="mean reward of an action, test episodes")
+            panel.legend()
+
+
+def table(rows: list[Row]) -> str:
+    """Return the table of last rewards."""
+    lines = [
+        "| task | method | steps of an update | reward at last: median [least, greatest] | first |",
+        "|---|---|---|---|---|",
+    ]
+    for task, method in dict.fromkeys((row["task"], row["method"]) for row in rows):
+        own = [row for row in rows if (row["task"], row["method"]) == (task, method)]
+        last, first = ([row["rewards"][k] for row in own] for k in (-1, 0))
+        ends = f"{np.median(last):.4f} [{min(last):.4f}, {max(last):.4f}]"
+        lines.append(f"| {task} | {method} | {own[0]['cost']:,.0f} | {ends} | {np.median(first):.4f} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Train, and write the rows, a picture and a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", nargs="+", choices=TASKS, default=list(TASKS))
+    parser.add_argument("--method", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
+    parser.add_argument("--steps", type=int, default=800, help="simulated steps of an episode")
+    parser.add_argument("--budget", type=int, default=240_000, help="simulated steps of a training")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--processes", type=int, default=1, help="more than 1: a seed and method at a time in each")
+    parser.add_argument("--out", type=Path, default=Path("runs/policies"), help="files of former calls are kept")
+    asked = parser.parse_args()
+    groups = [(seed,) for seed in asked.seeds] if asked.processes > 1 else [tuple(asked.seeds)]
+    each = [(task, method, group) for task in asked.task for method in asked.method for group in groups]
+    jobs = [Job(*own, asked.steps, asked.budget, asked.device) for own in each]
+    asked.out.mkdir(parents=True, exist_ok=True)
+    if asked.processes > 1:
+        os.environ.setdefault("CORTADO_CORES", "1")
+        with ProcessPoolExecutor(asked.processes, get_context("spawn")) as pool:
+            found = list(pool.map(Job.run, jobs))
+    else:
+        found = [job.run() for job in jobs]
+    for (task, method, group), rows in zip(each, found, strict=True):
+        (asked.out / f"{task}-{method}-{'-'.join(map(str, group))}.json").write_text(json.dumps(rows))
+    rows = [row for file in sorted(asked.out.glob("*.json")) for row in json.loads(file.read_text())]
+    draw(rows, asked.out / "policies.png")
+    (asked.out / "policies.md").write_text(table(rows) + "\n")
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
