@@ -34,6 +34,27 @@ CASES = {
 STEPS = 21
 
 
+class Doubled(PressureProbe):
+    """A sensor of one's own that reads something else than what it is made from."""
+
+    def value(self, at):
+        return 2.0 * super().value(at)
+
+
+def test_a_sensor_made_from_another_reads_its_own_values():
+    probes = {"one": PressureProbe([0.2, 0.1]), "two": Doubled([0.2, 0.1])}
+    read = cortado.Simulation(plane(), precision="float64").run(3, sensors=probes).sensors
+    np.testing.assert_allclose(read["two"].values, 2.0 * read["one"].values, rtol=1e-13)
+
+
+def test_a_place_in_another_dimension_is_refused_before_the_run(monkeypatch):
+    simulation = cortado.Simulation(plane())
+    monkeypatch.setattr(type(simulation.solver), "step", None)
+    for sensor in (PressureProbe([0.1] * 3), FlowRate([0.1] * 3, [1.0, 0.0, 0.0]), WaveGauge([0.1] * 3)):
+        with pytest.raises(cortado.InputError, match="position has 3 components"):
+            simulation.run(3, sensors={"sensor": sensor})
+
+
 class OnHost:
     """A sensor of one's own that reads what another does."""
 

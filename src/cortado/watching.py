@@ -13,7 +13,7 @@ from cortado.losses.loss import Snapshot, SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.rollout import Observer, Rollout
 from cortado.rollout.stepper import Steppable
-from cortado.runs.probes import sensors_of
+from cortado.runs.probes import SENSORS, sensors_of
 from cortado.runs.quantity_values import Moment, QuantityEvaluator, Recorder
 from cortado.runs.sensor import Readings, Sensor, SensorLog, value_of
 from cortado.runs.sensor_places import warn_of_places
@@ -69,7 +69,7 @@ class Watch:
         self._logs = [SensorLog(known, simulation.dimension) for _ in range(simulation.batch or 1)]
         """One for each scene."""
         self._rollout, self._simulation, self._evaluator = rollout, simulation, evaluator
-        self._on_host = {name: one for name, one in known.items() if not hasattr(one, "summed")}
+        self._on_host = {name: one for name, one in known.items() if type(one) not in SENSORS.values()}
         if self._on_host and simulation.batch is not None:
             name, own = next(iter(self._on_host.items()))
             wanted = "sensors of a batch must be those of cortado.sensors: read one scene's"

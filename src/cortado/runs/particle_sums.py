@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import grid
-from cortado.runs.sensor import Cut, Reading, SensedScene, Sensor, in_dimension
+from cortado.runs.sensor import Cut, Reading, SensedScene, Sensor
 
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}
 """Factor of w, over the reach to the number of dimensions, with which it has the integral 1."""
@@ -88,7 +88,6 @@ class Seen:
         """Find the particles of a state around a place."""
         place, reach, across, shifts = around.place, around.reach, around.across, around.shifts()
         widest = reach + float(np.linalg.norm(shifts, axis=1).max())
-        in_dimension("position", place, at.dimension)
         positions, domain, numbers = at["positions"], at.lattice.domain, np.arange(len(at["positions"]))
         if not any(domain.lengths):  # most particles are far away
             axes = across(np.eye(at.dimension))

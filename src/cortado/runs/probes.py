@@ -63,7 +63,8 @@ class PressureProbe:
     def summed(self, at: SensedScene) -> WeightedSum:
         """Return the sums of weights and of weighted pressures."""
         radius = at.lattice.support if self.radius is None else self.radius
-        return WeightedSum(Around(self.position, radius, lambda way: way), "pressure")
+        place = in_dimension("position", self.position, at.dimension)
+        return WeightedSum(Around(place, radius, lambda way: way), "pressure")
 
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
         """Return the mean pressure (1,) from the sums."""
@@ -111,8 +112,8 @@ class FlowRate:
     def summed(self, at: SensedScene) -> WeightedSum:
         """Return the sum of weighted velocities along the normal, of the distances (n, 1) of particles from the
         plane."""
-        reach = reach_of(self.reach, at)
-        around = Around(self.position, reach, self._along, parts_of(reach, at, self._along, 1))
+        reach, place = reach_of(self.reach, at), in_dimension("position", self.position, at.dimension)
+        around = Around(place, reach, self._along, parts_of(reach, at, self._along, 1))
         return WeightedSum(around, along=self.normal)
 
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
