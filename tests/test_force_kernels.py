@@ -279,7 +279,7 @@ ELSEWHERE = {
     "residual_kernels": "the same",
     "coarse_body_kernels": "of bodies that are free: whole steps in tests/test_free_bodies.py",
     "repair_kernels": "of the projection again: whole steps in tests/test_projection.py",
-    "pressed_adjoint_kernel": "of a quantity: tests/test_quantities.py",
+    "pressed_kernels": "of a quantity: tests/test_quantities.py",
     "mean_stress_kernels": "of a quantity: tests/test_energy_budget.py",
     "environment_kernels": "of rewards: tests/test_environments.py",
     "phase_colour_kernels": "of pictures, by differences: tests/test_render.py",

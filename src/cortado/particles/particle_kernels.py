@@ -22,9 +22,8 @@ so that particles keep their shares of the adjoints of a scene's parameters, whi
 tangent is put together of the gradients of the components of r. A rotation R changes by the vector w by which it turns
 further, R_dot u = w x (R u): w stands for its tangent, and the adjoint of w for its adjoint.
 
-Two traps of Warp: after ``a, b = array[j], c`` the name ``a`` is no copy, and writing to its component writes to the
-array, where after ``a = array[j]`` it is one. And ``wp.grad`` stands in the function that a kernel calls: in one that
-this function calls it does not compile.
+Two traps of Warp: after ``a, b = array[j], c`` writing to a component of ``a`` writes to the array, where after ``a =
+array[j]`` it is a copy. And in a function that the function of a kernel calls, ``wp.grad`` does not compile.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -295,6 +294,9 @@ class Kinds:
     """Results of which the sum over a scene has an adjoint, ``name_sum_bar`` (scenes,)."""
     turned: Mapping[str, str] = field(default_factory=dict)
     """Rotations, and what further turns of them are called."""
+    read: Mapping[str, str] = field(default_factory=dict)
+    """Parameters by which a function reads a table (`cortado.sph.own_arrays`), with their texts in a kernel. In the
+    adjoint each of so many ``rows`` of a scene is a thread then, which goes through particles."""
 
 
 class _Pointwise:
@@ -317,8 +319,9 @@ class _Pointwise:
         self._entries, self._indices, self._numbers, self._inputs = {}, {}, {}, {}
         self._arrays = {kinds.where: precision.real} if kinds.where else {}
         for name, kind in term.parameters.items():
-            if name in kinds.numbers:
-                self._entries[name], self._numbers[name] = name, kind
+            if name in kinds.numbers or name in kinds.read:
+                self._entries[name] = kinds.read.get(name, name)
+                self._numbers |= {name: kind} if name in kinds.numbers else {}
                 continue
             array, self._indices[array] = array_of(name) or name, "i" if array_of(name) else "i // particles"
             if array in kinds.told:
@@ -347,6 +350,7 @@ class _Pointwise:
             change = self._change(name, kind)
             dot = self._changed(name, "dot", self._indices[name])
             changes.append(f"{by} * {dot}" if change is real else f"wp.{dot_of(change)}({by}, {dot})")
+        changes += [f"_by_{name}" for name, text in self._kinds.read.items() if text == "_no"]
         lines, where = [self._found()] if turned.keys() & self._results.keys() else [], self._kinds.where
         zeros = ["_no" if kind is real else f"_whole_{n}()" for n, kind in enumerate(self._term.results)]
         if where:
@@ -381,7 +385,13 @@ class _Pointwise:
             bar, by = self._changed(name, "bar"), f"_by_{name}"
             by = f"_turning({self._entries[name]}, {by})" if name in turned else by
             lines.append(f"{bar} = {'' if name in self._overwritten else f'{bar} + '}{by}")
-        return f"{self._term.name}_adjoint", *self._kernel(left, self._changes("bar"), lines)
+        name, more = f"{self._term.name}_adjoint", self._changes("bar")
+        if not self._kinds.read:
+            return name, *self._kernel(left, more, lines)
+        types, (_, *body) = self._kernel(left, {**more, "rows": int}, [])
+        start = ["_row = wp.tid()", "first = _row // rows * particles"]
+        loop = "for i in range(first + _row % rows, first + particles, rows):"
+        return name, types, [*body, *start, loop, *(f"    {line}" for line in lines)]
 
     def _kernel(self, others: Types, more: Types, lines: Iterable[str]) -> tuple[Types, Iterable[str]]:
         """Types and lines of a kernel with so many other arrays and ``more`` arguments."""
@@ -392,6 +402,7 @@ class _Pointwise:
             body += [f"{each} = {label}.{each}" for label, kinds in groups.items() for each in kinds]
         else:
             arrays = {name: wp.array(dtype=kind) for name, kind in (*own.items(), *others.items())}
+        body += ["_row = -1"] if self._kinds.read else []
         return {"particles": int, **self._numbers, **arrays, **more}, [*body, *lines]
 
     def _change(self, name: str, kind: Any) -> Any:

@@ -286,8 +286,8 @@ class StateSeries:
 class Parameters(Arrays):
     """The inputs of steps besides the state, by the names of parameters. Also the type of its derivatives.
 
-    A parameter over time is (members, steps) vectors or numbers, one of phases (members, phases) numbers, any other
-    (members,) numbers or vectors, with one member for each scene of a batch.
+    A parameter over time is (members, steps) vectors or numbers, one of phases (members, phases) numbers, an array
+    (members, ...) numbers, any other (members,) numbers or vectors, with one member for each scene of a batch.
     """
 
     def __init__(self, arrays: Mapping[str, wp.array]):
@@ -388,5 +388,5 @@ class Layout:
         real, vector, members = self.precision.real, self.precision.vector, self.members
         sizes: dict[Axis, Any] = {Axis.STEP: (members, max(steps, 1)), Axis.PHASE: (members, self.phases)}
         used = [self.known[name] for name in self.known.run]
-        kinds = {p.name: (sizes.get(p.axis, members), vector if p.rank else real) for p in used}
+        kinds = {p.name: (sizes.get(p.axis, (members, *p.shape)), vector if p.rank else real) for p in used}
         return Parameters(zeros(kinds, self.device, requires_grad))

@@ -21,6 +21,7 @@ class Axis(Enum):
     PHASE = "each phase"
     STEP = "each step, or all of them"
     PARTICLE = "each particle"
+    ARRAY = "each entry of an array"
 
 
 class Role(Enum):
@@ -103,6 +104,8 @@ class Parameter:
     """Name of the parameter in whose place this one is another way to write it."""
     course: Changing | None = None
     """Course of a parameter over time of a user's force, where it is not given."""
+    shape: tuple[int, ...] = ()
+    """Shape of an array."""
 
     @property
     def rank(self) -> int:
@@ -111,6 +114,8 @@ class Parameter:
 
     def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
         """Return the shapes that the parameter's values may have, () for a number, where positions are (n, d)."""
+        if self.axis is Axis.ARRAY:
+            return [self.shape]
         particles, dimension = positions
         own = () if self.components is None else (self.components(dimension, phases),)
         if self.axis is Axis.STEP:

@@ -8,20 +8,34 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from math import prod
 from tempfile import TemporaryFile
 from types import FunctionType, MappingProxyType
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from cortado.device.precision import Precision, TypesByName
 from cortado.device.warp_start import c_stderr_to
 from cortado.errors import InputError
 from cortado.particles.state import Layout, Parameters
-from cortado.scene.parameters import Parameter
-from cortado.sph.function_meaning import REAL, VECTOR, InPrecision, check_calls, check_helper, check_truths, meanings
-from cortado.sph.function_text import DerivativeCheck, Frozen, check_names, check_returns, definition
+from cortado.scene.parameters import Axis, Parameter
+from cortado.sph.function_meaning import (
+    PLACE,
+    READ,
+    READ_OF,
+    REAL,
+    VECTOR,
+    InPrecision,
+    check_calls,
+    check_helper,
+    check_truths,
+    meanings,
+)
+from cortado.sph.function_text import DerivativeCheck, Frozen, SizesWritten, check_names, check_returns, definition
 from cortado.sph.integration import integration_module
+from cortado.sph.own_arrays import MOST_NUMBERS, reading, table_type
 from cortado.sph.parts import Adjoints, StepContext
 
 WIDTH = (1, 3)
@@ -81,7 +95,7 @@ class Packed:
     """The parameters of a user's function as one vector theta for every scene, with its tangent and its adjoint."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
-        self._parameters, self._layout = tuple(parameters), layout
+        self._parameters, self._layout = tuple(p for p in parameters if p.axis is not Axis.ARRAY), layout
         self._kernels = packing_kernels(layout.precision, taped)
         self.dtype = theta_of(layout.precision, [p.rank for p in self._parameters])
         """A Warp vector."""
@@ -162,14 +176,18 @@ class Inputs:
     """Names of the inputs in messages."""
     kind: str = "vector"
     """"vector" or "number": the type of the inputs and of the function's result."""
+    arrays: bool = False
+    """Whether parameters may be arrays."""
 
 
 TIME = "t", "time"
 """Names of an argument that is the time."""
+MOST_TURNS, MOST_AXES = 256, 3
+"""Greatest number of turns of a loop, which is written out turn by turn, and of axes of an array."""
 TYPES = re.compile(r"'[^']*' \(aka '[^']*'\)")
 """Finds the types of vectors and numbers as a compiler writes them."""
 INPUTS = {
-    "Body": Inputs(("x", "v")),
+    "Body": Inputs(("x", "v"), arrays=True),
     "Pair": Inputs(("x_ij", "v_ij")),
     "Rheology": Inputs(("shear_rate", "viscosity"), "number"),
 }
@@ -188,7 +206,9 @@ class Formula:
     kind: str
     """"vector" or "number": the type of the first two inputs and of the result."""
     parameters: tuple[str, ...]
-    """Its arguments after the inputs."""
+    """Its arguments after the inputs, without arrays."""
+    arrays: tuple[str, ...]
+    """Its arguments that are arrays, which the text reads from a table (`cortado.sph.own_arrays`)."""
     outside: str
     """A text of everything that `text` refers to: the functions under ``@wp.func`` that it calls, and values."""
     scope: Mapping[str, Any] = field(compare=False, repr=False)
@@ -198,14 +218,21 @@ class Formula:
         """Make the Warp function in a precision, with the types of its parameters; it has the name of the user's."""
         real, vector = precision.real, precision.vector
         scope = {**self.scope, **meanings(precision), REAL: real, VECTOR: vector}
+        if self.arrays:
+            functions = reading(precision, module.options["enable_backward"])
+            scope |= {PLACE: functions.place, READ: functions.read}
         code = compile(self.text, f"<force {self.name}>", "exec")
         exec(code, scope)
         made: Any = scope[self.name]
         own = vector if self.kind == "vector" else real
         known = (own, own, real)[: len(self.inputs)]
         made.__annotations__ = dict(zip((*self.inputs, *self.parameters), (*known, *types), strict=True))
-        made.__annotations__["return"] = own
+        made.__annotations__ |= self.reads(precision) | {"return": own}
         return wp.Function(func=made, key=self.name, namespace="", module=module, source=self.text)
+
+    def reads(self, precision: Precision) -> dict[str, Any]:
+        """Return the types, by name, of the last arguments of the compiled function, by which it reads arrays."""
+        return dict(zip(READ_OF, (precision.real, table_type(precision), int, int), strict=True)) if self.arrays else {}
 
 
 def formula(
@@ -215,22 +242,48 @@ def formula(
     those given, and its defaults for others. Raises `InputError`."""
     what = f"{kind} function {function.__name__}"
     inputs, values = _arguments(what, function, parameters, INPUTS[kind])
-    frozen, written = Frozen(what, function), definition(what, function, source)
+    shapes = _shapes(what, function, values, INPUTS[kind])
+    frozen, written = Frozen(what, function), SizesWritten(shapes).visit(definition(what, function, source))
     for helper in frozen.helpers:
         tree = helper.adj.tree
         DerivativeCheck(what).visit(tree)
         check_helper(what, tree.body[0])
-    DerivativeCheck(what).visit(written)
+    DerivativeCheck(what, MOST_TURNS).visit(written)
     local = {node.id for node in ast.walk(written) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
     own = {*inputs, *values, *local}
     check_returns(what, written, INPUTS[kind].kind)
     check_names(what, written, own, frozen.scope)
     check_calls(what, written, own, frozen.scope)
     check_truths(what, written)
-    rewritten = InPrecision(what, frozen.scope, own).visit(ast.Module([written], []))
+    rewritten = InPrecision(what, frozen.scope, own, shapes).visit(ast.Module([written], []))
     text = ast.unparse(ast.fix_missing_locations(rewritten)) + "\n"
     scope = MappingProxyType(frozen.scope)
-    return Formula(written.name, text, inputs, INPUTS[kind].kind, tuple(values), frozen.words, scope), values
+    numbers = tuple(name for name in values if name not in shapes)
+    return Formula(written.name, text, inputs, INPUTS[kind].kind, numbers, tuple(shapes), frozen.words, scope), values
+
+
+def _shapes(what: str, function: FunctionType, values: Mapping[str, Any], inputs: Inputs) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the parameters that are arrays: by their annotation, or where they are no vectors."""
+    found = {}
+    for name, value in values.items():
+        annotation = function.__annotations__.get(name)
+        told = annotation is wp.array or isinstance(annotation, wp.array) or "array" in str(annotation)
+        shape = np.shape(value) if hasattr(value, "__len__") else ()
+        if not (told or len(shape) > 1 or (shape and shape[0] not in (2, 3))):
+            continue
+        if not inputs.arrays:
+            raise InputError(f"{what} has the array {name}, but must have numbers and vectors: only Body has arrays.")
+        if not (1 <= len(shape) <= MOST_AXES and 0 < prod(shape) <= MOST_NUMBERS):
+            wanted = f"one to {MOST_AXES} axes, and 1 to {MOST_NUMBERS} numbers"
+            raise InputError(f"{what} has the array {name} of shape {shape}, but must have one with {wanted}.")
+        entries = getattr(annotation, "dtype", Any)
+        if entries not in (Any, float, wp.float32, wp.float64) or getattr(annotation, "ndim", len(shape)) != len(shape):
+            found_one = f"{what} has the array {name} of shape {shape}, which its annotation says otherwise"
+            raise InputError(f"{found_one}, but must be said to be of floats with so many axes.")
+        found[name] = shape
+    if sum(map(prod, found.values())) > MOST_NUMBERS:
+        raise InputError(f"{what} has arrays of more than {MOST_NUMBERS} numbers together, but must have fewer.")
+    return found
 
 
 def _arguments(
@@ -287,8 +340,8 @@ def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> N
 
 
 def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
-    """Make the Warp function of two vectors or numbers and theta that calls a user's function; in 2-D vectors lose
-    their z."""
+    """Make the Warp function of two vectors or numbers and theta, and of `Formula.reads`, that calls a user's
+    function; in 2-D vectors lose their z."""
     timed, of_numbers = len(text.inputs) == 3, text.kind == "number"
     types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
     terms, first = [], 0
@@ -296,18 +349,19 @@ def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimensi
         at = ", ".join(f"theta[{first + k}]" for k in range(3 if rank else 1))
         terms.append(f"vector({at})" if rank else at)
         first += 3 if rank else 1
-    called = f"own({', '.join(['x', 'v', *terms])})"
+    read = text.reads(precision)
+    called = f"own({', '.join(['x', 'v', *terms, *read])})"
     result = called if dimension == 3 or of_numbers else f"wp.cw_mul(vector(one, one, zero), {called})"
-    source = f"def applied(x: own_type, v: own_type, theta: numbers):\n    return {result}\n"
+    source = f"def applied(x, v, theta{''.join(f', {name}' for name in read)}):\n    return {result}\n"
+    own_type = precision.real if of_numbers else precision.vector
     scope = {
         "vector": precision.vector,
-        "own_type": precision.real if of_numbers else precision.vector,
         "one": wp.constant(precision.real(1.0)),
         "zero": wp.constant(precision.real(0.0)),
         "wp": wp,
-        "numbers": theta_of(precision, ranks),
         "own": text.function(precision, types, module),
     }
     exec(source, scope)
     made: Any = scope["applied"]
+    made.__annotations__ = {"x": own_type, "v": own_type, "theta": theta_of(precision, ranks), **read}
     return wp.Function(func=made, key="applied", namespace="", module=module, source=source)

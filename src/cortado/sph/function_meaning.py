@@ -7,6 +7,7 @@ import builtins
 from collections.abc import Mapping
 from copy import deepcopy
 from functools import cache
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,8 @@ def meanings(precision: Precision) -> dict[str, Any]:
 
 REAL, VECTOR = "cortado_real", "cortado_vector"
 """What the compiled text calls the types of a number and of a vector."""
+PLACE, READ, READ_OF = "cortado_place", "cortado_read", ("cortado_e", "cortado_w", "cortado_member", "cortado_row")
+"""What compiled texts call the functions that read arrays, and what these take before an index."""
 _TYPES = {float: REAL, wp.float32: REAL, wp.float64: REAL, wp.vec3f: VECTOR, wp.vec3d: VECTOR}
 _OPERATORS: Mapping[type[ast.operator], str] = {ast.Mod: REMAINDER, ast.FloorDiv: QUOTIENT}
 _CALLS = {"round": NEAREST, "int": WHOLE}
@@ -66,8 +69,16 @@ class InPrecision(ast.NodeTransformer):
     from outside are written out, which makes the text complete. Whole numbers stay as indices alone: loops are
     unrolled, with the value of each index."""
 
-    def __init__(self, what: str, scope: Mapping[str, Any], local: set[str]):
+    def __init__(
+        self, what: str, scope: Mapping[str, Any], local: set[str], arrays: Mapping[str, tuple[int, ...]] | None = None
+    ):
+        """Take what the function is called, the values of names from outside, and its own names, with the shapes of
+        those that are arrays."""
         self._what, self._scope, self._local = what, scope, local
+        shapes = arrays or {}
+        sizes = [prod(shape) for shape in shapes.values()]
+        self._arrays = {name: (sum(sizes[:k]), shape) for k, (name, shape) in enumerate(shapes.items())}
+        """Arrays, with where each begins in the table of all."""
         self._counts: dict[str, int] = {}
         """What loops count with, where the text has come to."""
         self._given = set[str]()
@@ -75,18 +86,28 @@ class InPrecision(ast.NodeTransformer):
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
         self._given = {one.arg for one in node.args.args}
+        node.args.args = [one for one in node.args.args if one.arg not in self._arrays]
+        if self._arrays:
+            node.args.args += [ast.arg(name) for name in READ_OF]
         return self.generic_visit(node)
 
     def visit_Constant(self, node: ast.Constant) -> ast.AST:
         return _number(node, node.value)
 
     def visit_Name(self, node: ast.Name) -> ast.AST:
+        if node.id in self._arrays:
+            found = f"{self._what} has the array {node.id} without indices, or gives it another value"
+            raise InputError(
+                f"{found}, but must read its numbers, as in {node.id}[0], or its sizes by {node.id}.shape."
+            )
         return self._resolved(node) if isinstance(node.ctx, ast.Load) else node
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
         return self.generic_visit(node) if (found := self._resolved(node)) is node else found
 
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
+        if isinstance(node.value, ast.Name) and node.value.id in self._arrays:
+            return self._read(node, *self._arrays[node.value.id])
         node.value = self.visit(node.value)
         parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         numbers = [self._index(part) for part in parts]
@@ -95,6 +116,29 @@ class InPrecision(ast.NodeTransformer):
         written: list[ast.expr] = [ast.Constant(number) for number in numbers]
         node.slice = ast.Tuple(written, ast.Load()) if isinstance(node.slice, ast.Tuple) else written[0]
         return node
+
+    def _read(self, node: ast.Subscript, first: int, shape: tuple[int, ...]) -> ast.AST:
+        """Return the call that reads a number of an array: indices known here are checked, others where it runs."""
+        parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        if len(parts) != len(shape) or any(isinstance(part, (ast.Slice, ast.Starred)) for part in parts):
+            found = f"{self._what} has {ast.unparse(node)}"
+            raise InputError(f"{found}, but must have an index for each axis of its shape {shape}.")
+        place: ast.expr = _number(node, first)  # type: ignore[assignment]
+        for k, (part, size) in enumerate(zip(parts, shape, strict=True)):
+            own = self._place(node, part, size)
+            place = ast.BinOp(place, ast.Add(), ast.BinOp(own, ast.Mult(), _number(node, prod(shape[k + 1 :]))))  # type: ignore[arg-type]
+        return ast.Call(ast.Name(READ, ast.Load()), [*(ast.Name(name, ast.Load()) for name in READ_OF), place], [])
+
+    def _place(self, node: ast.Subscript, part: ast.expr, size: int) -> ast.expr:
+        """Return a number's place along an axis of an array."""
+        number = self._whole(part)
+        if number is None:
+            given = ast.Call(ast.Name(REAL, ast.Load()), [self.visit(part)], [])
+            return ast.Call(ast.Name(PLACE, ast.Load()), [given, _number(node, size)], [])  # type: ignore[list-item]
+        if not -size <= number < size:
+            found = f"{self._what} has {ast.unparse(node)}, which has the index {number}"
+            raise InputError(f"{found}, but must have one from {-size} to {size - 1} there.")
+        return _number(node, number % size)  # type: ignore[return-value]
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST:
         return node if isinstance(node.value, ast.Constant) else self.generic_visit(node)
@@ -144,6 +188,15 @@ class InPrecision(ast.NodeTransformer):
 
     def _index(self, node: ast.expr) -> int:
         """Return the whole number of an index as Python computes it; raise `InputError` where it is none."""
+        number = self._whole(node)
+        if number is None:
+            found = f"{self._what} has the index {ast.unparse(node)}"
+            wanted = "whole numbers there, or what follows from the counts of its loops"
+            raise InputError(f"{found}, but must have {wanted}.")
+        return number
+
+    def _whole(self, node: ast.expr) -> int | None:
+        """Return the whole number of an expression as Python computes it; None where it is known only in the run."""
         known = {one.id: one for one in ast.walk(node) if isinstance(one, ast.Name)}
         values = {name: self._counts.get(name, self._scope.get(name)) for name in known if name not in self._local}
         values |= {name: count for name, count in self._counts.items() if name in known}
@@ -153,8 +206,7 @@ class InPrecision(ast.NodeTransformer):
                 return int(found)
         except Exception:  # whatever an expression of other things raises
             pass
-        found = f"{self._what} has the index {ast.unparse(node)}"
-        raise InputError(f"{found}, but must have whole numbers there, or what follows from the counts of its loops.")
+        return None
 
     def _resolved(self, node: ast.Name | ast.Attribute) -> ast.AST:
         """Replace a name from outside by the number or the type of the precision that it stands for, if it does."""

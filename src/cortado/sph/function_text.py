@@ -194,8 +194,9 @@ class DerivativeCheck(ast.NodeVisitor):
     """A check that refuses code which Warp would differentiate wrongly without a word: loops that it does not unroll,
     and vectors that are changed in part."""
 
-    def __init__(self, what: str):
-        self._what = what
+    def __init__(self, what: str, most: int = wp.config.max_unroll):
+        """Take what the function is called, and the greatest number of turns of a loop."""
+        self._what, self._most = what, most
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
         loops = [
@@ -211,7 +212,7 @@ class DerivativeCheck(ast.NodeVisitor):
     def visit_For(self, node: ast.For) -> None:
         ends = node.iter.args if isinstance(node.iter, ast.Call) and ast.unparse(node.iter.func) == "range" else []
         numbers = [end.value for end in ends if isinstance(end, ast.Constant) and isinstance(end.value, int)]
-        if not ends or len(numbers) < len(ends) or len(range(*numbers)) > wp.config.max_unroll:
+        if not ends or len(numbers) < len(ends) or len(range(*numbers)) > self._most:
             self._refuse(node)
         self.generic_visit(node)
 
@@ -228,7 +229,7 @@ class DerivativeCheck(ast.NodeVisitor):
         line = ast.unparse(node).splitlines()[0].rstrip(":")
         raise InputError(
             f"{self._what} has {line!r}, which Warp cannot differentiate, but must have no loops other than over "
-            f"range(k), with a number k of at most {wp.config.max_unroll}, and not leave them before their end."
+            f"range(k), with a number k of at most {self._most}, and not leave them before their end."
         )
 
     visit_While = visit_Break = visit_Continue = _refuse
@@ -263,3 +264,23 @@ def counts_of(function: ast.FunctionDef) -> list[str]:
     """Return the names of a function's loop counters."""
     targets = [node.target for node in ast.walk(function) if isinstance(node, ast.For)]
     return [target.id for target in targets if isinstance(target, ast.Name)]
+
+
+class SizesWritten(ast.NodeTransformer):
+    """A rewriting of a function's text that replaces ``len(w)`` and ``w.shape[0]`` of arrays w by numbers."""
+
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]]):
+        self._shapes = shapes
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        of = node.args[0] if len(node.args) == 1 and ast.unparse(node.func) == "len" else None
+        if isinstance(of, ast.Name) and of.id in self._shapes:
+            return ast.copy_location(ast.Constant(self._shapes[of.id][0]), node)
+        return self.generic_visit(node)
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
+        name, _, end = ast.unparse(node.value).partition(".")
+        axis = node.slice.value if isinstance(node.slice, ast.Constant) else None
+        if end == "shape" and name in self._shapes and axis in range(len(self._shapes[name])):
+            return ast.copy_location(ast.Constant(self._shapes[name][axis]), node)
+        return self.generic_visit(node)

@@ -40,6 +40,7 @@ from cortado.scene.parameters import Axis, Parameter, Source
 from cortado.scene.scene import Scene
 from cortado.sph.formula import Formula, Packed, applied, compiled, formula, theta_of
 from cortado.sph.function_text import keep_source, plain_function, source_of
+from cortado.sph.own_arrays import READ_AS, Tables, table_type
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 from cortado.sph.viscosity_law import Law, check_law
 from cortado.sph.viscous_stress import ViscousStress, stress_of
@@ -85,8 +86,8 @@ class OwnFunction(ABC):
 
     def __init__(self, function: Callable[..., Any], /, name: str | None = None, **parameters: Any):
         """Take a ``function`` made by ``def`` and ``parameters``: a value for each of its arguments but the first ones,
-        a number, a vector (d,) or an `OverTime`. An argument ``k`` becomes the parameter ``name.k``; by default the
-        name is that of the function. Raises `InputError`."""
+        a number, a vector (d,), an `OverTime`, or of `Body` an array. An argument ``k`` becomes the parameter
+        ``name.k``; by default the name is that of the function. Raises `InputError`."""
         self._function = plain_function(self.kind, function)
         self._source = source_of(f"{self.kind} function {self._function.__name__}", self._function)
         self._formula, values = formula(self.kind, self._function, self._source, parameters)
@@ -118,19 +119,18 @@ class OwnFunction(ABC):
         if isinstance(value, OverTime):
             return value
         what = f"parameter {self.name}.{argument}"
-        array = read_only(what, value)
-        if array.ndim > 1:
-            wanted = "a number, a vector (d,), or cortado.forces.OverTime(times, values)"
-            raise InputError(f"{what} has shape {array.shape}, but must be {wanted}.")
-        return array
+        return read_only(what, value)
 
     def _parameter(self, argument: str, value: Any) -> Parameter:
+        name, meaning = f"{self.name}.{argument}", f"{argument} of the force {self.name}"
+        if argument in self._formula.arrays:
+            return Parameter(name, "", meaning, Axis.ARRAY, lambda source: value, change=_usual, shape=value.shape)
         course = value if isinstance(value, OverTime) else None
         first = value if course is None else course.values[0]
         return Parameter(
-            f"{self.name}.{argument}",
+            name,
             "",
-            f"{argument} of the force {self.name}",
+            meaning,
             Axis.STEP if course else Axis.SCALAR,
             lambda source: first,
             components=_dimension if first.ndim else None,
@@ -141,6 +141,11 @@ class OwnFunction(ABC):
     @abstractmethod
     def force(self, setting: Setting) -> Force:
         """Make the force in a solver; raise `InputError` for a function that Warp cannot compile."""
+
+    @property
+    def _ranks(self) -> tuple[int, ...]:
+        """Return the ranks of the parameters that are no arrays, and of time if the function takes that."""
+        return tuple(p.rank for p in self.parameters if p.axis is not Axis.ARRAY)
 
 
 class OwnForce(OwnFunction):
@@ -167,6 +172,7 @@ class FunctionForce:
     def __init__(self, what: str, kernels: Kernels, parameters: tuple[Parameter, ...], setting: Setting):
         self._what, self._kernels, self._device = what, kernels, setting.layout.device
         self._packed = Packed(parameters, setting.layout, setting.discretisation.taped)
+        self._tables = Tables(parameters, setting.layout, setting.discretisation.taped)
 
     def compile(self, kernel: Any) -> Any:
         """Compile a kernel and return it; raise `InputError` where Warp cannot."""
@@ -183,17 +189,19 @@ class FunctionForce:
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         now = {"theta": self._packed.theta(step), "acceleration_in": before, "acceleration": after}
-        step.launch(self._kernels.forward, **now)
+        step.launch(self._kernels.forward, self._tables.now(step), **now)
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
         now = {"acceleration_in_dot": before, "acceleration_dot": after}
-        step.launch(self._tangent, *dot.named, **theta, **now)
+        step.launch(self._tangent, self._tables.along(step, dot.parameters), *dot.named, **theta, **now)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         now = {"theta": self._packed.theta(step), "acceleration_bar": acceleration_bar}
-        step.launch(self._adjoint, *bar.named, **now, theta_bar=self._packed.shares)
+        known, shares = (self._tables.back(step), *bar.named), self._packed.shares
+        step.launch(self._adjoint, *known, **now, theta_bar=shares, threads=self._tables.threads)
         self._packed.collect(step, bar)
+        self._tables.collect(step, bar)
 
 
 def topic(kind: str, text: Formula, ranks: tuple[int, ...], dimension: int) -> str:
@@ -222,6 +230,11 @@ def _size(source: Source, value: np.ndarray) -> np.ndarray:
     return np.where(value == 0.0, 1.0, np.abs(value))
 
 
+def _usual(source: Source, value: np.ndarray) -> float:
+    """Return the root mean square of numbers; 1 where all are 0."""
+    return float(np.sqrt(np.mean(value**2))) or 1.0
+
+
 def _length(source: Source, value: np.ndarray) -> float:
     """Return the length of a vector, of several the greatest; 1 where it is 0."""
     return float(np.linalg.norm(np.atleast_2d(value), axis=-1).max()) or 1.0
@@ -232,7 +245,7 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
     """Make the kernels of a user's force on each particle in 2 or 3 dimensions; ranks are 0 (numbers) or 1
     (vectors)."""
     precision, modules = discretisation.precision, discretisation.modules(topic("body", text, ranks, dimension))
-    vector, theta_type = precision.vector, theta_of(precision, ranks)
+    real, vector, theta_type = precision.real, precision.vector, theta_of(precision, ranks)
 
     def make(module: Any) -> Callable[..., Any]:
         force = applied(text, precision, ranks, dimension, module)
@@ -240,9 +253,15 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         def body(x_i: vector, v_i: vector, theta: theta_type) -> vector:
             return force(x_i, v_i, theta)
 
-        return body
+        def of_arrays(
+            x_i: vector, v_i: vector, theta: theta_type, table: table_type(precision), e: real, member: int, row: int
+        ) -> vector:
+            return force(x_i, v_i, theta, e, table, member, row)
 
-    return pointwise_kernels(precision, modules, make, ["acceleration:acceleration_in"], written=["theta"])
+        return of_arrays if text.arrays else body
+
+    options: dict[str, Any] = {"numbers": ["table"], "read": READ_AS} if text.arrays else {}
+    return pointwise_kernels(precision, modules, make, ["acceleration:acceleration_in"], written=["theta"], **options)
 
 
 class Body(OwnForce):
@@ -252,7 +271,7 @@ class Body(OwnForce):
     kind = "Body"
 
     def kernels(self, discretisation: Discretisation, dimension: int) -> Kernels:
-        return body_kernels(discretisation, self._formula, tuple(p.rank for p in self.parameters), dimension)
+        return body_kernels(discretisation, self._formula, self._ranks, dimension)
 
 
 def term(
@@ -301,7 +320,7 @@ class Pair(OwnForce):
     kind = "Pair"
 
     def kernels(self, discretisation: Discretisation, dimension: int) -> Kernels:
-        return pair_kernels(discretisation, self._formula, tuple(p.rank for p in self.parameters), dimension)
+        return pair_kernels(discretisation, self._formula, self._ranks, dimension)
 
 
 class Rheology(OwnFunction):
@@ -332,8 +351,8 @@ class Rheology(OwnFunction):
         return f"{self.kind} function {self._formula.name}"
 
     def _law(self, scene: Scene) -> Law:
-        ranks = tuple(p.rank for p in self.parameters)
-        return Law(self._formula, ranks, topic("rheology", self._formula, ranks, scene.dimension) + "_")
+        topic_of_law = topic("rheology", self._formula, self._ranks, scene.dimension)
+        return Law(self._formula, self._ranks, f"{topic_of_law}_")
 
     def _try(self, values: Arrays, scene: Scene, precision: Precision, device: Any) -> None:
         own = np.broadcast_to(values.get("viscosity", [phase.viscosity for phase in scene.phase]), len(scene.phase))

@@ -1,0 +1,200 @@
+"""Arrays as parameters of a user's function, such as the weights of a network or a field on a grid, which kernels read
+number by number.
+
+All arrays of a force stand one behind the other in a table w (members, numbers). What is read for a particle is
+
+    w_k + e w_dot_k,   with e = 0,
+
+so that the tangent along w_dot is the derivative by e, as if that were a number of the particle. The adjoint of w is a
+sum over particles without atomics: a thread takes every so manieth particle of a scene, one after the other, and adds
+to a row of its own. The rows are summed in a fixed order.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from math import prod
+from typing import Any
+
+import warp as wp
+
+from cortado.device.modules import kernel_module, kind_of
+from cortado.device.precision import Precision
+from cortado.device.reduction import sum_of
+from cortado.particles.state import Layout, Parameters
+from cortado.scene.parameters import Axis, Parameter
+from cortado.sph.parts import Adjoints, StepContext
+
+MOST_NUMBERS = 2**24
+"""Greatest number of numbers of a force's arrays, so that float32 has each whole index."""
+ROWS, MOST_PARTIAL = {"cpu": 16, "cuda": 2**15}, 2**24
+"""Rows of a scene on a device, and the number of numbers in all rows above which there are fewer."""
+
+READ_AS = {"e": "_no", "member": "i // particles", "row": "_row"}
+"""Texts in pointwise kernels of what `Reading.read` takes besides the table and the place."""
+
+
+@cache
+def table_type(precision: Precision) -> Any:
+    """Return the Warp struct of a force's arrays: w, and w_dot or the rows of w's adjoint, (numbers, members x rows),
+    where there are any."""
+    numbers = wp.array2d(dtype=precision.real)
+    fields = {"__annotations__": dict.fromkeys(("values", "dots", "rows"), numbers), "__module__": __name__}
+    return wp.struct(type(f"Table_{precision.name}", (), fields))
+
+
+def arrays_module(precision: Precision, forward: bool, taped: bool = False) -> Any:
+    """Return the Warp module of kernels and functions of tables; ``taped`` forward ones get Warp's own adjoint."""
+    return kernel_module(f"arrays_{kind_of(forward, taped)}_{precision.name}", forward and taped)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The Warp functions by which a user's function reads arrays."""
+
+    place: Any
+    """Returns an index, from the end where it is negative, for an axis of a size; NaN where there is no such place."""
+    read: Any
+    """Returns a number of the table, NaN where there is none."""
+
+
+@cache
+def reading(precision: Precision, taped: bool) -> Reading:
+    """Make the functions that read arrays; Warp's tape differentiates ``taped`` ones by itself."""
+    real, table = precision.real, table_type(precision)
+    module = arrays_module(precision, True, taped)
+    none, nothing = wp.constant(real(0.0)), wp.constant(real(float("nan")))
+
+    @wp.func(module=module)
+    def place(k: real, size: real) -> real:
+        found = k
+        if k < none:
+            found = k + size
+        if found < none or found >= size or found != wp.floor(found):
+            found = nothing
+        return found
+
+    @wp.func(module=module)
+    def read(e: real, w: table, member: int, row: int, k: real) -> real:
+        found = nothing
+        if k >= none:
+            found = w.values[member, int(k)]
+        return found
+
+    if not taped:
+
+        @wp.func_grad(read)
+        def read_adjoint(e: real, w: table, member: int, row: int, k: real, bar: real):
+            if k >= none and row >= 0:
+                w.rows[int(k), row] = w.rows[int(k), row] + bar
+            elif k >= none and w.dots.shape[0] > 0:
+                wp.adjoint[e] += bar * w.dots[member, int(k)]
+
+    return Reading(place, read)
+
+
+@dataclass(frozen=True)
+class TableKernels:
+    """Kernels that write a parameter's numbers into a table, and add adjoints of a table to those of a parameter."""
+
+    pack: Any
+    add: Any
+
+
+@cache
+def table_kernels(precision: Precision, taped: bool) -> TableKernels:
+    """Make the kernels of tables, with a thread for each number of each scene."""
+    real, numbers = precision.real, wp.array2d(dtype=precision.real)
+
+    @wp.kernel(module=arrays_module(precision, True, taped))
+    def pack_array(first: int, values: numbers, table: numbers):
+        member, k = wp.tid() // values.shape[1], wp.tid() % values.shape[1]
+        table[member, first + k] = values[member, k]
+
+    @wp.kernel(module=arrays_module(precision, False), enable_backward=False)
+    def add_array(first: int, total: wp.array(dtype=real), values_bar: numbers):
+        member, k = wp.tid() // values_bar.shape[1], wp.tid() % values_bar.shape[1]
+        values_bar[member, k] = values_bar[member, k] + total[(first + k) * values_bar.shape[0] + member]
+
+    return TableKernels(pack_array, add_array)
+
+
+class Tables:
+    """The arrays of a user's function as one table in each scene, with its tangent and its adjoint."""
+
+    def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
+        self._layout, self._kernels = layout, table_kernels(layout.precision, taped)
+        self._arrays = [one for one in parameters if one.axis is Axis.ARRAY]
+        self._size = sum(prod(one.shape) for one in self._arrays)
+        most = min(ROWS["cpu" if layout.device.is_cpu else "cuda"], layout.particles)
+        self.rows = max(min(most, MOST_PARTIAL // (layout.members * max(self._size, 1))), 1)
+        """Number of threads that share the particles of a scene in the adjoint."""
+        self._table = self._new(values=self._numbers(layout.members, self._size, requires_grad=taped))
+
+    @property
+    def threads(self) -> int | None:
+        """Return the number of threads of the adjoint, None where there is one for each particle."""
+        return self._layout.members * self.rows if self._arrays else None
+
+    def now(self, step: StepContext) -> dict[str, Any]:
+        """Return the arguments of a forward kernel for the arrays of a step; none without arrays."""
+        return self._packed(step, self._table) if self._arrays else {}
+
+    def along(self, step: StepContext, parameters_dot: Parameters) -> dict[str, Any]:
+        """Return the arguments of a tangent kernel for the arrays of a step and their tangents."""
+        if not self._arrays:
+            return {}
+        self._pack(step, parameters_dot, self._along.dots)
+        return self._packed(step, self._along)
+
+    def back(self, step: StepContext) -> dict[str, Any]:
+        """Return the arguments of an adjoint kernel, which adds to rows of the arrays' adjoints."""
+        return {**self._packed(step, self._back), "rows": self.rows} if self._arrays else {}
+
+    def collect(self, step: StepContext, bar: Adjoints) -> None:
+        """Add the rows up into the adjoints of the arrays, and set them to 0."""
+        if self._arrays:
+            total = self._sum(self._back.rows.flatten())
+            for first, bars in self._each(bar.parameters):
+                step.launch(self._kernels.add, first=first, total=total, values_bar=bars, threads=bars.size)
+            self._back.rows.zero_()
+
+    def _packed(self, step: StepContext, table: Any) -> dict[str, Any]:
+        self._pack(step, step.parameters, table.values)
+        return {"table": table}
+
+    def _pack(self, step: StepContext, values: Parameters, table: wp.array) -> None:
+        for first, own in self._each(values):
+            step.launch(self._kernels.pack, first=first, values=own, table=table, threads=own.size)
+
+    def _each(self, values: Parameters) -> list[tuple[int, wp.array]]:
+        """Return where each array begins in the table, and its values (members, numbers)."""
+        sizes = [prod(one.shape) for one in self._arrays]
+        firsts = [sum(sizes[:k]) for k in range(len(sizes))]
+        shapes = ((self._layout.members, size) for size in sizes)
+        return [
+            (f, values[one.name].reshape(shape)) for f, one, shape in zip(firsts, self._arrays, shapes, strict=True)
+        ]
+
+    @cached_property
+    def _along(self) -> Any:
+        return self._new(values=self._table.values, dots=self._numbers(self._layout.members, self._size))
+
+    @cached_property
+    def _back(self) -> Any:
+        return self._new(values=self._table.values, rows=self._numbers(self._size, self._layout.members * self.rows))
+
+    @cached_property
+    def _sum(self) -> Any:
+        layout = self._layout
+        return sum_of(layout.precision.real, self.rows, layout.device, self._size * layout.members)
+
+    def _new(self, **arrays: wp.array) -> Any:
+        made, none = table_type(self._layout.precision)(), self._numbers(0, 0)
+        for name in ("values", "dots", "rows"):
+            setattr(made, name, arrays.get(name, none))
+        return made
+
+    def _numbers(self, *shape: int, requires_grad: bool = False) -> wp.array:
+        options = {"device": self._layout.device, "requires_grad": requires_grad}
+        return wp.zeros(shape, dtype=self._layout.precision.real, **options)

@@ -1,0 +1,241 @@
+"""Arrays as parameters of a user's force: a network, a field on a grid; run, differentiated, batched, refused."""
+
+import pickle
+
+import numpy as np
+import pytest
+import warp as wp
+
+import cortado
+from cortado import InputError, Problem, Simulation, gradients
+from cortado.forces import Body, Pair
+from cortado.losses import FinalPositions
+from finite_differences import all_ways_agree, both_modes, central_difference
+from scenes import aimed, plane, splash
+
+RANDOM = np.random.default_rng(3)
+WEIGHTS = RANDOM.standard_normal((9, 7))
+NODES = RANDOM.standard_normal((5, 4, 3))
+BIAS = np.array([0.3, -0.2, 0.1, 0.4])
+
+
+def net(x, v, w: wp.array2d(dtype=float), gain, bias):
+    f = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(len(w)):
+        h = wp.tanh(w[k, 0] * x[0] + w[k, 1] * x[1] + w[k, 2] * v[0] + w[k, 3] * v[1] + w[k, 4])
+        f += h * wp.vec3(w[k, -2], w[k, 6], bias[k % 4])
+    return gain * f
+
+
+def wind(x, v, nodes, size):
+    """A field on a grid of nodes, linear between them."""
+    a = wp.clamp(x[0] / size, 0.0, nodes.shape[0] - 1.001)
+    b = wp.clamp(x[1] / size, 0.0, nodes.shape[1] - 1.001)
+    i = int(a)
+    j = int(b)
+    f = wp.vec3(0.0, 0.0, 0.0)
+    for p in range(2):
+        for q in range(2):
+            part = (1.0 - abs(a - i - p)) * (1.0 - abs(b - j - q))
+            f += part * wp.vec3(nodes[i + p, j + q, 0], nodes[i + p, j + q, 1], nodes[i + p, j + q, 2])
+    return f - v
+
+
+def problem(force, made=None, steps=6, **options):
+    return aimed(Simulation(made or splash(), **{"precision": "float64", **options}, forces=[force]), steps)
+
+
+def net_force():
+    return Body(net, w=WEIGHTS, gain=3.0, bias=BIAS)
+
+
+def test_reverse_forward_tape_and_differences_agree():
+    point = {"net.w": WEIGHTS, "net.bias": BIAS, "net.gain": 3.0, "time_step": np.array(0.002)}
+    all_ways_agree(problem(net_force()), point, 5, lambda name: 1e-5, rtol=3e-6)
+
+
+def test_those_of_a_field_on_a_grid_agree():
+    all_ways_agree(problem(Body(wind, nodes=NODES, size=0.11)), {"wind.nodes": NODES}, 5, lambda name: 1e-4, rtol=3e-6)
+
+
+def free(**more):
+    """Neither pressure nor viscosity, so that one step is exact: v + dt (g + f)."""
+    return plane(forces={"gravity": [0.0, -9.81], "viscosity": "none", "pressure": False}, **more)
+
+
+def test_what_a_run_reads_is_what_numpy_reads():
+    simulation = Simulation(free(), precision="float64", forces=[Body(wind, nodes=NODES, size=0.11)])
+    x = simulation.positions
+    a, b = (np.clip(x[:, k] / 0.11, 0.0, NODES.shape[k] - 1.001) for k in range(2))
+    i, j = a.astype(int), b.astype(int)
+    near = (np.array((1 - a + i, a - i)), np.array((1 - b + j, b - j)))
+    f = sum((near[0][p] * near[1][q])[:, None] * NODES[i + p, j + q, :2] for p in range(2) for q in range(2))
+    run = simulation.run(1)
+    dt = run.times[1] - run.times[0]
+    np.testing.assert_allclose(run.velocities[1], dt * (f + [0.0, -9.81]), rtol=1e-12, atol=1e-15)
+
+
+def test_it_is_right_in_float32():
+    single, double = (problem(net_force(), precision=name) for name in ("float32", "float64"))
+    both_modes(single, {"net.w": WEIGHTS}, {"net.w": np.ones_like(WEIGHTS)}, tolerance=2e-4)
+    found, exact = (one.value_and_gradient({"net.w": WEIGHTS})[1]["net.w"] for one in (single, double))
+    assert np.linalg.norm(found - exact) <= 1e-4 * np.linalg.norm(exact)
+    assert cortado.certify(single, ["net.w", "net.bias"]).right
+
+
+def test_scenes_of_a_batch_have_their_own():
+    judged, weights = problem(net_force(), batch=2), np.stack([WEIGHTS, 2.0 * WEIGHTS])
+    loss, gradient = judged.value_and_gradient({"net.w": weights, "net.gain": [3.0, 1.0]})
+    tangents = judged.tangent({"net.w": weights}, {"net.w": np.ones_like(weights)})
+    alone = problem(net_force())
+    for b, own in enumerate(weights):
+        value, found = alone.value_and_gradient({"net.w": own, "net.gain": [3.0, 1.0][b]})
+        assert value == loss[b]
+        np.testing.assert_array_equal(found["net.w"], gradient["net.w"][b])
+        np.testing.assert_array_equal(alone.tangent({"net.w": own}, {"net.w": np.ones_like(own)}), tangents[b])
+    shared = judged.value_and_gradient({"net.w": WEIGHTS})[1]["net.w"]
+    np.testing.assert_array_equal(shared, alone.value_and_gradient({"net.w": WEIGHTS})[1]["net.w"][None].repeat(2, 0))
+
+
+def test_other_arrays_compile_and_capture_nothing_and_bits_are_the_same(monkeypatch):
+    judged = problem(net_force(), steps=30)
+    first = [judged.value_and_gradient({"net.w": WEIGHTS}) for _ in range(3)]
+    for again in first[1:]:
+        assert again[0] == first[0][0]
+        np.testing.assert_array_equal(again[1]["net.w"], first[0][1]["net.w"])
+
+    def refuse(*arguments, **options):
+        raise AssertionError("captured or compiled again")
+
+    monkeypatch.setattr(wp, "ScopedCapture", refuse)
+    monkeypatch.setattr(wp._src.context.Module, "_compile", refuse)
+    other = judged.value_and_gradient({"net.w": 1.1 * WEIGHTS})
+    assert other[0] != first[0][0]
+
+
+def test_it_is_searched_for():
+    judged = problem(Body(wind, nodes=NODES, size=0.11))
+    target = judged.end({"wind.nodes": NODES + 0.5}).positions
+    judged = Problem(judged.simulation, judged.steps, FinalPositions(target))
+    found = cortado.optimise(judged, {"wind.nodes": NODES}, optimiser="lbfgs", iterations=12)
+    assert found.loss < 1e-3 * judged.value({"wind.nodes": NODES})
+    assert found.parameters["wind.nodes"].shape == NODES.shape
+
+
+def test_a_run_goes_on_with_the_same_bits_and_the_force_goes_to_other_processes():
+    simulation = pickle.loads(pickle.dumps(Simulation(splash(), forces=[net_force()])))
+    other = {"net.w": 0.5 * WEIGHTS}
+    whole, first = simulation.run(8, other), simulation.run(3, other)
+    rest = simulation.run(5, other, state=first.last_state)
+    np.testing.assert_array_equal(rest.positions[-1], whole.positions[-1])
+    assert np.abs(whole.positions[-1] - simulation.run(8).positions[-1]).max() > 0.0
+    assert len({problem(Body(net, w=w, gain=3.0, bias=BIAS)).fingerprint for w in (WEIGHTS, 2.0 * WEIGHTS)}) == 2
+
+
+def test_estimators_and_ensembles_take_it():
+    judged = problem(net_force())
+    exact = judged.value_and_gradient({"net.w": WEIGHTS})[1]["net.w"]
+    for estimator in (
+        gradients.AdjointViscosity(0.0),
+        gradients.EnsembleMean(1e-9, 4, position_noise=0.0, estimator=gradients.Exact()),
+    ):
+        found = judged.value_and_gradient({"net.w": WEIGHTS}, estimator)[1]["net.w"]
+        np.testing.assert_allclose(found, exact, rtol=1e-3, atol=1e-6 * np.abs(exact).max())
+
+
+def test_steps_of_jax_and_torch_take_it():
+    jax, torch = pytest.importorskip("jax"), pytest.importorskip("torch")
+    judged = problem(net_force())
+    exact = judged.value_and_gradient({"net.w": WEIGHTS})[1]["net.w"]
+    weights = torch.tensor(WEIGHTS, requires_grad=True)
+    cortado.torch.value(judged)({"net.w": weights}).backward()
+    np.testing.assert_allclose(weights.grad.numpy(), exact, rtol=1e-12)
+    with jax.enable_x64(True):
+        state = cortado.jax.state(judged.simulation)
+
+        def moved(w):
+            return cortado.jax.step(judged.simulation, state, {"net.w": w}, steps=6)["positions"]
+
+        target = judged.loss.target
+        slope = jax.grad(lambda w: ((moved(w) - target) ** 2).sum())(jax.numpy.array(WEIGHTS))
+        np.testing.assert_allclose(slope / slope[0, 0], exact / exact[0, 0], rtol=1e-9)
+
+
+def test_an_index_beyond_the_end_ends_the_run():
+    def beyond(x, v, w):
+        return w[int(100.0 * x[0])] * v
+
+    with pytest.raises(cortado.DivergedError):
+        Simulation(splash(), forces=[Body(beyond, w=np.ones(7))]).run(3)
+
+
+def made(function, **values):
+    return Simulation(splash(), forces=[Body(function, **values)])
+
+
+def one(x, v, w):
+    return w[2] * v
+
+
+def two(x, v, w):
+    return w[0, 1] * v
+
+
+def far(x, v, w):
+    return w[7] * v
+
+
+def whole(x, v, w: wp.array):
+    return w * v
+
+
+def of_vectors(x, v, w: wp.array(dtype=wp.vec3)):
+    return w[0]
+
+
+@pytest.mark.parametrize(
+    ("function", "w", "words"),
+    [
+        (two, np.ones(7), "has w.0, 1., but must have an index for each axis of its shape .7,."),
+        (far, np.ones(7), "has w.7., which has the index 7, but must have one from -7 to 6"),
+        (whole, np.ones(7), "has the array w without indices"),
+        (one, np.ones((2, 2, 2, 2)), "must have one with one to 3 axes"),
+        (one, np.ones((3, 0)), "must have one with one to 3 axes"),
+        (of_vectors, np.ones(7), "which its annotation says otherwise"),
+        (one, np.array([1.0, np.nan, 1.0, 1.0]), "one.w has a value that is not finite, but must be numbers"),
+        (one, np.ones(4) * 1j, "made of complex numbers"),
+        (one, [1.0, "a", 2.0, 3.0], "one.w is"),
+    ],
+)
+def test_what_is_wrong_is_said(function, w, words):
+    with pytest.raises(InputError, match=words):
+        made(function, w=w)
+
+
+def test_wrong_values_are_refused():
+    simulation = made(one, w=np.ones(4))
+    for value, words in (
+        (np.ones(5), "parameter one.w has shape .5,., but must be .4,."),
+        (2.0, "has shape .., but must be .4,."),
+        ([1.0, np.nan, 1.0, 1.0], "not finite"),
+        ([1e20, 1.0, 1.0, 1.0], "one.w"),
+        ("abc", "must be a number or an array of real numbers"),
+    ):
+        with pytest.raises(InputError, match=words):
+            simulation.run(1, {"one.w": value})
+
+
+def test_a_pair_force_has_no_arrays():
+    def pull(x_ij, v_ij, w):
+        return w[0] * x_ij
+
+    with pytest.raises(InputError, match="only Body has arrays"):
+        Pair(pull, w=np.ones(7))
+
+
+def test_differences_agree_to_ten_digits():
+    judged = problem(net_force(), free())
+    direction = {"net.w": RANDOM.standard_normal(WEIGHTS.shape)}
+    slope = both_modes(judged, {"net.w": WEIGHTS}, direction, 1e-12)[1]
+    found = [central_difference(judged.value, {"net.w": WEIGHTS}, direction, h) for h in (1e-3, 5e-4)]
+    assert abs((4.0 * found[1] - found[0]) / 3.0 - slope) <= 1e-10 * abs(slope)
