@@ -14,7 +14,7 @@ from cortado import InputError, Simulation
 from cortado.discretise.room import Domain
 from cortado.environments.catalogue import TASKS
 from cortado.environments.task import Position, Velocity
-from cortado.environments.terms import Distance, Missed, OneBox, Share, Spread, StepEnd
+from cortado.environments.terms import Distance, Miss, Missed, OneBox, Share, Spread, StepEnd
 
 
 @pytest.fixture(scope="module")
@@ -395,6 +395,87 @@ def test_adjoints_of_terms_are_differences(carried, name):
         product = (bars[field] * dot).reshape(2, -1).sum(axis=1)
         assert np.allclose(product, difference, rtol=1e-7, atol=1e-9), field
     assert bars["positions"].any() != (name == "distance")
+
+
+def test_terms_in_space_are_what_numpy_finds_with_derivatives_of_differences():
+    """The share in a cup that leans about z, and by how much it misses the goal."""
+    coarse = type("Coarse", (TASKS["CarryInSpace"],), {"coarse_spacing": 0.025})().scene
+    simulation = Simulation(coarse, precision="float64", batch=2)
+    path = {"cup.displacement": np.full((2, 1, 3), 0.003), "cup.turn": np.array([[[0, 0, 0.3]], [[0, 0, -0.2]]])}
+    state = simulation.step(simulation.on_device(), path)
+    lower, upper = np.array([-0.05, -0.04, -0.03]), np.array([0.02, 0.03, 0.05])
+    share = Share(OneBox(tuple(lower), tuple(upper)), 0.01, solid="cup")
+    at = StepEnd(state.arrays, np.array([[0.3], [0.9]]), np.array([1, 2]))
+    fields = at.state.numpy(3)
+    (c, s), r = (
+        (f(fields["cup.turn"][:, 0, 2:]) for f in (np.cos, np.sin)),
+        fields["positions"] - fields["cup.position"],
+    )
+    y = np.stack([c * r[..., 0] + s * r[..., 1], c * r[..., 1] - s * r[..., 0], r[..., 2]], axis=-1)
+    squares = ((y - np.clip(y, lower, upper)) ** 2).sum(axis=-1)
+    expected = (1.0 / (1.0 + squares / 1e-4)).mean(axis=1)
+    assert np.allclose(share.values(at), expected, rtol=1e-12) and (expected < 0.9).all()
+    term, factor, bar = Miss(share), np.array([2.0, -0.7]), at.state.like()
+    assert np.allclose(term.values(at), np.abs(expected - [0.3, 0.9]), rtol=1e-12)
+    assert (np.sign(expected - [0.3, 0.9]) == [1.0, -1.0]).all()
+    term.adjoint(at, factor, bar)
+    bars, generator = bar.numpy(3), np.random.default_rng(2)
+    for field in ("positions", "cup.position", "cup.turn"):
+        dot = generator.standard_normal(fields[field].shape)
+        dot[..., :2] *= field != "cup.turn"
+
+        def moved(h, field=field, dot=dot):
+            other = at.state.copy()
+            other.set({field: fields[field] + h * dot})
+            return term.values(replace(at, state=other))
+
+        difference = factor * (moved(3e-7) - moved(-3e-7)) / 6e-7
+        product = (bars[field] * dot).reshape(2, -1).sum(axis=1)
+        assert np.allclose(product, difference, rtol=1e-7, atol=1e-9) and product.all(), field
+    at.state.set({"cup.turn": np.array([[[0.1, 0, 0]], [[0, 0, 0]]])})
+    with pytest.raises(InputError, match=r"cup is turned by \[0.1, 0.0, 0.0\], but must turn about z alone"):
+        share.values(at)
+
+
+# ---- the tasks in space are neither solved by doing nothing nor too hard ---------------------------------------------
+
+
+def played(name, policy):
+    """The rewards of an episode, and its goal."""
+    env, found = cortado.environments.FluidEnv(name), []
+    seen, _ = env.reset(seed=2)
+    for k in range(env.scenes.task.horizon):
+        seen, reward, terminated, _, _ = env.step(policy(k, {name: seen[own] for name, own in env.layout.items()}))
+        assert not terminated
+        found.append(reward)
+    return np.array(found), env.scenes.goal[0, 0]
+
+
+def test_a_cup_in_space_is_carried_by_speeding_up_and_slowing_down_gently():
+    """At 2 and 1.6 m/s2. At full speed, and stopped at once, a fifteenth of the water is spilt."""
+
+    def gently(k, seen):
+        (x, speed), to = seen["cup.displacement"], seen["goal"][0] - 0.075
+        return np.array([np.clip(np.sqrt(3.2 * max(to - x, 0.0)), speed - 0.03, min(speed + 0.03, 0.6)) / 0.6, 0.0])
+
+    def at_once(k, seen):
+        return np.array([float(seen["cup.displacement"][0] < seen["goal"][0] - 0.075), 0.0])
+
+    rewards, goal = played("CarryInSpace", gently)
+    nothing = -(goal - 0.075) * len(rewards)
+    assert rewards.sum() > 0.5 * nothing and rewards[-1] > -0.02
+    rewards, _ = played("CarryInSpace", at_once)
+    assert rewards.sum() < nothing and rewards[-1] < -0.4
+
+
+def test_a_jug_in_space_is_emptied_to_a_share_by_turning_it_back_in_time():
+    """Before it turns back nothing is in the glass, and a jug that never does pours far too much."""
+    envs = cortado.environments.make_vec("PourInSpace", 2)
+    envs.reset(seed=[1, 1])
+    turns = [[[0.0, -0.5 if k < 49 else 0.5], [0.0, -0.5]] for k in range(envs.scenes.task.horizon)]
+    rewards = [envs.step(np.array(actions))[1] for actions in turns]
+    assert np.allclose(rewards[0], -envs.scenes.goal[:, 0], atol=0.02)
+    assert rewards[-1][0] > -0.05 and rewards[-1][1] < -0.2
 
 
 def test_terms_see_fluid_that_has_gone_around_a_period(carried):

@@ -1,4 +1,5 @@
-"""All tasks, by name: a cup that is carried, a latte, a jug that pours, a raft, a splash, and a cup that is stirred."""
+"""All tasks, by name: a cup that is carried, a latte, a jug that pours, a raft, a splash, and a cup that is stirred;
+the cup and the jug in the plane and in space."""
 
 import warnings
 from collections.abc import Sequence
@@ -9,8 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.environments.task import Position, Task, Velocity
-from cortado.environments.terms import Distance, Missed, OneBox, Pose, Reward, Share, Spread
+from cortado.environments.task import Actuator, Position, Task, Velocity
+from cortado.environments.terms import Distance, Miss, Missed, OneBox, Pose, Reward, Share, Spread
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
@@ -27,7 +28,45 @@ def box(lower: Sequence[float], upper: Sequence[float], **others: Any) -> dict[s
     return {"shape": "box", "lower": lower, "upper": upper, **others}
 
 
-class Carry(Task):
+def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Actuator, Actuator]:
+    """Return the actuators of a solid that goes along x, at most so fast [m/s], and turns about z [rad/s]."""
+    still, plane = (0.0,) * dimension, dimension == 2
+    turn: Any = {"rest": (0.0,), "axes": (0,)} if plane else {"rest": still, "axes": (2,)}
+    return (
+        Velocity(f"{solid}.displacement", still, (0,), (fastest,)),
+        Velocity(f"{solid}.turn", greatest=(turning,), is_number=plane, **turn),
+    )
+
+
+class Vessels(Task):
+    """A task of cups and jugs: in space they are round, about axes at z = 0, and in the plane they are cuts through
+    these."""
+
+    view: ClassVar[dict[str, Any]] = {}
+    """Table of the pictures: in space where the camera is, and where it looks at [m]."""
+
+    def place(self, x: float, y: float) -> list[float]:
+        """Return a point of the plane z = 0 [m]."""
+        return [x, y, 0.0][: self.dimension]
+
+    def corners(self, lower: Sequence[float], upper: Sequence[float]) -> tuple[list[float], list[float]]:
+        """Return the corners of a box in the plane [m], in space with a square base about z = 0."""
+        half = 0.5 * (upper[0] - lower[0])
+        return [*lower, -half][: self.dimension], [*upper, half][: self.dimension]
+
+    def filled(self, lower: Sequence[float], upper: Sequence[float], phase: str) -> dict[str, Any]:
+        """Return the table of fluid in a box of the plane [m], in space in a round vessel of this cut."""
+        if self.dimension == 2:
+            return box(lower, upper, phase=phase)
+        size = {"radius": 0.5 * (upper[0] - lower[0]), "height": upper[1] - lower[1]}
+        return {"shape": "cylinder", "base": self.place(0.5 * (lower[0] + upper[0]), lower[1]), **size, "phase": phase}
+
+    def room(self, lower: Sequence[float], upper: Sequence[float]) -> dict[str, Any]:
+        """Return the table of a container; in space there is none, and what is spilt falls on and on."""
+        return box(lower, upper) if self.dimension == 2 else {"shape": "none"}
+
+
+class Carry(Vessels):
     """The task of carrying a cup of water to a place, without spilling.
 
     Actions: velocity of the cup along x, and rate at which it leans. Goal: where its middle shall be. After
@@ -47,29 +86,41 @@ class Carry(Task):
     """Height of the floor on which spilt water falls, deeper than any corner of the cup [m]."""
     fastest, turning = 0.6, 1.0
     """[m/s], [rad/s]"""
-    actuators = (
-        Velocity("cup.displacement", (0.0, 0.0), (0,), (fastest,)),
-        Velocity("cup.turn", (0.0,), (0,), (turning,), is_number=True),
-    )
+    actuators = led("cup", fastest, turning, 2)
     goals = np.array([0.5 * width + 0.3]), np.array([0.5 * width + 0.5])
 
     @property
     def scene(self) -> Scene:
-        cup = {"name": "cup", "shape": "cup", "base": [0.5 * self.width, -self.wall], "radius": 0.5 * self.width}
+        base = self.place(0.5 * self.width, -self.wall)
+        cup = {"name": "cup", "shape": "cup", "base": base, "radius": 0.5 * self.width}
         cup |= {"height": self.wall + self.height, "thickness": self.wall}
         reach = 1.1 * self.fastest * self.horizon * self.repeats * self.coarse_step
         return self.scene_of(
-            container=box([-0.2 - reach, self.floor], [self.width + 0.2 + reach, 0.5]),
+            container=self.room([-0.2 - reach, self.floor], [self.width + 0.2 + reach, 0.5]),
             phase=[WATER],
-            fluid=[box([0.0, 0.0], [self.width, self.depth], phase="water")],
-            solid=[{**cup, **LED}],
+            fluid=[self.filled([0.0, 0.0], [self.width, self.depth], "water")],
+            solid=[{**cup, **LED, "velocity": self.place(0.0, 0.0)}],
+            picture=self.view,
         )
 
     def reward(self, simulation: Simulation) -> Reward:
         middle = simulation.scene.solid[0].middle()
-        inside = OneBox(tuple(-middle), tuple(np.array([self.width, self.height]) - middle))
-        share = Share(inside, self.coarse_spacing, solid="cup")
+        lower, upper = self.corners([0.0, 0.0], [self.width, self.height])
+        share = Share(OneBox(tuple(lower - middle), tuple(upper - middle)), self.coarse_spacing, solid="cup")
         return Reward(((-1.0, Distance("cup")), (10.0, share)), constant=-10.0)
+
+
+class CarryInSpace(Carry):
+    """The task of carrying a round cup of water along a line to a place, without spilling.
+
+    Actions, goal and reward are those of `Carry`; the cup leans about the axis across its way, and is less high.
+    """
+
+    name = "CarryInSpace"
+    dimension, finer = 3, 2
+    depth, height = 0.1125, 0.1375
+    view: ClassVar[dict[str, Any]] = {"camera": [0.3, 0.8, 1.5], "look_at": [0.3, 0.0, 0.0], "transparency": 0.1}
+    actuators = led("cup", Carry.fastest, Carry.turning, 3)
 
 
 class Latte(Task):
@@ -137,7 +188,7 @@ def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]
     return run.positions[1:], weights
 
 
-class Pour(Task):
+class Pour(Vessels):
     """The task of turning and moving a jug until its syrup is in a glass.
 
     Actions: velocity of the jug along x, and rate at which it turns, counterclockwise. After PourWater of SoftGym (Lin
@@ -153,27 +204,50 @@ class Pour(Task):
     """Corners of the inside of the glass, and the thickness of walls [m]."""
     fastest, turning = 0.1, 4.0
     """[m/s], [rad/s]"""
-    actuators = (
-        Velocity("jug.displacement", (0.0, 0.0), (0,), (fastest,)),
-        Velocity("jug.turn", (0.0,), (0,), (turning,), is_number=True),
-    )
+    actuators = led("jug", fastest, turning, 2)
 
     @property
     def scene(self) -> Scene:
         (left, low), (right, high) = self.lower, self.upper
         cup = {"shape": "cup", "thickness": self.wall, "colour": LED["colour"]}
-        jug: dict[str, Any] = {"name": "jug", "base": [0.075, -0.05], "radius": 0.075, "height": 0.25}
-        glass: dict[str, Any] = {"name": "glass", "base": [0.5 * (left + right), low - self.wall]}
+        jug: dict[str, Any] = {"name": "jug", "base": self.place(0.075, -0.05), "radius": 0.075, "height": 0.25}
+        glass: dict[str, Any] = {"name": "glass", "base": self.place(0.5 * (left + right), low - self.wall)}
         glass |= {"radius": 0.5 * (right - left), "height": high - low + self.wall}
         return self.scene_of(
-            container=box([-0.3, low - self.wall], [0.7, 0.4]),
+            container=self.room([-0.3, low - self.wall], [0.7, 0.4]),
             phase=[{**WATER, "name": "syrup", "viscosity": 0.3, "colour": [0.8, 0.45, 0.1]}],
-            fluid=[box([0.0, 0.0], [0.15, 0.125], phase="syrup")],
-            solid=[{**cup, **jug, "motion": "path", "angular_velocity": 0.0}, {**cup, **glass}],
+            fluid=[self.filled([0.0, 0.0], [0.15, 0.125], "syrup")],
+            solid=[{**cup, **jug, **LED, "velocity": self.place(0.0, 0.0)}, {**cup, **glass}],
+            picture=self.view,
         )
 
     def reward(self, simulation: Simulation) -> Reward:
-        return Reward(((1.0, Share(OneBox(self.lower, self.upper), 2.0 * self.coarse_spacing)),))
+        return Reward(((1.0, self.share),))
+
+    @property
+    def share(self) -> Share:
+        """The share of the syrup that is in the glass."""
+        lower, upper = self.corners(self.lower, self.upper)
+        return Share(OneBox(tuple(lower), tuple(upper)), 2.0 * self.coarse_spacing)
+
+
+class PourInSpace(Pour):
+    """The task of pouring a given share of a round jug into a round glass, and no more.
+
+    Actions are those of `Pour`. Goal: the share of the syrup that shall be in the glass. The reward is minus the
+    distance of the share that is in it from the goal.
+    """
+
+    name = "PourInSpace"
+    dimension, finer = 3, 2
+    lowest = -1.0
+    goal_names: ClassVar[tuple[str, ...]] = ("share in the glass [-]",)
+    view: ClassVar[dict[str, Any]] = {"camera": [0.25, 0.6, 1.5], "look_at": [0.2, -0.02, 0.0], "transparency": 0.1}
+    actuators = led("jug", Pour.fastest, Pour.turning, 3)
+    goals = np.array([0.3]), np.array([0.7])
+
+    def reward(self, simulation: Simulation) -> Reward:
+        return Reward(((-1.0, Miss(self.share)),))
 
 
 class Raft(Task):
@@ -302,7 +376,9 @@ class Stir(Task):
         return Reward(((1.0, Spread(milk, spread)),), constant=-1.0)
 
 
-TASKS: dict[str, type[Task]] = {one.name: one for one in (Carry, Latte, Pour, Raft, Splash, Stir)}
+TASKS: dict[str, type[Task]] = {
+    one.name: one for one in (Carry, CarryInSpace, Latte, Pour, PourInSpace, Raft, Splash, Stir)
+}
 
 
 def task_of(task: str | Task, size: str | None) -> Task:

@@ -17,7 +17,7 @@ from cortado.device.launching import launch
 from cortado.device.threads import WARP
 from cortado.environments.kernels import environment_kernels
 from cortado.environments.task import Task, split
-from cortado.errors import CortadoWarning, InputError, shown
+from cortado.errors import CortadoWarning, InputError, MassWarning, shown
 from cortado.losses.loss import SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState
@@ -145,7 +145,9 @@ class Scenes:
         """Make ``scenes`` scenes; ``seen``: how many particles are observed, at most all."""
         self._sensors = checked_sensors(sensors, {"particles", "goal", "progress", *task.free_solids, *task.driven})
         self.task = task
-        self.simulation = Simulation(task.scene, device, precision, batch=scenes, lanes=LANES)
+        with warnings.catch_warnings():  # rewards are shares of the fluid that there is
+            warnings.simplefilter("ignore", MassWarning)
+            self.simulation = Simulation(task.scene, device, precision, batch=scenes, lanes=LANES)
         warn_of_places(self.simulation, self._sensors)
         self._domain, self._stepper = self.simulation.lattice.domain, Stepper(self.simulation, task.substeps)
         self.reward = replace(task.reward(self.simulation), domain=self._domain)
@@ -191,7 +193,9 @@ class Scenes:
     @cached_property
     def single(self) -> Simulation:
         """A simulation of one scene, for twins."""
-        return Simulation(self.task.scene, self.simulation.device.alias, self.simulation.precision.name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MassWarning)
+            return Simulation(self.task.scene, self.simulation.device.alias, self.simulation.precision.name)
 
     def save(self, over: NDArray | None = None, observations: NDArray | None = None, generators: Any = ()) -> EnvState:
         """Return where all scenes are, with what an environment adds: which episodes are ``over``, the last

@@ -20,9 +20,6 @@ from cortado.optimisation.transforms import Affine
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
-FINENESS = {"small": 1, "large": 3}
-"""Factor of refinement by size: so many times more particles along each axis, and steps shorter by it."""
-
 
 @dataclass(frozen=True)
 class Actuator(ABC):
@@ -97,10 +94,14 @@ class Position(Actuator):
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """A task of control in the plane: a scene, its actuators, rewards and goals, in a small or a large size."""
+    """A task of control: a scene, its actuators, rewards and goals, in a small or a large size."""
 
     size: str = "small"
-    """"small", 100 to 200 particles for a processor, or "large", with nine times as many, for a GPU."""
+    """"small", for a processor, or "large", with `finer` times as many particles along each axis, for a GPU."""
+    dimension: ClassVar[int] = 2
+    """2 in the plane, 3 in space."""
+    finer: ClassVar[int] = 3
+    """Factor of refinement of the large size, whose steps are shorter by it."""
     name: ClassVar[str]
     horizon: ClassVar[int]
     """Steps of the environment after which an episode is truncated."""
@@ -118,23 +119,28 @@ class Task(ABC):
     """Descriptions of the numbers of a goal, with their units."""
 
     def __post_init__(self) -> None:
-        if self.size not in FINENESS:
+        if self.size not in ("small", "large"):
             raise InputError(f'size is {shown(self.size)}, but must be "small" or "large".')
+
+    @property
+    def fineness(self) -> int:
+        """How many times finer than the small size the scene is."""
+        return self.finer if self.size == "large" else 1
 
     @property
     def spacing(self) -> float:
         """Particle spacing of the scene [m]."""
-        return self.coarse_spacing / FINENESS[self.size]
+        return self.coarse_spacing / self.fineness
 
     @property
     def time_step(self) -> float:
         """The time step of the simulation [s]."""
-        return self.coarse_step / FINENESS[self.size]
+        return self.coarse_step / self.fineness
 
     @property
     def substeps(self) -> int:
         """Steps of the simulation in one step of the environment."""
-        return self.repeats * FINENESS[self.size]
+        return self.repeats * self.fineness
 
     @property
     @abstractmethod
@@ -167,7 +173,7 @@ class Task(ABC):
             "discretisation": {"spacing": self.spacing},
             "solver": {"time_step": self.time_step},
         }
-        return Scene(dimension=2, **{**common, **tables})
+        return Scene(dimension=self.dimension, **{**common, **tables})
 
 
 def checked_actions(what: str, given: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from cortado.device.threads import WARP
 from cortado.discretise.room import WITHOUT_PERIODS, Domain
 from cortado.discretise.shapes import apart
 from cortado.environments.kernels import environment_kernels
+from cortado.errors import InputError, shown
 from cortado.losses.loss import Snapshot, SnapshotBatch, precision_of
 from cortado.particles.state import State, padded, to_device
 from cortado.scene.motions import AXES, position_name, turn_name
@@ -138,7 +139,8 @@ class Share(OverParticles):
     kernel = "share"
 
     def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
-        """Set the boxes and the width w [m]; with a ``solid``, boxes move and turn with its middle, in the plane."""
+        """Set the boxes and the width w [m]; with a ``solid``, boxes move with its middle and turn with it, in space
+        about z alone."""
         super().__init__(boxes, width, solid)
         self._boxes, self._width, self._solid = boxes, width, solid
 
@@ -147,8 +149,13 @@ class Share(OverParticles):
         place_bar, turn_bar = wp.empty_like(x), wp.empty(len(x), dtype=precision_of(at.state).real, device=x.device)
         super().adjoint(at, factor, bar, place_bar=place_bar, turn_bar=turn_bar)
         if self._solid is not None:
-            for name, bars in ((position_name(self._solid), place_bar), (turn_name(self._solid), turn_bar)):
-                add(sum_of(bars.dtype, at.per, x.device, at.scenes)(bars), bar[name])
+            place, turn = (sum_of(bars.dtype, at.per, x.device, at.scenes)(bars) for bars in (place_bar, turn_bar))
+            add(place, bar[position_name(self._solid)])
+            of_turn = bar[turn_name(self._solid)]
+            if of_turn.dtype is turn.dtype:
+                add(turn, of_turn)
+            else:
+                _add(bar, turn_name(self._solid), turn.numpy()[:, None] * [0.0, 0.0, 1.0])
 
     def _over(self, at: StepEnd) -> float:
         return at.per
@@ -158,9 +165,19 @@ class Share(OverParticles):
         if self._solid is None:
             fixed = _vectors(at, np.zeros((at.scenes, 3))), _reals(at, np.zeros(at.scenes))
         else:
-            fixed = at.state[position_name(self._solid)], at.state[turn_name(self._solid)]
+            fixed = at.state[position_name(self._solid)], self._turn(at)
         found = {"width": self._width, "lower": lower, "upper": upper, **at.period}
         return {**found, "place": fixed[0], "turn": fixed[1]}
+
+    def _turn(self, at: StepEnd) -> wp.array:
+        """Return the angle (scenes,) of the solid about z. Raises `InputError` where it turns about another axis."""
+        turn = at.state[turn_name(self._solid or "")]
+        if turn.dtype is precision_of(at.state).real:
+            return turn
+        found = turn.numpy()
+        if found[:, :2].any():
+            raise InputError(f"{self._solid} is turned by {shown(found[0].tolist())}, but must turn about z alone.")
+        return _reals(at, found[:, 2])
 
 
 class Spread(OverParticles):
@@ -204,6 +221,19 @@ class Missed(OverParticles):
         steps = np.clip(at.step, 1, len(self._targets)) - 1
         step = wp.array(steps, dtype=wp.int32, device=at.state.positions.device)
         return {"step": step, "target": target, "weight": weight}
+
+
+@dataclass(frozen=True)
+class Miss:
+    """A reward term: by how much another term misses the first number of the goal, |value - goal|."""
+
+    term: Term
+
+    def values(self, at: StepEnd) -> NDArray:
+        return np.abs(self.term.values(at) - at.goal[:, 0])
+
+    def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
+        self.term.adjoint(at, factor * np.sign(self.term.values(at) - at.goal[:, 0]), bar)
 
 
 @dataclass(frozen=True)
