@@ -21,6 +21,7 @@ def bench(
     repeats: int = 5,
     device: str = "cpu",
     precision: str = "float32",
+    solver: Literal["projection", "pcisph"] = "projection",
     engine: Literal["warp", "reference"] = "warp",
     json: Flag = False,
 ) -> Work:
@@ -32,7 +33,8 @@ def bench(
         repeats: The median of so many repeats counts.
         device: "cpu", or "cuda:0" for the first GPU.
         precision: "float32" or "float64"; of the reference engine also "float80" and "float128".
-        engine: The one in Warp, or the reference engine in C++.
+        solver: The projection as scenes have it, or PCISPH with 5 iterations a step.
+        engine: The one in Warp, or the reference engine in C++, which is timed with PCISPH.
         json: Print JSON for machines, with more numbers, instead of tables.
     """
     require_at_least(1, len(particles), "the number of --particles")
@@ -44,7 +46,7 @@ def bench(
     if engine == "reference":
         return partial(bench_reference, particles, steps, repeats, precision, json)
     else:
-        return partial(bench_dam_break, particles, steps, repeats, device, precision, json)
+        return partial(bench_dam_break, particles, steps, repeats, device, precision, solver, json)
 
 
 @command(app, answers=True)
@@ -91,6 +93,28 @@ def watching(depth: int = 20, steps: int = 200, repeats: int = 3, device: str = 
     from benchmarks.bench.watching import bench_watching
 
     return partial(bench_watching, depth, steps, repeats, device, json)
+
+
+@command(app, answers=True)
+def batches(
+    scenes: tuple[int, ...] = (1, 256), steps: int = 100, repeats: int = 3, device: str = "cpu", json: Flag = False
+) -> Work:
+    """Time batches of dam breaks of 125 particles, forward and with the gradient.
+
+    Args:
+        scenes: Numbers of scenes in a batch; one measurement for each, compared with the first.
+        steps: Number of time steps.
+        repeats: The median of so many repeats counts.
+        device: "cpu", or "cuda:0" for the first GPU.
+        json: Print JSON for machines instead of text.
+    """
+    require_at_least(1, len(scenes), "the number of --scenes")
+    require_at_least(1, min(scenes), "--scenes")
+    require_at_least(1, steps, "--steps")
+    require_at_least(1, repeats, "--repeats")
+    from benchmarks.bench.batches import bench_batches
+
+    return partial(bench_batches, scenes, steps, repeats, device, json)
 
 
 @command(app, answers=True)

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve()
-PAGE = HERE.parent.parent / "docs" / "performance.md"
 STAGES = ("import", "scene made", "first step", "first gradient")
 
 
@@ -47,7 +46,7 @@ def scene(name: str) -> dict[str, Any]:
             for k, phase in enumerate(names)
         ],
         "container": {"shape": "box", "lower": corner(0.0, 0.0, 0.0), "upper": corner(1.0, 1.0, 0.5)},
-        "solver": {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 5, "maximum_iterations": 5},
+        "solver": {"time_step": 0.002},
         **({"mixture": {"mobility": 1e-6}} if several else {}),
     }
 
@@ -148,25 +147,6 @@ def table(found: dict[str, list[dict[str, Any]]]) -> str:
     return "\n".join(lines)
 
 
-def write_page(file: str) -> None:
-    """Write the table of a file that ``--json`` made into the document, at the place of its kind of device."""
-    given = json.loads(Path(file).read_text(encoding="utf-8"))
-    around, device = given["environment"], next(iter(given["starts"].values()))[0]["device"]
-    kind = "cpu" if given["device"] == "cpu" else "gpu"
-    begin, end = (
-        f"<!-- cold start, {kind}: written by benchmarks/cold_start.py -->",
-        f"<!-- end of cold start, {kind} -->",
-    )
-    name = around["processor"] if kind == "cpu" else device
-    said = (
-        f"{name}, {around['cores']} cores; {around['date'][:10]}, {given['precision']}, medians of {given['rounds']}:"
-    )
-    before, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)
-    after = rest.partition(end)[2]
-    PAGE.write_text(f"{before}{begin}\n{said}\n\n{table(given['starts'])}\n{end}{after}", encoding="utf-8")
-    print(f"{PAGE} is rewritten")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description="Time to the first step where no kernel is compiled yet.")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
@@ -177,13 +157,9 @@ def main() -> None:
     parser.add_argument("--warm", action="store_true", help="also start with the kernels that a start has left")
     parser.add_argument("--modules", action="store_true", help="also list the modules that are loaded")
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--page", metavar="FILE", help="write what --json printed into docs/performance.md")
     parser.add_argument("--one", action="store_true", help="one start of one scene, here and as JSON")
     parser.add_argument("--sources", help="where that one is to find Cortado")
     given = parser.parse_args()
-    if given.page is not None:
-        write_page(given.page)
-        return
     if given.one:
         if given.sources is not None:
             sys.meta_path.insert(0, Sources(given.sources))

@@ -39,12 +39,12 @@ class Program:
         `ProgramError`."""
         numbers = {"--particles": particles, "--steps": steps, "--repeats": repeats}
         options = [word for name, value in numbers.items() for word in (name, str(value))]
-        others = OtherProcesses(_seconds_of_children)
+        others = OtherProcesses(seconds_of_children)
         found = last_json([self.python, *self.words, *options, "--json"], timeout, environment)
         return {**found, "cores_busy_elsewhere": others.busy_cores()}
 
 
-def _seconds_of_children() -> float:
+def seconds_of_children() -> float:
     """Processor time of the programs that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
@@ -64,10 +64,11 @@ def last_json(command: Sequence[str], timeout: float, environment: dict[str, str
     return json.loads("\n".join(lines[start:]))
 
 
-def cortado(device: str, precision: str) -> Program:
-    """``python -m benchmarks bench``."""
-    words = ("-m", "benchmarks", "bench", "--device", device, "--precision", precision)
-    return Program("Cortado", sys.executable, words, "cortado")
+def cortado(device: str, precision: str) -> list[Program]:
+    """``python -m benchmarks bench`` with each of Cortado's solvers."""
+    words = ("-m", "benchmarks", "bench", "--device", device, "--precision", precision, "--solver")
+    solvers = {"projection": "Cortado, projection", "pcisph": "Cortado, PCISPH"}
+    return [Program(name, sys.executable, (*words, solver), "cortado") for solver, name in solvers.items()]
 
 
 def peers(device: str, jax_python: str, splishsplash_python: str) -> list[Program]:

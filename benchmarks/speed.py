@@ -1,17 +1,15 @@
-"""The speed of Cortado and of its peers, in one run and in turn: ``python benchmarks/speed.py --sizes 125 8000``.
+"""The speed of Cortado's solvers and of peers, in one run and in turn: ``python benchmarks/speed.py --sizes 125 8000``.
 
-Prints milliseconds a step and ratios, and appends everything to ``benchmarks/results/DEVICE-DATE.json``, from which
-`benchmarks/figures.py` makes what `docs/performance.md` shows. A peer that is missing is a line.
+Prints milliseconds a step of each, and how many times as long it takes as the projection. A peer that is missing is a
+line.
 """
 
 import argparse
 import json
 import math
 import os
-import re
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 from programs import Program, ProgramError, cortado, peers
@@ -20,7 +18,6 @@ from benchmarks.bench.environment import OtherProcesses
 
 QUIET, LOOK = 0.2, 3.0
 """Cores that others keep busy at most on a quiet machine, and the seconds for which they are watched."""
-RESULTS = Path(__file__).parent / "results"
 Row = dict[str, Any]
 
 
@@ -37,7 +34,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--jax-python", default=sys.executable, help="an interpreter that has jax")
     parser.add_argument("--splishsplash-python", default=sys.executable, help="one that has pysplishsplash")
     parser.add_argument("--no-peers", action="store_true", help="Cortado alone")
-    parser.add_argument("--json", type=Path, help="another file to write this run to")
+    parser.add_argument("--json", action="store_true", help="print all that was measured, also each pass of a step")
     return parser.parse_args()
 
 
@@ -86,24 +83,26 @@ def flat(found: Row) -> Row:
 
 
 def table(size: Row) -> str:
-    """The times of one size, and how many times as long the peers take as Cortado."""
-    measured, own = size["measured"], size["measured"].get("Cortado")
-    lines = [f"{size['particles']:,} particles: ms a step, forward and with the gradient"]
+    """The times of one size [ms a step], their ratios to the first program's, and what a gradient costs."""
+    measured, counted = size["measured"], " {:>22}" * 3 + "{:>12}"
+    lines = [
+        f"{size['particles']:,} particles",
+        f"{'':22}{counted.format('step alone', 'forward', 'gradient', 'bytes')}",
+    ]
+    first: Row = next(iter(measured.values()), {})
     for name, row in measured.items():
-        words = [f"{name:24}"]
-        for what in ("rollout", "gradient"):
-            if what in row:
-                ratio = f" ({row[what]['ms'] / own[what]['ms']:.2f} x)" if own and row is not own else ""
-                words.append(f"{row[what]['ms']:.4g}{ratio}")
-        lines.append("    ".join(words))
-    return "\n".join([*lines, *(f"{name:24}    failed: {why}" for name, why in size["failed"].items())])
+        times = [_time(row, first, what) for what in ("step", "rollout", "gradient")]
+        used = row.get("memory", {}).get("gradient_bytes_per_particle")
+        lines.append(f"{name:22}{counted.format(*times, '' if used is None else f'{used:,.0f}')}")
+    return "\n".join([*lines, *(f"{name:22} failed: {why}" for name, why in size["failed"].items())])
 
 
-def results_file(run: Row) -> Path:
-    """Where a run is kept, by the device and the day."""
-    around = run["environment"]
-    device = re.sub(r"[^a-z0-9]+", "-", around["device"].lower()).strip("-")
-    return RESULTS / f"{device}-{around['cores']}-cores-{around['date'][:10]}.json"
+def _time(row: Row, first: Row, what: str) -> str:
+    """A time [ms] and its ratio to the first program's."""
+    if what not in row:
+        return "-"
+    time = row[what]["ms"]
+    return f"{time:.4g}" + (f" ({time / first[what]['ms']:.2f} x)" if what in first and row is not first else "")
 
 
 def main() -> None:
@@ -111,25 +110,20 @@ def main() -> None:
     found = [] if given.no_peers else peers(given.device, given.jax_python, given.splishsplash_python)
     present = [program for program in found if program.is_installed]
     missing = [program.name for program in found if program not in present]
-    for name in missing:
-        print(f"not installed: {name}")
-    programs = [cortado(given.device, given.precision), *present]
+    programs = [*cortado(given.device, given.precision), *present]
     sizes = []
     for particles in given.sizes:
         sizes.append(measure_size(programs, particles, given))
-        print(table(sizes[-1]), flush=True)
-    own = [size["measured"]["Cortado"] for size in sizes if "Cortado" in size["measured"]]
-    if not own:
-        sys.exit("Cortado itself was not measured at any size.")
-    settings = {name: getattr(given, name) for name in ("device", "precision", "steps", "repeats", "rounds")}
-    run = {"environment": own[0]["environment"], "settings": settings, "not_installed": missing, "sizes": sizes}
-    file = results_file(run)
-    history = json.loads(file.read_text())["runs"] if file.exists() else []
-    RESULTS.mkdir(exist_ok=True)
-    file.write_text(json.dumps({"runs": [*history, run]}, indent=1) + "\n")
+        if not given.json:
+            print(table(sizes[-1]), flush=True)
     if given.json:
-        given.json.write_text(json.dumps(run, indent=1) + "\n")
-    print(f"The results are in {file}")
+        settings = {name: getattr(given, name) for name in ("device", "precision", "steps", "repeats", "rounds")}
+        print(json.dumps({"settings": settings, "not_installed": missing, "sizes": sizes}, indent=1))
+    else:
+        busy = ", ".join(f"{busiest(size['measured']):.1f}" for size in sizes)
+        print(f"cores that other processes kept busy, at each size: {busy}")
+        for name in missing:
+            print(f"not installed: {name}")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """`python -m benchmarks bench` and what it is made of: its numbers add up."""
 
+import importlib
 import json
 import time
 from functools import partial
@@ -31,7 +32,7 @@ STEP = [
 @pytest.fixture(scope="module")
 def found():
     """What the command prints for the smallest block."""
-    return json.loads(bench_dam_break([8, 27], 2, 1, "cpu", "float32", as_json=True))
+    return json.loads(bench_dam_break([8, 27], 2, 1, "cpu", "float32", "pcisph", as_json=True))
 
 
 def test_every_size_and_every_pass_of_a_step_has_a_time_and_a_floor(found):
@@ -172,7 +173,7 @@ def test_bench_speaks_json_and_words(benchmarks_command):
     found = json.loads(out)
     assert (code, err) == (0, "") and [row["particles"] for row in found["sizes"]] == [8, 125]
     assert all(row["steps"] == 2 and row["gradient"]["ms"] > 0.0 < row["rollout"]["ms"] for row in found["sizes"])
-    code, out, _ = benchmarks_command("bench", "--particles", 100, "--steps", 2, "--repeats", 1)
+    code, out, _ = benchmarks_command("bench", "--particles", 100, "--steps", 2, "--repeats", 1, "--solver", "pcisph")
     assert code == 0 and "125 particles" in out and "\npressure force adjoint" in out
 
 
@@ -195,6 +196,44 @@ def test_bench_speaks_json_and_words(benchmarks_command):
 def test_wrong_arguments_are_refused(benchmarks_command, options, words):
     code, out, err = benchmarks_command("bench", *options.split())
     assert (code, out) == (2, "") and words in err and err.count("\n") == 1
+
+
+def test_batches_are_timed_beside_the_first(benchmarks_command):
+    code, out, err = benchmarks_command("batches", "--scenes", 1, 2, "--steps", 2, "--repeats", 1, "--json")
+    first, second = json.loads(out)["rows"]
+    assert (code, err) == (0, "") and first["forward_gain"] == first["gradient_gain"] == 1.0
+    assert second["gradient_gain"] == pytest.approx(2.0 * first["gradient"] / second["gradient"])
+
+
+@pytest.fixture
+def page(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    return importlib.import_module("page")
+
+
+def test_pages_have_what_their_commands_print(page, tmp_path, monkeypatch, capsys):
+    (tmp_path / "docs").mkdir()
+    place = "<!-- measured by: python -c 'print({})'{} -->\nold\n<!-- end of measured -->\n"
+    text = place.format("6 * 7", "") + place.format("8 * 9", " --device cuda:0")
+    (tmp_path / "docs" / "one.md").write_text(text)
+    monkeypatch.setattr(page, "ROOT", tmp_path)
+    monkeypatch.setattr("sys.argv", ["page.py", "--commit", "abc"])
+    page.main()
+    text = (tmp_path / "docs" / "one.md").read_text()
+    assert "```text\n42\n```" in text and "commit abc" in text and text.count("old") == 1 and "72" not in text
+    assert capsys.readouterr().out == "python -c 'print(6 * 7)'\n"
+
+
+def test_the_commands_of_pages_are_there(page, benchmarks_command):
+    root = Path(__file__).parents[1]
+    commands = [place[1] for file in (root / "docs").glob("*.md") for place in page.PLACE.findall(file.read_text())]
+    assert len(commands) >= 9
+    for command in commands:
+        _, first, *words = command.split()
+        if first == "-m":
+            assert words[0] == "benchmarks" and benchmarks_command(words[1], "--help")[0] == 0, command
+        else:
+            assert (root / first).exists(), command
 
 
 def test_pictures_are_timed(monkeypatch):

@@ -22,14 +22,16 @@ Row = dict[str, Any]
 MEASURED, ESTIMATED = "measured: high-water mark of the memory pool", "estimated: cortado.device.memory"
 
 
-def measure_dam_break(particles: int, steps: int, device: str, precision: str, repeats: int) -> Row:
+def measure_dam_break(
+    particles: int, steps: int, device: str, precision: str, repeats: int, solver: str = "pcisph"
+) -> Row:
     """Times [ms a step] and memory of a dam break, without floors, which `with_floors` adds.
 
     ``step``: the device's work alone, step after step. ``rollout``: `Problem.value`, as a user calls it. ``gradient``:
     `Problem.value_and_gradient` with respect to gravity. ``passes`` and ``adjoint_passes``: see `PassTimer`.
     """
     gc.collect()
-    simulation = Simulation(dam_break(particles), device, precision)
+    simulation = Simulation(dam_break(particles, solver), device, precision)
     problem = Problem(simulation, check_steps(steps), FinalPositions(simulation.positions))
     start = {"gravity": np.array(simulation.scene.forces.gravity)}
     wait = partial(wp.synchronize_device, simulation.device)
@@ -40,7 +42,8 @@ def measure_dam_break(particles: int, steps: int, device: str, precision: str, r
         "precision": precision,
         "steps": steps,
         "repeats": repeats,
-        "iterations_per_step": ITERATIONS,
+        "solver": solver,
+        "iterations_per_step": getattr(simulation.scene.solver, "iterations", ITERATIONS),
     }
     forward = median_seconds(lambda: problem.value(start), repeats, wait)
     forward_high = memory_high(simulation.device)

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import subprocess
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -22,6 +23,7 @@ def environment() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "cortado": __version__,
+        "commit": _commit(),
         "warp": _version("warp-lang"),
         "numpy": _version("numpy"),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -58,6 +60,14 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(line for line in lines if line.startswith("model name")).partition(":")[2].strip()
     return platform.processor()
+
+
+def _commit() -> str | None:
+    """The commit of this clone; None where Git does not say."""
+    with suppress(OSError, subprocess.CalledProcessError):
+        command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=8", "HEAD"]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    return None
 
 
 def _version(package: str) -> str | None:

@@ -15,12 +15,12 @@ from cortado.device.launching import KernelLauncher
 
 
 def bench_dam_break(
-    particles: Sequence[int], steps: int, repeats: int, device: str, precision: str, as_json: bool
+    particles: Sequence[int], steps: int, repeats: int, device: str, precision: str, solver: str, as_json: bool
 ) -> str:
     """Times and memory of each size, as text: passes of a step, the step, the rollout and the gradient, each beside
     what the hardware allows."""
     around, others = environment(), OtherProcesses()
-    rows = [measure_dam_break(number, steps, device, precision, repeats) for number in sorted(particles)]
+    rows = [measure_dam_break(number, steps, device, precision, repeats, solver) for number in sorted(particles)]
     where = wp.get_device(device)
     # After the sizes, so that what is copied does not count as their memory.
     bandwidth = copy_bandwidth(where, repeats)

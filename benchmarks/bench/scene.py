@@ -1,22 +1,35 @@
 """The scene of benchmarks, of any size; the programs in ``benchmarks/peers`` simulate the same block."""
 
+from typing import Any
+
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.scene.fluids import BoxFluid
 from cortado.scene.model import DiscretisationTable, Forces, Phase
 from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import BoxContainer
-from cortado.scene.solvers import PcisphSolver
+from cortado.scene.solvers import PcisphSolver, ProjectionSolver
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 
 ITERATIONS = 5
-"""Pressure iterations of every step, whatever the density error."""
+"""Pressure iterations of every step of PCISPH, whatever the density error."""
 
 
-def dam_break(particles: int) -> Scene:
-    """A cube of about that many particles beside an empty half of a box; 5 iterations a step."""
+def dam_break(particles: int, solver: str = "pcisph") -> Scene:
+    """A cube of about that many particles beside an empty half of a box; PCISPH does `ITERATIONS` in each step, and the
+    projection has what a scene has that says nothing of it, but for the time step."""
     edge = max(round(particles ** (1 / 3)), 2)
     spacing = 1.0 / edge
+    gravity, time_step = (0.0, -9.81, 0.0), 0.02 * spacing
+    counts = {"minimum_iterations": ITERATIONS, "maximum_iterations": ITERATIONS}
+    kinds: dict[str, tuple[Forces, Any]] = {
+        "projection": (Forces(gravity=gravity), ProjectionSolver(time_step=time_step)),
+        "pcisph": (
+            Forces(gravity=gravity, viscosity="pairwise"),
+            PcisphSolver(kind="pcisph", time_step=time_step, **counts),
+        ),
+    }
+    forces, kind = kinds[solver]
     return Scene(
         name="dam break",
         dimension=3,
@@ -24,10 +37,8 @@ def dam_break(particles: int) -> Scene:
         phase=(Phase(name="water", rest_density=1000.0, viscosity=0.05),),
         fluid=(BoxFluid(lower=(0.0, 0.0, 0.0), upper=(1.0, 1.0, 1.0), phase="water"),),
         container=BoxContainer(lower=(0.0, 0.0, 0.0), upper=(2.0, 1.5, 1.0)),
-        forces=Forces(gravity=(0.0, -9.81, 0.0), viscosity="pairwise"),
-        solver=PcisphSolver(
-            kind="pcisph", time_step=0.02 * spacing, minimum_iterations=ITERATIONS, maximum_iterations=ITERATIONS
-        ),
+        forces=forces,
+        solver=kind,
     )
 
 

@@ -31,8 +31,8 @@ def _block(row: Mapping[str, Any]) -> list[str]:
     memory = row["memory"]
     return [
         f"{row['particles']:,} particles, {row['neighbours_per_particle']:.1f} neighbours each, "
-        f"{row['iterations_per_step']} iterations, {row['precision']}; medians of {row['repeats']} x {row['steps']} "
-        "steps",
+        f"{row['solver']}, {row['iterations_per_step']} iterations, {row['precision']}; medians of {row['repeats']} x "
+        f"{row['steps']} steps",
         _HEAD,
         *(_line(one) for one in row["passes"]),
         *(_line({"name": name, **row[name]}) for name in ("step", "rollout")),
