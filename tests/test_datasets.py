@@ -453,11 +453,24 @@ def test_a_half_written_file_is_told_and_mended(harm, file, cortado_command, qui
     assert "is complete already" in grown(cortado_command, file, 11 if harm == "part" else 5)[1]
 
 
-def test_a_disk_that_fills_as_a_data_set_grows_leaves_it_as_it_was(file, cortado_command, quick):
+@pytest.mark.parametrize("second", [False, True])
+def test_a_disk_that_fills_as_a_data_set_grows_leaves_it_as_it_was(second, file, cortado_command, quick, monkeypatch):
+    """As the first file is written, or the second, when the first one is whole."""
     assert grown(cortado_command, file, 5)[0] == 0
-    before = content_of("data")
-    with largest_file(Path("data/train.h5").stat().st_size + 1000):
-        code, _, err = grown(cortado_command, file)
+    before, copies, whole = content_of("data"), [], h5py.File.copy
+    first = len(command._table(file, []).split(11)["train"])
+
+    def refusing(*given):
+        copies.append(given)
+        if len(copies) > first:
+            raise RuntimeError("no space")
+        return whole(*given)
+
+    with monkeypatch.context() as patch:
+        if second:
+            patch.setattr(h5py.File, "copy", refusing)
+        with nullcontext() if second else largest_file(Path("data/train.h5").stat().st_size + 1000):
+            code, _, err = grown(cortado_command, file)
     assert code == 1 and "free some space" in err and "11 of 11 runs are finished" in err
     assert_same(content_of("data"), before)
     quick.asked.clear()
