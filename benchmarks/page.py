@@ -48,7 +48,8 @@ def measured(command: str, commit: str | None) -> str:
     machine = device_name(device_of(command), around["processor"])
     said = (
         f"`{command}`, {around['date'][:10]}, commit {commit or around['commit'] or 'not known'}, {machine}, "
-        f"{around['cores']} cores, of which other processes kept {'an unknown number' if busy is None else busy} busy:"
+        f"{'one core, by its time' if around['cores'] == 1 else str(around['cores']) + ' cores'}; other processes kept "
+        f"{'an unknown number' if busy is None else busy} busy:"
     )
     return f"{fill(said, 120, break_on_hyphens=False)}\n\n```text\n{done.stdout.strip()}\n```\n"
 

@@ -1,7 +1,6 @@
 """Steps of a batch of environments, timed beside those of the simulation alone."""
 
 import json
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -10,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from benchmarks.bench.environment import environment
+from benchmarks.bench.timing import now
 from cortado.environments import make_vec
 
 WARM = 3
@@ -53,12 +53,12 @@ def device_name(device: str, processor: str) -> str:
 
 
 def seconds(work: Callable[[], Any], device: str) -> float:
-    """Return the wall-clock time of work, until the device has done it."""
+    """Return the time of work, as `now` has it, until the device has done it."""
     wp.synchronize_device(device)
-    start = time.perf_counter()
+    start = now()
     work()
     wp.synchronize_device(device)
-    return time.perf_counter() - start
+    return now() - start
 
 
 def _as_text(found: dict[str, Any]) -> str:

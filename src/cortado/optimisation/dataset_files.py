@@ -90,7 +90,7 @@ class DatasetFolder:
         import h5py
 
         found: dict[int, FinishedRun] = {}
-        damaged = {}
+        damaged = {self.out / METADATA: "no JSON"} if not self.metadata and (self.out / METADATA).exists() else {}
         own = [path for purpose in PURPOSES if (path := self.path(purpose)).exists()]
         for path in [*sorted(self.parts.glob("*.h5")), *own]:
             try:
