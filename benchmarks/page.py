@@ -51,7 +51,9 @@ def measured(command: str, commit: str | None) -> str:
         f"{'one core, by its time' if around['cores'] == 1 else str(around['cores']) + ' cores'}; other processes kept "
         f"{'an unknown number' if busy is None else busy} busy:"
     )
-    return f"{fill(said, 120, break_on_hyphens=False)}\n\n```text\n{done.stdout.strip()}\n```\n"
+    printed = done.stdout.strip()
+    shown = printed if printed.startswith("|") else f"```text\n{printed}\n```"
+    return f"{fill(said, 120, break_on_hyphens=False)}\n\n{shown}\n"
 
 
 def main() -> None:
