@@ -77,6 +77,33 @@ def environments(
 
 
 @command(app, answers=True)
+def learners(
+    task: tuple[str, ...] = ("Carry", "Latte", "Pour", "Raft", "Splash", "Stir"),
+    episodes: int = 320,
+    seed: int = 1,
+    size: Literal["small", "large"] = "small",
+    device: str = "cpu",
+    policies: Flag = False,
+    json: Flag = False,
+) -> Work:
+    """Compare a cross-entropy method, gradients and PPO by the return of an episode, on the same simulated steps.
+
+    Args:
+        task: Such as "Carry"; several, one behind the other.
+        episodes: The budget in whole episodes; one with its gradient counts as four.
+        seed: The one of the episode, and of random numbers.
+        size: "small", with about 100 particles each, or "large", with about 1,000.
+        device: "cpu", or "cuda:0" for the first GPU.
+        policies: PPO as well, for which Stable-Baselines3 has to be installed.
+        json: Print JSON for machines instead of a table.
+    """
+    require_at_least(16, episodes, "--episodes")
+    from benchmarks.bench.learners import bench_learners
+
+    return partial(bench_learners, task, episodes, seed, size, device, policies, json)
+
+
+@command(app, answers=True)
 def watching(depth: int = 20, steps: int = 200, repeats: int = 3, device: str = "cpu", json: Flag = False) -> Work:
     """Time runs with sensors and frames, and steps one by one, beside the same steps alone.
 

@@ -14,6 +14,7 @@ from benchmarks.__main__ import BENCH
 from benchmarks.bench.dam_break import ESTIMATED, measure_dam_break, with_floors
 from benchmarks.bench.environment import OtherProcesses
 from benchmarks.bench.floor import copy_bandwidth, least_bytes, sums_over_neighbours
+from benchmarks.bench.learners import bench_learners
 from benchmarks.bench.passes import AGAIN, PassTimer
 from benchmarks.bench.pictures import bench_pictures
 from benchmarks.bench.run import bench_dam_break
@@ -22,6 +23,8 @@ from benchmarks.bench.text import as_text
 from benchmarks.bench.timing import BATCH, LaunchTimer, median_seconds
 from cortado import Simulation
 from cortado.device.launching import KernelLauncher, watched
+from cortado.environments import FluidEnv
+from cortado.environments.catalogue import Splash
 
 STEP = [
     *("sort by cell", "neighbour list", "density", "wall relaxation", "gravity", "viscosity", "pressure"),
@@ -243,3 +246,14 @@ def test_pictures_are_timed(monkeypatch):
     assert {"trace", "illuminate", "find_levels"} <= row["ms_of_kernels"].keys()
     monkeypatch.setattr("benchmarks.bench.pictures._measured", lambda *_: row)
     assert f"{row['particles']} particles: " in bench_pictures([216], 64, 1, "cpu", as_json=False)
+
+
+def test_controllers_of_an_environment_are_judged_by_its_own_returns(monkeypatch):
+    """In the same episode: to do nothing has the return of a single environment, and searches find more."""
+    monkeypatch.setattr(Splash, "horizon", 6)
+    (row,) = json.loads(bench_learners(["Splash"], 32, 3, "small", "cpu", False, True))["returns"]
+    env = FluidEnv("Splash")
+    env.reset(seed=3)
+    assert np.isclose(row["nothing"], sum(env.step(np.zeros(2))[1] for _ in range(6)), rtol=1e-6)
+    assert row["cem"] > row["nothing"] + 0.01 and row["gradient"] > row["nothing"] + 0.01
+    assert bench_learners(["Splash"], 16, 3, "small", "cpu", False, False).split()[:4] == [*row]
