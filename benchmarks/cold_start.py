@@ -174,8 +174,8 @@ def main() -> None:
                 with tempfile.TemporaryDirectory() as folder:
                     for state in ("cold", "warm")[: 2 if given.warm else 1]:
                         run = measured(name, words, folder, sources)
-                        label = [name, *([version] if given.beside else []), *([state] if given.warm else [])]
-                        found.setdefault(", ".join(label), []).append(run)
+                        parts = [name, *([version] if given.beside else []), *([state] if given.warm else [])]
+                        found.setdefault(", ".join(parts), []).append(run)
     from benchmarks.bench.environment import environment
 
     around = environment()

@@ -224,7 +224,8 @@ def test_pages_have_what_their_commands_print(page, tmp_path, monkeypatch, capsy
     page.main()
     text = (tmp_path / "docs" / "one.md").read_text()
     assert "```text\n42\n```" in text and "commit abc" in text and text.count("old") == 1 and "72" not in text
-    assert capsys.readouterr().out == "python -c 'print(6 * 7)'\n"
+    said = capsys.readouterr().out
+    assert said.startswith("python -c 'print(6 * 7)'\n") and said.count("python -c") == 1
 
 
 def test_the_commands_of_pages_are_there(page, benchmarks_command):
