@@ -316,7 +316,8 @@ class _Pointwise:
         names = (one.partition(":")[0] for one in results)
         self._results = dict(zip(names, term.results, strict=True))
         self._overwritten = {*replaced.values(), *kinds.written}
-        self._entries, self._indices, self._numbers, self._inputs = {}, {}, {}, {}
+        self._entries, self._indices, self._inputs = {}, {}, {}
+        self._numbers: dict[str, Any] = {}
         self._arrays = {kinds.where: precision.real} if kinds.where else {}
         for name, kind in term.parameters.items():
             if name in kinds.numbers or name in kinds.read:
