@@ -11,7 +11,7 @@ from cortado import InputError, Problem, Simulation, gradients
 from cortado.forces import Body, Pair
 from cortado.losses import FinalPositions
 from finite_differences import all_ways_agree, both_modes, central_difference
-from scenes import aimed, plane, splash
+from scenes import aimed, plane, splash, two_layers
 
 RANDOM = np.random.default_rng(3)
 WEIGHTS = RANDOM.standard_normal((9, 7))
@@ -239,3 +239,25 @@ def test_differences_agree_to_ten_digits():
     slope = both_modes(judged, {"net.w": WEIGHTS}, direction, 1e-12)[1]
     found = [central_difference(judged.value, {"net.w": WEIGHTS}, direction, h) for h in (1e-3, 5e-4)]
     assert abs((4.0 * found[1] - found[0]) / 3.0 - slope) <= 1e-10 * abs(slope)
+
+
+def closure(x, v, density, velocity_gradient, shear_rate, w, k):
+    """Of all that a particle has."""
+    grown = velocity_gradient[0, 1] + 2.0 * velocity_gradient[1, 1] * velocity_gradient[0, 0]
+    turned = velocity_gradient * v
+    return w[0] * shear_rate * v - w[1] * turned + k * wp.vec3(wp.tanh(0.001 * density), w[2] * grown, w[3] * x[0])
+
+
+@pytest.mark.parametrize("scene", [splash(), two_layers()], ids=["space", "plane"])
+def test_derivatives_by_density_and_strain_agree(scene):
+    force = Body(closure, w=np.array([0.5, 0.3, 0.2, 0.1]), k=0.7)
+    judged = problem(force, scene, steps=4)
+    moved = judged.simulation.initial.numpy(judged.simulation.dimension)["velocities"]
+    point = {
+        "closure.w": np.array([0.5, 0.3, 0.2, 0.1]),
+        "closure.k": 0.7,
+        "initial_velocities": moved + 0.3 * np.sin(9.0 * judged.simulation.positions),
+        "initial_positions": judged.simulation.positions,
+        "rest_density": judged.simulation.parameters()["rest_density"],
+    }
+    all_ways_agree(judged, point, 7, lambda name: 1e-5 if name != "initial_positions" else 1e-6, rtol=1e-4)

@@ -88,11 +88,18 @@ def _work({", ".join(types)}):
     {", ".join(f"_term_{n}" for n in range(len(bars)))} = _term({", ".join(term.parameters)})
     return {" + ".join(products)}
 """
-    known: dict[str, Any] = {"_term": wp.func(term.function, module=module), "_wp": wp}
+    known: dict[str, Any] = {"_term": warp_function(term.function, module), "_wp": wp}
     exec(text, known)
     made: Any = known["_work"]
     made.__annotations__ = {**types, "return": precision.real}
     return wp.Function(made, f"{term.name}_work", "", module=module, source=text)
+
+
+def warp_function(function: Callable[..., Any], module: Any) -> Any:
+    """Make a Warp function in a module of a Python function, which has its text as ``source`` if it is in no file."""
+    if not hasattr(function, "source"):
+        return wp.func(function, module=module)
+    return wp.Function(function, function.__name__, "", module=module, source=function.source)
 
 
 def dot_of(kind: Any) -> str:

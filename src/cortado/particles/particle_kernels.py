@@ -38,7 +38,7 @@ from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
-from cortado.particles.made_derivatives import bars_of, dot_of, work_of
+from cortado.particles.made_derivatives import bars_of, dot_of, warp_function, work_of
 from cortado.particles.moving_walls import turn_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import Term, array_of
@@ -269,7 +269,7 @@ def pointwise_kernels(
     texts: Sequence[Any] = (of.forward(), of.tangent(), of.adjoint())
     made = []
     for k, ((name, types, lines), term, module) in enumerate(zip(texts, terms, modules, strict=True)):
-        scope = {"_function": wp.func(term.function, module=module), **of.scope}
+        scope = {"_function": warp_function(term.function, module), **of.scope}
         if k > 0:
             scope["_work"] = work_of(term, precision, module)
         made.append(made_kernel(f"{MADE}{name}", types, lines, scope, module))

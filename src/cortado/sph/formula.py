@@ -35,6 +35,7 @@ from cortado.sph.function_meaning import (
 )
 from cortado.sph.function_text import DerivativeCheck, Frozen, SizesWritten, check_names, check_returns, definition
 from cortado.sph.integration import integration_module
+from cortado.sph.moment_functions import matrix_type
 from cortado.sph.own_arrays import MOST_NUMBERS, reading, table_type
 from cortado.sph.parts import Adjoints, StepContext
 
@@ -176,6 +177,8 @@ class Inputs:
     """Names of the inputs in messages."""
     kind: str = "vector"
     """"vector" or "number": the type of the inputs and of the function's result."""
+    fields: tuple[str, ...] = ()
+    """Names of what else of a particle it may take, after these and time."""
     arrays: bool = False
     """Whether parameters may be arrays."""
 
@@ -187,7 +190,7 @@ MOST_TURNS, MOST_AXES = 256, 3
 TYPES = re.compile(r"'[^']*' \(aka '[^']*'\)")
 """Finds the types of vectors and numbers as a compiler writes them."""
 INPUTS = {
-    "Body": Inputs(("x", "v"), arrays=True),
+    "Body": Inputs(("x", "v"), fields=("density", "shear_rate", "velocity_gradient"), arrays=True),
     "Pair": Inputs(("x_ij", "v_ij")),
     "Rheology": Inputs(("shear_rate", "viscosity"), "number"),
 }
@@ -202,7 +205,9 @@ class Formula:
     text: str
     """Its definition, with types of the precision and with numbers from outside written out."""
     inputs: tuple[str, ...]
-    """Its arguments before the parameters: two vectors or numbers, and time if there is a third."""
+    """Its first arguments: two vectors or numbers, and time if there is a third."""
+    fields: tuple[str, ...]
+    """Its arguments between these and the parameters: what else it takes of a particle."""
     kind: str
     """"vector" or "number": the type of the first two inputs and of the result."""
     parameters: tuple[str, ...]
@@ -225,10 +230,13 @@ class Formula:
         exec(code, scope)
         made: Any = scope[self.name]
         own = vector if self.kind == "vector" else real
-        known = (own, own, real)[: len(self.inputs)]
-        made.__annotations__ = dict(zip((*self.inputs, *self.parameters), (*known, *types), strict=True))
-        made.__annotations__ |= self.reads(precision) | {"return": own}
+        made.__annotations__ = dict(zip(self.inputs, (own, own, real), strict=False)) | self.takes(precision)
+        made.__annotations__ |= dict(zip(self.parameters, types, strict=True)) | self.reads(precision) | {"return": own}
         return wp.Function(func=made, key=self.name, namespace="", module=module, source=self.text)
+
+    def takes(self, precision: Precision) -> dict[str, Any]:
+        """Return the types of its fields by name."""
+        return {name: matrix_type(precision) if "gradient" in name else precision.real for name in self.fields}
 
     def reads(self, precision: Precision) -> dict[str, Any]:
         """Return the types, by name, of the last arguments of the compiled function, by which it reads arrays."""
@@ -241,7 +249,9 @@ def formula(
     """Read a user's function with its text, called ``kind`` in messages, and return it with its parameters' values:
     those given, and its defaults for others. Raises `InputError`."""
     what = f"{kind} function {function.__name__}"
-    inputs, values = _arguments(what, function, parameters, INPUTS[kind])
+    taken, values = _arguments(what, function, parameters, INPUTS[kind])
+    inputs = tuple(name for name in taken if name not in INPUTS[kind].fields)
+    fields = taken[len(inputs) :]
     shapes = _shapes(what, function, values, INPUTS[kind])
     frozen, written = Frozen(what, function), SizesWritten(shapes).visit(definition(what, function, source))
     for helper in frozen.helpers:
@@ -250,7 +260,7 @@ def formula(
         check_helper(what, tree.body[0])
     DerivativeCheck(what, MOST_TURNS).visit(written)
     local = {node.id for node in ast.walk(written) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
-    own = {*inputs, *values, *local}
+    own = {*taken, *values, *local}
     check_returns(what, written, INPUTS[kind].kind)
     check_names(what, written, own, frozen.scope)
     check_calls(what, written, own, frozen.scope)
@@ -259,7 +269,8 @@ def formula(
     text = ast.unparse(ast.fix_missing_locations(rewritten)) + "\n"
     scope = MappingProxyType(frozen.scope)
     numbers = tuple(name for name in values if name not in shapes)
-    return Formula(written.name, text, inputs, INPUTS[kind].kind, numbers, tuple(shapes), frozen.words, scope), values
+    names = (inputs, fields, INPUTS[kind].kind, numbers, tuple(shapes))
+    return Formula(written.name, text, *names, frozen.words, scope), values
 
 
 def _shapes(what: str, function: FunctionType, values: Mapping[str, Any], inputs: Inputs) -> dict[str, tuple[int, ...]]:
@@ -307,14 +318,18 @@ def _arguments(
     for name in known:
         if name in values:
             raise InputError(f"{what} is given a value of {name}, but must be given none, as the run has its own.")
-    inputs = tuple(name for name in signature if name not in values)
+    taken = tuple(name for name in signature if name not in values)
+    inputs = tuple(name for name in taken if name not in first.fields or name in taken[:2])
     if lacking := [name for k, name in enumerate(inputs[2:]) if k > 0 or name not in TIME]:
         found = f"{what} is given no value of {', '.join(lacking)}"
         raise InputError(f"{found}, but must have one of each parameter, as in {lacking[0]}=1.0.")
-    if len(inputs) not in (2, 3) or tuple(signature)[: len(inputs)] != inputs:
-        wanted = f"two {first.kind}s first, then time or nothing, and then parameters that all have values"
-        raise InputError(f"{what} has {', '.join(inputs) or 'nothing'} without a value, but must have {wanted}.")
-    return inputs, values
+    if len(inputs) not in (2, 3) or tuple(signature)[: len(taken)] != taken or taken[: len(inputs)] != inputs:
+        of_particles = f", {', '.join(first.fields)} or none of them" if first.fields else ""
+        wanted = (
+            f"two {first.kind}s first, then time or nothing{of_particles}, and then parameters that all have values"
+        )
+        raise InputError(f"{what} has {', '.join(taken) or 'nothing'} without a value, but must have {wanted}.")
+    return taken, values
 
 
 def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> None:
@@ -340,8 +355,8 @@ def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> N
 
 
 def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
-    """Make the Warp function of two vectors or numbers and theta, and of `Formula.reads`, that calls a user's
-    function; in 2-D vectors lose their z."""
+    """Make the Warp function of two vectors or numbers theta, and those of `Formula.takes` and
+    `Formula.reads`, that calls a user's function; in 2-D vectors lose their z."""
     timed, of_numbers = len(text.inputs) == 3, text.kind == "number"
     types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
     terms, first = [], 0
@@ -349,10 +364,10 @@ def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimensi
         at = ", ".join(f"theta[{first + k}]" for k in range(3 if rank else 1))
         terms.append(f"vector({at})" if rank else at)
         first += 3 if rank else 1
-    read = text.reads(precision)
-    called = f"own({', '.join(['x', 'v', *terms, *read])})"
+    more, places = text.takes(precision) | text.reads(precision), [*terms[:timed], *text.fields, *terms[timed:]]
+    called = f"own({', '.join(['x', 'v', *places, *text.reads(precision)])})"
     result = called if dimension == 3 or of_numbers else f"wp.cw_mul(vector(one, one, zero), {called})"
-    source = f"def applied(x, v, theta{''.join(f', {name}' for name in read)}):\n    return {result}\n"
+    source = f"def applied(x, v, theta{''.join(f', {name}' for name in more)}):\n    return {result}\n"
     own_type = precision.real if of_numbers else precision.vector
     scope = {
         "vector": precision.vector,
@@ -363,5 +378,5 @@ def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimensi
     }
     exec(source, scope)
     made: Any = scope["applied"]
-    made.__annotations__ = {"x": own_type, "v": own_type, "theta": theta_of(precision, ranks), **read}
+    made.__annotations__ = {"x": own_type, "v": own_type, "theta": theta_of(precision, ranks), **more}
     return wp.Function(func=made, key="applied", namespace="", module=module, source=source)

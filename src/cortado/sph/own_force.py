@@ -40,8 +40,10 @@ from cortado.scene.parameters import Axis, Parameter, Source
 from cortado.scene.scene import Scene
 from cortado.sph.formula import Formula, Packed, applied, compiled, formula, theta_of
 from cortado.sph.function_text import keep_source, plain_function, source_of
-from cortado.sph.own_arrays import READ_AS, Tables, table_type
+from cortado.sph.moment_functions import matrix_type
+from cortado.sph.own_arrays import READ_AS, Tables
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
+from cortado.sph.velocity_gradients import VelocityGradients, gradient_functions
 from cortado.sph.viscosity_law import Law, check_law
 from cortado.sph.viscous_stress import ViscousStress, stress_of
 
@@ -158,7 +160,9 @@ class OwnForce(OwnFunction):
     def force(self, setting: Setting) -> "FunctionForce":
         """Make the force in a solver; raise `InputError` for a function that Warp cannot compile."""
         kernels = self.kernels(setting.discretisation, setting.scene.dimension)
-        made = FunctionForce(f"{self.kind} function {self._formula.name}", kernels, self.parameters, setting)
+        made = FunctionForce(
+            f"{self.kind} function {self._formula.name}", kernels, self.parameters, self._formula.fields, setting
+        )
         made.compile(kernels.forward)
         return made
 
@@ -169,10 +173,14 @@ class FunctionForce:
     shares: tuple[str, ...] = ()
     batches = True
 
-    def __init__(self, what: str, kernels: Kernels, parameters: tuple[Parameter, ...], setting: Setting):
+    def __init__(
+        self, what: str, kernels: Kernels, parameters: tuple[Parameter, ...], fields: tuple[str, ...], setting: Setting
+    ):
         self._what, self._kernels, self._device = what, kernels, setting.layout.device
         self._packed = Packed(parameters, setting.layout, setting.discretisation.taped)
         self._tables = Tables(parameters, setting.layout, setting.discretisation.taped)
+        takes_gradients = not {"shear_rate", "velocity_gradient"}.isdisjoint(fields)
+        self._gradients = VelocityGradients(setting) if takes_gradients else None
 
     def compile(self, kernel: Any) -> Any:
         """Compile a kernel and return it; raise `InputError` where Warp cannot."""
@@ -189,19 +197,24 @@ class FunctionForce:
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         now = {"theta": self._packed.theta(step), "acceleration_in": before, "acceleration": after}
-        step.launch(self._kernels.forward, self._tables.now(step), **now)
+        sums = self._gradients.measure(step) if self._gradients else {}
+        step.launch(self._kernels.forward, self._tables.now(step), sums, **now)
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
         now = {"acceleration_in_dot": before, "acceleration_dot": after}
-        step.launch(self._tangent, self._tables.along(step, dot.parameters), *dot.named, **theta, **now)
+        sums = self._gradients.tangent(step, dot) if self._gradients else {}
+        step.launch(self._tangent, self._tables.along(step, dot.parameters), sums, *dot.named, **theta, **now)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         now = {"theta": self._packed.theta(step), "acceleration_bar": acceleration_bar}
-        known, shares = (self._tables.back(step), *bar.named), self._packed.shares
+        sums = self._gradients.known() if self._gradients else {}
+        known, shares = (self._tables.back(step), sums, *bar.named), self._packed.shares
         step.launch(self._adjoint, *known, **now, theta_bar=shares, threads=self._tables.threads)
         self._packed.collect(step, bar)
         self._tables.collect(step, bar)
+        if self._gradients:
+            self._gradients.adjoint(step, bar)
 
 
 def topic(kind: str, text: Formula, ranks: tuple[int, ...], dimension: int) -> str:
@@ -245,28 +258,46 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
     """Make the kernels of a user's force on each particle in 2 or 3 dimensions; ranks are 0 (numbers) or 1
     (vectors)."""
     precision, modules = discretisation.precision, discretisation.modules(topic("body", text, ranks, dimension))
-    real, vector, theta_type = precision.real, precision.vector, theta_of(precision, ranks)
+    gradient, rate = gradient_functions(precision, dimension)
+    types: dict[str, Any] = {"x_i": precision.vector, "v_i": precision.vector, "theta": theta_of(precision, ranks)}
+    given = [*types]
+    for name in text.fields:
+        value, kind = FIELDS[name]
+        types |= dict.fromkeys(kind, precision.real if name == "density" else matrix_type(precision))
+        given.append(value)
+    reads = dict(zip(("e", "table", "member", "row"), text.reads(precision).values(), strict=False))
+    types |= reads
 
     def make(module: Any) -> Callable[..., Any]:
-        force = applied(text, precision, ranks, dimension, module)
+        scope: dict[str, Any] = {
+            "force": applied(text, precision, ranks, dimension, module),
+            "gradient": gradient,
+            "rate": rate,
+        }
+        source = f"def body({', '.join(types)}):\n    return force({', '.join([*given, *reads])})\n"
+        exec(source, scope)
+        body: Any = scope["body"]
+        body.__annotations__, body.source = {**types, "return": precision.vector}, source
+        return body
 
-        def body(x_i: vector, v_i: vector, theta: theta_type) -> vector:
-            return force(x_i, v_i, theta)
+    summed = {"M", "A"} if "M_i" in types else set()
+    options: dict[str, Any] = {"numbers": ["table"], "read": READ_AS} if reads else {}
+    results = ["acceleration:acceleration_in"]
+    return pointwise_kernels(precision, modules, make, results, written={"theta", *summed}, **options)
 
-        def of_arrays(
-            x_i: vector, v_i: vector, theta: theta_type, table: table_type(precision), e: real, member: int, row: int
-        ) -> vector:
-            return force(x_i, v_i, theta, e, table, member, row)
 
-        return of_arrays if text.arrays else body
-
-    options: dict[str, Any] = {"numbers": ["table"], "read": READ_AS} if text.arrays else {}
-    return pointwise_kernels(precision, modules, make, ["acceleration:acceleration_in"], written=["theta"], **options)
+FIELDS = {
+    "density": ("m_i * n_i", ("m_i", "n_i")),
+    "velocity_gradient": ("gradient(M_i, A_i)", ("M_i", "A_i")),
+    "shear_rate": ("rate(M_i, A_i)", ("M_i", "A_i")),
+}
+"""What a function may take of a particle, with its text in a kernel and the entries of arrays in this."""
 
 
 class Body(OwnForce):
     """A force on each particle: ``function(x, v, t, ...)`` returns its acceleration [m/s2], as gravity is one, from the
-    position [m], the velocity [m/s] and the time [s] of the particle. Time may be left out."""
+    position [m], the velocity [m/s] and the time [s] of the particle. Time may be left out. After it come, by their
+    names, what else it takes: ``density`` [kg/m3], ``shear_rate`` [1/s], ``velocity_gradient`` [1/s]."""
 
     kind = "Body"
 
