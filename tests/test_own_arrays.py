@@ -8,6 +8,7 @@ import warp as wp
 
 import cortado
 from cortado import InputError, Problem, Simulation, gradients
+from cortado.device.launching import watched
 from cortado.forces import Body, Pair
 from cortado.losses import FinalPositions
 from finite_differences import all_ways_agree, both_modes, central_difference
@@ -261,3 +262,51 @@ def test_derivatives_by_density_and_strain_agree(scene):
         "rest_density": judged.simulation.parameters()["rest_density"],
     }
     all_ways_agree(judged, point, 7, lambda name: 1e-5 if name != "initial_positions" else 1e-6, rtol=1e-4)
+
+
+def test_what_a_particle_has_is_what_it_is():
+    """Velocities that are linear in x have their own gradient, also at the surface; the density is the quantity."""
+
+    def seen(x, v, t, density, velocity_gradient, shear_rate):
+        return wp.vec3(velocity_gradient[0, 1], velocity_gradient[1, 0], 0.0) + wp.vec3(shear_rate, density, 0.0)
+
+    simulation = Simulation(free(), precision="float64", forces=[Body(seen)])
+    turn = np.array([[0.4, 1.5], [-0.7, -0.4]])
+    values = {"initial_velocities": simulation.positions @ turn.T}
+    run = simulation.run(1, values)
+    found = (run.velocities[1] - run.velocities[0]) / (run.times[1] - run.times[0]) - [0.0, -9.81]
+    rate = np.sqrt(2.0 * 2.0 * (0.4**2 + 0.4**2))
+    wanted = np.column_stack([np.full(64, 1.5 + rate), -0.7 + simulation.quantity("density")])
+    inner = np.delete(np.arange(64), [0, 7, 56, 63])  # corners have too few neighbours for all of it
+    np.testing.assert_allclose(found[inner], wanted[inner], rtol=1e-9)
+
+
+def test_a_field_that_is_not_there_is_said():
+    def late(x, v, k, density):
+        return density * k * v
+
+    def of_pairs(x_ij, v_ij, density):
+        return density * v_ij
+
+    with pytest.raises(InputError, match="density, shear_rate, velocity_gradient or none of them"):
+        Body(late, k=1.0)
+    with pytest.raises(InputError, match="given no value of density"):
+        Pair(of_pairs)
+
+
+def test_they_cost_nothing_where_nobody_asks():
+    def drag(x, v, k):
+        return -k * v
+
+    def thick(x, v, shear_rate, k):
+        return -k * shear_rate * v
+
+    counts = []
+    for function in (drag, thick):
+        launched: list[str] = []
+        simulation = Simulation(splash(), forces=[Body(function, k=1.0)])
+        simulation.run(1)
+        with watched(lambda name, threads, arguments, work, seen=launched: (seen.append(name), work())):
+            simulation.run(1)
+        counts.append(len(launched))
+    assert counts[1] == counts[0] + 1 > 10
