@@ -40,7 +40,7 @@ def arguments() -> argparse.Namespace:
 
 def measure_size(programs: list[Program], particles: int, given: argparse.Namespace) -> Row:
     """What every program measures at one size in the quietest round, and why one has measured nothing."""
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu"} if given.device == "cpu" else dict(os.environ)
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu" if given.device == "cpu" else "cuda"}  # and no other instead
     environment["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # so that the memory that JAX needs is seen
     rounds: list[dict[str, Row]] = []
     failed: dict[str, str] = {}
