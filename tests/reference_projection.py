@@ -51,6 +51,49 @@ class Body:
 
 
 @dataclass(frozen=True)
+class Face:
+    """A flat face of a solid that moves in the plane, where it is at the end of a step."""
+
+    walls: np.ndarray
+    """Which wall particles are behind it."""
+    place: np.ndarray
+    normal: np.ndarray
+    half: float
+    """Half its length."""
+    matrix: np.ndarray
+    """Q and c_0 - Q c of the way back to the start of the step, x -> Q x + c_0 - Q c."""
+    shift: np.ndarray
+
+    @classmethod
+    def all_of(cls, simulation):
+        search, faces = simulation.solver.search, simulation.solver.system.faces
+        walls, found = search.walls["wall_faces"].numpy(), []
+        for f, k in enumerate(faces.solids):
+            c, R, c_0, R_0 = (
+                search.moving.named[name].numpy()[0, k] for name in ("after", "turns", "before", "turns_before")
+            )
+            Q, scale = R_0 @ R.T, search.moving.named["scales"].numpy()[0, k]
+            place, normal = c + scale * R @ faces.places[f], R @ faces.frames[f][0]
+            own = (walls == f, place[:2], normal[:2], scale * faces.sizes[f][1])
+            found.append(cls(*own, Q[:2, :2], (c_0 - Q @ c)[:2]))
+        return tuple(found)
+
+    @property
+    def reflection(self):
+        return np.eye(2) - 2 * np.outer(self.normal, self.normal), 2 * self.normal @ self.place * self.normal
+
+    def heights(self, x, reach):
+        """How far positions are in front of it, infinite where they are not."""
+        height, along = (x - self.place) @ self.normal, (x - self.place) @ [self.normal[1], -self.normal[0]]
+        return np.where((height >= 0) & (np.abs(along) < self.half + reach), height, np.inf)
+
+    def swept(self, x):
+        """How far the step takes images of positions."""
+        (R, offset), back = self.reflection, np.eye(2) - self.matrix
+        return ((x @ R + offset) @ back.T - self.shift) - (x @ back.T - self.shift) @ R
+
+
+@dataclass(frozen=True)
 class Projection:
     """Of a scene without forces but gravity."""
 
@@ -74,7 +117,10 @@ class Projection:
     """Of the coarse grid: the place of the first node, 1 / the distance of two, and how many there are, along each
     axis."""
     bodies: tuple[Body, ...] = ()
-    """Free ones: their walls are where the last step of the simulation had them."""
+    """Free ones: their walls are where the last step of the simulation had them, as are those of other solids."""
+    velocities: np.ndarray | float = 0.0
+    """Of wall particles."""
+    faces: tuple[Face, ...] = ()
 
     @classmethod
     def of(cls, simulation):
@@ -97,7 +143,9 @@ class Projection:
         nodes = None if solver.coarse.endless else nodes
         mirrors = tuple(end[:d] for end in solver.system.mirrors)
         walls = (*walls, mirrors, (solids == -1) & np.isfinite(mirrors).any())
-        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, *counts, follow, nodes, bodies)
+        moving = search.walls["wall_velocities"].numpy()[:, :d], Face.all_of(simulation)
+        own = kernel, lattice.support, lattice.volume, spacing
+        return cls(*own, *walls, periods, *counts, follow, nodes, bodies, *moving)
 
     def pairs(self, x, y):
         """Separations (n, m, d), and V W and V grad W of them."""
@@ -113,7 +161,7 @@ class Projection:
 
     def images(self, x, before=None):
         """Of each reflection what it does to vectors, the separations from images, and V W and V grad W of them, of
-        what is in front of its walls at positions before a step."""
+        what is in front of its walls at positions before a step, and how far a step takes images."""
         before, (lower, upper) = x if before is None else before, self.mirrors
         ways = [
             [(1, 0, 0), *((-1, 2 * end, side) for end, side in ((low, 1), (high, -1)) if np.isfinite(end))]
@@ -125,14 +173,29 @@ class Projection:
                 front = (side * (before - offset / 2) >= 0).all(axis=1)
                 both = front[:, None] & front[None, :]
                 apart, W, g = self.pairs(x, flip * x + offset)
-                yield flip, apart, W * both, g * both[..., None]
+                yield np.diag(flip), apart, W * both, g * both[..., None], 0.0 * x
+        for face in self.faces:
+            R, offset = face.reflection
+            front = np.isfinite(face.heights(before, (1 + SKIN) * self.support))
+            both = front[:, None] & front[None, :]
+            apart, W, g = self.pairs(x, x @ R + offset)
+            yield R, apart, W * both, g * both[..., None], face.swept(x)
+
+    def mirroring(self, x):
+        """(n, b) which wall particles mirror about which position: those of the container, and of the nearest face."""
+        reach, found = (1 + SKIN) * self.support, np.tile(self.container, (len(x), 1))
+        heights = np.array([face.heights(x, reach) for face in self.faces] or [np.full(len(x), np.inf)])
+        for f, face in enumerate(self.faces):
+            found |= ((heights.argmin(0) == f) & (heights[f] < reach))[:, None] & face.walls
+        return found
 
     def share(self, x):
         """h, of walls that mirror the push and nu, and how far others are away."""
         _, wall_W, wall_g = self.pairs(x, self.walls)
-        alone = 1 / (1 + (wall_W @ (self.wall_weights * ~self.container) / 0.005) ** 4)
-        mirror, behind = self.pushes(wall_g, self.container)[0], wall_W @ (self.wall_weights * self.container)
-        images = sum((W.sum(1) for _, _, W, _ in self.images(x)), np.zeros(len(x)))
+        own, all_W = self.mirroring(x), wall_W * self.wall_weights
+        alone = 1 / (1 + ((all_W * ~own).sum(1) / 0.005) ** 4)
+        mirror, behind = self.pushes(wall_g, own)[0], (all_W * own).sum(1)
+        images = sum((W.sum(1) for _, _, W, *_ in self.images(x)), np.zeros(len(x)))
         return between(images / (behind + 1e-6), 0.7, 0.9) * alone, mirror, behind, alone
 
     def density(self, x, h, before=None):
@@ -142,7 +205,7 @@ class Projection:
         def listed(W, apart):
             return (W * (np.linalg.norm(apart, axis=-1) < reach)).sum(1)
 
-        wall = self.pairs(x, self.walls)[1] * (1 - h[:, None] * self.container) * self.wall_weights
+        wall = self.pairs(x, self.walls)[1] * (1 - h[:, None] * self.mirroring(x)) * self.wall_weights
         found = listed(self.pairs(x, x)[1], self.pairs(before, before)[0])
         found += listed(wall, self.pairs(before, self.walls)[0])
         for now, then in zip(self.images(x, before), self.images(before), strict=True):
@@ -178,8 +241,19 @@ class Projection:
     def pushes(self, wall_g, own=True):
         """gamma_n and gamma_w, of all wall particles or of a body's ``own``."""
         normal = self.feet / np.linalg.norm(self.feet, axis=1, keepdims=True)
-        weights = self.wall_weights * own
-        return np.einsum("b,iba,ba,bc->ic", weights, wall_g, normal, normal), np.einsum("b,iba->ia", weights, wall_g)
+        weights = np.broadcast_to(self.wall_weights * own, wall_g.shape[:2])
+        return np.einsum("ib,iba,ba,bc->ic", weights, wall_g, normal, normal), np.einsum("ib,iba->ia", weights, wall_g)
+
+    def drift(self, x, h, dt):
+        """By walls that move, of whose share h images stand for."""
+        g, normal = self.pairs(x, self.walls)[2], self.feet / np.linalg.norm(self.feet, axis=1, keepdims=True)
+        v = np.broadcast_to(self.velocities, self.walls.shape)
+        parts = np.einsum("iba,ba,bc,bc->ib", g, normal, normal, v) * self.wall_weights
+        wholes = np.einsum("iba,ba->ib", g, v) * self.wall_weights
+        (gamma, whole), least = self.pushes(g), 5e-4 * self.constants[1]
+        e = between(((whole**2).sum(1) - (gamma**2).sum(1)) / ((whole**2).sum(1) + least), 0.1, 0.4)
+        found = (1 - e) * parts.sum(1) + e * wholes.sum(1) - h * (parts * self.mirroring(x)).sum(1)
+        return found + h * sum(np.einsum("ija,ja->i", g, swept) / dt for *_, g, swept in self.images(x))
 
     def body_rows(self, x):
         """(6, n) of each body."""
@@ -215,7 +289,7 @@ class Projection:
         L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (inside * (K - np.eye(d)) + (1 - Bo) * beside)
         own = np.einsum("iab,ib->ia", L, total) + walled
         gamma = walled - h[:, None] * mirror
-        images = [(flip, g_image) for flip, _, _, g_image in self.images(x)]
+        images = [(R, g_image) for R, _, _, g_image, _ in self.images(x)]
         a = ((own**2).sum(1) + 0.05 * square) / m
         unequal = 1 + 2 * ((m[:, None] - m) / (m[:, None] + m)) ** 2
         a += (unequal * (np.einsum("iab,ijb->ija", L, g) ** 2).sum(-1)) @ (1 / m)
@@ -225,7 +299,7 @@ class Projection:
         for body, row in zip(self.bodies, rows, strict=True):
             a += body.diagonal(row)
             yielding += row.T @ body.mobility @ row
-        falls = sum((row[:d].T @ np.broadcast_to(gravity, d) * dt for row in rows), np.zeros(n))
+        falls = sum((row[:d].T @ np.broadcast_to(gravity, d) * dt for row in rows), self.drift(x, h, dt))
 
         def lift(k):
             both = (h * k)[:, None] + (h * k)[None, :]
@@ -241,8 +315,8 @@ class Projection:
         def divergence(v):
             apart = v[:, None] - v[None, :]
             found = np.einsum("iab,ija,ijb->i", L, apart, g) + (gamma * v).sum(1)
-            for flip, image in images:
-                found = found + h * np.einsum("ija,ija->i", v[:, None] - flip * v[None, :], image)
+            for R, image in images:
+                found = found + h * np.einsum("ija,ija->i", v[:, None] - (v @ R)[None, :], image)
             return found
 
         share = between(H + 2 * nu, 0.7, 0.95)

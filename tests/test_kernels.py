@@ -133,9 +133,8 @@ def cloud(name: str, seed: int = 7) -> Cloud:
     grid = Grid.around(np.full(3, -0.4)[:dimension], np.full(3, side)[:dimension], period, 1.03 * SUPPORT, 512)
     weights, layout = random.uniform(0.5, 1.5, WALLS), Layout(N, 1, FLOAT64, CPU)
     feet = np.stack([0.0 * walls[:, 0], -walls[:, 1], 0.0 * walls[:, 2]], axis=1)
-    search = NeighbourSearch(
-        DISCRETISATION, grid, WallArrays(walls, weights, weights, feet, 0.0 * feet, np.full(WALLS, -1)), layout, 100
-    )
+    known = WallArrays(walls, weights, weights, feet, 0.0 * feet, *[np.full(WALLS, -1)] * 2)
+    search = NeighbourSearch(DISCRETISATION, grid, known, layout, 100)
     s = neighbourhood_type(FLOAT64)()
     s.particles = N
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count

@@ -36,7 +36,7 @@ def padded(vectors: np.ndarray) -> np.ndarray:
 def walls_at(places: np.ndarray) -> WallArrays:
     """With their numbers as weights, so that sorted walls tell who they were."""
     names, nowhere = np.arange(len(places), dtype=np.float64), 0.0 * padded(places)
-    return WallArrays(padded(places), names, names, nowhere, nowhere, np.full(len(places), -1))
+    return WallArrays(padded(places), names, names, nowhere, nowhere, *[np.full(len(places), -1)] * 2)
 
 
 def around(search: NeighbourSearch, period: np.ndarray, precision: Precision) -> Any:

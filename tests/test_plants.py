@@ -32,6 +32,7 @@ UNNAMED = {
         *("projection_sums.divergence_back", "projection_sums.velocity_gradient_back", "projection_sums.push_back"),
     },
     "solvers.projection.walls": {"beside_sums.beside_back", "_work.beside_work"},
+    "solvers.projection.repair": {"_work.repair_work"},
     "solvers.projection.body_kernels": {"body_kernels.push_back"},
     "solvers.pcisph.pressure": {"_work.pressure_work"},
     "particles.wall_terms": {"solid_kernel.share"},
@@ -68,6 +69,7 @@ ELSEWHERE = {
     "device.modules": "it compiles adjoints and has none",
     "particles.made_derivatives": "it makes them of terms, in texts: tests/test_terms.py",
     "sph.integration.begin_adjoint_kernel.begin_adjoint": "for solvers from outside: tests/test_solver.py",
+    "solvers.projection.image_loads": "of loads, which no loss of these scenes sees: tests/test_faces.py",
     "solvers.projection.mean_stress": "of a quantity, which no loss of these scenes sees: tests/test_energy_budget.py",
 }
 """Modules with functions of adjoints that no plant is in, and single such functions, and why."""

@@ -131,7 +131,7 @@ def test_water_rests_between_solids_that_stand_on_the_floor_of_a_box():
 
 
 def test_more_images_than_have_numbers_are_refused(monkeypatch):
-    monkeypatch.setattr("cortado.particles.neighbours.MOST_IMAGED", 99)
+    monkeypatch.setattr("cortado.particles.mirrors.NUMBERS", 99 * 64 + 1)
     with pytest.raises(InputError, match="100 particles are too many beside walls that mirror them: at most 99"):
         Simulation(resting())
 

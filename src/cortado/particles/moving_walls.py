@@ -43,6 +43,8 @@ class WallArrays(Rows):
     solid: np.ndarray
     """(b,) number of each particle's solid: from 0 on for solids that move, from -2 on downwards for solids at rest; -1
     for the container"""
+    faces: np.ndarray
+    """(b,) number of the flat face that each is behind, of those that mirror the fluid, or -1"""
 
 
 @dataclass(frozen=True)
@@ -110,9 +112,10 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
     module = kernel_module(f"moving_walls_{precision.name}")
     vectors = {f"wall_{name}": vector for name in ("positions", "feet", "velocities")}
     own_vectors = dict.fromkeys(("own", "own_feet", "own_slides"), vector)
-    own_of: Any = bundle(**own_vectors, own_weights=real, own_grips=real, own_solids=wp.int32)
+    own_of: Any = bundle(**own_vectors, own_weights=real, own_grips=real, own_solids=wp.int32, own_faces=wp.int32)
     sizes_of = sizes_type(precision)
-    walls_of: Any = bundle(**vectors, wall_weights=real, wall_grips=real, wall_solids=wp.int32)
+    numbers = {f"wall_{name}": wp.int32 for name in ("solids", "faces")}
+    walls_of: Any = bundle(**vectors, wall_weights=real, wall_grips=real, **numbers)
     length_of: Any = bundle(time_step=real, time_step_dot=real)
     vector_dots = {f"wall_{name}_dot": vector for name in ("positions", "velocities", "turns")}
     dots_of: Any = bundle(**vector_dots, wall_growths_dot=real)
@@ -173,6 +176,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         walls.wall_weights[first + p] = grown * of.own_weights[b]
         walls.wall_grips[first + p] = grown * of.own_grips[b]
         walls.wall_solids[first + p] = k
+        walls.wall_faces[first + p] = of.own_faces[b]
 
     @wp.kernel(module=module, enable_backward=False)
     def shift(
@@ -272,6 +276,7 @@ class MovingWalls:
             "count": count,
             "sizes": self.sizes,
             "own_solids": wp.array(walls.solid, dtype=wp.int32, device=device),
+            "own_faces": wp.array(walls.faces, dtype=wp.int32, device=device),
             "x": wp.zeros(self._all, dtype=precision.vector, device=device),
             **{name: wp.array(values, dtype=precision.vector, device=device) for name, values in vectors.items()},
             **{name: wp.array(values, dtype=precision.real, device=device) for name, values in numbers.items()},

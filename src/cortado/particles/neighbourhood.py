@@ -1,13 +1,6 @@
 """The neighbourhood of a particle: other particles, walls and images in these, as one argument of kernels that sum over
 them; and how the entries of particles and of wall particles are read in a sum.
 
-Flat walls mirror the fluid: an image of particle j is what one of them mirrors, or two or three that meet. A reflection
-has a bit for each wall: 1, 2 and 4 for those at the lower ends of the axes, 8, 16 and 32 for the upper ones. It is
-x -> R x + o, with R diagonal. Seen from particle i, the image of j is where the image of i sees j, so that every image
-that i can see is one of its neighbours, or its own. In lists of neighbours the image of j by a reflection has the
-number ``REFLECTIONS j + reflection``. A wall mirrors what is in front of it, for what is in front of it, and not a
-column that waits behind it to come out of an opening.
-
 Entries are read without the count from an array's end that Warp's own indices allow: a negative index takes a
 comparison and an addition, for every neighbour and every array.
 """
@@ -24,6 +17,7 @@ from cortado.device.modules import kernel_module, kind_of
 from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
+from cortado.particles.mirrors import mirror_functions
 
 
 @dataclass(frozen=True)
@@ -152,8 +146,6 @@ def wall_functions(precision: Precision, taped: bool, neighbourhood: Any) -> dic
 UNROLL = 4
 """Fluid neighbours that a loop takes at a time, so that their loads overlap; lists are filled up to a multiple of it
 with the particle itself, which adds nothing to a sum but W(0) to the density's."""
-REFLECTIONS = 64
-"""A number above all bits of a reflection."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +203,7 @@ class Discretisation:
 @cache
 def neighbourhood_type(precision: Precision) -> Any:
     """Make the Warp struct of a neighbourhood; arrays are sorted by cell, lists are [neighbour, particle]."""
-    real, vector = precision.real, precision.vector
+    real, vector, matrix = precision.real, precision.vector, wp.types.matrix(shape=(3, 3), dtype=precision.real)
 
     class Neighbourhood:
         first: wp.int32
@@ -277,55 +269,33 @@ def neighbourhood_type(precision: Precision) -> Any:
         """Coordinates of the flat walls that mirror the fluid [m], -inf along an axis where none does."""
         mirror_upper: vector
         """Coordinates of mirroring walls at the upper ends, inf where none does."""
+        faces: wp.int32
+        """Number of flat faces of moving solids that mirror the fluid; what follows is read where walls move."""
+        face_solids: wp.array(dtype=wp.int32)
+        """Number of each face's solid."""
+        face_places: wp.array(dtype=vector)
+        """Middles of the faces in the frames of their solids [m]."""
+        face_frames: wp.array(dtype=matrix)
+        """Rows: the normal towards the fluid and two unit vectors along a face, in the frame of its solid."""
+        face_sizes: wp.array(dtype=vector)
+        """0, and the half lengths of a face along its two unit vectors [m]."""
+        wall_faces: wp.array(dtype=wp.int32)
+        """Number of the face that a wall particle is behind, or -1."""
+        after: wp.array2d(dtype=vector)
+        """Positions (members, solids) of solids at the end of the step [m], and so on: see `MovingWalls.named`."""
+        turns: wp.array2d(dtype=matrix)
+        before: wp.array2d(dtype=vector)
+        turns_before: wp.array2d(dtype=matrix)
+        scales: wp.array2d(dtype=real)
+        after_dot: wp.array2d(dtype=vector)
+        turned_dot: wp.array2d(dtype=vector)
+        before_dot: wp.array2d(dtype=vector)
+        turned_before_dot: wp.array2d(dtype=vector)
+        scales_dot: wp.array2d(dtype=real)
 
     Neighbourhood.__qualname__ = f"Surroundings_{precision.name}"
     Neighbourhood.__name__ = Neighbourhood.__qualname__
     return wp.struct(Neighbourhood)
-
-
-@cache
-def mirror_functions(precision: Precision, neighbourhood: Any) -> dict[str, Any]:
-    """Make Warp functions of mirrors by name. ``near_mirrors`` has the bits of the walls within reach of a position, on
-    either side, ``before_mirrors`` of those that it is in front of. ``reflects`` tells whether bits are those of a
-    reflection in some walls, and ``reflection`` has the diagonal of R, and o."""
-    real, vector = precision.real, precision.vector
-
-    @wp.func
-    def near_mirrors(x: vector, s: neighbourhood) -> int:
-        found = int(0)
-        for axis in range(3):
-            if x[axis] - s.mirror_lower[axis] < s.reach:
-                found = found | (1 << axis)
-            if s.mirror_upper[axis] - x[axis] < s.reach:
-                found = found | (8 << axis)
-        return found
-
-    @wp.func
-    def before_mirrors(x: vector, s: neighbourhood) -> int:
-        found = int(0)
-        for axis in range(3):
-            if x[axis] >= s.mirror_lower[axis]:
-                found = found | (1 << axis)
-            if x[axis] <= s.mirror_upper[axis]:
-                found = found | (8 << axis)
-        return found
-
-    @wp.func
-    def reflects(bits: int, near: int) -> bool:
-        """Test that bits are those of a reflection in near walls; opposite walls do not mirror each other's images."""
-        return (bits & near) == bits and (bits & (bits >> 3)) == 0
-
-    @wp.func
-    def reflection(bits: int, s: neighbourhood):
-        flip, offset = vector(real(1.0), real(1.0), real(1.0)), vector()
-        for axis in range(3):
-            lower, upper = (bits >> axis) & 1, (bits >> (axis + 3)) & 1
-            if lower + upper == 1:
-                flip[axis] = real(-1.0)
-                offset[axis] = real(2.0) * wp.where(lower == 1, s.mirror_lower[axis], s.mirror_upper[axis])
-        return flip, offset
-
-    return {one.func.__name__: one for one in (near_mirrors, before_mirrors, reflects, reflection)}
 
 
 @cache
@@ -337,9 +307,9 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
     per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
     list of i), ``several`` (the numbers of `UNROLL` of them from the k-th on), ``wall_position`` and others, which load
-    what a wall particle has, ``weight_in`` (its weight if it is of the given moving solid, and 0 if not); and
-    ``vectors``, ``numbers`` and ``sixes``, which load what several neighbours have before any of it is used, so that
-    the loads do not wait for one another (on a GPU a tenth of a whole step).
+    what a wall particle has, ``weight_in`` (its weight if it is of the given moving solid, and 0 if not), those of
+    `mirror_functions`; and ``vectors``, ``numbers`` and ``sixes``, which load what several neighbours have before any
+    of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -444,5 +414,5 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
         separation=nearest_image if discretisation.periodic else difference,
         **{one.func.__name__: one for one in own},
         **wall_functions(discretisation.precision, discretisation.taped, neighbourhood),
-        **mirror_functions(discretisation.precision, neighbourhood),
+        **mirror_functions(discretisation.precision, discretisation.moving, neighbourhood),
     )

@@ -20,9 +20,9 @@ from cortado.device.launching import MOST_PARTS, HostCopy, KernelLauncher
 from cortado.device.precision import TypesByName
 from cortado.errors import InputError
 from cortado.particles.candidates import append_function, scan_around
+from cortado.particles.mirrors import most_imaged, reflections
 from cortado.particles.moving_walls import MovingWalls, WallArrays
 from cortado.particles.neighbourhood import (
-    REFLECTIONS,
     UNROLL,
     Discretisation,
     loads,
@@ -30,9 +30,6 @@ from cortado.particles.neighbourhood import (
     pair_functions,
 )
 from cortado.particles.state import Layout
-
-MOST_IMAGED = (2**31 - 1) // REFLECTIONS
-"""Most particles whose images have numbers."""
 
 
 @cache
@@ -88,9 +85,9 @@ def image_kernel(discretisation: Discretisation) -> Any:
     """Make the kernel that appends images of particles, and of the particle itself, to lists of neighbours."""
     vector, neighbourhood = discretisation.precision.vector, neighbourhood_type(discretisation.precision)
     pair, load = pair_functions(discretisation), loads(discretisation.precision, discretisation.taped)
-    separation, reflects, reflection = pair.separation, pair.reflects, pair.reflection
-    near_mirrors, before_mirrors = pair.near_mirrors, pair.before_mirrors
-    load_vector, neighbour = load.vector, pair.neighbour
+    separation, sees, shows, sides = pair.separation, pair.sees, pair.shows, pair.sides
+    reflection, turned, last_reflection = pair.reflection, pair.turned, pair.last_reflection
+    load_vector, neighbour, REFLECTIONS = load.vector, pair.neighbour, wp.constant(reflections(discretisation.moving))
     LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
 
     @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
@@ -105,21 +102,23 @@ def image_kernel(discretisation: Discretisation) -> Any:
         """Append images to lists; ``needed`` becomes the longest list, as in `fill_kernel`."""
         i = s.first + wp.tid() // LANES
         x_i, limit, found = x[i], s.reach * s.reach, int(s.count[i])
-        near_walls = near_mirrors(x_i, s) & before_mirrors(x_i, s)
-        if near_walls == 0 or bad_step[i // s.particles] >= 0:
+        member = i // s.particles
+        near = sides(x_i, s)
+        last = last_reflection(near, x_i, member, s)
+        if last == 0 or bad_step[member] >= 0:
             return
         others = s.fluid_count[i] - s.filling[i]
-        for bits in range(1, near_walls + 1):
-            if reflects(bits, near_walls):
-                flip, offset = reflection(bits, s)
+        for one in range(1, last + 1):
+            if sees(one, near, x_i, member, s):
+                R, offset = reflection(one, member, s)
                 for first in range(0, others + 1, LANES):
                     place, j = first + lane(), int(i)
                     if place < others:
                         j = neighbour(place, i, s)
                     x_j = load_vector(x, j)
-                    x_ij = separation(x_i, wp.cw_mul(flip, x_j) + offset, s)
-                    is_near = place <= others and wp.dot(x_ij, x_ij) < limit and reflects(bits, before_mirrors(x_j, s))
-                    found = append(i, wp.static(REFLECTIONS) * j + bits, is_near, found, s)
+                    x_ij = separation(x_i, turned(R, x_j) + offset, s)
+                    is_near = place <= others and wp.dot(x_ij, x_ij) < limit and shows(one, x_j, member, s)
+                    found = append(i, REFLECTIONS * j + one, is_near, found, s)
         if lane() > 0:
             return
         all_count[i] = wp.min(found, s.neighbours.shape[0])
@@ -160,9 +159,9 @@ class NeighbourSearch:
         scene by scene, and are written by `MovingWalls.write`, of so many ``solids`` in a ``dimension``. Lists of
         ``mirrored`` fluid have images."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
-        if mirrored and particles > MOST_IMAGED:
+        if mirrored and particles > (most := most_imaged(discretisation.moving)):
             raise InputError(
-                f"{particles:,} particles are too many beside walls that mirror them: at most {MOST_IMAGED:,}, or any "
+                f"{particles:,} particles are too many beside walls that mirror them: at most {most:,}, or any "
                 'number with container.slip = "no".'
             )
         self.particles, self.device = particles, device
@@ -180,7 +179,7 @@ class NeighbourSearch:
         still, moving = walls.some(walls.solid < 0), walls.some(walls.solid >= 0)
         count = len(still) + layout.members * len(moving)
         kinds = {"positions": precision.vector, "feet": precision.vector, "velocities": precision.vector}
-        kinds |= {"weights": precision.real, "grips": precision.real, "solids": wp.int32}
+        kinds |= {"weights": precision.real, "grips": precision.real, "solids": wp.int32, "faces": wp.int32}
         own = dict.fromkeys(("positions_dot", "velocities_dot", "turns_dot"), precision.vector)
         own["growths_dot"] = precision.real
         sizes = {**dict.fromkeys(kinds, count), **dict.fromkeys(own, count if solids else 0)}
@@ -188,6 +187,7 @@ class NeighbourSearch:
             f"wall_{name}": wp.zeros(sizes[name], dtype=kind, device=device) for name, kind in {**kinds, **own}.items()
         }
         """What kernels know of wall particles, those at rest first; no tangents where no solid moves."""
+        self.walls["wall_faces"].fill_(-1)
         self._write_walls(still)
         self._wall_sort = CellSort(grid, len(still), precision, device)
         self._unsorted_walls: WallArrays | None = still

@@ -11,7 +11,10 @@ is the Warp function ``force(i, x, c, s)`` of particle i, the arrays x and c, an
     c_i, c_j, v_ij     an array's entry of the particle, that of its neighbour, and v_i - v_j
     i, j               their numbers; j is -1 for a particle of a wall
     foot               of a particle of a wall, from it to the surface of the container; in terms of walls alone
+    mirrored           of a particle of a wall, 1 where the wall mirrors about particle i, or 0; in works of walls
     turn_dot           of a particle of a wall, the tangent of how its solid is turned; in tangents of terms of walls
+    swept              of an image, how far a step of its mirror takes it, where solids move; and swept_dot, its tangent
+    owned              of an image, 1 where it is by the walls of ``solid``, or of all walls, or 0
     s                  the neighbourhood
     any other          what is the same for all neighbours of a particle, and stands between the arrays and s
 
@@ -41,11 +44,12 @@ from typing import Any, get_args
 import warp as wp
 
 from cortado.device.lanes import lane_functions, sum_over_lanes
-from cortado.particles.neighbourhood import REFLECTIONS, UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.mirrors import OF_IMAGES, OVER_IMAGES, reflections
+from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 NUMBERS = ("i", "j")
 INDICES = ("i", "j", "ij")
-OF_WALLS = {"foot": "_foot", "turn_dot": "_turn_dot"}
+OF_WALLS = {"foot": "_foot", "turn_dot": "_turn_dot", "mirrored": "_mirrored"}
 """Names of a wall particle's data in terms of walls, with their texts."""
 
 
@@ -91,12 +95,12 @@ class Term:
     @property
     def others(self) -> dict[str, Any]:
         """Return the types, by name, of arguments that are equal for all neighbours."""
-        known = (*NUMBERS, *OF_WALLS, "s")
+        known = (*NUMBERS, *OF_WALLS, *OF_IMAGES, "s")
         return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in known}
 
     def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j") -> str:
         """Return the term's arguments as source text, given the texts of a neighbour's entries and of its number."""
-        return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j, **OF_WALLS})
+        return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j, **OF_WALLS, **OF_IMAGES})
 
     def seen_from_j(self, of_j: Mapping[str, str]) -> str:
         """Return the term's arguments as source text, with particle and neighbour exchanged."""
@@ -143,14 +147,6 @@ OVER_FLUID = """\
             {separation}
             {body}
 """
-OVER_IMAGES = """\
-    for _place in range(s.count[i] + _lane(), s.all_count[i], _LANES):
-        _image = _neighbour(_place, i, s)
-        _j = _image // _REFLECTIONS
-        _flip, _offset = _reflection(_image % _REFLECTIONS, s)
-        _x_ij = _separation(_x_i, _times(_flip, x[_j]) + _offset, s)
-        {body}
-"""
 OVER_WALLS = """\
     for _place in range(s.fluid_count[i] + _lane(), s.count[i], _LANES):
         _b = _neighbour(_place, i, s)
@@ -159,6 +155,8 @@ OVER_WALLS = """\
         {more}
         {body}
 """
+ALL, RUBBING = "_wall_weight(_b, s)", "_wall_grip(_b, s)"
+"""Texts of the weights of wall particles, and of those along which fluid does not slip."""
 MOVING = {"v": "_wall_velocity(_b, s)", "x_dot": "_wall_position_dot(_b, s)", "v_dot": "_wall_velocity_dot(_b, s)"}
 """Texts of the entries of arrays that wall particles have where they move."""
 
@@ -193,24 +191,28 @@ def over_fluid(
 def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
     """Return the text of a loop over the images of the fluid and of the particle itself, which have their particles'
     numbers and mirrored vectors."""
-    of_j = {
-        array: f"{array}[_j]" if kind is d.precision.real else f"_times(_flip, {array}[_j])"
-        for array, kind in arrays.items()
-    }
-    return OVER_IMAGES.format(body=_lines(8, body(of_j)))
+
+    def of_j(array: str, kind: Any) -> str:
+        of = array.removesuffix("_dot")
+        if kind is d.precision.real:
+            return f"{array}[_j]"
+        if of in (array, "") or not d.moving:
+            return f"_turned(_R, {array}[_j])"
+        return f"_{'image' if of == 'x' else 'turned'}_dot(_one, {of}[_j], {array}[_j], _member, s)"
+
+    return OVER_IMAGES.format(body=_lines(8, body({array: of_j(array, kind) for array, kind in arrays.items()})))
 
 
-def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], rubs: bool, of_one: bool) -> str:
-    """Return the text of a loop over the walls, whose particles have a place, a weight _w_b, and the entries ``known``
-    of `OF_WALLS`. Where walls move they have a velocity, too, which is their entry of the array
-    v, and tangents of both. Where it ``rubs``, walls that slip freely have no weight, and where it is ``of_one`` all
-    that are not of the moving ``solid``."""
+def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], weight: str) -> str:
+    """Return the text of a loop over the walls, whose particles have a place, a ``weight``, and the entries ``known``
+    of `OF_WALLS`. Where walls move they have a velocity, too, which is their entry of the array v, and tangents of
+    both."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
     of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays}
     turned = "_wall_turn_dot(_b, s)" if d.moving else zero(d.precision.vector, d)
     more = {"foot": "_foot = _wall_foot(_b, s)", "turn_dot": f"_turn_dot = {turned}"}
     return OVER_WALLS.format(
-        weight="_wall_grip(_b, s)" if rubs else "_weight_in(_b, solid, s)" if of_one else "_wall_weight(_b, s)",
+        weight=weight,
         more=_lines(8, (text for name, text in more.items() if name in known)),
         body=_lines(8, body({**of_b, "x": "_wall_position(_b, s)"})),
     )
@@ -243,7 +245,7 @@ def summed(
     text = "".join(line for line in text.splitlines(keepends=True) if line.strip())
     known = {
         **scope_of(d),
-        **{"_times": wp.cw_mul, "_REFLECTIONS": REFLECTIONS, "_LANES": d.lanes, "_UNROLL": UNROLL},
+        **{"wp": wp, "_REFLECTIONS": reflections(d.moving), "_LANES": d.lanes, "_UNROLL": UNROLL},
         "_lane": lane_functions(d.precision, d.lanes).lane,
         **{f"_of_{name}": wp.array(dtype=kind) for name, kind in arrays.items()},
         **{f"_of_{name}": kind for name, kind in others.items()},
@@ -295,7 +297,13 @@ def pair_sum(
     def make(function: Function) -> Any:
         term, wall = Term.of(function), Term.of(walls or function)
         _check_walls(wall, term)
-        return _made(term, d, _over_fluid(term, d, ahead) + _over_walls(wall, d, rubs, grows), wall, grows=grows)
+        return _made(
+            term,
+            d,
+            _over_fluid(term, d, ahead) + _over_walls(wall, d, grows, RUBBING if rubs else ALL),
+            wall,
+            grows=grows,
+        )
 
     return make
 
@@ -332,25 +340,24 @@ def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
     return summed
 
 
-def wall_sum(d: Discretisation, grows: Any = None) -> Decorator:
-    """Return a decorator that turns a term into its sum over the walls alone."""
+def wall_sum(d: Discretisation, grows: Any = None, weight: str = ALL) -> Decorator:
+    """Return a decorator that turns a term into its sum over the walls alone, with the text of a ``weight``."""
 
     def make(function: Function) -> Any:
         term = Term.of(function)
-        return _made(term, d, _over_walls(term, d, rubs=False, grows=grows), term, grows=grows)
+        return _made(term, d, _over_walls(term, d, grows, weight), term, grows=grows)
 
     return make
 
 
 def solid_sum(d: Discretisation) -> Decorator:
-    """Return a decorator that turns a term into its sum over the walls of one moving solid, whose number is
-    ``solid``."""
+    """Return a decorator that turns a term into its sum over the walls of one moving ``solid``, told by its number."""
+    return wall_sum(d, weight="_weight_in(_b, solid, s)")
 
-    def make(function: Function) -> Any:
-        term = Term.of(function)
-        return _made(term, d, _over_walls(term, d, rubs=False, of_one=True), term)
 
-    return make
+def mirror_sum(d: Discretisation, grows: Any = None) -> Decorator:
+    """Return a decorator that turns a term into its sum over the walls that mirror about a particle (``mirrors``)."""
+    return wall_sum(d, grows, "wp.where(_mirrors_in(_b, mirrors, s), _wall_weight(_b, s), _real(0.0))")
 
 
 def _check_walls(wall: Term, term: Term) -> None:
@@ -374,7 +381,7 @@ def _over_fluid(term: Term, d: Discretisation, ahead: bool) -> str:
     return over_fluid(d, term.of_neighbours, _adding_up(term), ahead, *knows)
 
 
-def _over_walls(wall: Term, d: Discretisation, rubs: bool, grows: Any = None, of_one: bool = False) -> str:
+def _over_walls(wall: Term, d: Discretisation, grows: Any, weight: str) -> str:
     def body(of_b: Mapping[str, str]) -> list[str]:
         return [*added("_wall_term", wall, "_w_b", of_b), *growth(of_b)]
 
@@ -390,7 +397,7 @@ def _over_walls(wall: Term, d: Discretisation, rubs: bool, grows: Any = None, of
 
     if "x_ij" not in wall.parameters:
         raise TypeError(f"term {wall.name} has no x_ij, but must have it where it is summed over walls.")
-    return over_walls(d, wall.of_neighbours, body, wall.parameters, rubs, of_one)
+    return over_walls(d, wall.of_neighbours, body, wall.parameters, weight)
 
 
 def _terms(term: Term) -> str:

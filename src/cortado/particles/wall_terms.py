@@ -35,14 +35,13 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.device.reduction import add
 from cortado.particles.made_derivatives import dot_of
+from cortado.particles.mirrors import ALL_WALLS
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import Term, scope_of
 from cortado.particles.particle_kernels import MADE, made_kernel
 from cortado.particles.state import Layout
 
-ALL_WALLS = -(2**31)
-"""Stands in place of a solid's number for the walls of all solids and of the container."""
 NAMES = ("force", "torque", "force_before", "torque_before", "growth")
 """f, t, f_0, t_0 and g / sigma."""
 BARS = [f"{name}_bar" for name in ("after", "turned", "before", "turned_before", "scales")]
@@ -51,6 +50,7 @@ WHOLE = ("force", "torque", "growth")
 """Shares of a solid that others than particles give."""
 LOOP = """\
 _x_i = at.x[i]
+    _mirrors = _mirror_of(_x_i, i // s.particles, s)
     {own}
     for _place in range(s.fluid_count[i], s.count[i]):
         _b = _neighbour(_place, i, s)
@@ -60,6 +60,7 @@ _x_i = at.x[i]
             _v_b = _wall_velocity(_b, s)
             _foot = _wall_foot(_b, s)
             _x_ij = _separation(_x_i, _x_b, s)
+            _mirrored = wp.where(_mirrors_in(_b, _mirrors, s), _real(1.0), _real(0.0))
             {body}"""
 SHARE = """\
 def {name}(

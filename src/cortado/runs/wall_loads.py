@@ -2,11 +2,12 @@
 
 Particle i pushes walls, those of one solid or all, with
 
-    f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i),
+    f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i + B_i),
 
 where A_i is the sum over wall particles along which its pressure acts (``wall_push`` of
-`cortado.solvers.particles.ParticleSolver`) and a_i the acceleration that they give it by a force such as viscosity. The
-walls so get what momentum the fluid loses to them: the mass of a particle is m_i s^d, with the spacing s.
+`cortado.solvers.particles.ParticleSolver`), a_i the acceleration that they give it by a force such as viscosity, and
+B_i the part of images (`cortado.solvers.projection.image_loads`), if walls mirror. The walls so get what momentum the
+fluid loses to them: the mass of a particle is m_i s^d, with the spacing s.
 """
 
 from dataclasses import dataclass
@@ -34,15 +35,28 @@ from cortado.sph.walls import WallAction
 
 @cache
 def wall_force_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the forces f of particles on walls, given the sums A as ``push`` and a as ``rub``."""
+    """Make the kernels of the forces f of particles on walls, given the sums A, a and B as ``push``, ``rub`` and
+    ``by_images``."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
 
     def wall_force(
-        scale: real, power: real, cell: real, p_i: real, n_i: real, m_i: real, push_i: vector, rub_i: vector
+        scale: real,
+        power: real,
+        cell: real,
+        p_i: real,
+        n_i: real,
+        m_i: real,
+        push_i: vector,
+        rub_i: vector,
+        by_images_i: vector,
     ) -> vector:
-        return (scale * p_i / wp.pow(n_i, power)) * push_i - (cell * m_i) * rub_i
+        return (scale * p_i / wp.pow(n_i, power)) * push_i - (cell * m_i) * rub_i + cell * by_images_i
 
-    numbers, written, modules = ["scale", "power", "cell"], ["push", "rub"], discretisation.modules("wall_force")
+    numbers, written, modules = (
+        ["scale", "power", "cell"],
+        ["push", "rub", "by_images"],
+        discretisation.modules("wall_force"),
+    )
     make = pointwise_kernels
     return make(discretisation.precision, modules, lambda _: wall_force, ["f"], numbers=numbers, written=written)
 
@@ -99,20 +113,18 @@ class WallLoads:
         self._solver, self._kernels, self.cell = solver, wall_force_kernels(solver.discretisation), solver.lattice.cell
         power, scale = float(solver.density_power), self.cell * solver.lattice.volume
         self._numbers = {"power": power, "scale": scale, "cell": self.cell}
-        self._push, self._rubs, self._twists = (
-            solver.wall_push(),
-            self._actions("wall_action"),
-            self._actions("wall_couple"),
-        )
-        self._vectors = {name: solver.vectors() for name in ("rub", "f", "twist", "rub_dot", "f_dot", "twist_dot")}
-        self._bars = {name: solver.vectors() for name in ("push_bar", "rub_bar")}
+        self._push, self._images = solver.wall_push(), solver.image_loads()
+        self._rubs, self._twists = self._actions("wall_action"), self._actions("wall_couple")
+        names = ("rub", "f", "twist", "by_images", "rub_dot", "f_dot", "twist_dot", "by_images_dot")
+        self._vectors = {name: solver.vectors() for name in names}
+        self._bars = {name: solver.vectors() for name in ("push_bar", "rub_bar", "by_images_bar")}
 
     def _actions(self, name: str) -> list[WallAction]:
         return [action for force in self._solver.forces if (action := getattr(force, name, None)) is not None]
 
     def forces(self, step: StepContext, p: wp.array, solid: int) -> wp.array:
         """Return the forces f of particles on the walls of a solid."""
-        found, known = self._vectors["f"], {**self._sums(step, solid), "p": p}
+        found, known = self._vectors["f"], self._sums(step, p, solid)
         step.launch(self._kernels.forward, known, self._numbers, f=found)
         return found
 
@@ -120,16 +132,21 @@ class WallLoads:
         """Return the tangent of the forces f of particles on the walls of a solid."""
         rub_dot = self._total("rub_dot", [action.tangent(step, along, solid) for action in self._rubs])
         dots = {"push_dot": self._push.tangent(step, along, solid), "rub_dot": rub_dot, "p_dot": p_dot}
-        found, known = self._vectors["f_dot"], {**self._sums(step, solid), "p": p}
+        dots["by_images_dot"] = self._vectors["by_images_dot"]
+        if self._images is not None:
+            dots["by_images_dot"] = self._images.tangent(step, along, solid, p, p_dot)
+        found, known = self._vectors["f_dot"], self._sums(step, p, solid)
         step.launch(self._kernels.tangent, known, dots, *along.named, self._numbers, f_dot=found)
         return found
 
     def adjoint(self, step: StepContext, p: wp.array, f_bar: wp.array, bar: "Particles", solid: int) -> None:
         """Add to the adjoints of the particles by that of the forces f."""
-        within, known = bar.within, {**self._sums(step, solid), "p": p}
+        within, known = bar.within, self._sums(step, p, solid)
         bars = {**self._bars, "p_bar": bar.push}
         step.launch(self._kernels.adjoint, known, bars, *within.bar.named, self._numbers, f_bar=f_bar)
         self._push.adjoint(step, within.bar, solid, self._bars["push_bar"], within.v_star)
+        if self._images is not None:
+            self._images.adjoint(step, within.bar, solid, p, self._bars["by_images_bar"], bar.push)
         for action in self._rubs:
             action.adjoint(step, within.bar, solid, self._bars["rub_bar"], within.v_star)
 
@@ -147,9 +164,12 @@ class WallLoads:
         for action in self._twists:
             action.adjoint(step, bar.within.bar, solid, total_bar, bar.within.v_star)
 
-    def _sums(self, step: StepContext, solid: int) -> dict[str, wp.array]:
+    def _sums(self, step: StepContext, p: wp.array, solid: int) -> dict[str, wp.array]:
         rub = self._total("rub", [action.total(step, solid) for action in self._rubs])
-        return {"push": self._push.total(step, solid), "rub": rub}
+        found = {"push": self._push.total(step, solid), "rub": rub, "by_images": self._vectors["by_images"], "p": p}
+        if self._images is not None:
+            found["by_images"] = self._images.total(step, solid, p)
+        return found
 
     def _total(self, name: str, arrays: list[wp.array]) -> wp.array:
         """Add up arrays; the sum of one is itself."""

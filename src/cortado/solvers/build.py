@@ -18,11 +18,13 @@ from cortado.device.precision import Precision
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.solid import Hollow, Mass, Solid
 from cortado.errors import InputError, shown
+from cortado.particles.mirrors import MOST_FACES, most_imaged
 from cortado.particles.moving_walls import WallArrays
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout, padded
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
+from cortado.scene.flat_faces import ON, FlatFaces, flat_faces
 from cortado.scene.fluid_particles import reserve_offset
 from cortado.scene.motions import motion_parameters, moving, solid_frames, wall_numbers
 from cortado.scene.parameter_values import REGISTRY, Known, checked_value
@@ -230,7 +232,9 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     lanes, moves = lanes_for(layout.particles, device, setting.lanes), bool(moving(scene.solid))
     shared = Discretisation(discrete.kernel, precision, lanes, any(discrete.periods), moves)
     mirrors = mirrors_of(scene)
-    search = _search(scene, discrete, shared, layout, bool(np.isfinite(mirrors).any()))
+    most = MOST_FACES if layout.all_particles <= most_imaged(moving=True) else 0
+    faces = flat_faces(scene, discrete.lattice.support, most)
+    search = _search(scene, discrete, shared, layout, bool(np.isfinite(mirrors).any()), faces)
 
     def system(discretisation: Discretisation) -> ParticleSystem:
         return ParticleSystem(
@@ -245,6 +249,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
             discrete.fluid.emitted.start,
             _walled(scene, discrete),
             mirrors,
+            faces,
             _named_solids(scene),
             of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
         )
@@ -253,7 +258,12 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
 
 
 def _search(
-    scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, layout: Layout, mirrored: bool
+    scene: Scene,
+    discrete: DiscreteScene,
+    discretisation: Discretisation,
+    layout: Layout,
+    mirrored: bool,
+    faces: FlatFaces,
 ) -> NeighbourSearch:
     """Make the search for neighbours of particles within the support radius, and a little beyond."""
     support = discrete.lattice.support
@@ -271,8 +281,11 @@ def _search(
         own = walls.solid == number
         positions[own], feet[own] = (positions[own] - middle) @ turn, feet[own] @ turn
     grips = walls.weights * walls.sticks
-    arrays = WallArrays(padded(positions), walls.weights, grips, padded(feet), padded(walls.slides), walls.solid)
-    return NeighbourSearch(discretisation, grid, arrays, layout, room, len(middles), scene.dimension, mirrored)
+    positions, feet = padded(positions), padded(feet)
+    behind = faces.behind(walls.solid, positions, feet, ON * scene.discretisation.spacing)
+    arrays = WallArrays(positions, walls.weights, grips, feet, padded(walls.slides), walls.solid, behind)
+    imaged = mirrored or len(faces.solids) > 0
+    return NeighbourSearch(discretisation, grid, arrays, layout, room, len(middles), scene.dimension, imaged)
 
 
 def _forces(

@@ -19,10 +19,12 @@ from cortado.device.threads import Turn
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.shapes import Points
 from cortado.errors import MissingDerivativeError
+from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import POSITIONS, VELOCITIES, Fields, Layout, Parameters, State, StateField, check_fields
 from cortado.scene.discrete_scene import Lattice
+from cortado.scene.flat_faces import FlatFaces
 from cortado.solvers.containment import Containment
 from cortado.solvers.loop import IterationLog, Loop, convergence_kernels
 from cortado.solvers.obstacles import NamedSolid, Walled
@@ -54,6 +56,8 @@ class ParticleSystem:
     mirrors: tuple[Points, Points]
     """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite where none
     does."""
+    faces: FlatFaces
+    """Faces of moving solids that mirror the fluid."""
     solids: Mapping[str, NamedSolid]
     """The solids of the scene by their names."""
     of_one_lane: Callable[[], "ParticleSystem"]
@@ -120,6 +124,11 @@ class ParticleSolver(Staying):
     def wall_push(self) -> WallAction:
         """Return the sums over walls, along which a particle's V^2 p_i / n_i^`density_power` pushes them."""
         return WallSums(wall_slope_term(self.discretisation), self.layout)
+
+    def image_loads(self) -> Any:
+        """Return what walls that mirror get beside `wall_push`: `cortado.solvers.projection.image_loads.ImageLoads`;
+        None where none does."""
+        return None
 
     def vectors(self) -> wp.array:
         """Make an array (n,) of zero vectors for a step or its derivative to work in."""
@@ -305,6 +314,12 @@ def _neighbourhood(system: ParticleSystem) -> Any:
     s.self_weight, s.volume, s.response_scale = lattice.self_weight, lattice.volume, lattice.response**-0.5
     s.laplacian_correction = lattice.laplacian_correction
     s.mirror_lower, s.mirror_upper = (precision.vector(*ends) for ends in system.mirrors)
+    faces, kinds = system.faces, {"places": precision.vector, "frames": matrix_of(precision), "sizes": precision.vector}
+    s.faces = len(faces.solids)
+    for name, kind in {"solids": wp.int32, **kinds}.items():
+        setattr(s, f"face_{name}", wp.array(getattr(faces, name), dtype=kind, device=system.layout.device))
+    for name, array in {} if search.moving is None else search.moving.named.items():
+        setattr(s, name, array)
     s.period = precision.vector(*periods)
     s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))
     return s

@@ -23,6 +23,7 @@ from cortado.solvers.projection.coarse_levels import Levels
 from cortado.solvers.projection.coarse_nodes import node_kernels
 from cortado.solvers.projection.coarse_pressure import coarse_pressure_kernels, length_kernels
 from cortado.solvers.projection.coarse_residual import coarse_push_kernels, residual_kernels
+from cortado.solvers.projection.faces import FaceShares
 from cortado.solvers.projection.lattice import SPACING
 from cortado.solvers.projection.sums import velocity_kernels
 from cortado.sph.conjugate_gradients import round_off
@@ -204,8 +205,9 @@ class CoarseTangent:
 class CoarseAdjoint:
     """The adjoint of the coarse pressure correction, for reverse mode."""
 
-    def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesAdjoint | None, bar: Adjoints):
+    def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesAdjoint | None, bar: Adjoints, faces: FaceShares):
         precision = layout.precision
+        self._bar, self._faces = bar, faces
         real, vector, six = precision.real, precision.vector, symmetric(precision).kind
         self._coarse, self._multiplier = coarse, coarse.numbers()
         self._bodies = None
@@ -245,6 +247,7 @@ class CoarseAdjoint:
         thrown = {"u": new["thrust"], "v_star": own.still, "y": new["change"], "u_bar": found["thrust_bar"]}
         context.launch(own.velocity.own_adjoint, thrown, through, *known)
         context.launch(own.velocity.velocity.adjoint, thrown, through, *known, y_bar=found["change_bar"])
+        self._faces.add(context, self._bar, *known, u=through["f"], spread=new["change"])
         every = (own.grid, left, own.pushed, self._bars, found, *known)
         context.launch(own.pressure.correct_adjoint, at, {"y_bar": steps["y_bar"]}, own.source, *every)
         own.solve(context, new["e"], self._multiplier)

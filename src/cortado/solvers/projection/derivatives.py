@@ -12,11 +12,12 @@ from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse import CoarseAdjoint, CoarseTangent
+from cortado.solvers.projection.faces import FaceShares
 from cortado.solvers.projection.mean_stress import pressed_kernels
+from cortado.solvers.projection.repair import repair_solid_kernel
 from cortado.solvers.projection.steps import IMPULSE, KICK, ProjectionSteps
 from cortado.solvers.projection.surroundings import SurroundingsAdjoint, SurroundingsTangent
 from cortado.solvers.solver import Counts, WithinBar
-from cortado.sph.density import density_solid_kernel
 from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent
 from cortado.sph.parts import StepContext
 
@@ -146,6 +147,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._x_now_bar, self._x_moved_bar, self._u_bar, self._f = (solver.vectors() for _ in range(4))
         self._kick_bar, self._kick_before_bar = (solver.vectors() for _ in range(2))
         self._A_bar = wp.zeros_like(solver.iterates[0]["A"])
+        self._faces = FaceShares(solver.discretisation, solver.layout, len(solver.system.faces.solids))
         six = solver.pull.dtype
         pull = solver.layout.arrays(T=six, S=six)
         self._pull, self._push = pull["T"], pull["S"]
@@ -154,7 +156,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         free = [part for part in self._parts if isinstance(part, FreeSolidsAdjoint)]
         self._bodies = None if solver.bodies is None else BodiesAdjoint(solver.bodies, free[0].bodies)
         own = solver.layout, self._bodies, self.bar
-        self._coarse = CoarseAdjoint(solver.coarse, *own)
+        self._coarse = CoarseAdjoint(solver.coarse, *own, self._faces)
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """Replace the adjoint of the replayed step's result by that of its state."""
@@ -246,8 +248,11 @@ class ProjectionAdjoint(ParticleAdjoint):
             context.launch(move, *known, measured, own, omega=solver.repair_relaxations[k])
             own = {"x_now": at["x_now"], "n_now_bar": self._n_now_bar, "x_now_bar": self._x_now_bar}
             context.launch(kernels.measure.adjoint, *known, own)
-            densities = partial(density_solid_kernel, solver.discretisation, solver.topic)
-            self.bar.solids.add(context.launch, densities, *known, x=at["x_now"], bar=self._n_now_bar)
+            own = {**own, "x": at["x_now"]}
+            self._faces.add(context, self.bar, context.fields.named(), solver.around, u=self._f, spread=new["c"])
+            self._faces.add(context, self.bar, solver.around, own, weighted=self._n_now_bar)
+            densities = partial(repair_solid_kernel, solver.discretisation)
+            self.bar.solids.add(context.launch, densities, *known, own)
         add(self._x_now_bar, self._x_moved_bar)
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
@@ -280,6 +285,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         steps = {"f": self._f, "T": self._pull, "y": at["y"]}
         context.launch(velocity.own_adjoint, *known, found, steps)
         context.launch(velocity.velocity.adjoint, *known, steps, y_bar=y_bar)
+        self._faces.add(context, self.bar, context.fields.named(), solver.around, u=self._f, spread=at["y"])
 
     def _back(
         self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], beta: float, moves: bool
@@ -301,5 +307,7 @@ class ProjectionAdjoint(ParticleAdjoint):
     ) -> None:
         """Turn the adjoints d_bar and S in ``steps`` into that of u, by a kernel for one of the two kinds of S."""
         context.launch(kernel, *known, at, steps, u_bar=self._u_bar)
+        around = context.fields.named(), self._solver.around
+        self._faces.add(context, self.bar, *around, u=at["u"], spread=steps["d_bar"])
         if self._bodies is not None:
             self._bodies.drifted(context, self.bar, self._around["drift_bar"], at["y"], self._y_bar)

@@ -43,7 +43,7 @@ import warp as wp
 
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import image_sum, solid_sum
+from cortado.particles.pair_sums import image_sum, mirror_sum
 from cortado.solvers.projection.walls import DIRECTION, normal_part
 from cortado.sph.moment_functions import matrix_type, moment_functions
 
@@ -214,10 +214,6 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
     return EffectFunctions(weights, correction, inverse, diagonal, share, back)
 
 
-CONTAINER = -1
-"""Number of the container in place of a solid's."""
-NOTHING = -(2**31)
-"""A number that no solid has."""
 EVEN = (0.7, 0.9)
 """The images' part in the density over that of wall particles, below which images do not count, and above which they
 count wholly. From 0.5 to 0.8 waves are the same, but spray that is thrown at a wall in long steps passes it."""
@@ -242,18 +238,21 @@ class ImageSums:
     spread: Any
     """sum (u_i - R u_j) . g_i'"""
     spread_tangent: Any
+    sweep: Any
+    """sum g_i' . (what mirrors have swept), where solids move."""
+    sweep_tangent: Any
     walls: Any
-    """Sums over the walls of the solid ``mirror_of`` a position, which mirror: along their normals, and nu."""
+    """Sums over walls that mirror about a position: along their normals, nu, and the drift along their normals."""
     walls_tangent: Any
     walls_back: Any
-    """The adjoint of x from those of both sums over mirroring walls."""
+    """The adjoint of x from those of the sums over mirroring walls."""
     behind: Any
     """The wall coverage nu alone."""
     behind_tangent: Any
     behind_back: Any
     """The gradient of nu."""
     mirror_of: Any
-    """The number of the container, or of nothing where no wall mirrors."""
+    """The number of the walls that mirror about a position."""
 
 
 @cache
@@ -262,7 +261,7 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
-    normal, near_mirrors = normal_part(discretisation), pair.near_mirrors
+    normal, mirror_of = normal_part(discretisation), pair.mirror_of
 
     @image_sum(discretisation)
     def image_weights(x_ij: vector, s: neighbourhood) -> real:
@@ -314,43 +313,68 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
         bent = wp.dot(hessian_product(x_ij, x_dot_ij, s), u_ij)
         return s.volume * (wp.dot(gradient(x_ij, s), u_dot_ij) + bent)
 
-    @solid_sum(discretisation)
-    def mirror_walls(x_ij: vector, foot: vector, solid: int, s: neighbourhood) -> tuple[vector, real]:
-        return s.volume * normal(gradient(x_ij, s), foot), s.volume * weight(x_ij, s)
+    @image_sum(discretisation)
+    def sweep(x_ij: vector, swept: vector, s: neighbourhood) -> real:
+        return s.volume * wp.dot(gradient(x_ij, s), swept)
 
-    @solid_sum(discretisation)
+    @image_sum(discretisation)
+    def sweep_tangent(x_ij: vector, x_dot_ij: vector, swept: vector, swept_dot: vector, s: neighbourhood) -> real:
+        bent = wp.dot(hessian_product(x_ij, x_dot_ij, s), swept)
+        return s.volume * (wp.dot(gradient(x_ij, s), swept_dot) + bent)
+
+    @mirror_sum(discretisation)
+    def mirror_walls(
+        x_ij: vector, v_j: vector, foot: vector, mirrors: int, s: neighbourhood
+    ) -> tuple[vector, real, real]:
+        part = s.volume * normal(gradient(x_ij, s), foot)
+        return part, s.volume * weight(x_ij, s), wp.dot(part, v_j)
+
+    @mirror_sum(discretisation, grows=mirror_walls)
     def mirror_walls_tangent(
-        x_ij: vector, x_dot_i: vector, foot: vector, solid: int, s: neighbourhood
-    ) -> tuple[vector, real]:
-        """Return the tangent of the sums over mirroring walls, which are at rest."""
-        bent = normal(hessian_product(x_ij, x_dot_i, s), foot)
-        return s.volume * bent, s.volume * wp.dot(gradient(x_ij, s), x_dot_i)
+        x_ij: vector,
+        x_dot_ij: vector,
+        v_j: vector,
+        v_dot_j: vector,
+        foot: vector,
+        turn_dot: vector,
+        mirrors: int,
+        s: neighbourhood,
+    ) -> tuple[vector, real, real]:
+        rest, g = x_dot_ij - wp.cross(turn_dot, x_ij), s.volume * gradient(x_ij, s)
+        part = normal(g, foot)
+        part_dot = normal(s.volume * hessian_product(x_ij, rest, s), foot) + wp.cross(turn_dot, part)
+        return part_dot, wp.dot(g, rest), wp.dot(part_dot, v_j) + wp.dot(part, v_dot_j)
 
-    @solid_sum(discretisation)
+    @mirror_sum(discretisation)
     def mirror_walls_back(
-        x_ij: vector, mirror_bar_i: vector, behind_bar_i: real, foot: vector, solid: int, s: neighbourhood
+        x_ij: vector,
+        v_j: vector,
+        mirror_bar_i: vector,
+        behind_bar_i: real,
+        sweep_bar_i: real,
+        foot: vector,
+        mirrors: int,
+        s: neighbourhood,
     ) -> vector:
-        bent = hessian_product(x_ij, normal(mirror_bar_i, foot), s)
+        """Return the adjoint of x by those of the sums; that of the drift is -``sweep_bar``."""
+        bent = hessian_product(x_ij, normal(mirror_bar_i - sweep_bar_i * v_j, foot), s)
         return s.volume * (bent + behind_bar_i * gradient(x_ij, s))
 
-    @solid_sum(discretisation)
-    def behind(x_ij: vector, solid: int, s: neighbourhood) -> real:
+    @mirror_sum(discretisation)
+    def behind(x_ij: vector, mirrors: int, s: neighbourhood) -> real:
         return s.volume * weight(x_ij, s)
 
-    @solid_sum(discretisation)
-    def behind_tangent(x_ij: vector, x_dot_i: vector, solid: int, s: neighbourhood) -> real:
-        return s.volume * wp.dot(gradient(x_ij, s), x_dot_i)
+    @mirror_sum(discretisation, grows=behind)
+    def behind_tangent(x_ij: vector, x_dot_ij: vector, mirrors: int, s: neighbourhood) -> real:
+        return s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
 
-    @solid_sum(discretisation)
-    def behind_back(x_ij: vector, solid: int, s: neighbourhood) -> vector:
+    @mirror_sum(discretisation)
+    def behind_back(x_ij: vector, mirrors: int, s: neighbourhood) -> vector:
         return s.volume * gradient(x_ij, s)
-
-    @wp.func
-    def mirror_of(x: vector, s: neighbourhood) -> int:
-        return wp.where(near_mirrors(x, s) > 0, CONTAINER, NOTHING)
 
     return ImageSums(
         *(image_weights, image_weights_tangent, lift, lift_tangent, lift_back, echo, spread, spread_tangent),
+        *(sweep, sweep_tangent),
         *(mirror_walls, mirror_walls_tangent, mirror_walls_back, behind, behind_tangent, behind_back, mirror_of),
     )
 

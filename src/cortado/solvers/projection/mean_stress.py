@@ -29,7 +29,7 @@ from cortado.particles.pair_sums import fluid_sum, image_sum
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.particles.state import Layout
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm
-from cortado.solvers.projection.effects import CONTAINER
+from cortado.solvers.projection.faces import FaceShares
 from cortado.solvers.projection.walls import normal_part
 from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
@@ -44,7 +44,8 @@ class MeanStress:
     """The mean normal stress dt p of the sorted particles of a step, with its derivatives. ``around`` is what surrounds
     them (`cortado.solvers.projection.surroundings`), and ``at`` has k and T of the last iteration."""
 
-    def __init__(self, discretisation: Discretisation, layout: Layout, dimension: int):
+    def __init__(self, discretisation: Discretisation, layout: Layout, dimension: int, faces: int):
+        self._faces = FaceShares(discretisation, layout, faces)
         self._kernels = mean_stress_kernels(discretisation, dimension)
         self._reach = WallSums(reach_term(discretisation), layout)
         self._mirrors = WallSums(mirror_term(discretisation), layout)
@@ -53,7 +54,7 @@ class MeanStress:
     def impulses(self, context: StepContext, around: Named, at: Named) -> wp.array:
         """Return the mean normal stress times the time step, dt p (n,) [Pa s]."""
         found, reach = self._arrays["q"], self._reach.total(context, ALL_WALLS, around)
-        mirrors = self._mirrors.total(context, CONTAINER, around)
+        mirrors = self._mirrors.total(context, ALL_WALLS, around)
         context.launch(self._kernels.forward, around, at, reach=reach, mirrors=mirrors, q=found)
         return found
 
@@ -61,8 +62,8 @@ class MeanStress:
         """Return the tangent (n,) of the stress impulses dt p; ``around`` and ``at`` come with their tangents."""
         reach = self._reach.total(context, ALL_WALLS, *around)
         reach_dot = self._reach.tangent(context, dot, ALL_WALLS, *around)
-        mirrors = self._mirrors.total(context, CONTAINER, *around)
-        mirrors_dot = self._mirrors.tangent(context, dot, CONTAINER, *around)
+        mirrors = self._mirrors.total(context, ALL_WALLS, *around)
+        mirrors_dot = self._mirrors.tangent(context, dot, ALL_WALLS, *around)
         found, walls = self._arrays["q"], {"reach": reach, "mirrors": mirrors}
         walls |= {"reach_dot": reach_dot, "mirrors_dot": mirrors_dot}
         context.launch(self._kernels.tangent, *dot.named, *around, at, walls, q_dot=found)
@@ -72,11 +73,12 @@ class MeanStress:
         """Add to the adjoints of k, of particles and of ``around`` from that of the stress, ``q_bar`` in ``at``."""
         own, pairs = self._kernels.adjoint
         reach, reach_bar = self._reach.total(context, ALL_WALLS, *around), self._arrays["reach_bar"]
-        mirrors = self._mirrors.total(context, CONTAINER, *around)
+        mirrors = self._mirrors.total(context, ALL_WALLS, *around)
         context.launch(own, *bar.named, at, reach=reach, mirrors=mirrors, reach_bar=reach_bar)
         context.launch(pairs, *bar.named, *around, at)
         self._reach.adjoint(context, bar, ALL_WALLS, reach_bar, reach_bar, *around)
-        self._mirrors.adjoint(context, bar, CONTAINER, reach_bar, reach_bar, *around)
+        self._faces.add(context, bar, *around, k=at["k"], q=at["q_bar"])
+        self._mirrors.adjoint(context, bar, ALL_WALLS, reach_bar, reach_bar, *around)
 
 
 def spread_term(d: Discretisation) -> Any:
@@ -186,9 +188,15 @@ def _mirror_work(d: Discretisation) -> Any:
     real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
 
     def mirror_work(
-        x_ij: vector, image_i: real, reach_bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)
+        x_ij: vector,
+        image_i: real,
+        reach_bar_i: vector,
+        mirrored: real,
+        foot: vector,
+        s: neighbourhood_type(d.precision),
     ) -> real:
-        return -wp.dot(s.volume * normal(gradient(x_ij, s), foot), x_ij - foot) * image_i * reach_bar_i[0]
+        part = s.volume * normal(gradient(x_ij, s), foot)
+        return -mirrored * wp.dot(part, x_ij - foot) * image_i * reach_bar_i[0]
 
     return mirror_work
 

@@ -16,14 +16,16 @@ neighbours of the start.
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import warp as wp
 
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
-from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.particle_kernels import over, particle_kernel
+from cortado.particles.wall_terms import solid_kernel
 from cortado.solvers.projection.effects import image_sums, weights_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
@@ -80,7 +82,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         a sum and a maximum)."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x_now, s)
-        surplus = image_weights(i, x_now, s) - behind(i, x_now, mirror_of(x_now[i], s), s)
+        surplus = image_weights(i, x_now, s) - behind(i, x_now, mirror_of(x_now[i], i // s.particles, s), s)
         if lane() > 0:
             return
         over = s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - real(1.0)
@@ -98,7 +100,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     def measure_tangent(s, omega: real, of, dot, x_now, x_now_dot, c_in, c_in_dot, excess, c_out_dot):
         i = s.first + wp.tid() // LANES
         total = s.volume * weights_tangent(i, x_now, x_now_dot, s)
-        solid = mirror_of(x_now[i], s)
+        solid = mirror_of(x_now[i], i // s.particles, s)
         surplus = image_weights(i, x_now, s) - behind(i, x_now, solid, s)
         change = image_weights_tangent(i, x_now, x_now_dot, s) - behind_tangent(i, x_now, x_now_dot, solid, s)
         if lane() > 0:
@@ -116,7 +118,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     def measure_adjoint(s, x_now, image, n_now_bar, image_bar, x_now_bar):
         i = s.first + wp.tid() // LANES
         total = weights_adjoint(i, x_now, n_now_bar, s)
-        solid = mirror_of(x_now[i], s)
+        solid = mirror_of(x_now[i], i // s.particles, s)
         surplus = image_weights(i, x_now, s) - behind(i, x_now, solid, s)
         lifted, walled = lift(i, x_now, n_now_bar, image, s), behind_back(i, x_now, solid, s)
         if lane() > 0:
@@ -185,3 +187,19 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         Kernels(measure, measure_tangent, measure_adjoint),
         Kernels(move, move_tangent, (begin_adjoint, move_adjoint)),
     )
+
+
+def repair_solid_kernel(discretisation: Discretisation) -> Any:
+    """Make the kernel from the adjoints of densities n(x_k) to those of solids (`SolidShares.add`)."""
+    return solid_kernel(discretisation, "projection", _work)
+
+
+def _work(d: Discretisation) -> Any:
+    real, vector, weight = d.precision.real, d.precision.vector, pair_functions(d).weight
+
+    def repair_work(
+        x_ij: vector, n_now_bar_i: real, image_i: real, mirrored: real, s: neighbourhood_type(d.precision)
+    ) -> real:
+        return s.volume * weight(x_ij, s) * (real(1.0) - mirrored * image_i) * n_now_bar_i
+
+    return repair_work

@@ -36,6 +36,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from cortado.device.grid import Grid
@@ -49,6 +50,7 @@ from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.coarse import Coarse
 from cortado.solvers.projection.effects import effect_functions, weights_type
+from cortado.solvers.projection.image_loads import ImageLoads
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.mean_stress import MeanStress, pressed_kernels
 from cortado.solvers.projection.pressure import PressureKernels, beginning_kernels, pressure_kernels
@@ -262,7 +264,7 @@ class ProjectionSteps(ParticleSolver):
 
     def new_density(self) -> Surroundings:
         own = self.discretisation, self.layout, self.topic, self.system.walled.dimension
-        return Surroundings(*own, self.constants)
+        return Surroundings(*own, self.constants, len(self.system.faces.solids))
 
     @property
     def around(self) -> dict[str, wp.array]:
@@ -272,6 +274,10 @@ class ProjectionSteps(ParticleSolver):
     def wall_push(self) -> ProjectionPush:
         own = self.discretisation, self.layout, self.constants, self.lattice.volume
         return ProjectionPush(*own, self.system.walled.dimension)
+
+    def image_loads(self) -> ImageLoads | None:
+        mirrors = np.isfinite(self.system.mirrors).any() or len(self.system.faces.solids)
+        return ImageLoads(self.density) if mirrors else None
 
     @cached_property
     def relaxed(self) -> dict[str, float]:
@@ -339,7 +345,8 @@ class ProjectionSteps(ParticleSolver):
     @cached_property
     def mean_stress(self) -> MeanStress:
         """Make the kernels and arrays of mean stresses when stresses are first asked for."""
-        return MeanStress(self.discretisation, self.layout, self.system.walled.dimension)
+        own = self.discretisation, self.layout, self.system.walled.dimension
+        return MeanStress(*own, len(self.system.faces.solids))
 
     @property
     def parameters(self) -> Parameters:

@@ -13,6 +13,7 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.state import Layout
 from cortado.solvers.projection.effects import effect_functions, image_share, image_sums, weights_type
+from cortado.solvers.projection.faces import FaceShares
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.sums import APART, projection_sums
 from cortado.solvers.projection.walls import beside_solid_kernel, beside_sums, edge_functions
@@ -26,7 +27,7 @@ def entries(precision: Precision) -> dict[str, Any]:
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
     own |= {"normal": vector, "whole": vector, "normal_drift": real, "whole_drift": real, "edge": real}
-    own |= {"beside": vector, "mirror": vector, "behind": real, "images": real, "image": real}
+    own |= {"beside": vector, "mirror": vector, "behind": real, "images": real, "image": real, "sweep": real}
     own |= {"crowd": vector, "apart": vector, "L": matrix, "a": real}
     return {**own, "weights": weights_type(precision), "coarse": real}
 
@@ -49,7 +50,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     mirrors = image_sums(discretisation)
     image_weights, image_weights_tangent, echo = mirrors.weights, mirrors.weights_tangent, mirrors.echo
     mirror_walls, mirror_walls_tangent, mirror_walls_back = mirrors.walls, mirrors.walls_tangent, mirrors.walls_back
-    mirror_of = mirrors.mirror_of
+    mirror_of, sweep, sweep_tangent = mirrors.mirror_of, mirrors.sweep, mirrors.sweep_tangent
     topic = f"projection_{dimension}d"
     module, tangent_module, adjoint_module = discretisation.modules(topic)
     own, packed = moment_functions(precision, dimension), symmetric(precision)
@@ -64,7 +65,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     image_of = image_share(precision, dimension, module)[0]
     image_along = image_share(precision, dimension, tangent_module)[1]
     image_back = image_share(precision, dimension, adjoint_module)[1]
-    around, bars = bundle(**entries(precision)), bundle(**bar_entries(precision))
+    around, bars = bundle(time_step=real, **entries(precision)), bundle(**bar_entries(precision))
     LANES, lane = discretisation.lanes, discretisation.lane
 
     typed = TypesByName(real, {neighbourhood: "s", vector: "x v", around: "of dot", bars: "bar", six: "M Q"})
@@ -77,7 +78,9 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         diagonal, others, square, mixed, g, crowd, apart, near = moments(i, x, m, per_nearest, per_apart, s)
         normal, entire, nu, normal_drift, whole_drift = beside(i, x, v, s)
         images = image_weights(i, x, s)
-        mirror, behind = mirror_walls(i, x, mirror_of(x[i], s), s)
+        mirror, behind, swept = mirror_walls(i, x, v, mirror_of(x[i], i // s.particles, s), s)
+        if wp.static(discretisation.moving):
+            swept = sweep(i, x, s) / of.time_step[i // s.particles] - swept
         if lane() > 0:
             return
         e, h = edge(normal, entire, least), image_of(images, behind, nu)
@@ -95,7 +98,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of.behind[i] = behind
         of.images[i] = images
         of.image[i] = h
-        of.drift[i] = normal_drift + e * (whole_drift - normal_drift)
+        of.drift[i] = normal_drift + e * (whole_drift - normal_drift) + h * swept
+        of.sweep[i] = swept
         of.normal[i] = normal
         of.whole[i] = entire
         of.normal_drift[i] = normal_drift
@@ -123,7 +127,14 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         )
         normal_dot, whole_dot, nu_i_dot, normal_drift_dot, whole_drift_dot = beside_tangent(i, x, x_dot, v, v_dot, s)
         images_i_dot = image_weights_tangent(i, x, x_dot, s)
-        mirror_i_dot, behind_i_dot = mirror_walls_tangent(i, x, x_dot, mirror_of(x[i], s), s)
+        mirror_i_dot, behind_i_dot, swept_dot = mirror_walls_tangent(
+            i, x, x_dot, v, v_dot, mirror_of(x[i], i // s.particles, s), s
+        )
+        if wp.static(discretisation.moving):
+            dt = of.time_step[i // s.particles]
+            swept_dot = (
+                sweep_tangent(i, x, x_dot, s) - sweep(i, x, s) * dot.time_step[i // s.particles] / dt
+            ) / dt - swept_dot
         if lane() > 0:
             return
         e, off = of.edge[i], of.whole[i] - of.normal[i]
@@ -133,7 +144,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         h, h_dot = of.image[i], by_images * images_i_dot + by_behind * behind_i_dot + by_all * nu_i_dot
         gamma_i_dot = normal_dot + e * (whole_dot - normal_dot) + e_dot * off
         drift_i_dot = normal_drift_dot + e * (whole_drift_dot - normal_drift_dot)
-        drift_i_dot += e_dot * (of.whole_drift[i] - of.normal_drift[i])
+        drift_i_dot += e_dot * (of.whole_drift[i] - of.normal_drift[i]) + h * swept_dot + h_dot * of.sweep[i]
         M_i_dot, Q_i_dot = change(diagonal, others), change(square, mixed)
         M, Q, g, gamma, nu, m_i = of.M[i], of.Q[i], of.g[i], of.beside[i], of.nu[i], m[i]
         L_dot, weights_dot, a_dot, coarse_dot = matrix(), weights4(), real(0.0), real(0.0)
@@ -204,10 +215,11 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         Q_pull[i] = pack(Q_bar)
         bar.g[i] = bar.g[i] + g_bar
         h, h_bar = of.image[i], bar.image[i] - wp.dot(bar.gamma[i], of.mirror[i])
-        h_bar += n_bar[i] * (of.images[i] - of.behind[i])
+        h_bar += n_bar[i] * (of.images[i] - of.behind[i]) + bar.drift[i] * of.sweep[i]
         by_images, by_behind, by_all = image_back(of.images[i], of.behind[i], of.nu[i])
         bar.nu[i] = bar.nu[i] + nu_bar + n_bar[i] + by_all * h_bar
         bar.mirror[i] = mirror_bar - h * bar.gamma[i]
+        bar.sweep[i] = h * bar.drift[i]
         bar.images[i] = h * n_bar[i] + by_images * h_bar
         bar.behind[i] = behind_bar - h * n_bar[i] + by_behind * h_bar
         push_bar, drift_bar, e = bar.gamma[i] + bar.beside[i] + gamma_bar, bar.drift[i], of.edge[i]
@@ -227,7 +239,9 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
             i, x, m, M_pull, Q_pull, bar.g, bar.crowd, bar.apart, n_bar, per_nearest, per_apart, s
         )
         wall_part = beside_back(i, x, v, bar.normal, bar.whole, bar.nu, bar.normal_drift, bar.whole_drift, s)
-        wall_part += mirror_walls_back(i, x, bar.mirror, bar.behind, mirror_of(x[i], s), s) + echo(i, x, bar.images, s)
+        mirrors = mirror_of(x[i], i // s.particles, s)
+        wall_part += mirror_walls_back(i, x, v, bar.mirror, bar.behind, bar.sweep, mirrors, s)
+        wall_part += echo(i, x, bar.images, s)
         if lane() > 0:
             return
         x_bar[i] = x_bar[i] + x_part + wall_part
@@ -240,10 +254,16 @@ class Surroundings(Density):
     """The measurement of the number density n and of all surroundings that the projection needs."""
 
     def __init__(
-        self, discretisation: Discretisation, layout: Layout, topic: str, dimension: int, constants: ProjectionConstants
+        self,
+        discretisation: Discretisation,
+        layout: Layout,
+        topic: str,
+        dimension: int,
+        constants: ProjectionConstants,
+        faces: int,
     ):
         super().__init__(discretisation, topic, surrounding_kernels(discretisation, dimension))
-        self.layout = layout
+        self.layout, self.faces = layout, faces
         self.around = layout.arrays(**entries(layout.precision))
         per_nearest, per_apart = 1.0 / constants.nearest_weight, (APART * constants.spacing) ** -2
         self.constants = {"least": constants.least_diagonal, "per_nearest": per_nearest, "per_apart": per_apart}
@@ -285,6 +305,7 @@ class SurroundingsAdjoint(DensityAdjoint):
         super().__init__(surroundings)
         precision = surroundings.layout.precision
         self.around = surroundings.layout.arrays("_bar", **bar_entries(precision))
+        self._faces = FaceShares(surroundings.discretisation, surroundings.layout, surroundings.faces)
         six = symmetric(precision).kind
         self._moments = surroundings.layout.arrays("_pull", M=six, Q=six)
 
@@ -298,3 +319,5 @@ class SurroundingsAdjoint(DensityAdjoint):
         for kernel in own.kernels.adjoint:
             context.launch(kernel, *known, self._moments, own.constants)
         bar.solids.add(context.launch, partial(beside_solid_kernel, own.discretisation), *known)
+        images = {"density": self.around["images_bar"], "swept": self.around["sweep_bar"]}
+        self._faces.add(context, bar, context.fields.named(), own.around, images)

@@ -179,13 +179,18 @@ def _work(d: Discretisation) -> Any:
         nu_bar_i: real,
         normal_drift_bar_i: real,
         whole_drift_bar_i: real,
+        mirror_bar_i: vector,
+        behind_bar_i: real,
+        sweep_bar_i: real,
+        mirrored: real,
         foot: vector,
         s: neighbourhood_type(d.precision),
     ) -> real:
-        whole = gradient(x_ij, s)
-        part = wp.dot(normal(whole, foot), normal_bar_i + normal_drift_bar_i * v_j)
+        """Also of the sums over walls that mirror, whose drift has the adjoint -``sweep_bar``."""
+        whole, by_mirror = gradient(x_ij, s), mirrored * (mirror_bar_i - sweep_bar_i * v_j)
+        part = wp.dot(normal(whole, foot), normal_bar_i + normal_drift_bar_i * v_j + by_mirror)
         part += wp.dot(whole, whole_bar_i + whole_drift_bar_i * v_j)
-        return s.volume * (part + nu_bar_i * weight(x_ij, s))
+        return s.volume * (part + (nu_bar_i + mirrored * behind_bar_i) * weight(x_ij, s))
 
     return beside_work
 

@@ -1,0 +1,314 @@
+"""Mirrors: flat walls whose images of the fluid stand in place of wall particles.
+
+An image of particle j is what a flat wall mirrors, or two or three sides of the container that meet. A reflection of
+the container has a bit for each side: 1, 2 and 4 for those at the lower ends of the axes, 8, 16 and 32 for the upper
+ones. Beyond these numbers, from `FACES` on, are the flat faces of solids that move. A reflection is x -> R x + o, with
+R diagonal at the container. Seen from particle i, the image of j is where the image of i sees j, so that every image
+that i can see is one of its neighbours, or its own. In lists of neighbours the image of j by a reflection has the
+number ``reflections j + reflection``. A wall mirrors what is in front of it, for what is in front of it, and not a
+column that waits behind it to come out of an opening; a face mirrors no further than `reach` beyond its edges.
+
+A solid takes the points x of a face to x' from c_0 + Q (x - c) = x - D(x), with its middle c, at c_0 before the step,
+and Q = R_0 R^T. An image moves by R u + (D(R x + o) - R D(x)) / dt where its particle moves by u: the second part,
+times dt, is what the face has ``swept``. Where the pose of a solid changes by c', w' and g' (`MovingWalls`), so do D by
+what follows from it, images by t(R x + o) - R t(x) with t(x) = c' + w' x (x - c) + g' (x - c), and mirrored vectors by
+w' x R u - R (w' x u).
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from cortado.device.precision import Precision
+
+FACES, MOST_FACES = 64, 64
+"""Number of the first face's reflection, one above all bits of the container's; and how many faces there may be."""
+NUMBERS = 2**31
+"""Images have numbers below it."""
+CONTAINER = -1
+"""Number of the container in place of a solid's."""
+NOTHING = ALL_WALLS = -NUMBERS
+"""A number that no solid has. It stands in its place for nothing, or for the walls of all solids and the container."""
+
+
+def reflections(moving: bool) -> int:
+    """Return a number above those of all reflections, where solids move or where none does."""
+    return FACES + MOST_FACES * moving
+
+
+def most_imaged(moving: bool) -> int:
+    """Return how many particles may have images with numbers of their own."""
+    return (NUMBERS - 1) // reflections(moving)
+
+
+OVER_IMAGES = """\
+    _member = i // s.particles
+    for _place in range(s.count[i] + _lane(), s.all_count[i], _LANES):
+        _image = _neighbour(_place, i, s)
+        _j, _one = _image // _REFLECTIONS, _image % _REFLECTIONS
+        _R, _offset = _reflection(_one, _member, s)
+        _x_ij = _separation(_x_i, _turned(_R, x[_j]) + _offset, s)
+        {body}
+"""
+"""The text of a loop over images, see `cortado.particles.pair_sums`."""
+OF_IMAGES = {
+    "swept": "_swept(_one, x[_j], _member, s)",
+    "swept_dot": "_swept_dot(_one, x[_j], x_dot[_j], _member, s)",
+    "owned": "wp.where(_mirrors_by(_one, solid, s), _real(1.0), _real(0.0))",
+}
+"""Names of an image's data in terms of images, with their texts."""
+
+
+def mirror_functions(precision: Precision, moving: bool, neighbourhood: Any) -> dict[str, Any]:
+    """Make Warp functions of mirrors by name, in scenes where solids move or where none does, for positions in scene
+    ``member``.
+
+    ``sides`` has the bits of the container's sides that a position is in front of and within reach of. ``sees`` tells
+    whether it is so of the walls of a reflection, ``shows`` whether it is in front of them; ``last_reflection`` is the
+    last that it may see, or 0. ``reflection`` has R and o, and ``turned`` R a. ``mirror_of`` numbers the walls that
+    mirror about a position, ``mirrors_in`` tells whether a wall particle is theirs, and ``mirrors_by`` whether a
+    reflection is by a solid. ``swept``, ``image_dot``, ``turned_dot`` and ``swept_dot`` are there where solids move.
+    """
+    container = _container(precision, neighbourhood)
+    own = (_with_faces if moving else _without)(precision, neighbourhood, container)
+    return {one.func.__name__: one for one in (container.sides, *own)}
+
+
+@cache
+def _container(precision: Precision, neighbourhood: Any) -> SimpleNamespace:
+    """Make Warp functions of the container's sides alone."""
+    real, vector = precision.real, precision.vector
+
+    @wp.func
+    def near_mirrors(x: vector, s: neighbourhood) -> int:
+        """Return the bits of the container's sides within reach of a position, on either side of them."""
+        found = int(0)
+        for axis in range(3):
+            if x[axis] - s.mirror_lower[axis] < s.reach:
+                found = found | (1 << axis)
+            if s.mirror_upper[axis] - x[axis] < s.reach:
+                found = found | (8 << axis)
+        return found
+
+    @wp.func
+    def before_mirrors(x: vector, s: neighbourhood) -> int:
+        """Return the bits of the container's sides that a position is in front of."""
+        found = int(0)
+        for axis in range(3):
+            if x[axis] >= s.mirror_lower[axis]:
+                found = found | (1 << axis)
+            if x[axis] <= s.mirror_upper[axis]:
+                found = found | (8 << axis)
+        return found
+
+    @wp.func
+    def reflects(bits: int, near: int) -> bool:
+        """Test that bits are those of a reflection in near walls; opposite walls do not mirror each other's images."""
+        return (bits & near) == bits and (bits & (bits >> 3)) == 0
+
+    @wp.func
+    def side_reflection(bits: int, s: neighbourhood):
+        flip, offset = vector(real(1.0), real(1.0), real(1.0)), vector()
+        for axis in range(3):
+            lower, upper = (bits >> axis) & 1, (bits >> (axis + 3)) & 1
+            if lower + upper == 1:
+                flip[axis] = real(-1.0)
+                offset[axis] = real(2.0) * wp.where(lower == 1, s.mirror_lower[axis], s.mirror_upper[axis])
+        return flip, offset
+
+    @wp.func
+    def sides(x: vector, s: neighbourhood) -> int:
+        return near_mirrors(x, s) & before_mirrors(x, s)
+
+    return SimpleNamespace(
+        near_mirrors=near_mirrors,
+        before_mirrors=before_mirrors,
+        reflects=reflects,
+        side_reflection=side_reflection,
+        sides=sides,
+    )
+
+
+def _without(precision: Precision, neighbourhood: Any, container: SimpleNamespace) -> tuple[Any, ...]:
+    vector = precision.vector
+    near_mirrors, before_mirrors, reflects = container.near_mirrors, container.before_mirrors, container.reflects
+    side_reflection = container.side_reflection
+
+    @wp.func
+    def sees(one: int, near: int, x: vector, member: int, s: neighbourhood) -> bool:
+        return reflects(one, near)
+
+    @wp.func
+    def shows(one: int, x: vector, member: int, s: neighbourhood) -> bool:
+        return reflects(one, before_mirrors(x, s))
+
+    @wp.func
+    def last_reflection(near: int, x: vector, member: int, s: neighbourhood) -> int:
+        return near
+
+    @wp.func
+    def reflection(one: int, member: int, s: neighbourhood):
+        flip, offset = side_reflection(one, s)
+        return flip, offset
+
+    @wp.func
+    def turned(flip: vector, a: vector) -> vector:
+        return wp.cw_mul(flip, a)
+
+    @wp.func
+    def mirror_of(x: vector, member: int, s: neighbourhood) -> int:
+        return wp.where(near_mirrors(x, s) > 0, CONTAINER, NOTHING)
+
+    @wp.func
+    def mirrors_in(b: int, mirrors: int, s: neighbourhood) -> bool:
+        return s.wall_solids[b] == mirrors
+
+    @wp.func
+    def mirrors_by(one: int, solid: int, s: neighbourhood) -> bool:
+        return solid == ALL_WALLS
+
+    return sees, shows, last_reflection, reflection, turned, mirror_of, mirrors_in, mirrors_by
+
+
+def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNamespace) -> tuple[Any, ...]:
+    real, vector, matrix = precision.real, precision.vector, wp.types.matrix(shape=(3, 3), dtype=precision.real)
+    near_mirrors, before_mirrors, reflects = container.near_mirrors, container.before_mirrors, container.reflects
+    side_reflection = container.side_reflection
+
+    @wp.func
+    def place_at(x: vector, f: int, member: int, s: neighbourhood) -> vector:
+        """Return how far a position is in front of a face, and how far from its middle along it."""
+        k = s.face_solids[f]
+        own = wp.transpose(s.turns[member, k]) * (x - s.after[member, k])
+        return s.face_frames[f] * (own - s.scales[member, k] * s.face_places[f])
+
+    @wp.func
+    def before_face(x: vector, f: int, furthest: real, member: int, s: neighbourhood) -> bool:
+        at, sizes = place_at(x, f, member, s), s.scales[member, s.face_solids[f]] * s.face_sizes[f]
+        beside = wp.abs(at[1]) < sizes[1] + s.reach and wp.abs(at[2]) < sizes[2] + s.reach
+        return at[0] >= real(0.0) and at[0] < furthest and beside
+
+    @wp.func
+    def face_reflection(f: int, member: int, s: neighbourhood):
+        """Return R = I - 2 n n^T and o = 2 n (n . p) of a face."""
+        k = s.face_solids[f]
+        n = s.turns[member, k] * s.face_frames[f][0]
+        p = s.after[member, k] + s.scales[member, k] * (s.turns[member, k] * s.face_places[f])
+        unit = wp.diag(vector(real(1.0), real(1.0), real(1.0)))
+        return unit - real(2.0) * wp.outer(n, n), (real(2.0) * wp.dot(n, p)) * n
+
+    @wp.func
+    def sees(one: int, near: int, x: vector, member: int, s: neighbourhood) -> bool:
+        if one < FACES:
+            return reflects(one, near)
+        return before_face(x, one - FACES, s.reach, member, s)
+
+    @wp.func
+    def shows(one: int, x: vector, member: int, s: neighbourhood) -> bool:
+        if one < FACES:
+            return reflects(one, before_mirrors(x, s))
+        return before_face(x, one - FACES, real(1e30), member, s)
+
+    @wp.func
+    def last_reflection(near: int, x: vector, member: int, s: neighbourhood) -> int:
+        last = int(near)
+        for f in range(s.faces):
+            if before_face(x, f, s.reach, member, s):
+                last = FACES + f
+        return last
+
+    @wp.func
+    def reflection(one: int, member: int, s: neighbourhood):
+        if one < FACES:
+            flip, shift = side_reflection(one, s)
+            return wp.diag(flip), shift
+        R, offset = face_reflection(one - FACES, member, s)
+        return R, offset
+
+    @wp.func
+    def turned(R: matrix, a: vector) -> vector:
+        return R * a
+
+    @wp.func
+    def mirror_of(x: vector, member: int, s: neighbourhood) -> int:
+        """Return 1 near the container's mirrors, and twice the number of the nearest face in reach, from 1 on."""
+        found, face, nearest = wp.where(near_mirrors(x, s) > 0, 1, 0), int(0), real(s.reach)
+        for f in range(s.faces):
+            if before_face(x, f, nearest, member, s):
+                nearest = place_at(x, f, member, s)[0]
+                face = f + 1
+        return found + 2 * face
+
+    @wp.func
+    def mirrors_in(b: int, mirrors: int, s: neighbourhood) -> bool:
+        if s.wall_solids[b] == CONTAINER:
+            return (mirrors & 1) == 1
+        return mirrors > 1 and s.wall_faces[b] + 1 == mirrors // 2
+
+    @wp.func
+    def carried(x: vector, k: int, member: int, s: neighbourhood) -> vector:
+        """Return D, how far the step has taken the point of a solid that is at x now."""
+        back = s.turns_before[member, k] * (wp.transpose(s.turns[member, k]) * (x - s.after[member, k]))
+        return x - s.before[member, k] - back
+
+    @wp.func
+    def swept(one: int, x: vector, member: int, s: neighbourhood) -> vector:
+        found = vector()
+        if one >= FACES:
+            k = s.face_solids[one - FACES]
+            R, offset = face_reflection(one - FACES, member, s)
+            found = carried(R * x + offset, k, member, s) - R * carried(x, k, member, s)
+        return found
+
+    @wp.func
+    def twist(x: vector, k: int, member: int, s: neighbourhood) -> vector:
+        arm = x - s.after[member, k]
+        grown = s.scales_dot[member, k] / s.scales[member, k]
+        return s.after_dot[member, k] + wp.cross(s.turned_dot[member, k], arm) + grown * arm
+
+    @wp.func
+    def image_dot(one: int, x: vector, x_dot: vector, member: int, s: neighbourhood) -> vector:
+        R, offset = reflection(one, member, s)
+        found = R * x_dot
+        if one >= FACES:
+            k = s.face_solids[one - FACES]
+            found += twist(R * x + offset, k, member, s) - R * twist(x, k, member, s)
+        return found
+
+    @wp.func
+    def turned_dot(one: int, a: vector, a_dot: vector, member: int, s: neighbourhood) -> vector:
+        R, _offset = reflection(one, member, s)
+        found = R * a_dot
+        if one >= FACES:
+            w = s.turned_dot[member, s.face_solids[one - FACES]]
+            found += wp.cross(w, R * a) - R * wp.cross(w, a)
+        return found
+
+    @wp.func
+    def carried_dot(x: vector, x_dot: vector, k: int, member: int, s: neighbourhood) -> vector:
+        Q, w = s.turns_before[member, k] * wp.transpose(s.turns[member, k]), s.turned_dot[member, k]
+        arm = x - s.after[member, k]
+        found = x_dot - s.before_dot[member, k] - wp.cross(s.turned_before_dot[member, k], Q * arm)
+        return found - Q * (x_dot - s.after_dot[member, k] - wp.cross(w, arm))
+
+    @wp.func
+    def swept_dot(one: int, x: vector, x_dot: vector, member: int, s: neighbourhood) -> vector:
+        found = vector()
+        if one >= FACES:
+            k = s.face_solids[one - FACES]
+            R, offset = face_reflection(one - FACES, member, s)
+            end_dot = image_dot(one, x, x_dot, member, s)
+            found = carried_dot(R * x + offset, end_dot, k, member, s)
+            found -= turned_dot(one, carried(x, k, member, s), carried_dot(x, x_dot, k, member, s), member, s)
+        return found
+
+    @wp.func
+    def mirrors_by(one: int, solid: int, s: neighbourhood) -> bool:
+        if one >= FACES:
+            return solid == ALL_WALLS or s.face_solids[one - FACES] == solid
+        return solid == ALL_WALLS
+
+    own = (sees, shows, last_reflection, reflection, turned, mirror_of, mirrors_in, mirrors_by)
+    return (*own, swept, image_dot, turned_dot, swept_dot)

@@ -1,0 +1,154 @@
+"""Flat faces of solids that move mirror the fluid: against the slow twin, theory, differences and momentum."""
+
+import numpy as np
+import pytest
+
+from cortado import Problem, Simulation
+from cortado.gradients import ImplicitPressure
+from cortado.losses import CentreOfMass
+from cortado.sensors import SolidLoad, WallForce
+from finite_differences import both_modes, central_difference
+from reference_projection import Projection
+from scenes import box, pool
+from test_quantities import Weighted
+from test_solid_parameters import check, point_of
+
+S = 0.05
+FLAP = box([-0.5, -0.2], [0.0, 0.8], name="flap", motion="path", velocity=[0.3, 0.05], angular_velocity=-0.6)
+FALL = {"gravity": [0.0, -9.81]}
+STEPS = 5
+
+
+def flume(flap=FLAP, **tables):
+    """Water between a flap that goes through the floor, and the end of a box."""
+    own = {"container": box([-0.8, 0.0], [0.6, 1.0]), "fluid": [box([0.02, 0.0], [0.52, 0.5], phase="water")]}
+    own |= {"forces": FALL, "solver": {"kind": "projection", "time_step": 0.004}}
+    return pool([0.5, 0.5], [0.6, 1.0], S, 1.0, **{"solid": [flap], **own, **tables})
+
+
+def faces_of(scene):
+    return len(Simulation(scene).solver.system.faces.solids)
+
+
+def test_faces_that_mirror():
+    """Both long sides do; others stay as walls of particles."""
+    assert faces_of(flume()) == 2
+    space = {"dimension": 3, "container": box([-0.8, 0.0, 0.0], [0.6, 1.0, 0.2])}
+    space |= {"fluid": [box([0.02, 0.0, 0.0], [0.52, 0.5, 0.2], phase="water")], "forces": {}}
+    wide = box([-0.5, -0.2, 0.0], [0.0, 0.8, 0.2], name="flap", motion="path", velocity=[0.3, 0.0, 0.0])
+    ball = {
+        "name": "ball",
+        "shape": "sphere",
+        "centre": [-0.3, 0.5],
+        "radius": 0.2,
+        "motion": "path",
+        "velocity": [0, 0],
+    }
+    still = {"name": "flap", "shape": "box", "lower": [-0.5, -0.2], "upper": [0.0, 0.8]}
+    for other in (
+        flume({**FLAP, "slip": "no"}),
+        flume({**FLAP, "upper": [0.0, 0.19]}),
+        flume(ball),
+        flume(still),
+        flume({**still, "lower": [-0.5, 0.1], "motion": "free", "density": 500.0}),
+        flume(container=box([-0.8, 0.0], [0.6, 1.0], periodic=[True, False])),
+        flume(solver={"kind": "pcisph", "time_step": 0.004}),
+        flume(wide, **space),
+    ):
+        assert faces_of(other) == 0
+
+
+def test_a_step_is_that_of_the_twin():
+    """Three steps without viscosity beside a flap that moves, turns and is stretched."""
+    simulation = Simulation(flume().replaced("phase[0].viscosity=0"), precision="float64")
+    random, m = np.random.default_rng(1), simulation.state()["reference_density"]
+    x = simulation.positions + 0.005 * random.uniform(-1.0, 1.0, simulation.positions.shape)
+    v, ends, dt = random.normal(scale=0.1, size=x.shape), (np.zeros(len(x)), np.zeros_like(x)), 0.004
+    given = {"initial_positions": x, "initial_velocities": v, "flap.scale": 1.03}
+    for steps in (1, 2, 3):
+        run = simulation.run(steps, given)
+        twin = Projection.of(simulation)
+        h = simulation.solver.around["image"].numpy()
+        assert (h > 0.9).sum() > 15 and ((h > 0.1) & (h < 0.9)).any() and np.ptp(x[h > 0.9], axis=0).min() > 0.3
+        x, v, ends, _ = twin.step(x, v + dt * np.array(FALL["gravity"]), ends, m, dt)
+        np.testing.assert_allclose(run.positions[-1], x, rtol=1e-10, atol=1e-11)
+        np.testing.assert_allclose(run.velocities[-1], v, rtol=1e-10, atol=1e-11)
+
+
+def test_water_at_rest_between_two_faces_stays():
+    """After half a second to a second it moves by 0.032 m/s; with wall particles instead by 0.055."""
+    sides = (("left", -0.4, 0.0), ("right", 1.0, 1.4))
+    solids = [box([a, -0.06], [b, 1.1], name=name, motion="path", velocity=[0.0, 0.0]) for name, a, b in sides]
+    own = {"container": box([-1.0, 0.0], [2.2, 1.2]), "fluid": [box([0.0, 0.0], [1.0, 0.6], phase="water")]}
+    made = flume(solid=solids, discretisation={"spacing": 0.04, "jitter": 0.05}, **own).replaced("phase[0].viscosity=0")
+    late = Simulation(made, precision="float64").run(250, record_every=10).velocities[13:]
+    assert np.sqrt((late**2).sum(axis=2).mean()) < 0.04
+
+
+def test_walls_get_the_momentum_that_the_fluid_loses():
+    """In every step and to round-off, with images in the face and in the container's sides. Of the flap alone but for
+    what the floor takes in the corner."""
+    scene = flume().replaced('forces.viscosity="none"')
+    run = Simulation(scene, precision="float64").run(20, sensors={"walls": WallForce(), "flap": SolidLoad("flap")})
+    push = 1000.0 * S**2 * (np.array(FALL["gravity"]) - np.diff(run.velocities, axis=0) / 0.004)
+    lost, found = push.sum(axis=1), run.sensors["walls"].values[:-1]
+    np.testing.assert_allclose(found[:, :2], lost, atol=1e-10 * np.abs(lost).max())
+    touches_the_flap_alone = (run.positions[:-1, :, 0] < 0.5).all(axis=1)
+    assert touches_the_flap_alone.any()
+    sideways = run.sensors["flap"].values[:-1, 0] - lost[:, 0]
+    np.testing.assert_allclose(sideways[touches_the_flap_alone], 0.0, atol=1e-5 * np.abs(lost).max())
+
+
+@pytest.mark.parametrize("quantity", ["speed", "density", "pressure", "wall_force", "flap.load"])
+def test_derivatives_by_what_the_solid_does(quantity):
+    """Where it is, how it is turned, how it moves and turns, and how large it is: reverse and forward mode to
+    round-off, and differences; of particles, of pressures and of loads."""
+    scene = flume()
+    simulation = Simulation(scene, precision="float64")
+    weights = np.random.default_rng(1).uniform(size=simulation.quantity(quantity).shape)
+    check(Problem(simulation, STEPS, Weighted(quantity, weights)), *point_of(scene))
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_derivatives_by_states_forces_and_steps(precision):
+    simulation = Simulation(flume(), precision=precision)
+    random, x = np.random.default_rng(1), simulation.positions
+    values = {
+        "initial_positions": (x + 0.005 * random.uniform(-1.0, 1.0, x.shape), 0.05),
+        "initial_velocities": (0.1 * random.normal(size=x.shape), 1.0),
+        "gravity": (np.array([0.5, -9.81]), 1.0),
+        "viscosity": (np.array(1.0), 0.3),
+        "time_step": (np.array(0.004), 4e-4),
+        "flap.position": (np.array([-0.25, 0.3]), 0.1),
+    }
+    point = {name: value for name, (value, _) in values.items()}
+    along = {name: size * random.normal(size=value.shape) for name, (value, size) in values.items()}
+    problem = Problem(simulation, 12, CentreOfMass([0.5, 0.3]))
+    _, forward = both_modes(problem, point, along, 1e-10 if precision == "float64" else 1e-3)
+    if precision == "float64":
+        differences = [central_difference(problem.value, point, along, h) for h in (1e-5, 1e-6, 1e-7)]
+        assert min(abs(one / forward - 1.0) for one in differences) < 1e-6
+    else:
+        exact = Problem(Simulation(flume(), precision="float64"), 12, CentreOfMass([0.5, 0.3])).tangent(point, along)
+        assert forward == pytest.approx(exact, rel=1e-2)
+
+
+def test_the_pressure_as_a_fixed_point_has_the_same_gradient():
+    scene = flume().replaced("solver.iterations=8")
+    problem = Problem(Simulation(scene, precision="float64"), 12, CentreOfMass([0.5, 0.3]))
+    point, _ = point_of(scene, 12)
+    gradients = (problem.value_and_gradient(point, gradient=one)[1] for one in (None, ImplicitPressure()))
+    exact, fixed = (gradient["flap.position"] for gradient in gradients)
+    assert exact @ fixed > 0.999 * np.linalg.norm(exact) * np.linalg.norm(fixed)
+
+
+def test_scenes_of_a_batch_have_faces_of_their_own():
+    """To the bit what single scenes have, and their gradients."""
+    paths = np.array([[[0.001, 0.0], [0.002, 0.001]], [[-0.001, 0.0], [-0.001, 0.002]]])
+    alone = Problem(Simulation(flume()), 2, CentreOfMass([0.5, 0.3]))
+    single = [alone.value_and_gradient({"flap.displacement": path}) for path in paths]
+    together = Problem(Simulation(flume(), batch=2), 2, CentreOfMass([0.5, 0.3]))
+    values, gradients = together.value_and_gradient({"flap.displacement": paths})
+    assert [value for value, _ in single] == values.tolist()
+    for (_, gradient), own in zip(single, gradients["flap.displacement"], strict=True):
+        np.testing.assert_array_equal(gradient["flap.displacement"], own)
