@@ -31,8 +31,10 @@ def faces_of(scene):
 
 
 def test_faces_that_mirror():
-    """Both long sides do; others stay as walls of particles."""
+    """Both long sides do, and all of a tank; others stay as walls of particles."""
     assert faces_of(flume()) == 2
+    tank = box([0.0, 0.0], [0.6, 1.0], name="tank", side="inside", motion="path", velocity=[0.1, 0.0])
+    assert faces_of(flume(tank, container={"shape": "none"})) == 4
     space = {"dimension": 3, "container": box([-0.8, 0.0, 0.0], [0.6, 1.0, 0.2])}
     space |= {"fluid": [box([0.02, 0.0, 0.0], [0.52, 0.5, 0.2], phase="water")], "forces": {}}
     wide = box([-0.5, -0.2, 0.0], [0.0, 0.8, 0.2], name="flap", motion="path", velocity=[0.3, 0.0, 0.0])

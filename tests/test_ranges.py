@@ -13,6 +13,7 @@ from cortado import Problem, Simulation, forces, gradients
 from cortado.device import launching
 from cortado.device.launching import KernelLauncher
 from scenes import MIXING, box, jet, plane_of_three, scene, splash, two_layers
+from test_faces import flume
 
 ROOT = Path(cortado.__file__).parent
 APART = "study/one_kernel_loops.py"
@@ -47,6 +48,7 @@ CASES = {
     "velocities that follow": lambda: two_layers(solver=PROJECTION | {"velocities_follow": True}),
     "a solid that moves": lambda: scene(solid=[BALL | ALONG], solver=PROJECTION),
     "a solid that moves, PCISPH, stress": lambda: scene(forces=STRESS, solid=[BALL | ALONG]),
+    "a face that mirrors": flume,
     "a solid that is free": lambda: scene(solid=[BALL | {"motion": "free", "density": 500.0}], solver=PROJECTION),
 }
 
