@@ -40,8 +40,8 @@ METHODS = {"AdjointViscosity": gradients.AdjointViscosity(), "Exact": None, "CEM
 TASKS = {"carry": Carry(), "splash": Splash()}
 JITTER, TESTS, CHECKS = 0.02, 4, 10
 """Of first positions [spacings]; test episodes; how often they are run."""
-RATE, CLIP, EPISODES = 0.03, 1.0, 2
-"""Of Adam; greatest norm of a gradient; episodes of a gradient."""
+RATE, CLIP, EPISODES = 0.02, 1.0, 2
+"""Of Adam at first, falling to 0 by half a cosine; greatest norm of a gradient; episodes of a gradient."""
 POPULATION, ELITE, WIDTH, NARROWEST = 20, 5, 0.5, 0.05
 """Of CEM: policies of a generation, how many of them lead, first and least standard deviation of the weights."""
 Row = dict[str, Any]
@@ -207,12 +207,13 @@ class Job:
     def _adam(self, loop: Loop, value: Any, weights: NDArray[Any], random: Any) -> tuple[Callable[[], Any], float]:
         mapped, seeds = jax.vmap(loop.loss(METHODS[self.method])), len(weights)
         slope = jax.jit(jax.grad(lambda w, x: mapped(jnp.repeat(w, EPISODES, axis=0), x).sum() / EPISODES))
-        optimiser = optax.chain(optax.clip_by_global_norm(CLIP), optax.adam(RATE))
-        memory = [optimiser.init(jnp.asarray(own)) for own in weights]
         x = jnp.asarray(loop.starts(random, seeds * EPISODES), jnp.float32)
         w = jnp.asarray(weights, jnp.float32)
         longer = seconds(self.device, slope, w, x) / seconds(self.device, value, jnp.repeat(w, EPISODES, axis=0), x)
-        now = weights
+        cost, now = EPISODES * loop.steps * longer, weights
+        rate = optax.cosine_decay_schedule(RATE, int(self.budget // cost) or 1)
+        optimiser = optax.chain(optax.clip_by_global_norm(CLIP), optax.adam(rate))
+        memory = [optimiser.init(jnp.asarray(own)) for own in weights]
 
         def update() -> NDArray[Any]:
             nonlocal now
@@ -223,7 +224,7 @@ class Job:
                 now = np.where(np.arange(seeds)[:, None] == b, now + np.asarray(change), now)
             return now
 
-        return update, EPISODES * loop.steps * longer
+        return update, cost
 
     def _cem(self, loop: Loop, value: Any, weights: NDArray[Any], random: Any) -> tuple[Callable[[], Any], float]:
         mean, width = weights, np.full(weights.shape, WIDTH)
