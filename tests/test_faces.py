@@ -60,6 +60,44 @@ def test_faces_that_mirror():
         assert faces_of(other) == 0
 
 
+def dipped(lower, upper=0.8, to=0.0):
+    """A box in a pool, which goes up or down in half a second."""
+    middle = np.array([0.25, 0.5 * (lower + upper)])
+    path = {"times": [0.0, 0.5], "positions": [middle.tolist(), (middle + [0.0, to]).tolist()]}
+    return flume(box([0.0, lower], [0.5, upper], name="box", motion="path", **path))
+
+
+@pytest.mark.parametrize(
+    ("scene", "faces"),
+    [
+        (dipped(0.0), 2),
+        (dipped(-0.1), 2),
+        (dipped(0.1), 0),  # fluid flows around its lower edges
+        (dipped(-0.1, to=0.15), 0),
+        (dipped(0.72, 1.5), 2),
+        (dipped(0.72, 1.5, to=-0.3), 0),
+        (dipped(0.0, 0.525), 0),  # and over its upper ones
+        (flume(box([-0.5, 0.1], [0.0, 0.8], name="flap", motion="path", angular_velocity=-0.6)), 0),
+        (flume(box([-0.1, 0.05], [0.55, 0.95], name="tank", side="inside", motion="path", velocity=[0.1, 0.0])), 4),
+    ],
+)
+def test_faces_around_whose_ends_fluid_flows_do_not_mirror(scene, faces):
+    assert faces_of(scene) == faces
+
+
+def test_water_beside_a_box_that_hangs_in_it_moves_as_beside_wall_particles():
+    """Where its faces mirrored up to their ends, it moved twice as fast."""
+    rest = {"solver": {"kind": "projection", "time_step": 0.002}, "discretisation": {"spacing": 0.02}}
+    tank = {"container": box([0.0, 0.0], [1.0, 1.0]), "fluid": [box([0.0, 0.0], [1.0, 0.5], phase="water")]}
+    boxes = [box([0.4, 0.06], [0.6, 0.8], name="box", motion="path", velocity=[0.0, 0.0]), box([0.4, 0.06], [0.6, 0.8])]
+    speeds = []
+    for one in boxes:
+        scene = flume({"name": "box", **one}, **tank, **rest)
+        run = Simulation(scene).run(120, record_every=20)
+        speeds.append(np.sqrt((run.velocities[3:] ** 2).mean()))
+    assert speeds[0] < 1.3 * speeds[1]
+
+
 def test_a_step_is_that_of_the_twin():
     """Three steps without viscosity beside a flap that moves, turns and is stretched."""
     simulation = Simulation(flume().replaced("phase[0].viscosity=0"), precision="float64")
