@@ -60,11 +60,14 @@ def test_faces_that_mirror():
         assert faces_of(other) == 0
 
 
+POOL = {"container": box([0.0, 0.0], [2.0, 1.5]), "fluid": [box([0.0, 0.0], [2.0, 0.5], phase="water")]}
+
+
 def dipped(lower, upper=0.8, to=0.0):
     """A box in a pool, which goes up or down in half a second."""
-    middle = np.array([0.25, 0.5 * (lower + upper)])
+    middle = np.array([1.0, 0.5 * (lower + upper)])
     path = {"times": [0.0, 0.5], "positions": [middle.tolist(), (middle + [0.0, to]).tolist()]}
-    return flume(box([0.0, lower], [0.5, upper], name="box", motion="path", **path))
+    return flume(box([0.8, lower], [1.2, upper], name="box", motion="path", **path), **POOL)
 
 
 @pytest.mark.parametrize(
@@ -74,9 +77,9 @@ def dipped(lower, upper=0.8, to=0.0):
         (dipped(-0.1), 2),
         (dipped(0.1), 0),  # fluid flows around its lower edges
         (dipped(-0.1, to=0.15), 0),
-        (dipped(0.72, 1.5), 2),
-        (dipped(0.72, 1.5, to=-0.3), 0),
-        (dipped(0.0, 0.525), 0),  # and over its upper ones
+        (dipped(0.72, 1.4), 2),
+        (dipped(0.72, 1.4, to=-0.3), 0),
+        (dipped(0.0, 0.6), 0),  # and over its upper ones
         (flume(box([-0.5, 0.1], [0.0, 0.8], name="flap", motion="path", angular_velocity=-0.6)), 0),
         (flume(box([-0.1, 0.05], [0.55, 0.95], name="tank", side="inside", motion="path", velocity=[0.1, 0.0])), 4),
     ],
