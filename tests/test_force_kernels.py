@@ -281,6 +281,7 @@ ELSEWHERE = {
     "repair_kernels": "of the projection again: whole steps in tests/test_projection.py",
     "pressed_kernels": "of a quantity: tests/test_quantities.py",
     "mean_stress_kernels": "of a quantity: tests/test_energy_budget.py",
+    "image_load_kernels": "of loads: tests/test_faces.py",
     "environment_kernels": "of rewards: tests/test_environments.py",
     "phase_colour_kernels": "of pictures, by differences: tests/test_render.py",
     "colour_field_kernels": "the same",

@@ -322,4 +322,8 @@ def _neighbourhood(system: ParticleSystem) -> Any:
         setattr(s, name, array)
     s.period = precision.vector(*periods)
     s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))
+    for name, entry in s._cls.vars.items():
+        if isinstance(entry.type, wp.array) and getattr(s, name) is None:  # a tape looks at each
+            none = wp.empty((0,) * entry.type.ndim, dtype=entry.type.dtype, device=system.layout.device)
+            setattr(s, name, none)
     return s
