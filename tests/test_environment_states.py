@@ -2,6 +2,8 @@
 
 import copy
 import pickle
+from dataclasses import replace
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 import cortado
 import cortado.environments
 from cortado import InputError, Simulation
-from cortado.environments import FluidEnv, make_vec
+from cortado.environments import FluidEnv, make_vec, scenes, side_by_side
 from cortado.environments.catalogue import TASKS, Carry, Splash
 
 
@@ -185,6 +187,39 @@ def test_scenes_that_diverged_stay_so(batches):
     assert envs.step(actions[0])[2].tolist() == [False, True]
     other = pickle.loads(pickle.dumps(envs))
     assert other.scenes._lost == {1} and gone_on(other, actions[1:]) == gone_on(envs, actions[1:])
+
+
+@pytest.mark.parametrize("name", ["Raft", "Chosen"])
+def test_batches_that_are_cut_for_the_cores_have_the_bits_of_single_ones(name, monkeypatch):
+    """Also where a scene diverged, and in the episode after it."""
+    monkeypatch.setattr(scenes, "parts_of", lambda simulation: 1)
+    task = MADE[name]() if name in MADE else name
+    whole = make_vec(task, 5, max_episode_steps=4)
+    monkeypatch.setattr(scenes, "parts_of", lambda simulation: 3)
+    cut = make_vec(task, 5, max_episode_steps=4)
+    actions = actions_of(cut, 7)
+    for envs in (whole, cut):
+        envs.reset(seed=3)
+        fields = envs.scenes.state.arrays.copy()
+        velocities = fields.numpy(2)["velocities"]
+        velocities[3, 0, 0] = 1e6
+        fields.set({"velocities": velocities})
+        envs.scenes.state = replace(envs.scenes.state, arrays=fields)
+    assert len(cut.scenes._steps.steppers) == 3 and gone_on(cut, actions) == gone_on(whole, actions)
+    assert pickle.loads(pickle.dumps(cut)).scenes.state["positions"].shape == cut.scenes.state["positions"].shape
+
+
+def test_a_batch_is_cut_where_it_is_too_large_for_a_graph_and_too_small_for_a_launch_of_many_cores(monkeypatch):
+    monkeypatch.setattr(side_by_side, "usable_cores", lambda: 2)
+    cpu, gpu = SimpleNamespace(is_cpu=True), SimpleNamespace(is_cpu=False)
+
+    def parts(scenes, particles=144, device=cpu):
+        return side_by_side.parts_of(SimpleNamespace(batch=scenes, particles=particles, device=device))
+
+    assert [parts(scenes) for scenes in (1, 8, 27, 28, 32, 64, 432, 433)] == [1, 1, 1, 2, 2, 4, 16, 1]
+    assert parts(64, device=gpu) == parts(4, particles=4000) == 1
+    monkeypatch.setattr(side_by_side, "usable_cores", lambda: 1)
+    assert parts(64) == 1
 
 
 # ---- planning --------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from cortado.device.launching import launch
 from cortado.device.threads import WARP
 from cortado.environments.kernels import environment_kernels
+from cortado.environments.side_by_side import SideBySide, parts_of
 from cortado.environments.task import Task, split
 from cortado.errors import CortadoWarning, InputError, MassWarning, shown
 from cortado.losses.loss import SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState
-from cortado.rollout.stepper import Stepper
 from cortado.runs.quantity_values import Moment, row_of
 from cortado.runs.sensor import Sensor, checked_sensor, value_of
 from cortado.runs.sensor_places import warn_of_places
@@ -147,9 +147,12 @@ class Scenes:
         self.task = task
         with warnings.catch_warnings():  # rewards are shares of the fluid that there is
             warnings.simplefilter("ignore", MassWarning)
-            self.simulation = Simulation(task.scene, device, precision, batch=scenes, lanes=LANES)
+            make = partial(Simulation, task.scene, device, precision, lanes=LANES)
+            self.simulation = make(batch=scenes)
+            parts = 1 if self._sensors else parts_of(self.simulation)  # sensors read the step of a whole
+            self._steps = SideBySide(self.simulation, lambda count: make(batch=count), parts, task.substeps)
         warn_of_places(self.simulation, self._sensors)
-        self._domain, self._stepper = self.simulation.lattice.domain, Stepper(self.simulation, task.substeps)
+        self._domain = self.simulation.lattice.domain
         self.reward = replace(task.reward(self.simulation), domain=self._domain)
         self._first = self.simulation.on_device()
         n, free = self.simulation.particles, self.simulation.free_particles or self.simulation.particles
@@ -173,7 +176,7 @@ class Scenes:
         still = {name: np.repeat(row, task.substeps, axis=1) for name, row in self._driven.items()}
         with warnings.catch_warnings():  # see `advance`
             warnings.simplefilter("ignore", CortadoWarning)
-            self._stepper.advance(self._first, still)  # so that other steps can follow
+            self._steps.begin(still)
 
     def __len__(self) -> int:
         """Number of scenes."""
@@ -273,7 +276,7 @@ class Scenes:
         self.advance(actions)
         rewards = self.reward.values(self.reward.at(self.state.arrays, self.goal, self.step_number))
         lost = {}
-        for b, error in self._stepper.rollout.lost.items():
+        for b, error in self._steps.lost.items():
             lost[b] = f"The episode ended in its step {self.step_number[b]}: {error}"
             # As if every step that is left had the least reward: to end early is never worth it.
             rewards[b] = self.task.lowest * max(self.task.horizon - self.step_number[b] + 1, 1)
@@ -287,7 +290,7 @@ class Scenes:
             self._now[k], rows[one.parameter] = one.advance(self._now[k], u, task.substeps, task.time_step)
         with warnings.catch_warnings():  # of a loose pressure, and of lost scenes, which are told of otherwise
             warnings.simplefilter("ignore", CortadoWarning)
-            self.state = self._stepper.follow(self.state, rows)
+            self.state = self._steps.follow(self.state, rows)
         self.step_number += 1
 
     @property
@@ -340,7 +343,7 @@ class Scenes:
             state = state.copy()
             for b in self._lost:
                 state.member(b).assign(self._first.arrays.member(b))
-        simulation, rollout = self.simulation, self._stepper.rollout
+        simulation, rollout = self.simulation, self._steps.steppers[0].rollout
         row = rollout.steps - 1
         parameters = {**row_of(rollout, rollout.parameters.written, row), **self._driven}
         moment = Moment(state, parameters, rollout.substeps, row, simulation.evaluator)
