@@ -1,6 +1,7 @@
 """What a user sees: the names of the package and its modules, and what is shown of results."""
 
 import importlib
+import importlib.util
 import json
 import pickle
 import re
@@ -82,7 +83,9 @@ def test_what_documents_name_is_there_as_an_attribute_and_to_import(monkeypatch)
     """Each in packages that know no module by what was used before. That a module can be the first of all to be
     imported is tests/test_layers.py's."""
     assert {"cortado.optimisers.Adam", "cortado.pictures.read_picture", "cortado.losses.Image"} <= NAMED
-    imported = {name: by_import(name) for name in sorted(NAMED)}
+    there = importlib.util.find_spec("stable_baselines3") is not None  # which no test needs but its own
+    named = [name for name in sorted(NAMED) if there or not name.startswith("cortado.environments.stable_baselines")]
+    imported = {name: by_import(name) for name in named}
     without_what_imports_leave(monkeypatch)
     for name, found in imported.items():
         assert reduce(getattr, name.split(".")[1:], cortado) == found, name

@@ -82,6 +82,7 @@ class Watch:
         self._colours = np.array([phase.colour for phase in simulation.scene.phase])
         self.names = self._recorder.names
         """Of the quantities that are recorded."""
+        self._waiting: Any = None
 
     def run(
         self,
@@ -102,22 +103,23 @@ class Watch:
 
         def keep(step: int, state: State) -> None:
             if self._on_host or is_frame(step):
-                waiting.keep(step, state)
+                self._waiting.keep(step, state)
             if observe is not None:
                 observe(step)
 
-        def look_at_all() -> None:
-            waiting.look()
-            if self._reader is not None:
-                for row in self._reader.rows():
-                    self._logs[row.member].read(row.sensor, row.number, row.reading)
-
-        waiting = Waiting(look, self._rollout.initial, self._rollout.copies)
+        self._waiting = Waiting(look, self._rollout.initial, self._rollout.copies)
         try:
-            last = self._rollout.forward(keep, keep=False, meanwhile=look_at_all, reader=self._reader)
+            last = self._rollout.forward(keep, keep=False, meanwhile=self.look, reader=self._reader)
         finally:
-            look_at_all()
+            self.look()
         return last
+
+    def look(self) -> None:
+        """Look at all that waits: states that were copied, and what sensors have read on the device."""
+        if self._waiting is not None:
+            self._waiting.look()
+        for row in () if self._reader is None else self._reader.rows():
+            self._logs[row.member].read(row.sensor, row.number, row.reading)
 
     def first(self) -> None:
         """Let sensors of one's own read the first state, before the run."""

@@ -188,8 +188,11 @@ class SensorLog:
     def readings(self, times: NDArray[Any]) -> dict[str, Readings]:
         """Return the readings of all states that every sensor has read, at the first of these times [s]."""
         count = min(map(len, self._rows.values()), default=0)
-        values = {name: np.array(rows[:count]).reshape(count, -1) for name, rows in self._rows.items()}
-        return {name: Readings(np.asarray(times)[:count], values[name], self._units[name]) for name in self.sensors}
+        found = {}
+        for name, units in self._units.items():
+            values = np.array(self._rows[name][:count]).reshape(count, len(units))
+            found[name] = Readings(np.asarray(times)[:count], values, units)
+        return found
 
 
 def as_csv(readings: Mapping[str, Readings]) -> str:

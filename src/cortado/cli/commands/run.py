@@ -178,6 +178,7 @@ class Notes:
     def write(self) -> None:
         """Write the readings of sensors, and the solver's notes on the steps that were observed."""
         rollout = self._recording.rollout
+        self._recording.watch.look()
         if self._step > len(rollout.diagnostics["converged"]):  # an interrupt within a chunk of steps
             rollout.log.read(self._step)
         self._recording.folder.write_sensors(self._recording.watch.readings())
