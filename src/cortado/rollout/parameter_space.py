@@ -200,8 +200,7 @@ class ParameterSpace:
         rollout.advice = lambda member: divergence_advice(scene, each[member], float(rollout.time_steps[member]))
         own = {name: value.copy() for name, value in values.items()}
         self._begun = rollout, rollout.evaluation, own, _VARIED.intersection(varied)
-        fields = () if arrays is None else arrays.fields
-        self._constants = {f.name: arrays[f.name] for f in fields if f.is_constant} if arrays is not None else {}
+        self._constants = {} if arrays is None else {f.name: arrays[f.name] for f in arrays.fields if f.is_constant}
         return each
 
     def _goes_on(self, rollout: Rollout, values: Arrays, varied: Iterable[str], states: Sequence[RestartState]) -> bool:
@@ -222,9 +221,8 @@ class ParameterSpace:
     @cached_property
     def _is_still(self) -> bool:
         """Tell if nothing of the scene changes by the clock, moves by itself or comes in."""
-        scene, courses = self._simulation.scene, self._simulation.known.courses
-        changes = scene.schedule.courses or courses or scene.solver.chooses
-        return not (changes or scene.emitter or any(table.moves for table in scene.solid))
+        scene = self._simulation.scene
+        return not (self.depends_on_time({}) or scene.emitter or any(table.moves for table in scene.solid))
 
     def _warn(self, sentence: str | None) -> None:
         """Give a warning sentence unless this space has given it before."""

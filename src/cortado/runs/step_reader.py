@@ -132,6 +132,6 @@ class StepReader:
         found = {}
         for pose in self._poses:
             array, row = (self._first, 0) if k == 0 else (self._later, k - 1)
-            values = array[pose.name].numpy().astype(np.float64)[row * self._members + member][None]
+            values = array[pose.name].numpy()[row * self._members + member][None].astype(np.float64)
             found[pose.name] = values[:, : self._scene.dimension] if pose.entry is Entry.VECTOR else values
         return found
