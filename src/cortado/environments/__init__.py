@@ -3,13 +3,14 @@
 The import registers them, for ``gymnasium.make("cortado/Carry-v0")`` and ``gymnasium.make_vec``.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cortado.calls import face
 from cortado.environments.catalogue import TASKS
 from cortado.environments.fluid_env import FluidEnv, FluidVectorEnv, Twin, gymnasium
 from cortado.environments.scenes import EnvState
 from cortado.environments.task import Task
+from cortado.lazy import getter
 
 __all__ = ["EnvState", "FluidEnv", "FluidVectorEnv", "Task", "Twin", "make_vec"]
 
@@ -30,3 +31,5 @@ for _name, _task in TASKS.items():
     )
 
 __dir__ = face(globals())
+if not TYPE_CHECKING:
+    __getattr__ = getter(__name__)
