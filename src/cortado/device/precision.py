@@ -77,10 +77,10 @@ class TypesByName:
     A parameter without a type has that of the longest of these names with which its words begin, as those of x_dot_ij
     begin with x. One that begins with none of them has the usual type, which is that of numbers as a rule."""
 
-    def __init__(self, usual: Any, names: Mapping[Any, str] | None = None):
-        """Take the usual type, and words that are names of each other type."""
+    def __init__(self, usual: Any, *names: Mapping[Any, str]):
+        """Take the usual type, and tables of words that are names of each other type, of which later ones count."""
         self._usual = usual
-        self._types = {name: kind for kind, words in (names or {}).items() for name in words.split()}
+        self._types = {name: kind for own in names for kind, words in own.items() for name in words.split()}
 
     def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Give types to the parameters of a function."""

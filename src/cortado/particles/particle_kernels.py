@@ -57,10 +57,10 @@ TANGENT = """\
 _total_{n} = _kind_{n}()
     _components = int({components})
     for _k in range(_components):
-        _unit = _kind_{n}()
-        _unit[{entry}] = _one
+        {unit} = _kind_{n}()
+        {unit}[{entry}] = _one
         {gradient}
-        _total_{n} += ({change}) * _unit"""
+        _total_{n} += ({change}) * {unit}"""
 """The text of the tangent of a vector or a matrix. The number of components is a variable, as Warp would write each
 gradient out."""
 
@@ -358,14 +358,15 @@ class _Pointwise:
             none = (f"    {self._place(result, '_dot')}{zeros[n]}" for n, result in enumerate(self._results))
             lines += [f"if {where}[i] == _no:", *none, "    return"]
         for n, (result, kind) in enumerate(self._results.items()):
-            one = "_one" if kind is real else f"_leaning(_found_{n}, _unit)" if result in turned else "_unit"
+            unit = f"_unit{n or ''}"
+            one = "_one" if kind is real else f"_leaning(_found_{n}, {unit})" if result in turned else unit
             gradient, change = self._gradient([*zeros[:n], one, *zeros[n + 1 :]]), " + ".join(changes)
             if kind is real:
                 lines += [gradient, f"_total_{n} = {change}"]
             else:
                 shape = self._change(result, kind)._shape_
                 entry = "_k" if len(shape) == 1 else f"_k // {shape[1]}, _k % {shape[1]}"
-                own = {"n": n, "components": prod(shape), "entry": entry}
+                own = {"n": n, "components": prod(shape), "entry": entry, "unit": unit}
                 lines.append(TANGENT.format(gradient=gradient, change=change, **own))
         lines += [f"{self._place(result, '_dot')}_total_{n}" for n, result in enumerate(self._results)]
         written = self._written("_dot")

@@ -27,6 +27,7 @@ from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
+from cortado.solvers.projection.names import types_by_name
 from cortado.solvers.projection.walls import normal_part
 from cortado.sph.free_solids import free_module, rate_function
 
@@ -55,7 +56,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, pair = precision.pair, pair_functions(discretisation)
     gradient, hessian_product, separation = pair.gradient, pair.hessian_product, pair.separation
-    normal = normal_part(discretisation)
+    normal, typed = normal_part(discretisation), types_by_name(precision)
     topic = "projection_bodies"
     modules = module, tangent_module, adjoint_module = discretisation.modules(topic)
 
@@ -70,24 +71,15 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
         return s.volume * between(gradient(x_ij, s), foot, edge_i)
 
     @solid_sum(discretisation)
-    def push_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        edge_i: real,
-        edge_dot_i: real,
-        foot: vector,
-        turn_dot: vector,
-        solid: int,
-        s: neighbourhood,
-    ) -> vector:
+    @typed
+    def push_tangent(x_ij, x_dot_ij, edge_i, edge_dot_i, foot, turn_dot, solid: int, s) -> vector:
         G, rest = gradient(x_ij, s), x_dot_ij - wp.cross(turn_dot, x_ij)
         change = between(hessian_product(x_ij, rest, s), foot, edge_i) + edge_dot_i * (G - normal(G, foot))
         return s.volume * (change + wp.cross(turn_dot, between(G, foot, edge_i)))
 
     @solid_sum(discretisation)
-    def push_back(
-        x_ij: vector, edge_i: real, bar_i: vector, foot: vector, solid: int, s: neighbourhood
-    ) -> tuple[vector, real]:
+    @typed
+    def push_back(x_ij, edge_i, bar_i: vector, foot, solid: int, s) -> tuple[vector, real]:
         G = gradient(x_ij, s)
         pushed = s.volume * hessian_product(x_ij, between(bar_i, foot, edge_i), s)
         return pushed, s.volume * wp.dot(G - normal(G, foot), bar_i)
@@ -124,9 +116,8 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
         return y_i * gamma_of_i, y_i * wp.cross(arm_i, gamma_of_i)
 
     @particle_kernel(tangent_module, "pulled_dot twisted_dot")
-    def pull_tangent(
-        y_i: real, y_dot_i: real, gamma_of_i: vector, gamma_of_dot_i: vector, arm_i: vector, arm_dot_i: vector
-    ) -> tuple[vector, vector]:
+    @typed
+    def pull_tangent(y_i, y_dot_i, gamma_of_i, gamma_of_dot_i, arm_i, arm_dot_i) -> tuple[vector, vector]:
         """Write the tangents of `pull`, by hand: each iteration computes them, and a made kernel is slower."""
         turn = wp.cross(arm_dot_i, gamma_of_i) + wp.cross(arm_i, gamma_of_dot_i)
         return y_dot_i * gamma_of_i + y_i * gamma_of_dot_i, y_dot_i * wp.cross(arm_i, gamma_of_i) + y_i * turn

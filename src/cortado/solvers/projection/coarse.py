@@ -8,6 +8,7 @@ as much and gain a tenth at most, but in a cold scene, which has no pressure of 
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import warp as wp
 
@@ -144,12 +145,15 @@ class Coarse:
         context.launch(self.pressure.correct, own, around, at, self.grid, T=T)
         thrown = {"y": new["change"], "T": T, "kick": new["thrust"], "u": new["u"]}
         context.launch(self.velocity.velocity.forward, around, thrown, v_star=self.still)
-        stays = self.warm if k == 0 else self._none_stays
         carried = self.carried(context, new["change"])
-        context.launch(self.length.share, own, carried, self.spaced, self.parts, first=int(k == 0), stays=stays)
+        context.launch(self.length.share.forward, own, carried, self.spaced, self.parts, self.staying(k))
         wp.copy(new["sums"], self.sums(self.parts["parts"]))
         out = {"k_out": new["k"], "y_out": new["y"], "u_out": new["u"]}
-        context.launch(self.length.apply, out, own, at)
+        context.launch(self.length.apply.forward, out, own, at)
+
+    def staying(self, k: int) -> dict[str, Any]:
+        """Return whether k is the first iteration, and the scenes that need no correction before it."""
+        return {"first": int(k == 0), "stays": self.warm if k == 0 else self._none_stays}
 
     def carried(self, context: StepContext, change: wp.array) -> dict[str, wp.array]:
         """Return the divergence G d that a pressure change d takes away by moving free bodies."""
@@ -196,10 +200,10 @@ class CoarseTangent:
         carried = self._unmoved
         if self._bodies is not None:
             carried = self._bodies.carried(context, new["change"], change["change"])
-        given = {**own.spaced, "first": int(k == 0)}
-        context.launch(own.length.share_tangent, given, found, left, carried, own.parts, *known)
-        steps = {name: at[name] for name in ("k_dot", "y_dot", "u_dot")}
-        context.launch(own.length.apply_tangent, steps, found, left, sums_dot=own.sums(own.parts["parts"]))
+        given, parts = {**own.spaced, **own.staying(k)}, own.parts["parts"]
+        context.launch(own.length.share.tangent, given, found, left, carried, *known, parts_dot=parts)
+        steps = {"k_out_dot": at["k_dot"], "y_out_dot": at["y_dot"], "u_out_dot": at["u_dot"]}
+        context.launch(own.length.apply.tangent, steps, at, found, left, sums_dot=own.sums(parts))
 
 
 class CoarseAdjoint:
@@ -214,9 +218,9 @@ class CoarseAdjoint:
         if coarse.bodies is not None and bodies is not None:
             self._bodies = CoarseBodiesAdjoint(coarse.bodies, bodies, bar)
         self._bars = layout.arrays("_bar", h=vector, N=matrix_type(precision))
-        self._steps = layout.arrays("_bar", r=real, change=real, carried=real, thrust=vector, alpha=real)
+        self._steps = layout.arrays("_bar", r=real, change=real, carried=real, thrust=vector, sums=precision.pair)
         self._through = layout.arrays(T=six, f=vector, kick_bar=vector, v_bar=vector)
-        self._sum = layout.sum_of(real)
+        self._sum = layout.sum_of(precision.pair)
 
     def begin(self) -> None:
         for array in self._bars.values():
@@ -237,11 +241,12 @@ class CoarseAdjoint:
         the adjoint of u."""
         own, through, found = self._coarse, self._through, self._steps
         left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
-        context.launch(own.length.along_adjoint, steps, left, u_bar=u_bar, alpha_bar=found["alpha_bar"])
-        total = self._sum(found["alpha_bar"])
+        bars = {"k_out_bar": steps["k_bar"], "y_bar": steps["y_bar"], "u_bar": u_bar}
+        context.launch(own.length.apply.adjoint, bars, left, found, at)
+        steps["k_bar"].zero_()
         left |= own.carried(context, new["change"])
-        given = {"alpha_bar": total, **own.spaced, "first": int(k == 0)}
-        context.launch(own.length.apply_adjoint, given, left, steps, found, *known, u_bar=u_bar)
+        given = {"parts_sum_bar": self._sum(found["sums_bar"]), **own.spaced, **own.staying(k)}
+        context.launch(own.length.share.adjoint, given, left, found, *known)
         if self._bodies is not None:
             self._bodies.carried(context, found["carried_bar"], new["change"], found["change_bar"])
         thrown = {"u": new["thrust"], "v_star": own.still, "y": new["change"], "u_bar": found["thrust_bar"]}

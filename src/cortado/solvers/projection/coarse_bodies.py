@@ -20,11 +20,12 @@ import warp as wp
 from cortado.device.cells import cell_grid_type
 from cortado.device.launching import Named, bundle
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision
 from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import Layout
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse_nodes import hat_functions, node_functions
+from cortado.solvers.projection.names import types_by_name
 from cortado.sph.moment_functions import matrix_type
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
@@ -94,7 +95,7 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
     def lift(i: int, grid: grid_type, particles: int, factor: real, x_i: vector, coarse_i: real, e: values) -> real:
         return factor * coarse_i * at(i, particles, x_i, e, grid).value
 
-    typed = TypesByName(real, {grid_type: "grid", vector: "x", values: "e multiplier"})
+    typed = types_by_name(precision, {grid_type: "grid", values: "e multiplier", int: "i particles", real: "lifted"})
 
     @particle_kernel(module, "lifted_dot", numbers=numbers)
     @typed
@@ -104,9 +105,8 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
         return coarse_dot_i * f.value + coarse_i * wp.dot(f.slope, x_dot_i)
 
     @particle_kernel(module, "+s_value +s_slope")
-    def source_tangent(
-        x_dot_i: vector, coarse_i: real, coarse_dot_i: real, carried_i: real, carried_dot_i: real
-    ) -> tuple[real, vector]:
+    @typed
+    def source_tangent(x_dot_i, coarse_i, coarse_dot_i, carried_i, carried_dot_i) -> tuple[real, vector]:
         return -coarse_dot_i * carried_i - coarse_i * carried_dot_i, -(coarse_i * carried_i) * x_dot_i
 
     @particle_kernel(module, "+coarse_bar +x_bar", numbers=numbers)

@@ -30,11 +30,11 @@ from typing import Any
 import warp as wp
 
 from cortado.device.cells import cell_grid_type
-from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision, TypesByName
-from cortado.particles.particle_kernels import particle_kernel
+from cortado.device.modules import Kernels, kernel_module
+from cortado.device.precision import Precision
+from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels
 from cortado.solvers.projection.coarse_nodes import ALONE, hat_functions
-from cortado.solvers.projection.effects import weights_type
+from cortado.solvers.projection.names import types_by_name, weights_type
 from cortado.solvers.projection.pressure import clamp_functions
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
 
@@ -66,7 +66,7 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
 
     numbers, values = ["grid", "particles"], wp.array(dtype=real)
 
-    typed = TypesByName(real, {grid_type: "grid", vector: "x h", weights4: "weights", values: "e multiplier"})
+    typed = types_by_name(precision, {grid_type: "grid", values: "e multiplier", int: "i particles"})
 
     @particle_kernel(module, "change T", numbers=numbers)
     @typed
@@ -110,20 +110,9 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
         return value, own, slope, -(cross_terms(p, x_dot_i) + cross_terms(x_dot_i, p))
 
     @particle_kernel(module, "change_dot", numbers=numbers)
+    @typed
     def correct_tangent(
-        i: int,
-        grid: grid_type,
-        particles: int,
-        x_i: vector,
-        x_dot_i: vector,
-        coarse_i: real,
-        coarse_dot_i: real,
-        weights_i: weights4,
-        weights_dot_i: weights4,
-        y_i: real,
-        y_dot_i: real,
-        e: values,
-        e_dot: values,
+        i, grid, particles, x_i, x_dot_i, coarse_i, coarse_dot_i, weights_i, weights_dot_i, y_i, y_dot_i, e, e_dot
     ) -> real:
         f, f_dot = at(i, particles, x_i, e, grid), at(i, particles, x_i, e_dot, grid)
         z = y_i + coarse_i * f.value
@@ -188,15 +177,10 @@ class LengthKernels:
     """Kernels of the length alpha of a coarse correction, given the pressure change d, the thrust -D^T d / m, and as
     ``carried`` the G d of free bodies, see `cortado.solvers.projection.coarse_bodies`."""
 
-    share: Any
-    share_tangent: Any
-    """The tangent of a particle's share of both sums of alpha."""
-    apply: Any
-    apply_tangent: Any
-    apply_adjoint: Any
-    """The adjoint of y' and u', given both sums."""
-    along_adjoint: Any
-    """The part of the adjoint of alpha by y' and u'."""
+    share: Kernels
+    """A particle's share of both sums of alpha; the adjoint starts from that of the sums."""
+    apply: Kernels
+    """k', y' and u', given both sums, of whose adjoint particles' shares are written."""
     every: Any
     """Tells whether all scenes of a batch are warm."""
 
@@ -205,127 +189,50 @@ class LengthKernels:
 def length_kernels(precision: Precision) -> LengthKernels:
     """Make the kernels of the length alpha of a coarse correction, in any dimension."""
     real, vector, pair_of = precision.real, precision.vector, precision.pair
-    small = wp.constant(real(SMALL))
-    module = kernel_module(f"coarse_length_{precision.name}")
+    small, typed = wp.constant(real(SMALL)), types_by_name(precision, {int: "first stays"})
+    modules = [kernel_module(f"coarse_length_{precision.name}")] * 3
 
     @wp.func
     def length(sums: pair_of) -> real:
         """Return alpha, the ratio of both sums within 0 and 1; NaN stays NaN, which must not be hidden."""
         found = sums[0] / sums[1]
-        return wp.where(found < real(0.0), real(0.0), wp.where(found > real(1.0), real(1.0), found))
+        return wp.where(found <= real(0.0), real(0.0), wp.where(found >= real(1.0), real(1.0), found))
 
-    @wp.func
-    def bends(sums: pair_of) -> bool:
-        """Test whether alpha is between 0 and 1, where it depends on the sums."""
-        return sums[0] > real(0.0) and sums[0] < sums[1]
-
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=modules[0], enable_backward=False)
     def every(scenes: int, warm: wp.array(dtype=int), all_warm: wp.array(dtype=int)):
         found = int(1)
         for scene in range(scenes):
             found = wp.min(found, warm[scene])
         all_warm[0] = found
 
-    @wp.func
-    def least(m: real, spacing: real, dt: real) -> real:
-        """Return m (1e-6 s / dt)^2, the energy that a particle adds to the sums of alpha in any case."""
-        v = small * spacing / dt
-        return m * v * v
-
-    typed = TypesByName(real, {vector: "thrust u", pair_of: "sums"})
-
-    @particle_kernel(module, "parts", numbers=["first", "spacing"])
     @typed
-    def share(first: int, spacing, stays: int, time_step, m_i, r_i, change_i, carried_i, thrust_i) -> pair_of:
+    def share(first, spacing, stays, time_step, m_i, r_i, change_i, carried_i, thrust_i) -> pair_of:
         """Return a particle's addends to both sums whose ratio is alpha, which is 0 in a scene that ``stays``
-        uncorrected."""
+        uncorrected; m (1e-6 s / dt)^2 is added in any case."""
         if stays != 0:
             return pair_of(real(0.0), m_i)
-        own = least(m_i, spacing, time_step)
+        v = small * spacing / time_step
+        own = m_i * v * v
         energy = m_i * wp.dot(thrust_i, thrust_i) + change_i * carried_i + own
         return pair_of(r_i * change_i + real(1 - first) * own, energy)
 
-    @particle_kernel(module, "k_out y_out u_out")
-    def apply(sums: pair_of, y_i: real, u_i: vector, change_i: real, thrust_i: vector) -> tuple[real, real, vector]:
+    @typed
+    def apply(sums, y_i, u_i, change_i, thrust_i) -> tuple[real, real, vector]:
         alpha = length(sums)
         new = y_i + alpha * change_i
         return new, new, u_i + alpha * thrust_i
 
-    @particle_kernel(module, "parts", numbers=["first", "spacing"])
-    def share_tangent(
-        first: int,
-        spacing: real,
-        time_step: real,
-        time_step_dot: real,
-        m_i: real,
-        m_dot_i: real,
-        r_i: real,
-        r_dot_i: real,
-        change_i: real,
-        change_dot_i: real,
-        carried_i: real,
-        carried_dot_i: real,
-        thrust_i: vector,
-        thrust_dot_i: vector,
-    ) -> pair_of:
-        along = r_dot_i * change_i + r_i * change_dot_i
-        energy = m_dot_i * wp.dot(thrust_i, thrust_i) + real(2.0) * m_i * wp.dot(thrust_i, thrust_dot_i)
-        energy += change_dot_i * carried_i + change_i * carried_dot_i
-        longer = real(2.0) * least(m_i, spacing, time_step) * time_step_dot / time_step
-        own_dot = least(m_dot_i, spacing, time_step) - longer
-        return pair_of(along + real(1 - first) * own_dot, energy + own_dot)
-
-    @particle_kernel(module, "k_dot y_dot u_dot")
-    @typed
-    def apply_tangent(
-        sums, sums_dot, y_dot_i, u_dot_i, change_i, change_dot_i, thrust_i, thrust_dot_i
-    ) -> tuple[real, real, vector]:
-        alpha, alpha_dot = length(sums), real(0.0)
-        if bends(sums):
-            alpha_dot = (sums_dot[0] - alpha * sums_dot[1]) / sums[1]
-        new = y_dot_i + alpha_dot * change_i + alpha * change_dot_i
-        return new, new, u_dot_i + alpha_dot * thrust_i + alpha * thrust_dot_i
-
-    @particle_kernel(module, "alpha_bar")
-    def along_adjoint(k_bar_i: real, y_bar_i: real, u_bar_i: vector, change_i: real, thrust_i: vector) -> real:
-        return (k_bar_i + y_bar_i) * change_i + wp.dot(u_bar_i, thrust_i)
-
-    @particle_kernel(
-        module,
-        "k_bar y_bar +m_bar +time_step_bar change_bar carried_bar thrust_bar r_bar",
+    shares = pointwise_kernels(
+        precision,
+        modules,
+        lambda _: share,
+        ["parts"],
         numbers=["first", "spacing"],
+        known=["stays"],
+        written=["r", "carried"],
+        summed=["parts"],
     )
-    def apply_adjoint(
-        first: int,
-        spacing: real,
-        time_step: real,
-        sums: pair_of,
-        alpha_bar: real,
-        m_i: real,
-        r_i: real,
-        change_i: real,
-        carried_i: real,
-        thrust_i: vector,
-        u_bar_i: vector,
-        k_bar_i: real,
-        y_bar_i: real,
-    ) -> tuple[real, real, real, real, real, real, vector, real]:
-        """Turn the adjoints of k', y' and u' into those of k, y, u and the inputs of alpha. Those of k' and y' are
-        overwritten; that of u' is that of u, too. ``alpha_bar`` is that of each scene."""
-        alpha, along_bar, energy_bar = length(sums), real(0.0), real(0.0)
-        if bends(sums):
-            along_bar = alpha_bar / sums[1]
-            energy_bar = -alpha * along_bar
-        new_bar, own_bar = k_bar_i + y_bar_i, real(1 - first) * along_bar + energy_bar
-        return (
-            real(0.0),
-            new_bar,
-            energy_bar * wp.dot(thrust_i, thrust_i) + own_bar * least(real(1.0), spacing, time_step),
-            -real(2.0) * own_bar * least(m_i, spacing, time_step) / time_step,
-            alpha * new_bar + along_bar * r_i + energy_bar * carried_i,
-            energy_bar * change_i,
-            alpha * u_bar_i + (real(2.0) * m_i * energy_bar) * thrust_i,
-            along_bar * change_i,
-        )
-
-    return LengthKernels(share, share_tangent, apply, apply_tangent, apply_adjoint, along_adjoint, every)
+    results, replaced = ["k_out", "y_out", "u_out"], {"y_out": "y", "u_out": "u"}
+    written = ["sums", "change", "thrust"]
+    applied = pointwise_kernels(precision, modules, lambda _: apply, results, replaced, written=written)
+    return LengthKernels(shares, applied, every)

@@ -17,11 +17,11 @@ from functools import cache
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.device.precision import TypesByName
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel
-from cortado.solvers.projection.effects import image_sums, weights_type
+from cortado.solvers.projection.effects import image_sums
+from cortado.solvers.projection.names import types_by_name, weights_type
 from cortado.solvers.projection.pressure import clamp_functions
 from cortado.solvers.projection.sums import projection_sums
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions, symmetric
@@ -33,10 +33,10 @@ def coarse_sums(discretisation: Discretisation) -> Kernels:
     which T_i g_i and c_i gamma_i complete to h, and the rows of N. The adjoint is from those of h and N to the
     symmetric part of that of T, as its diagonal and its other entries, and to that of x."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
-    matrix, pair = matrix_type(precision), pair_functions(discretisation)
+    pair = pair_functions(discretisation)
     packed, cross_terms = symmetric(precision), cross_terms_function(precision)
     six, times = packed.kind, packed.times
-    gradient, hessian_product = pair.gradient, pair.hessian_product
+    gradient, hessian_product, typed = pair.gradient, pair.hessian_product, types_by_name(precision)
 
     @fluid_sum(discretisation)
     def push(x_ij: vector, T_j: six, s: neighbourhood) -> tuple[vector, vector, vector, vector]:
@@ -45,24 +45,15 @@ def coarse_sums(discretisation: Discretisation) -> Kernels:
 
     @tangent_of(push)
     @fluid_sum(discretisation, ahead=False)
-    def push_tangent(
-        x_ij: vector, x_dot_ij: vector, T_j: six, T_dot_j: six, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector]:
+    @typed
+    def push_tangent(x_ij, x_dot_ij, T_j, T_dot_j, s) -> tuple[vector, vector, vector, vector]:
         g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
         f, c = times(T_j, g), times(T_dot_j, g) + times(T_j, g_dot)
         return c, -c[0] * x_ij - f[0] * x_dot_ij, -c[1] * x_ij - f[1] * x_dot_ij, -c[2] * x_ij - f[2] * x_dot_ij
 
     @fluid_sum(discretisation)
-    def push_back(
-        x_ij: vector,
-        T_i: six,
-        T_j: six,
-        h_bar_i: vector,
-        h_bar_j: vector,
-        N_bar_i: matrix,
-        N_bar_j: matrix,
-        s: neighbourhood,
-    ) -> tuple[vector, vector, vector]:
+    @typed
+    def push_back(x_ij, T_i, T_j, h_bar_i, h_bar_j, N_bar_i, N_bar_j, s) -> tuple[vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
         from_i, from_j = h_bar_i - N_bar_i * x_ij, h_bar_j + N_bar_j * x_ij
         pulled = s.volume * hessian_product(x_ij, times(T_j, from_i) - times(T_i, from_j), s)
@@ -88,7 +79,7 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def pull(coarse_i: real, L_i: matrix) -> six:
         return coarse_i * pack(L_i)
 
-    typed = TypesByName(real, {vector: "total row g beside diagonal others x h", six: "T", matrix: "L"})
+    typed = types_by_name(precision)
 
     @particle_kernel(module, "h N", [over(push, "total row_x row_y row_z")])
     @typed
@@ -133,7 +124,7 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     spread, spread_tangent = image_sums(discretisation).spread, image_sums(discretisation).spread_tangent
     gradient, gradient_tangent = sums.velocity_gradient.forward, sums.velocity_gradient.tangent
     packed, clamp = symmetric(precision), clamp_functions(precision)
-    wanted, wanted_tangent = clamp.wanted, clamp.wanted_tangent
+    wanted, wanted_tangent, typed = clamp.wanted, clamp.wanted_tangent, types_by_name(precision)
     six, pack = packed.kind, packed.pack
     module, tangent_module, adjoint_module = discretisation.modules(f"projection_{dimension}d")
 
@@ -148,21 +139,9 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     both = [over(gradient, "row_x row_y row_z", v="u"), over(spread, "widened")]
 
     @particle_kernel(module, "A d r s_value s_slope s_bent s_own", both)
+    @typed
     def residual(
-        row_x: vector,
-        row_y: vector,
-        row_z: vector,
-        widened: real,
-        time_step: real,
-        n_i: real,
-        L_i: matrix,
-        gamma_i: vector,
-        drift_i: real,
-        weights_i: weights4,
-        image_i: real,
-        coarse_i: real,
-        u_i: vector,
-        y_i: real,
+        row_x, row_y, row_z, widened, time_step, n_i, L_i, gamma_i, drift_i, weights_i, image_i, coarse_i, u_i, y_i
     ) -> tuple[matrix, real, real, real, vector, vector, real]:
         """Return A, the divergence, the residual r and the source c r of a particle."""
         A = wp.matrix_from_rows(row_x, row_y, row_z)

@@ -56,8 +56,10 @@ class ProjectionTangent(ParticleTangent):
         flow = {"A": solver.last_gradient(counts[0]), "A_dot": self._A_dot}
         pull = {"k": solver.iterates[counts[0]]["k"], "k_dot": self._k_dot}
         context.launch(kernels.shift.tangent, *known, solver.spaced, flow, pull, delta_dot=self._delta_dot)
-        begun = {"x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot, "c_dot": self._c_dot}
-        context.launch(kernels.moving.tangent, *known, v_new, begun, delta_dot=self._delta_dot)
+        moved = {"x_moved_dot": self._x_moved_dot, "delta": solver.delta, "delta_dot": self._delta_dot}
+        context.launch(kernels.moving.tangent, *known, v_new, moved)
+        wp.copy(self._x_now_dot, self._x_moved_dot)
+        self._c_dot.zero_()
         omegas = solver.repair_relaxations
         for k in range(counts[1]):
             at, new = solver.repaired[k], solver.repaired[k + 1]
@@ -97,7 +99,7 @@ class ProjectionTangent(ParticleTangent):
         beginning = solver.kernels.beginning
         before = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
         before |= {"kick_before": solver.carried[KICK], "kick_before_dot": self.carried_dot[KICK]}
-        before["surfaced"] = solver.density.surfaced
+        before |= {"surfaced": solver.density.surfaced, "v_star": solver.v_star}
         change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
         context.launch(beginning.tangent, *known, solver.spaced, before, change, v_star_dot=self._v_star_dot)
         self._coarse.begin(context, known)
@@ -169,7 +171,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         state_bar.clear()
         self._begin(state_bar, parameters)
         context, known = solver.context(parameters), self.bar.named
-        (_, pressed), k = pressed_kernels(solver.layout.precision), self._last(counts)["k"]
+        pressed, k = pressed_kernels(solver.layout.precision).adjoint, self._last(counts)["k"]
         context.launch(pressed, *known, impulse=k, p_bar=within.p, impulse_bar=self._k_bar)
         if within.stress is not None:
             at = {"k": k, "T": solver.pull, "k_bar": self._k_bar, "q_bar": solver.numbers()}
@@ -219,14 +221,14 @@ class ProjectionAdjoint(ParticleAdjoint):
             ends = {"x_now": solver.repaired[counts[1]]["x_now"], "x_now_bar": self._x_now_bar}
             context.launch(solver.following.adjoint, *known, flow, v_new, ends)
         self._mend(context, known, counts[1])
-        context.launch(kernels.moving.adjoint, *known, v_new, x_moved_bar=self._x_moved_bar)
+        context.launch(kernels.moving.adjoint, *known, v_new, delta=solver.delta, delta_bar=self._x_moved_bar)
         pull = {"k": self._last(counts)["k"], "k_bar": self._k_bar}
         context.launch(kernels.shift.adjoint, *known, solver.spaced, flow, pull, delta_bar=self._x_moved_bar)
         self._project(context, known, counts[0])
         before = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
         before |= {"kick_before": solver.carried[KICK], "kick_before_bar": self._kick_before_bar}
-        before["surfaced"] = solver.density.surfaced
-        steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "u_bar": self._u_bar}
+        before |= {"surfaced": solver.density.surfaced, "v_star": solver.v_star}
+        steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "u_bar": self._u_bar, "v_star_bar": self.bar.fields["v"]}
         context.launch(kernels.beginning.adjoint, *known, solver.spaced, before, steps)
         if self._bodies is not None:
             self._bodies.finish(context, self.bar, solver.around, self._around)

@@ -44,6 +44,7 @@ import warp as wp
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import image_sum, mirror_sum
+from cortado.solvers.projection.names import types_by_name, weights_type
 from cortado.solvers.projection.walls import DIRECTION, normal_part
 from cortado.sph.moment_functions import matrix_type, moment_functions
 
@@ -71,12 +72,6 @@ ALONG = 0.2
 """The part of what gradients along a wall lack beside it that is made up. On the lattice, with Wendland C2, the first
 row lacks 25 % of a pressure's gradient along the wall. With 0 water at rest sinks along upright walls, in a lasting
 vortex, and with 1, where divergences are right, the second row has 6 % too much and rises."""
-
-
-@cache
-def weights_type(precision: Precision) -> Any:
-    """Return the Warp type of a particle's four weights (sigma, f, u, r)."""
-    return wp.types.vector(length=4, dtype=precision.real)
 
 
 @cache
@@ -117,7 +112,7 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
     own = moment_functions(precision, dimension)
     fullness, invert, smoothstep = own.fullness, own.inverse, own.smoothstep
     weights4 = weights_type(precision)
-    away = away_function(precision)
+    away, typed = away_function(precision), types_by_name(precision)
     regular, newton, walled, apart = (wp.constant(real(value)) for value in (REGULAR, NEWTON, WALLED, APART))
     mirrored = wp.constant(real(MIRRORED))
     along, direction = (wp.constant(real(value)) for value in (ALONG, DIRECTION))
@@ -170,41 +165,15 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         return smoothstep(fullness(M) + real(2.0) * nu, s_0, s_1)
 
     @wp.func(module=module)
-    def work(
-        M: matrix,
-        Q: matrix,
-        g: vector,
-        gamma: vector,
-        mirror: vector,
-        nu: real,
-        behind: real,
-        m: real,
-        least: real,
-        L_bar: matrix,
-        a_bar: real,
-        weights_bar: weights4,
-        share_bar: real,
-    ) -> real:
+    @typed
+    def work(M, Q, g, gamma, mirror, nu, behind, m, least, L_bar, a_bar, weights_bar, share_bar) -> real:
         L = correction(M, gamma, mirror, nu, behind, least)
         total = wp.ddot(L, L_bar) + wp.dot(weights(M, nu, behind), weights_bar) + share_bar * share(M, nu)
         return total + a_bar * diagonal(L, Q, g, gamma, m, least)
 
     @wp.func(module=module)
-    def back(
-        M: matrix,
-        Q: matrix,
-        g: vector,
-        gamma: vector,
-        mirror: vector,
-        nu: real,
-        behind: real,
-        m: real,
-        least: real,
-        L_bar: matrix,
-        a_bar: real,
-        weights_bar: weights4,
-        share_bar: real,
-    ):
+    @typed
+    def back(M, Q, g, gamma, mirror, nu, behind, m, least, L_bar, a_bar, weights_bar, share_bar):
         by_M, by_Q, by_g, by_gamma, by_mirror, by_nu, by_behind, by_m, _least, _L, _a, _w, _c = wp.grad(work)(
             M, Q, g, gamma, mirror, nu, behind, m, least, L_bar, a_bar, weights_bar, share_bar
         )
@@ -261,7 +230,7 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
-    normal, mirror_of = normal_part(discretisation), pair.mirror_of
+    normal, mirror_of, typed = normal_part(discretisation), pair.mirror_of, types_by_name(discretisation.precision)
 
     @image_sum(discretisation)
     def image_weights(x_ij: vector, s: neighbourhood) -> real:
@@ -276,27 +245,17 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
         return ((image_i * y_i + image_j * y_j) * s.volume) * gradient(x_ij, s)
 
     @image_sum(discretisation)
+    @typed
     def lift_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        y_i: real,
-        y_j: real,
-        y_dot_i: real,
-        y_dot_j: real,
-        image_i: real,
-        image_j: real,
-        image_dot_i: real,
-        image_dot_j: real,
-        s: neighbourhood,
+        x_ij, x_dot_ij, y_i, y_j, y_dot_i, y_dot_j, image_i, image_j, image_dot_i, image_dot_j, s
     ) -> vector:
         c_dot = image_dot_i * y_i + image_i * y_dot_i + image_dot_j * y_j + image_j * y_dot_j
         bent = (image_i * y_i + image_j * y_j) * hessian_product(x_ij, x_dot_ij, s)
         return s.volume * (c_dot * gradient(x_ij, s) + bent)
 
     @image_sum(discretisation)
-    def lift_back(
-        x_ij: vector, y_i: real, y_j: real, image_i: real, image_j: real, f_ij: vector, s: neighbourhood
-    ) -> tuple[real, vector]:
+    @typed
+    def lift_back(x_ij, y_i, y_j, image_i, image_j, f_ij, s) -> tuple[real, vector]:
         c = (image_i * y_i + image_j * y_j) * s.volume
         return s.volume * wp.dot(gradient(x_ij, s), f_ij), c * hessian_product(x_ij, f_ij, s)
 
@@ -323,22 +282,15 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
         return s.volume * (wp.dot(gradient(x_ij, s), swept_dot) + bent)
 
     @mirror_sum(discretisation)
-    def mirror_walls(
-        x_ij: vector, v_j: vector, foot: vector, mirrors: int, s: neighbourhood
-    ) -> tuple[vector, real, real]:
+    @typed
+    def mirror_walls(x_ij, v_j, foot, mirrors: int, s) -> tuple[vector, real, real]:
         part = s.volume * normal(gradient(x_ij, s), foot)
         return part, s.volume * weight(x_ij, s), wp.dot(part, v_j)
 
     @mirror_sum(discretisation, grows=mirror_walls)
+    @typed
     def mirror_walls_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        v_j: vector,
-        v_dot_j: vector,
-        foot: vector,
-        turn_dot: vector,
-        mirrors: int,
-        s: neighbourhood,
+        x_ij, x_dot_ij, v_j, v_dot_j, foot, turn_dot, mirrors: int, s
     ) -> tuple[vector, real, real]:
         rest, g = x_dot_ij - wp.cross(turn_dot, x_ij), s.volume * gradient(x_ij, s)
         part = normal(g, foot)
@@ -346,16 +298,8 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
         return part_dot, wp.dot(g, rest), wp.dot(part_dot, v_j) + wp.dot(part, v_dot_j)
 
     @mirror_sum(discretisation)
-    def mirror_walls_back(
-        x_ij: vector,
-        v_j: vector,
-        mirror_bar_i: vector,
-        behind_bar_i: real,
-        sweep_bar_i: real,
-        foot: vector,
-        mirrors: int,
-        s: neighbourhood,
-    ) -> vector:
+    @typed
+    def mirror_walls_back(x_ij, v_j, mirror_bar_i, behind_bar_i, sweep_bar_i, foot, mirrors: int, s) -> vector:
         """Return the adjoint of x by those of the sums; that of the drift is -``sweep_bar``."""
         bent = hessian_product(x_ij, normal(mirror_bar_i - sweep_bar_i * v_j, foot), s)
         return s.volume * (bent + behind_bar_i * gradient(x_ij, s))

@@ -22,14 +22,15 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import Named
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, image_sum
-from cortado.particles.particle_kernels import over, particle_kernel
+from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
 from cortado.particles.state import Layout
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm
 from cortado.solvers.projection.faces import FaceShares
+from cortado.solvers.projection.names import types_by_name
 from cortado.solvers.projection.walls import normal_part
 from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
@@ -111,7 +112,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def images(x_ij: vector, k_i: real, k_j: real, image_i: real, image_j: real, s: neighbourhood) -> real:
         return real(-0.5) * s.volume * (image_i * k_i + image_j * k_j) * wp.dot(gradient(x_ij, s), x_ij)
 
-    typed = TypesByName(real, {vector: "x reach mirrors", neighbourhood: "s"})
+    typed = types_by_name(precision, {vector: "reach mirrors"})
 
     @image_sum(discretisation)
     @typed
@@ -124,9 +125,8 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         return real(-0.5) * s.volume * (c_dot * wp.dot(g, x_ij) + c * bent)
 
     @image_sum(discretisation)
-    def images_back(
-        x_ij: vector, k_i: real, k_j: real, image_i: real, image_j: real, q_bar_i: real, q_bar_j: real, s: neighbourhood
-    ) -> tuple[vector, real]:
+    @typed
+    def images_back(x_ij, k_i, k_j, image_i, image_j, q_bar_i, q_bar_j, s) -> tuple[vector, real]:
         bar, g = real(-0.5) * s.volume * (q_bar_i + q_bar_j), gradient(x_ij, s)
         bent = hessian_product(x_ij, x_ij, s) + g
         return (bar * (image_i * k_i + image_j * k_j)) * bent, bar * wp.dot(g, x_ij)
@@ -167,11 +167,10 @@ def reach_term(discretisation: Discretisation) -> WallTerm:
 
 
 def _reach_work(d: Discretisation) -> Any:
-    real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
+    real, gradient, normal = d.precision.real, pair_functions(d).gradient, normal_part(d)
 
-    def reach_work(
-        x_ij: vector, edge_i: real, reach_bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)
-    ) -> real:
+    @types_by_name(d.precision, {d.precision.vector: "reach"})
+    def reach_work(x_ij, edge_i, reach_bar_i, foot, s) -> real:
         whole, from_surface = s.volume * gradient(x_ij, s), x_ij - foot
         part = normal(whole, foot)
         return wp.dot(part + edge_i * (whole - part), from_surface) * reach_bar_i[0]
@@ -185,16 +184,10 @@ def mirror_term(discretisation: Discretisation) -> WallTerm:
 
 
 def _mirror_work(d: Discretisation) -> Any:
-    real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
+    real, gradient, normal = d.precision.real, pair_functions(d).gradient, normal_part(d)
 
-    def mirror_work(
-        x_ij: vector,
-        image_i: real,
-        reach_bar_i: vector,
-        mirrored: real,
-        foot: vector,
-        s: neighbourhood_type(d.precision),
-    ) -> real:
+    @types_by_name(d.precision, {d.precision.vector: "reach"})
+    def mirror_work(x_ij, image_i, reach_bar_i, mirrored, foot, s) -> real:
         part = s.volume * normal(gradient(x_ij, s), foot)
         return -mirrored * wp.dot(part, x_ij - foot) * image_i * reach_bar_i[0]
 
@@ -202,16 +195,11 @@ def _mirror_work(d: Discretisation) -> Any:
 
 
 @cache
-def pressed_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Make the kernel of a pressure p = k / dt from its impulse k, and that of its adjoint."""
-    real, module = precision.real, integration_module(precision, False)
+def pressed_kernels(precision: Precision) -> Kernels:
+    """Make the kernels of a pressure p = k / dt from its impulse k."""
+    real, modules = precision.real, [integration_module(precision, False)] * 3
 
-    @particle_kernel(module, "p")
     def pressed(time_step: real, impulse_i: real) -> real:
         return impulse_i / time_step
 
-    @particle_kernel(module, "+impulse_bar +time_step_bar")
-    def pressed_adjoint(time_step: real, impulse_i: real, p_bar_i: real) -> tuple[real, real]:
-        return p_bar_i / time_step, -impulse_i / (time_step * time_step) * p_bar_i
-
-    return pressed, pressed_adjoint
+    return pointwise_kernels(precision, modules, lambda _: pressed, ["p"])

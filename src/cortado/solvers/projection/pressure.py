@@ -32,7 +32,7 @@ correction comes before the first iteration too (`cortado.solvers.projection.ste
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -42,8 +42,9 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.particle_kernels import particle_kernel
-from cortado.solvers.projection.effects import image_sums, weights_type
+from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels
+from cortado.solvers.projection.effects import image_sums
+from cortado.solvers.projection.names import types_by_name, weights_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import matrix_type, symmetric
@@ -277,91 +278,53 @@ and a fountain it took none further than that, but particles that wait in a nozz
 @cache
 def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     """Make the kernels of the first pressure and velocity of a step, in 2 or 3 dimensions."""
-    precision = discretisation.precision
+    precision, modules = discretisation.precision, discretisation.modules(f"projection_{dimension}d")
     real, vector, weights4 = precision.real, precision.vector, weights_type(precision)
-    topic = f"projection_{dimension}d"
-    module, tangent_module, adjoint_module = discretisation.modules(topic)
     towards = wp.constant(real(TOWARDS))
+    typed = types_by_name(precision, {int: "surfaced warm", bundle(k=real, y=real, u=vector): "first"})
 
-    @wp.func
-    def taken(kick: vector, gamma: vector, dt: real, spacing: real) -> real:
-        """Return 1 for a particle that takes on the pressure of the step before, 0 for one kicked towards a wall."""
-        if wp.dot(kick, gamma) > real(0.0) and dt * wp.length(kick) > towards * spacing:
-            return real(0.0)
-        return real(1.0)
-
-    @wp.kernel(module=module)
-    def begin(
-        particles: int,
-        spacing: real,
-        time_step: wp.array(dtype=real),
-        k_before: wp.array(dtype=real),
-        kick_before: wp.array(dtype=vector),
-        beside: wp.array(dtype=vector),
-        v_star: wp.array(dtype=vector),
-        surfaced: wp.array(dtype=int),
-        # in and out
-        weights: wp.array(dtype=weights4),
-        # out
-        k: wp.array(dtype=real),
-        y: wp.array(dtype=real),
-        u: wp.array(dtype=vector),
-        warm: wp.array(dtype=int),
-    ):
-        """Write k, y and u of the first iterate of a step; ``warm`` is 0 for each scene before."""
-        i = wp.tid()
-        if surfaced[i // particles] == 0:
-            weights[i][0] = real(1.0)
-        full = weights[i][1] * taken(kick_before[i], beside[i], time_step[i // particles], spacing)
-        first = full * k_before[i]
-        k[i] = first
-        y[i] = first
-        u[i] = v_star[i] + full * kick_before[i]
-        if not (first <= real(0.0)) and warm[i // particles] == 0:
-            warm[i // particles] = 1
-
-    @particle_kernel(tangent_module, "weights_dot k_dot y_dot u_dot", numbers=["spacing"])
-    def begin_tangent(
-        spacing: real,
-        time_step: real,
-        k_before_i: real,
-        k_before_dot_i: real,
-        kick_before_i: vector,
-        kick_before_dot_i: vector,
-        weights_i: weights4,
-        weights_dot_i: weights4,
-        beside_i: vector,
-        surfaced: int,
-        v_star_dot_i: vector,
+    @typed
+    def start(
+        spacing, time_step, k_before_i, kick_before_i, weights_i, beside_i, surfaced, v_star_i
     ) -> tuple[weights4, real, real, vector]:
-        part, kept = taken(kick_before_i, beside_i, time_step, spacing), weights_dot_i
+        """Return the weights, k, y and u of a particle, without what it had if its kick would take it towards a
+        wall."""
+        full, tension = weights_i[1], weights_i[0]
+        if wp.dot(kick_before_i, beside_i) > real(0.0) and time_step * wp.length(kick_before_i) > towards * spacing:
+            full = real(0.0)
         if surfaced == 0:
-            kept[0] = real(0.0)
-        full, full_dot = part * weights_i[1], part * weights_dot_i[1]
-        first = full_dot * k_before_i + full * k_before_dot_i
-        return kept, first, first, v_star_dot_i + full_dot * kick_before_i + full * kick_before_dot_i
+            tension = real(1.0)
+        first = full * k_before_i
+        kept = weights4(tension, weights_i[1], weights_i[2], weights_i[3])
+        return kept, first, first, v_star_i + full * kick_before_i
 
-    @particle_kernel(adjoint_module, "weights_bar +v_bar k_before_bar kick_before_bar", numbers=["spacing"])
-    def begin_adjoint(
-        spacing: real,
-        time_step: real,
-        k_before_i: real,
-        kick_before_i: vector,
-        weights_i: weights4,
-        weights_bar_i: weights4,
-        beside_i: vector,
-        surfaced: int,
-        k_bar_i: real,
-        y_bar_i: real,
-        u_bar_i: vector,
-    ) -> tuple[weights4, vector, real, vector]:
-        """Apply the adjoint of the first iterate of a step; ``v_bar`` is the adjoint of v*."""
-        part = taken(kick_before_i, beside_i, time_step, spacing)
-        both, full, no = k_bar_i + y_bar_i, part * weights_i[1], real(0.0)
-        full_bar = part * (k_before_i * both + wp.dot(kick_before_i, u_bar_i))
-        found = weights_bar_i + weights4(no, full_bar, no, no)
-        if surfaced == 0:
-            found[0] = real(0.0)
-        return found, u_bar_i, full * both, full * u_bar_i
+    begun = wp.func(start, module=modules[0])
 
-    return Kernels(begin, begin_tangent, begin_adjoint)
+    @wp.kernel(module=modules[0])
+    @typed.arrays
+    def begin(
+        particles: int, spacing: real, time_step, k_before, kick_before, beside, v_star, surfaced, weights, first, warm
+    ):
+        """Write k, y and u of the first iterate of a step, and weights; ``warm`` is 0 for each scene before."""
+        i, member = wp.tid(), wp.tid() // particles
+        kept, pressure, _same, velocity = begun(
+            spacing, time_step[member], k_before[i], kick_before[i], weights[i], beside[i], surfaced[member], v_star[i]
+        )
+        weights[i] = kept
+        first.k[i] = pressure
+        first.y[i] = pressure
+        first.u[i] = velocity
+        if not (pressure <= real(0.0)) and warm[member] == 0:
+            warm[member] = 1
+
+    made = pointwise_kernels(
+        precision,
+        modules,
+        lambda _: start,
+        ["weights", "k", "y", "u"],
+        {"weights": "weights"},
+        numbers=["spacing"],
+        known=["time_step", "beside", "surfaced"],
+        written=["k_before", "kick_before"],
+    )
+    return replace(made, forward=begin)

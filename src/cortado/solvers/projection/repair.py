@@ -26,7 +26,8 @@ from cortado.device.precision import TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.particles.wall_terms import solid_kernel
-from cortado.solvers.projection.effects import image_sums, weights_type
+from cortado.solvers.projection.effects import image_sums
+from cortado.solvers.projection.names import weights_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
 from cortado.sph.density import density_sums

@@ -34,8 +34,9 @@ from cortado.solvers.build import SolverSetting, particle_system
 from cortado.solvers.loop import LoopLimits
 from cortado.solvers.pcisph.solver import Pcisph
 from cortado.solvers.projection.derivatives import ProjectionAdjoint, ProjectionTangent
-from cortado.solvers.projection.effects import image_sums, weights_type
+from cortado.solvers.projection.effects import image_sums
 from cortado.solvers.projection.lattice import coarse_grid, endless, lattice_constants
+from cortado.solvers.projection.names import weights_type
 from cortado.solvers.projection.pressure import clamp_functions
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
 from cortado.solvers.projection.sums import projection_sums, velocity_gradient_kernels

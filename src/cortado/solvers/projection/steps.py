@@ -43,16 +43,17 @@ from cortado.device.grid import Grid
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels
+from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Parameters, State, StateField
 from cortado.solvers.loop import ROOT_MEAN_SQUARE, IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.coarse import Coarse
-from cortado.solvers.projection.effects import effect_functions, weights_type
+from cortado.solvers.projection.effects import effect_functions
 from cortado.solvers.projection.image_loads import ImageLoads
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.mean_stress import MeanStress, pressed_kernels
+from cortado.solvers.projection.names import types_by_name
 from cortado.solvers.projection.pressure import PressureKernels, beginning_kernels, pressure_kernels
 from cortado.solvers.projection.repair import RepairKernels, repair_kernels
 from cortado.solvers.projection.sums import VelocityKernels, velocity_kernels
@@ -84,25 +85,14 @@ WEAK = 0.004
 
 def shift_of_particle(precision: Precision, dimension: int, module: Any) -> Callable[..., Any]:
     """Make the function of the shift delta by A = sum_j v_ij g_ij^T, k = dt p and surroundings; ``beside`` is gamma."""
-    real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
+    real, vector, typed = precision.real, precision.vector, types_by_name(precision)
     inverse = effect_functions(precision, dimension, module).inverse
     rate, greatest, least = (wp.constant(real(value)) for value in (RATE, GREATEST, LEAST))
     farthest, away = wp.constant(real(FARTHEST)), wp.constant(real(AWAY))
     surface, pulled, weak = (wp.constant(real(value)) for value in (SURFACE**2, PULLED, WEAK))
 
-    def shift(
-        spacing: real,
-        time_step: real,
-        A_i: matrix,
-        k_i: real,
-        m_i: real,
-        M_i: matrix,
-        g_i: vector,
-        beside_i: vector,
-        crowd_i: vector,
-        apart_i: vector,
-        weights_i: weights4,
-    ) -> vector:
+    @typed
+    def shift(spacing, time_step, A_i, k_i, m_i, M_i, g_i, beside_i, crowd_i, apart_i, weights_i) -> vector:
         G = A_i * inverse(real(0.5) * (M_i + wp.transpose(M_i)))  # so that the adjoint of M is symmetric, as M is
         turned = time_step * time_step * wp.ddot(G, G)
         strength = rate * turned / (wp.sqrt(turned + least * least) + least)
@@ -148,31 +138,15 @@ def following_kernels(d: Discretisation, dimension: int) -> Kernels:
 
 @cache
 def moving_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of the positions before the first repair; the adjoint of these is that of delta too."""
-    real, vector, derivatives = precision.real, precision.vector, integration_module(precision, False)
+    """Make the kernels of the positions before the first repair, whose adjoint stands where that of delta is
+    written."""
+    modules = [integration_module(precision, forward) for forward in (True, False, False)]
+    real, vector = precision.real, precision.vector
 
-    @particle_kernel(integration_module(precision, True), "x_moved x_now c")
-    def move(time_step: real, x_i: vector, v_new_i: vector, delta_i: vector) -> tuple[vector, vector, real]:
-        moved = x_i + time_step * v_new_i + delta_i
-        return moved, moved, real(0.0)
+    def move(time_step: real, x_i: vector, v_new_i: vector, delta_i: vector) -> vector:
+        return x_i + time_step * v_new_i + delta_i
 
-    @particle_kernel(derivatives, "x_moved_dot x_now_dot c_dot")
-    def move_tangent(
-        time_step: real,
-        time_step_dot: real,
-        v_new_i: vector,
-        x_dot_i: vector,
-        v_new_dot_i: vector,
-        delta_dot_i: vector,
-    ) -> tuple[vector, vector, real]:
-        moved = x_dot_i + time_step * v_new_dot_i + time_step_dot * v_new_i + delta_dot_i
-        return moved, moved, real(0.0)
-
-    @particle_kernel(derivatives, "+x_bar +v_new_bar +time_step_bar")
-    def move_adjoint(time_step: real, v_new_i: vector, x_moved_bar_i: vector) -> tuple[vector, vector, real]:
-        return x_moved_bar_i, time_step * x_moved_bar_i, wp.dot(x_moved_bar_i, v_new_i)
-
-    return Kernels(move, move_tangent, move_adjoint)
+    return pointwise_kernels(precision, modules, lambda _: move, ["x_moved"], {"x_moved": "delta"})
 
 
 IMPULSE = "pressure_impulse"
@@ -333,7 +307,7 @@ class ProjectionSteps(ParticleSolver):
         return self._over_time(self.mean_stress.impulses(self.context(self.parameters), self.around, at), "stress")
 
     def _over_time(self, impulses: wp.array, name: str) -> wp.array:
-        pressed, found = pressed_kernels(self.layout.precision)[0], self._pressures[name]
+        pressed, found = pressed_kernels(self.layout.precision).forward, self._pressures[name]
         self.context(self.parameters).launch(pressed, impulse=impulses, p=found)
         return found
 
@@ -411,7 +385,9 @@ class ProjectionSteps(ParticleSolver):
         flow = {"A": self.last_gradient(last), "k": self.iterates[last]["k"]}
         context.launch(kernels.shift.forward, self.around, self.spaced, flow, delta=self.delta)
         moved = {"v_new": self.iterates[last]["u"], "delta": self.delta, "x_moved": self.x_moved}
-        context.launch(kernels.moving.forward, moved, x_now=first["x_now"], c=first["c"])
+        context.launch(kernels.moving.forward, moved)
+        wp.copy(first["x_now"], self.x_moved)
+        first["c"].zero_()
 
     def last_gradient(self, slot: int) -> wp.array:
         """Return A, the velocity gradient sums of the last iteration, whose result is in a slot."""

@@ -13,11 +13,12 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.device.precision import TypesByName, arithmetic
+from cortado.device.precision import arithmetic
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.solvers.projection.effects import image_sums
+from cortado.solvers.projection.names import types_by_name
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions, symmetric
 
 CROWDED = 0.25
@@ -60,13 +61,13 @@ class ProjectionSums:
 def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     """Make the sums over neighbours of the projection, for a discretisation."""
     real, vector, neighbourhood = discretisation.types
-    matrix = matrix_type(discretisation.precision)
     pair = pair_functions(discretisation)
     packed, cross_terms = symmetric(discretisation.precision), cross_terms_function(discretisation.precision)
     six, times = packed.kind, packed.times
     crowded, unequal = wp.constant(real(CROWDED)), wp.constant(real(UNEQUAL))
     reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
     weight, slope, gradient, hessian_product = pair.weight, pair.slope, pair.gradient, pair.hessian_product
+    typed = types_by_name(discretisation.precision)
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
@@ -121,16 +122,9 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
 
     @tangent_of(moments)
     @fluid_sum(discretisation, ahead=False)
+    @typed
     def moments_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        m_i: real,
-        m_j: real,
-        m_dot_i: real,
-        m_dot_j: real,
-        per_nearest: real,
-        per_apart: real,
-        s: neighbourhood,
+        x_ij, x_dot_ij, m_i, m_j, m_dot_i, m_dot_j, per_nearest, per_apart, s
     ) -> tuple[vector, vector, vector, vector, vector, vector, vector, real]:
         g = s.volume * gradient(x_ij, s)
         g_dot = s.volume * hessian_product(x_ij, x_dot_ij, s)
@@ -203,9 +197,8 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
 
     @tangent_of(velocity_gradient)
     @fluid_sum(discretisation, ahead=False)
-    def velocity_gradient_tangent(
-        x_ij: vector, x_dot_ij: vector, v_ij: vector, v_dot_ij: vector, s: neighbourhood
-    ) -> tuple[vector, vector, vector]:
+    @typed
+    def velocity_gradient_tangent(x_ij, x_dot_ij, v_ij, v_dot_ij, s) -> tuple[vector, vector, vector]:
         g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
         return (
             v_dot_ij[0] * g + v_ij[0] * g_dot,
@@ -214,9 +207,8 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         )
 
     @fluid_sum(discretisation)
-    def velocity_gradient_back(
-        x_ij: vector, v_ij: vector, A_bar_i: matrix, A_bar_j: matrix, s: neighbourhood
-    ) -> tuple[vector, vector]:
+    @typed
+    def velocity_gradient_back(x_ij, v_ij, A_bar_i, A_bar_j, s) -> tuple[vector, vector]:
         pulled = wp.transpose(A_bar_i + A_bar_j) * v_ij
         return A_bar_j * (s.volume * gradient(x_ij, s)), s.volume * hessian_product(x_ij, pulled, s)
 
@@ -231,9 +223,8 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
 
     @tangent_of(push)
     @fluid_sum(discretisation, ahead=False)
-    def push_tangent(
-        x_ij: vector, x_dot_ij: vector, c_i: real, c_j: real, c_dot_i: real, c_dot_j: real, s: neighbourhood
-    ) -> vector:
+    @typed
+    def push_tangent(x_ij, x_dot_ij, c_i, c_j, c_dot_i, c_dot_j, s) -> vector:
         change = (c_dot_i + c_dot_j) * gradient(x_ij, s) + (c_i + c_j) * hessian_product(x_ij, x_dot_ij, s)
         return s.volume * change
 
@@ -277,7 +268,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     whole = moment_functions(precision, dimension).change
     module, tangent_module, adjoint_module = discretisation.modules(f"projection_{dimension}d")
 
-    typed = TypesByName(real, {vector: "total lifted g gamma v diagonal others x f", six: "T", matrix: "L"})
+    typed = types_by_name(precision)
 
     @particle_kernel(module, "kick u", [over(sums.force.forward, "total"), over(mirrors.lift, "lifted")])
     @typed
@@ -329,9 +320,8 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         return y_part, y_i * widened, y_i * A, y_i * f_i, x_part + x_lift
 
     @particle_kernel(adjoint_module, "+v_bar +m_bar T f kick_bar")
-    def own_adjoint(
-        m_i: real, v_star_i: vector, y_i: real, L_i: matrix, u_i: vector, u_bar_i: vector, kick_bar_i: vector
-    ) -> tuple[vector, real, six, vector, vector]:
+    @typed
+    def own_adjoint(m_i, v_star_i, y_i, L_i, u_i, u_bar_i, kick_bar_i) -> tuple[vector, real, six, vector, vector]:
         """Write f = -(u_bar + kick_bar) / m and T = y L; the adjoint of the kick is 0 afterwards."""
         bar = u_bar_i + kick_bar_i
         return u_bar_i, wp.dot(bar, v_star_i - u_i) / m_i, y_i * pack(L_i), -bar / m_i, vector()
@@ -350,6 +340,7 @@ def velocity_gradient_kernels(discretisation: Discretisation, dimension: int) ->
     """Make the kernels of A = sum v_ij g_ij^T in 2 or 3 dimensions; the adjoint needs g, the sum of g_ij."""
     precision, modules = discretisation.precision, discretisation.modules(f"projection_{dimension}d")
     vector, matrix, sums = precision.vector, matrix_type(precision), projection_sums(discretisation)
+    typed = types_by_name(precision)
 
     def gradient(name: str, module: Any, result: str, total: Any) -> Any:
         @particle_kernel(module, result, [over(total, "row_x row_y row_z", v="v_flow", v_dot="v_flow_dot")], name=name)
@@ -361,9 +352,8 @@ def velocity_gradient_kernels(discretisation: Discretisation, dimension: int) ->
     back = over(sums.velocity_gradient.adjoint, "v_part x_part", v="v_flow")
 
     @particle_kernel(modules[2], "+x_bar +v_flow_bar", [back])
-    def velocity_gradient_adjoint(
-        v_part: vector, x_part: vector, g_i: vector, A_bar_i: matrix
-    ) -> tuple[vector, vector]:
+    @typed
+    def velocity_gradient_adjoint(v_part, x_part, g_i, A_bar_i) -> tuple[vector, vector]:
         return x_part, v_part + A_bar_i * g_i
 
     return Kernels(

@@ -33,6 +33,7 @@ from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm, solid_kernel
 from cortado.solvers.projection.lattice import ProjectionConstants
+from cortado.solvers.projection.names import types_by_name
 from cortado.sph.moment_functions import moment_functions
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 from cortado.sph.walls import WallSums, wall_slope_term
@@ -102,7 +103,7 @@ def beside_sums(discretisation: Discretisation) -> BesideSums:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
-    normal = normal_part(discretisation)
+    normal, typed = normal_part(discretisation), types_by_name(discretisation.precision)
 
     @wall_sum(discretisation)
     def beside(x_ij: vector, v_j: vector, foot: vector, s: neighbourhood) -> tuple[vector, vector, real, real, real]:
@@ -111,15 +112,8 @@ def beside_sums(discretisation: Discretisation) -> BesideSums:
         return part, whole, s.volume * weight(x_ij, s), wp.dot(part, v_j), wp.dot(whole, v_j)
 
     @wall_sum(discretisation, grows=beside)
-    def beside_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        v_j: vector,
-        v_dot_j: vector,
-        foot: vector,
-        turn_dot: vector,
-        s: neighbourhood,
-    ) -> tuple[vector, vector, real, real, real]:
+    @typed
+    def beside_tangent(x_ij, x_dot_ij, v_j, v_dot_j, foot, turn_dot, s) -> tuple[vector, vector, real, real, real]:
         """Return the tangent of a wall particle's terms. A wall that turns turns its push; the rest of its way changes
         the push as beside a wall that does not turn."""
         rest = x_dot_ij - wp.cross(turn_dot, x_ij)
@@ -130,16 +124,9 @@ def beside_sums(discretisation: Discretisation) -> BesideSums:
         return part_dot, whole_dot, wp.dot(whole, rest), part_drift, whole_drift + wp.dot(whole, v_dot_j)
 
     @wall_sum(discretisation)
+    @typed
     def beside_back(
-        x_ij: vector,
-        v_j: vector,
-        normal_bar_i: vector,
-        whole_bar_i: vector,
-        nu_bar_i: real,
-        normal_drift_bar_i: real,
-        whole_drift_bar_i: real,
-        foot: vector,
-        s: neighbourhood,
+        x_ij, v_j, normal_bar_i, whole_bar_i, nu_bar_i, normal_drift_bar_i: real, whole_drift_bar_i: real, foot, s
     ) -> vector:
         pushed = normal(normal_bar_i + normal_drift_bar_i * v_j, foot) + whole_bar_i + whole_drift_bar_i * v_j
         return s.volume * (hessian_product(x_ij, pushed, s) + nu_bar_i * gradient(x_ij, s))
