@@ -1,7 +1,6 @@
 """Surface tension by curvature: its constants, particles that are too few for a curvature, and what depends on it.
 
-Its kernels and whole steps: tests/test_force_kernels.py, tests/test_step.py. How drops oscillate:
-tests/test_validation_flows.py."""
+Whole steps: tests/test_step.py. How drops oscillate: tests/test_validation_flows.py."""
 
 import warnings
 

@@ -106,6 +106,16 @@ def test_all_parameters_at_once(made):
     assert distance(problem.value, point, directions, tangent, decades(2.0, 11.0, apart=0.25), enough=1e-6) < 1e-6
 
 
+def test_a_fluid_without_viscosity_has_gradients_by_pairs():
+    """Whose mean viscosity divides by 0 where nobody looks."""
+    water = [{"name": "water", "rest_density": 1000.0, "viscosity": 0.0}]
+    problem = problem_of(plane(phase=water, forces={"gravity": [0.0, -9.81], "viscosity": "pairwise"}), 40)
+    point = {"initial_positions": disturbed(problem.simulation.positions)}
+    directions = {"initial_positions": 0.05 * np.random.default_rng(1).standard_normal((64, 2)) / 8.0}
+    _, tangent = both_modes(problem, point, directions)
+    assert distance(problem.value, point, directions, tangent, decades(2.0, 11.0, apart=0.25), enough=1e-6) < 1e-6
+
+
 def test_float32_gradient_is_near_the_float64_one():
     point = {"gravity": np.array([0.0, -9.81, 0.0])}
     found = []

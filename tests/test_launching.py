@@ -1,9 +1,10 @@
-"""How kernels are launched: arguments bound by their names, and several threads for one particle."""
+"""How kernels are launched: arguments bound by their names, several threads for one particle, and sums over all."""
 
 import gc
 import pickle
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import warp as wp
 
@@ -11,7 +12,7 @@ from cortado import InputError, Problem, Simulation, losses
 from cortado.device.lanes import BY_SIZE, lanes_for, lanes_of
 from cortado.device.launching import Bundles, KernelLauncher, bound, launch, launch_together, watched
 from cortado.device.precision import FLOAT32, FLOAT64
-from cortado.device.reduction import SHARED, sum_and_maximum_kernel, sum_kernel
+from cortado.device.reduction import SHARED, add, sum_and_maximum, sum_and_maximum_kernel, sum_kernel, sum_of
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C4
 from cortado.gradients.reverse_mode import adjoint_filter_kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
@@ -242,3 +243,62 @@ def test_kernels_for_lanes_compile_for_a_gpu_that_is_not_there(k, tmp_path):
     modules = list({kernel.module.name: kernel.module for kernel in kernels}.values())
     for module in modules[k :: len(COMBINATIONS)]:
         compiles(module, tmp_path)
+
+
+SIZES = [1, 2, 63, 64, 65, 128, 4096, 4097, 5000]
+precisions = pytest.mark.parametrize("precision", [FLOAT32, FLOAT64], ids=lambda precision: precision.name)
+
+
+def summed(tree, values, dtype):
+    return tree(wp.array(values, dtype=dtype, device="cpu")).numpy()
+
+
+TYPES = {
+    "numbers": lambda precision: precision.real,
+    "vectors": lambda precision: precision.vector,
+    "four fractions": lambda precision: precision.fractions(4),
+    "matrices": lambda precision: wp.types.matrix(shape=(3, 3), dtype=precision.real),
+}
+types = pytest.mark.parametrize("type_of", TYPES.values(), ids=TYPES)
+
+
+@precisions
+@types
+@pytest.mark.parametrize("size", SIZES)
+def test_sum_of(size, type_of, precision):
+    dtype = type_of(precision)
+    one = getattr(dtype, "_shape_", ())
+    values = np.random.default_rng(size).standard_normal((size, *one)).astype(precision.numpy)
+    tree = sum_of(dtype, size, wp.get_device("cpu"))
+    first, second = (summed(tree, values, dtype).copy() for _ in range(2))
+    again = summed(sum_of(dtype, size, wp.get_device("cpu")), values, dtype)
+    assert first.shape == (1, *one)
+    assert first.tobytes() == second.tobytes() == again.tobytes()
+    error = 20 * np.finfo(precision.numpy).eps * np.abs(values).sum()
+    np.testing.assert_allclose(first[0], values.astype(np.float64).sum(axis=0), rtol=0, atol=error)
+    whole = np.arange(values.size).reshape(values.shape) % 7  # every partial sum is exact
+    np.testing.assert_array_equal(summed(tree, whole.astype(precision.numpy), dtype)[0], whole.sum(axis=0))
+
+
+@precisions
+@types
+def test_add(type_of, precision):
+    dtype = type_of(precision)
+    shape = (60, *getattr(dtype, "_shape_", ()))
+    values, total = np.random.default_rng(81).standard_normal((2, *shape)).astype(precision.numpy)
+    target = wp.array(total, dtype=dtype, device="cpu")
+    add(wp.array(values, dtype=dtype, device="cpu"), target)
+    np.testing.assert_array_equal(target.numpy(), total + values)
+
+
+@precisions
+@pytest.mark.parametrize("size", SIZES)
+def test_sum_and_maximum(size, precision):
+    values = np.random.default_rng(size).uniform(-2.0, -1.0, (size, 2)).astype(precision.numpy)
+    tree, error = sum_and_maximum(size, precision, wp.get_device("cpu")), 20 * float(np.finfo(precision.numpy).eps)
+    for place in {0, size // 2, size - 1}:
+        values[place, 1] = -0.5
+        (found,) = summed(tree, values, precision.pair)
+        assert found[0] == pytest.approx(values[:, 0].astype(np.float64).sum(), rel=error)
+        assert found[1] == -0.5
+        values[place, 1] = -1.5

@@ -826,24 +826,12 @@ def test_wrong_settings_are_refused(make):
         ({"start": {"x": [[1.0], [1.0, 2.0]]}}, r"'x' is \[\[1.0\], \[1.0, 2.0\]\], but must be a number or an array"),
         ({"start": np.ones(2)}, r"^The start is array\(\[1., 1.\]\), but must name its parameters"),
         ({"optimiser": Adam}, "^The optimiser must be an object such as"),
-        (
-            {"optimiser": "adm"},
-            "^The optimiser is 'adm', but must be one of 'adam', 'gradient_descent', 'lbfgs', 'line_search', or an obj",
-        ),
-        (
-            {"optimiser": "gradient_descent"},
-            "^'gradient_descent' needs 'learning_rate'; its settings are 'learning_rate', 'momentum'.$",
-        ),
-        (
-            {"optimiser": "lbfgs", "learning_rate": 0.1},
-            "^'learning_rate' is no setting of 'lbfgs', whose settings are 'memory', 'tolerance', 'scale'.$",
-        ),
+        ({"optimiser": "adm"}, "^The optimiser is 'adm', but must be one of 'adam', 'gradient_descent', 'lbfgs'"),
+        ({"optimiser": "gradient_descent"}, "^'gradient_descent' needs 'learning_rate'; its settings are"),
+        ({"optimiser": "lbfgs", "learning_rate": 0.1}, "^'learning_rate' is no setting of 'lbfgs', whose settings"),
         ({"optimiser": "adam", "learning_rate": -1.0}, "^learning_rate must be a positive, finite number"),
         ({"learning_rate": 0.1}, "^optimise was given 'learning_rate', but takes settings only of an optimiser that"),
-        (
-            {"optimiser": Adam({"y": 0.1})},
-            "learning_rate is given for 'y', but the optimised parameters are 'x'",
-        ),
+        ({"optimiser": Adam({"y": 0.1})}, "learning_rate is given for 'y', but the optimised parameters are 'x'"),
         ({"optimiser": LBFGS(scale={})}, "scale is given for none"),
         ({"iterations": 0}, "number of iterations"),
         ({"iterations": 2.5}, "number of iterations"),

@@ -11,8 +11,6 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-import test_force_kernels
-import test_kernels
 from cortado import Problem, Scene, Simulation
 from cortado.losses import CentreOfMass, FinalPositions, Frames
 from scenes import jet, plane, plane_of_three
@@ -20,7 +18,6 @@ from test_ranges import Weighed, set_parts
 
 STEPS = 7
 SCENES = {"one fluid": plane, "mixture": plane_of_three, "emitter": jet}
-OPERATIONS = [*test_kernels.TANGENT, *test_force_kernels.OPERATIONS]
 
 seeds = st.integers(0, 2**31)
 names = st.sampled_from(list(SCENES))
@@ -59,25 +56,6 @@ def evaluation(problem: Problem, point: dict[str, Any]) -> dict[str, bytes]:
     loss, gradient = problem.value_and_gradient(point)
     assert all(np.any(bar) for bar in gradient.values())
     return bits({"loss": loss, **gradient})
-
-
-@pytest.mark.parametrize("operation", OPERATIONS, ids=lambda operation: operation.__name__)
-@examples(5)
-@given(where=st.sampled_from(["3-D", "2-D", "periodic"]), seed=seeds)
-def test_derivatives_of_operations_on_any_cloud(operation, where, seed):
-    """The tangent is the limit of differences, and the adjoint, where there is one, its transpose."""
-    if operation in (test_force_kernels.OfOneFunction, test_force_kernels.PairOfOneFunction):
-        where = "3-D" if where == "2-D" else where  # their kernels are those of space
-    op = operation(test_kernels.cloud(where, seed))
-    directions, weights = op.directions(seed + 1), op.weights(seed + 2)
-    tangent = op.tangent(op.start, directions)
-    test_kernels.check_differences(op, directions, tangent)
-    if operation in test_kernels.TANGENT and operation not in test_kernels.ADJOINT:
-        return
-    forward = test_kernels.inner(tangent, weights, op.outputs)
-    backward = test_kernels.inner(op.adjoint(op.start, weights), directions, op.inputs)
-    sizes = test_kernels.norm(tangent, op.outputs) * test_kernels.norm(weights, op.outputs)
-    assert abs(forward - backward) <= 1e-12 * sizes
 
 
 @examples(8)

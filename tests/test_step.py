@@ -9,7 +9,7 @@ from cortado import Simulation
 from cortado.gradients import Exact
 from cortado.losses.loss import ADJOINT_FIELDS
 from cortado.rollout.parameter_space import ParameterSpace
-from scenes import jet, plane, plane_of_three, pour, scatter, scene, two_layers
+from scenes import MIXING, jet, plane, plane_of_three, pour, scatter, scene, two_layers
 from twins import emitter_twin, nozzle_of, tension_twin, twin
 
 BY_CURVATURE = {"kind": "projection", "time_step": 0.0021}
@@ -44,6 +44,17 @@ def curved(make=tense, **changes):
 
 def curved_cube(**changes):
     return curved(tense_cube, **changes)
+
+
+def miscible(make=two_layers, **changes):
+    """Fluids that mix in any share."""
+    return make(**changes, mixture={**make().mixture.model_dump(), "free_energy": "miscible"})
+
+
+def three_miscible(**changes):
+    """Of three, with a mobility that depends on the fractions."""
+    mixture = {**MIXING, "mobility": 0.03, "free_energy": "miscible"}
+    return plane_of_three(**changes, mixture=mixture)
 
 
 def point_of(simulation, seed=0):
@@ -121,6 +132,8 @@ CASES = [
     (two_layers, "cubic_spline", "pairwise", "free"),
     (two_layers, "wendland_c2", "stress", "no"),
     (plane_of_three, "cubic_spline", "pairwise", "no"),
+    (miscible, "wendland_c2", "stress", "no"),
+    (three_miscible, "cubic_spline", "stress", "free"),
     (tense, "cubic_spline", "pairwise", "free"),
     (tense_cube, "wendland_c2", "pairwise", "no"),
     (curved, "wendland_c4", "stress", "free"),

@@ -50,7 +50,7 @@ def test_what_is_slow_is_left_out_of_what_is_short():
         def __init__(self, file, name):
             self.path, self.name, self.originalname = TESTS / f"{file}.py", name, name.partition("[")[0]
 
-    kept, quick = Item("test_examples", "test_the_code_runs_as_printed"), Item("test_kernels", "test_of_a_second")
+    kept, quick = Item("test_examples", "test_the_code_runs_as_printed"), Item("test_terms", "test_of_a_second")
     whole, case = (
         Item("test_plants", "test_every_plant_is_found[x]"),
         Item("test_docs", "test_the_code_runs_as_printed[solids.md]"),
