@@ -1,6 +1,5 @@
-"""Cortado as a layer of JAX: derivatives in both modes, bits, compiled programs, maps, and bad uses in sentences."""
+"""Cortado as a layer of JAX, what it has alone (see test_layer.py): compiled programs, lost scenes, bad uses."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,7 +12,6 @@ from cortado import InputError, Problem, Simulation, gradients, sensors
 from cortado.optimisation.layers.layer import KEPT
 from layered import (
     BAD_PARAMETERS,
-    POINT,
     STIFF,
     assert_refused,
     matched,
@@ -24,10 +22,7 @@ from layered import (
     uses_of_parameters,
     uses_of_state,
 )
-from scenes import jet, plane, two_layers
-
-STEP = 1e-8
-"""Of differences: most directions lead through a kink within a longer one."""
+from scenes import plane, two_layers
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -58,57 +53,12 @@ def problem(simulation):
 
 
 @pytest.fixture(scope="module")
-def chained(layer, simulation):
-    """Three segments of 20 steps, as a function of first positions, velocities, gravity and viscosity."""
-    first = layer.state(simulation)
-
-    def end(positions, velocities, gravity, viscosity):
-        state = {**first, "positions": positions, "velocities": velocities}
-        for _ in range(3):
-            state = layer.step(simulation, state, {"gravity": gravity, "viscosity": STIFF * viscosity}, steps=20)
-        return state["positions"], state["velocities"]
-
-    return end
-
-
-@pytest.fixture(scope="module")
 def point(jax, simulation):
     values = simulation.positions, shear(simulation), np.array([0.4, -9.0]), np.array(0.7)
     return tuple(jax.numpy.asarray(value) for value in values)
 
 
 # ---- derivatives -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("argument", range(4))
-def test_chained_segments_have_the_derivatives_of_differences(jax, chained, point, argument):
-    """In both modes, with respect to each argument alone, whose derivative is far above the tolerance."""
-    from jax.test_util import check_grads
-
-    def of_one(value):
-        return chained(*point[:argument], value, *point[argument + 1 :])
-
-    check_grads(of_one, (point[argument],), order=1, modes=["fwd", "rev"], eps=STEP, atol=1e-6, rtol=1e-5)
-    _, dots = jax.jvp(of_one, (point[argument],), (jax.numpy.ones_like(point[argument]),))
-    assert all(np.abs(dot).max() > 1e-3 for dot in dots)
-
-
-@pytest.mark.parametrize("made", [two_layers, scheduled, jet])
-def test_both_modes_agree_for_every_field_of_a_state(jax, layer, made):
-    """<bar, J dot> = <J^T bar, dot>, for the time too."""
-    simulation = Simulation(made(), precision="float64")
-    first = layer.state(simulation, simulation.run(5).last_state)
-    run, rng = partial(layer.step, simulation, steps=4), np.random.default_rng(0)
-    dot = {name: jax.numpy.asarray(rng.standard_normal(array.shape)) for name, array in first.items()}
-    end, forward = jax.jvp(run, (first,), (dot,))
-    bar = {name: jax.numpy.asarray(rng.standard_normal(array.shape)) for name, array in end.items()}
-    (back,) = jax.vjp(run, first)[1](bar)
-    for name in first:
-        one = {**{n: jax.numpy.zeros_like(a) for n, a in dot.items()}, name: dot[name]}
-        _, own = jax.jvp(run, (first,), (one,))
-        wanted = sum(float((bar[n] * own[n]).sum()) for n in own)
-        assert float((back[name] * dot[name]).sum()) == pytest.approx(wanted, rel=1e-9, abs=1e-9), name
-    assert float(forward["positions"].std()) > 0.0
 
 
 def test_compiled_scanned_and_recomputed_segments_have_the_same_gradient(jax, layer, simulation, point):
@@ -195,97 +145,7 @@ def test_a_gradient_is_taken_twice_from_one_forward_run(jax, problem, layer):
     assert back(1.0) == back(1.0) != 0.0
 
 
-# ---- bits --------------------------------------------------------------------------------------------------------
-
-ESTIMATORS = [
-    None,
-    gradients.AdjointViscosity(0.2),
-    gradients.AdjointViscosity(0.2, order=2),
-    gradients.RandomizedSmoothing(samples=4),
-]
-
-
-@pytest.mark.parametrize("gradient", ESTIMATORS, ids=["exact", "viscosity", "order 2", "smoothing"])
-def test_a_value_and_its_gradient_have_the_bits_of_the_problem(jax, layer, problem, gradient):
-    parameters = {name: jax.numpy.asarray(value) for name, value in POINT.items()}
-    wanted, wanted_gradient = problem.value_and_gradient(POINT, gradient)
-    loss = jax.value_and_grad(layer.value(problem, gradient))
-    for evaluate in (loss, jax.jit(loss)):
-        found, found_gradient = evaluate(parameters)
-        assert float(found) == wanted
-        same_bits(found_gradient, wanted_gradient)
-
-
-def test_forward_mode_of_a_value_is_the_tangent_of_the_problem(jax, layer, problem):
-    parameters = {name: jax.numpy.asarray(value) for name, value in POINT.items()}
-    along = {"gravity": jax.numpy.array([1.0, 0.5]), "viscosity": jax.numpy.asarray(3.0)}
-    _, found = jax.jvp(layer.value(problem), (parameters,), (along,))
-    assert float(found) == problem.tangent(POINT, along)
-    gradient = problem.value_and_gradient(POINT, gradients.AdjointViscosity(0.2))[1]
-    _, filtered = jax.jvp(layer.value(problem, gradients.AdjointViscosity(0.2)), (parameters,), (along,))
-    assert float(filtered) == pytest.approx(sum(float((gradient[n] * along[n]).sum()) for n in along), rel=1e-12)
-
-
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("made", [scheduled, two_layers])
-def test_chained_steps_and_rollouts_have_the_bits_of_one_run(jax, layer, made, precision):
-    simulation = Simulation(made(), precision=precision)
-    wanted, state = simulation.run(12), layer.state(simulation)
-    states = jax.jit(lambda first: layer.rollout(simulation, first, steps=12, record_every=4))(state)
-    for steps in (1, 7, 4):
-        state = layer.step(simulation, state, steps=steps)
-    last = wanted.last_state
-    same_bits({name: state[name] for name in last.fields}, last.fields)
-    same_bits({name: states[name][-1] for name in last.fields}, last.fields)
-    np.testing.assert_array_equal(states["positions"][1], wanted.positions[4])
-    assert states["time"].shape == (4,) and float(state["time"]) == pytest.approx(last.clock.time, rel=1e-6)
-    again = layer.restart_state(simulation, state)
-    same_bits(again.fields, last.fields)
-    np.testing.assert_array_equal(simulation.run(3, state=again).positions[-1], simulation.run(15).positions[-1])
-
-
-def test_a_rollout_gives_each_segment_its_rows(jax, layer, simulation):
-    rows = np.array([0.0, -9.81]) + np.random.default_rng(1).standard_normal((6, 2))
-    wanted = simulation.run(6, {"gravity": rows})
-    found = layer.rollout(simulation, layer.state(simulation), {"gravity": jax.numpy.asarray(rows)}, 6, 2)
-    np.testing.assert_array_equal(found["positions"], wanted.positions[::2])
-
-
-def test_a_value_begins_at_a_state_and_has_its_gradient(jax, layer, simulation, problem):
-    state = layer.step(simulation, layer.state(simulation), steps=9)
-    parameters = {name: jax.numpy.asarray(value) for name, value in POINT.items()}
-    loss, (gradient, initial) = jax.value_and_grad(layer.value(problem), argnums=(0, 1))(parameters, state)
-    begun = problem.beginning_at(layer.restart_state(simulation, state))
-    wanted, wanted_gradient, wanted_initial = begun.value_and_gradients(POINT)
-    assert float(loss) == wanted
-    same_bits(gradient, wanted_gradient)
-    same_bits(initial, {name: wanted_initial[name] for name in initial})
-    along = {name: jax.numpy.ones_like(array) for name, array in state.items()}
-    _, forward = jax.jvp(lambda own: layer.value(problem)(parameters, own), (state,), (along,))
-    assert float(forward) == pytest.approx(sum(float(array.sum()) for array in initial.values()), rel=1e-12)
-
-
 # ---- maps --------------------------------------------------------------------------------------------------------
-
-
-def test_a_map_is_a_batch_with_the_bits_of_single_evaluations(jax, layer, simulation, problem):
-    gravities = jax.numpy.array([[0.4, -9.0], [0.0, -9.81], [-1.0, -8.0]])
-    first = {**layer.state(simulation), "velocities": jax.numpy.asarray(shear(simulation))}
-
-    def end(gravity):
-        state = layer.step(simulation, first, {"gravity": gravity}, steps=3)
-        return layer.step(simulation, state, {"gravity": gravity, "viscosity": 5.0}, steps=3)["positions"]
-
-    def loss(gravity):
-        return layer.value(problem)({"gravity": gravity, "viscosity": 9.0})
-
-    for function in (end, loss, jax.grad(loss), jax.grad(lambda g: (end(g) ** 2).sum())):
-        wanted = np.stack([function(gravity) for gravity in gravities])
-        assert np.abs(wanted).max() > 0.0
-        for mapped in (jax.vmap(function), jax.jit(jax.vmap(function))):
-            assert np.asarray(mapped(gravities)).tobytes() == wanted.tobytes()
-    nested = jax.vmap(jax.vmap(loss))(gravities.reshape(1, 3, 2))
-    assert nested.shape == (1, 3) and nested[0, 1] == loss(gravities[1])
 
 
 GONE = np.array([[0.4, -9.0], [9e5, 0.0], [-1.0, -8.0]])
@@ -359,6 +219,12 @@ def test_lost_evaluations_of_a_map_that_goes_one_by_one_leave_the_others(jax, la
     assert np.isfinite(along).all() and along[kept].all() and not along[1].any()
 
 
+def test_a_map_of_a_map_has_the_bits_of_single_evaluations(jax, layer, problem):
+    gravities = jax.numpy.array([[0.4, -9.0], [0.0, -9.81], [-1.0, -8.0]])
+    nested = jax.vmap(jax.vmap(lambda g: layer.value(problem)({"gravity": g, "viscosity": 9.0})))(gravities[None])
+    assert nested.shape == (1, 3) and nested[0, 1] == layer.value(problem)({"gravity": gravities[1], "viscosity": 9.0})
+
+
 def test_constant_rows_of_a_map_are_no_rows_of_steps(jax, layer, simulation):
     """There are as many maps as steps."""
     gravities = np.array([[0.4, -9.0], [0.0, -9.81], [-1.0, -8.0]])
@@ -366,54 +232,6 @@ def test_constant_rows_of_a_map_are_no_rows_of_steps(jax, layer, simulation):
     found = jax.vmap(lambda g: layer.step(simulation, first, {"gravity": g}, steps=3)["velocities"])(gravities)
     wanted = [simulation.run(3, {"gravity": gravity}).last_state["velocities"] for gravity in gravities]
     np.testing.assert_array_equal(found, wanted)
-
-
-def test_an_estimator_without_batches_is_mapped_one_by_one(jax, layer, problem):
-    estimator = gradients.RandomizedSmoothing(samples=4)
-    loss = layer.value(problem, estimator)
-    viscosities = jax.numpy.array([10.0, 12.0])
-    found = jax.vmap(jax.grad(lambda m: loss({"viscosity": m})))(viscosities)
-    wanted = [problem.value_and_gradient({"viscosity": float(m)}, estimator)[1]["viscosity"] for m in viscosities]
-    np.testing.assert_array_equal(found, wanted)
-
-
-def test_jacobians_by_both_modes_agree_and_are_mapped(jax, layer, simulation):
-    first = {**layer.state(simulation), "velocities": jax.numpy.asarray(shear(simulation))}
-
-    def corner(parameters):
-        return layer.step(simulation, first, parameters, steps=1)["velocities"][0]
-
-    def check(point, mapped):
-        back, forward = mapped(jax.jacrev(corner))(point), mapped(jax.jacfwd(corner))(point)
-        for name in point:
-            np.testing.assert_allclose(back[name], forward[name], rtol=1e-8, atol=1e-13)
-            assert np.abs(forward[name]).max() > 1e-5
-        return forward
-
-    one = {"gravity": jax.numpy.array([0.4, -9.0]), "viscosity": jax.numpy.asarray(14.0)}
-    several = {"gravity": jax.numpy.array([[0.4, -9.0], [1.0, -9.0]]), "viscosity": jax.numpy.array([14.0, 3.0])}
-    alone, both = check(one, lambda f: f), check(several, jax.vmap)
-    for name in one:
-        np.testing.assert_array_equal(both[name][0], alone[name])
-    of_all = jax.jacrev(lambda points: jax.vmap(corner)(points))(several)
-    np.testing.assert_allclose(of_all["viscosity"][1, ..., 1], both["viscosity"][1], rtol=1e-8, atol=1e-13)
-
-
-def test_a_batch_of_a_user_has_parameters_in_all_shapes(jax, layer, simulation):
-    problem = matched(Simulation(sheared(), precision="float64", batch=2))
-    gravity = np.array([[[0.4, -9.0]], [[0.0, -9.81]]])
-    losses, wanted = problem.value_and_gradient({"gravity": gravity, "viscosity": 9.0})
-    loss = layer.value(problem)
-    found, back = jax.vjp(lambda g, m: loss({"gravity": g, "viscosity": m}), jax.numpy.asarray(gravity), 9.0)
-    np.testing.assert_array_equal(found, losses)
-    of_gravity, of_viscosity = back(jax.numpy.array([1.0, 2.0]))
-    np.testing.assert_array_equal(of_gravity, wanted["gravity"] * np.array([1.0, 2.0])[:, None, None])
-    assert float(of_viscosity) == pytest.approx(wanted["viscosity"] @ [1.0, 2.0], rel=1e-14)
-    batch = problem.simulation
-    ends = layer.step(batch, layer.state(batch), {"gravity": jax.numpy.asarray(gravity)}, steps=3)
-    assert ends["positions"].shape == (2, 64, 2) and ends["time"].shape == (2,)
-    with pytest.raises(InputError, match="is a batch of 2 cannot be mapped"):
-        jax.vmap(lambda m: loss({"viscosity": m}))(jax.numpy.array([1.0, 2.0]))
 
 
 # ---- searches, threads, what is looked at ------------------------------------------------------------------------
@@ -452,14 +270,6 @@ def test_optax_and_optimistix_search(jax, layer, simulation):
     solver = optimistix.BFGS(rtol=1e-6, atol=1e-9)
     found = optimistix.minimise(lambda own, _: 1e4 * loss(own), solver, start, max_steps=20, throw=False)
     assert loss(found.value) < 1e-3 * loss(start)
-
-
-def test_threads_that_share_a_layer_get_the_bits_of_one(jax, layer, simulation, problem):
-    loss = jax.jit(jax.value_and_grad(lambda m: layer.value(problem)({"viscosity": m})))
-    points = [jax.numpy.asarray(value) for value in (3.0, 8.0, 12.0, 17.0)]
-    wanted = [loss(one) for one in points]
-    with ThreadPoolExecutor(4) as threads:
-        assert list(threads.map(loss, points * 3)) == wanted * 3
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
-"""Cortado as a layer of PyTorch: derivatives in both modes, bits, maps, modules, and bad uses in sentences."""
+"""Cortado as a layer of PyTorch, what it has alone (see test_layer.py): graphs, modules, bad uses in sentences."""
 
 import gc
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -12,21 +11,16 @@ import layered
 from cortado import DivergedError, InputError, Problem, Simulation, gradients, sensors
 from layered import (
     POINT,
-    STIFF,
     assert_refused,
     matched,
     same_bits,
-    scheduled,
-    shear,
     sheared,
     uses_of_parameters,
     uses_of_state,
 )
-from scenes import jet, plane, scene, two_layers
+from scenes import plane, scene, two_layers
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: its CPU wheel is optional", exc_type=ImportError)
-STEP = 1e-8
-"""Of differences: most directions lead through a kink within a longer one."""
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +40,9 @@ def problem(simulation):
     return matched(simulation)
 
 
+ALONG = {"gravity": np.array([1.0, 0.5]), "viscosity": 3.0}
+
+
 def tensor(values):
     return torch.tensor(np.asarray(values), dtype=torch.float64)
 
@@ -57,89 +54,15 @@ def wanted_of(values):
 # ---- derivatives -------------------------------------------------------------------------------------------------
 
 
-def test_chained_segments_pass_the_check_of_gradients(layer, simulation):
-    """60 steps in three segments, in both modes, with respect to positions, velocities, gravity and viscosity, each far
-    above the tolerance."""
-    first = layer.state(simulation)
-
-    def end(positions, velocities, gravity, viscosity):
-        state = {**first, "positions": positions, "velocities": velocities}
-        for _ in range(3):
-            state = layer.step(simulation, state, {"gravity": gravity, "viscosity": STIFF * viscosity}, steps=20)
-        return state["positions"], state["velocities"]
-
-    arguments = tuple(map(wanted_of, (simulation.positions, shear(simulation), [0.4, -9.0], 0.7)))
-    check = partial(torch.autograd.gradcheck, eps=STEP, rtol=1e-4, atol=1e-5, fast_mode=True, check_forward_ad=True)
-    for k in range(4):
-        fixed = [one.detach() for one in arguments]
-
-        def of_one(value, k=k, fixed=fixed):
-            return end(*fixed[:k], value, *fixed[k + 1 :])
-
-        assert check(of_one, (arguments[k],))
-        _, dots = torch.func.jvp(of_one, (fixed[k],), (torch.ones_like(fixed[k]),))
-        assert all(float(dot.abs().max()) > 1e-3 for dot in dots)
-
-    def corner(gravity, viscosity):
-        return end(*[one.detach() for one in arguments[:2]], gravity, viscosity)[1][:2]
-
-    assert torch.autograd.gradcheck(corner, arguments[2:], eps=STEP, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("made", [two_layers, scheduled, jet])
-def test_both_modes_agree_for_every_field_of_a_state(layer, made):
-    """<bar, J dot> = <J^T bar, dot>, for the time too."""
-    simulation = Simulation(made(), precision="float64")
-    first = layer.state(simulation, simulation.run(5).last_state)
-    run, rng = partial(layer.step, simulation, steps=4), np.random.default_rng(0)
-    dot = {name: tensor(rng.standard_normal(array.shape)) for name, array in first.items()}
-    end, pull = torch.func.vjp(run, first)
-    bar = {name: tensor(rng.standard_normal(array.shape)) for name, array in end.items()}
-    (back,) = pull(bar)
-    for name in first:
-        one = {**{n: torch.zeros_like(a) for n, a in dot.items()}, name: dot[name]}
-        _, own = torch.func.jvp(run, (first,), (one,))
-        wanted = sum(float((bar[n] * own[n]).sum()) for n in own)
-        assert float((back[name] * dot[name]).sum()) == pytest.approx(wanted, rel=1e-9, abs=1e-9), name
-
-
-@pytest.mark.parametrize(
-    "gradient",
-    [None, gradients.AdjointViscosity(0.2), gradients.RandomizedSmoothing(samples=4)],
-    ids=lambda one: type(one).__name__,
-)
-def test_a_value_and_its_gradient_have_the_bits_of_the_problem(layer, problem, gradient):
-    parameters = {name: wanted_of(value) for name, value in POINT.items()}
-    wanted, wanted_gradient = problem.value_and_gradient(POINT, gradient)
-    loss = layer.value(problem, gradient)(parameters)
-    loss.backward()
-    assert loss.item() == wanted
-    same_bits({name: one.grad for name, one in parameters.items()}, wanted_gradient)
-    with torch.no_grad():
-        plain = layer.value(problem, gradient)(parameters)
-    assert plain.item() == problem.value(POINT) and not plain.requires_grad
-
-
-def test_forward_mode_of_a_value_is_the_tangent_of_the_problem(layer, problem):
-    parameters = {name: tensor(value) for name, value in POINT.items()}
-    along = {"gravity": tensor([1.0, 0.5]), "viscosity": tensor(3.0)}
-    _, found = torch.func.jvp(layer.value(problem), (parameters,), (along,))
-    assert found.item() == problem.tangent(POINT, along)
+def test_dual_numbers_have_the_tangent_of_the_problem_and_no_graph_is_kept_where_none_is_asked_for(layer, problem):
+    parameters, along = ({name: tensor(one) for name, one in own.items()} for own in (POINT, ALONG))
     with torch.autograd.forward_ad.dual_level():
         dual = {n: torch.autograd.forward_ad.make_dual(parameters[n], along[n]) for n in parameters}
-        assert torch.autograd.forward_ad.unpack_dual(layer.value(problem)(dual)).tangent == found
-
-
-def test_a_value_begins_at_a_state_and_has_its_gradient(layer, simulation, problem):
-    state = {name: one.requires_grad_() for name, one in layer.state(simulation, simulation.run(9).last_state).items()}
-    parameters = {name: wanted_of(value) for name, value in POINT.items()}
-    loss = layer.value(problem)(parameters, state)
-    loss.backward()
-    begun = problem.beginning_at(layer.restart_state(simulation, state))
-    wanted, wanted_gradient, wanted_initial = begun.value_and_gradients(POINT)
-    assert loss.item() == wanted
-    same_bits({name: one.grad for name, one in parameters.items()}, wanted_gradient)
-    same_bits({name: one.grad for name, one in state.items()}, {name: wanted_initial[name] for name in state})
+        found = torch.autograd.forward_ad.unpack_dual(layer.value(problem)(dual)).tangent
+    assert found.item() == problem.tangent(POINT, ALONG)
+    with torch.no_grad():
+        plain = layer.value(problem)({name: one.requires_grad_() for name, one in parameters.items()})
+    assert plain.item() == problem.value(POINT) and not plain.requires_grad
 
 
 def test_a_graph_is_gone_back_through_again_only_where_it_was_kept(layer, problem):
@@ -167,25 +90,6 @@ def test_residuals_of_a_graph_go_with_it(layer, simulation):
     assert alive() == before
 
 
-# ---- bits --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("made", [scheduled, two_layers])
-def test_chained_steps_and_rollouts_have_the_bits_of_one_run(layer, made, precision):
-    simulation = Simulation(made(), precision=precision)
-    wanted, state = simulation.run(12), layer.state(simulation)
-    states = layer.rollout(simulation, state, steps=12, record_every=4)
-    for steps in (1, 7, 4):
-        state = layer.step(simulation, state, steps=steps)
-    last = wanted.last_state
-    same_bits({name: state[name] for name in last.fields}, last.fields)
-    same_bits({name: states[name][-1] for name in last.fields}, last.fields)
-    np.testing.assert_array_equal(states["positions"][1], wanted.positions[4])
-    again = layer.restart_state(simulation, state)
-    np.testing.assert_array_equal(simulation.run(3, state=again).positions[-1], simulation.run(15).positions[-1])
-
-
 def test_a_state_may_be_a_view_and_be_written_to_afterwards(layer, simulation):
     state = layer.state(simulation)
     wanted = layer.step(simulation, state, steps=3)
@@ -197,35 +101,7 @@ def test_a_state_may_be_a_view_and_be_written_to_afterwards(layer, simulation):
     same_bits(layer.step(simulation, state, steps=3), wanted)
 
 
-def test_a_rollout_gives_each_segment_its_rows_and_is_differentiated(layer, simulation):
-    rows = np.array([0.0, -9.81]) + np.random.default_rng(1).standard_normal((6, 2))
-    gravity = wanted_of(rows)
-    found = layer.rollout(simulation, layer.state(simulation), {"gravity": gravity}, 6, 2)
-    np.testing.assert_array_equal(found["positions"].detach(), simulation.run(6, {"gravity": rows}).positions[::2])
-    found["positions"][-1].square().mean().backward()
-    assert (gravity.grad.abs() > 0.0).all()
-
-
 # ---- maps, modules, compiled functions, threads ------------------------------------------------------------------
-
-
-def test_a_map_is_a_batch_with_the_bits_of_single_evaluations(layer, simulation, problem):
-    gravities = tensor([[0.4, -9.0], [0.0, -9.81], [-1.0, -8.0]])
-    first = {**layer.state(simulation), "velocities": tensor(shear(simulation))}
-
-    def end(gravity):
-        state = layer.step(simulation, first, {"gravity": gravity}, steps=3)
-        return layer.step(simulation, state, {"gravity": gravity, "viscosity": 5.0}, steps=3)["positions"]
-
-    def loss(gravity):
-        return layer.value(problem)({"gravity": gravity, "viscosity": 9.0})
-
-    for function in (end, loss, torch.func.grad(loss), torch.func.grad(lambda g: (end(g) ** 2).sum())):
-        wanted = torch.stack([function(gravity) for gravity in gravities])
-        assert float(wanted.abs().max()) > 0.0
-        assert torch.vmap(function)(gravities).numpy().tobytes() == wanted.numpy().tobytes()
-    summed = torch.func.grad(lambda g: torch.vmap(loss)(g).sum())(gravities)
-    np.testing.assert_array_equal(summed, torch.vmap(torch.func.grad(loss))(gravities))
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
@@ -247,43 +123,6 @@ def test_a_lost_scene_of_a_map_adds_nothing_where_its_cotangent_is_0(layer, simu
         assert torch.isnan(each(gravities, viscosity)).tolist() == [False, True, False]
         found = torch.func.grad(lambda v, each=each: torch.nansum(each(gravities, v)))(viscosity)
         assert found == torch.func.grad(lambda v, each=each: each(gravities[[0, 2]], v).sum())(viscosity) != 0.0
-
-
-def test_an_estimator_without_batches_is_mapped_one_by_one(layer, problem):
-    estimator = gradients.RandomizedSmoothing(samples=4)
-    loss = layer.value(problem, estimator)
-    viscosities = tensor([10.0, 12.0])
-    found = torch.vmap(torch.func.grad(lambda m: loss({"viscosity": m})))(viscosities)
-    wanted = [problem.value_and_gradient({"viscosity": float(m)}, estimator)[1]["viscosity"] for m in viscosities]
-    np.testing.assert_array_equal(found, wanted)
-
-
-def test_jacobians_by_both_modes_agree_and_are_mapped(layer, simulation):
-    first = {**layer.state(simulation), "velocities": tensor(shear(simulation))}
-
-    def corner(gravity):
-        return layer.step(simulation, first, {"gravity": gravity}, steps=2)["velocities"][:2]
-
-    gravities = tensor([[0.4, -9.0], [1.0, -9.0]])
-    back, forward = torch.func.jacrev(corner)(gravities[0]), torch.func.jacfwd(corner)(gravities[0])
-    np.testing.assert_allclose(back, forward, rtol=1e-8, atol=1e-13)
-    assert float(forward.abs().max()) > 1e-4
-    both = torch.vmap(torch.func.jacrev(corner))(gravities)
-    np.testing.assert_allclose(both, torch.vmap(torch.func.jacfwd(corner))(gravities), rtol=1e-8, atol=1e-13)
-    np.testing.assert_allclose(both[0], back, rtol=1e-12, atol=1e-15)
-
-
-def test_a_batch_of_a_user_has_parameters_in_all_shapes(layer):
-    problem = matched(Simulation(sheared(), precision="float64", batch=2))
-    gravity, viscosity = wanted_of([[[0.4, -9.0]], [[0.0, -9.81]]]), wanted_of(9.0)
-    losses, wanted = problem.value_and_gradient({"gravity": gravity.detach().numpy(), "viscosity": 9.0})
-    found = layer.value(problem)({"gravity": gravity, "viscosity": viscosity})
-    np.testing.assert_array_equal(found.detach(), losses)
-    found.backward(tensor([1.0, 2.0]))
-    np.testing.assert_array_equal(gravity.grad, wanted["gravity"] * np.array([1.0, 2.0])[:, None, None])
-    assert viscosity.grad.item() == pytest.approx(wanted["viscosity"] @ [1.0, 2.0], rel=1e-14)
-    with pytest.raises(InputError, match="is a batch of 2 cannot be mapped"):
-        torch.vmap(lambda m: layer.value(problem)({"viscosity": m}))(tensor([1.0, 2.0]))
 
 
 class Far:
@@ -335,18 +174,6 @@ def test_a_compiled_function_leaves_it_as_it_is(layer, problem):
     compiled(one).backward()
     loss(other).backward()
     assert one.grad == other.grad != 0.0
-
-
-def test_threads_that_share_a_layer_get_the_bits_of_one(layer, problem):
-    def gradient(viscosity):
-        own = wanted_of(viscosity)
-        layer.value(problem)({"viscosity": own}).backward()
-        return own.grad.item()
-
-    points = [3.0, 8.0, 12.0, 17.0]
-    wanted = [gradient(one) for one in points]
-    with ThreadPoolExecutor(4) as threads:
-        assert list(threads.map(gradient, points * 3)) == wanted * 3
 
 
 def test_what_is_measured_and_drawn_has_the_derivatives_of_differences(layer):
