@@ -12,7 +12,7 @@ from cortado.device.launching import watched
 from cortado.forces import Body, Pair
 from cortado.losses import FinalPositions
 from finite_differences import all_ways_agree, both_modes, central_difference
-from scenes import aimed, plane, splash, two_layers
+from scenes import aimed, plane, plane_of_three, splash, two_layers
 
 RANDOM = np.random.default_rng(3)
 WEIGHTS = RANDOM.standard_normal((9, 7))
@@ -288,7 +288,7 @@ def test_a_field_that_is_not_there_is_said():
     def of_pairs(x_ij, v_ij, density):
         return density * v_ij
 
-    with pytest.raises(InputError, match="density, shear_rate, velocity_gradient or none of them"):
+    with pytest.raises(InputError, match="density, mass_fractions, shear_rate, velocity_gradient or none of them"):
         Body(late, k=1.0)
     with pytest.raises(InputError, match="given no value of density"):
         Pair(of_pairs)
@@ -301,12 +301,94 @@ def test_they_cost_nothing_where_nobody_asks():
     def thick(x, v, shear_rate, k):
         return -k * shear_rate * v
 
+    def oily(x, v, mass_fractions, k):
+        return -k * mass_fractions[1] * v
+
     counts = []
-    for function in (drag, thick):
+    for function in (drag, oily, thick):
         launched: list[str] = []
-        simulation = Simulation(splash(), forces=[Body(function, k=1.0)])
+        simulation = Simulation(two_layers(), forces=[Body(function, k=1.0)])
         simulation.run(1)
         with watched(lambda name, threads, arguments, work, seen=launched: (seen.append(name), work())):
             simulation.run(1)
         counts.append(len(launched))
-    assert counts[1] == counts[0] + 1 > 10
+    assert counts[2] == counts[0] + 1 > 10
+    assert counts[1] == counts[0]
+
+
+def buoyant(x, v, mass_fractions, k):
+    c = mass_fractions[0]
+    return k * wp.vec3(c * c - 2.0 * mass_fractions[-1] * v[1], 0.3 * c * mass_fractions[1], wp.length(mass_fractions))
+
+
+def oily(x, v, t, density, mass_fractions, w):
+    return wp.vec3(w[0] * density * mass_fractions[1], w[3] * wp.sin(w[1] * mass_fractions[0]), t) - w[2] * v
+
+
+def of_fractions(made, steps=6, **options):
+    """Fluids that are mixed a little, under two forces that know how: with the point at which derivatives are taken."""
+    forces = [Body(buoyant, k=3.0), Body(oily, w=np.array([0.002, 2.0, 0.3, 1.5]))]
+    judged = aimed(Simulation(made, **{"precision": "float64", **options}, forces=forces), steps)
+    usual = judged.simulation.parameters()
+    names = ("mass_fractions", "mobility", "interface_width", "rest_density", "buoyant.k", "oily.w")
+    mixed = 0.7 * usual["mass_fractions"] + 0.3 / len(judged.simulation.scene.phase)
+    return judged, {**{name: usual[name] for name in names}, "mass_fractions": mixed}
+
+
+def test_derivatives_by_mass_fractions_agree():
+    judged, point = of_fractions(two_layers())
+    all_ways_agree(judged, point, 7, lambda name: 1e-5, rtol=1e-5)
+
+
+def test_those_of_three_fluids_in_the_plane_agree_by_the_projection():
+    made = plane_of_three(solver={"kind": "projection", "time_step": 0.0021})
+    (judged, point), single = of_fractions(made, 3), of_fractions(made, 3, precision="float32")[0]
+    for name, value in point.items():
+        direction = {name: np.random.default_rng(9).standard_normal(np.shape(value)) * np.abs(value).max()}
+        slope = both_modes(judged, point, direction, 1e-12)[1]
+        errors = [abs(central_difference(judged.value, point, direction, h) / slope - 1.0) for h in (1e-4, 1e-5, 1e-6)]
+        assert min(errors) < 1e-6 and max(errors) < 1e-4, (name, errors)
+        assert abs(both_modes(single, point, direction, 1e-3)[1] / slope - 1.0) < 1e-2
+
+
+def test_mass_fractions_are_those_after_the_diffusion_of_the_step():
+    def seen(x, v, mass_fractions):
+        return wp.vec3(mass_fractions[0], mass_fractions[1], 0.0)
+
+    free = {"gravity": [0.0, -9.81], "viscosity": "none", "pressure": False}
+    simulation = Simulation(plane_of_three(forces=free), precision="float64", forces=[Body(seen)])
+    run = simulation.run(1)
+    moved = np.abs(run.mass_fractions[1] - run.mass_fractions[0]).max()
+    found = run.velocities[1] / (run.times[1] - run.times[0]) - [0.0, -9.81]
+    assert moved > 1e-6
+    np.testing.assert_allclose(found, run.mass_fractions[1][:, :2], rtol=1e-10, atol=1e-12)
+
+
+def test_scenes_of_a_batch_have_their_own_mass_fractions():
+    both, point = of_fractions(two_layers(), batch=2)
+    alone = of_fractions(two_layers())[0]
+    each = [point["mass_fractions"], alone.simulation.parameters()["mass_fractions"]]
+    loss, gradient = both.value_and_gradient({"mass_fractions": np.stack(each), "buoyant.k": [3.0, 3.0]})
+    for b, own in enumerate(each):
+        value, found = alone.value_and_gradient({"mass_fractions": own, "buoyant.k": 3.0})
+        assert value == loss[b]
+        for name, bar in found.items():
+            np.testing.assert_array_equal(bar, gradient[name][b])
+
+
+def test_the_certificate_knows_mass_fractions():
+    judged, point = of_fractions(two_layers(), steps=10)
+    assert cortado.certify(judged, point).right
+
+
+def test_mass_fractions_that_are_not_there_are_said():
+    def second(x, v, mass_fractions):
+        return mass_fractions[2] * v
+
+    for made, words in (
+        (splash(), "takes mass_fractions, but must take them in scenes of several phases alone"),
+        (two_layers(), r"mass_fractions\[2\], but must have an index from -2 to 1 there, as there are 2 phases"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Simulation(made, forces=[Body(second)])
+    Simulation(plane_of_three(), forces=[Body(second)]).run(1)

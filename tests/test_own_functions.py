@@ -344,7 +344,7 @@ def test_the_forces_of_the_page_run_as_printed(tmp_path, monkeypatch):
     program = tmp_path / "page.py"
     program.write_text("\n".join(blocks))
     monkeypatch.chdir(ROOT)
-    assert len(blocks) == 5
+    assert len(blocks) == 6
     runpy.run_path(str(program))
 
 

@@ -195,8 +195,9 @@ def test_gravity_adds_to_its_adjoint():
     ones = wp.array(np.ones((n, 3)), dtype=wp.vec3d, device=simulation.device)
     solver.step_number.fill_(1)
     gravity, solids = Gravity(solver.layout, taped=False), SolidShares(None, solver.layout)
+    bars = Adjoints(fields, solver.new_fractions(), bar, shares, solids)
     for _ in range(2):
-        gravity.adjoint(solver.context(solver.new_parameters(2)), ones, Adjoints(fields, bar, shares, solids))
+        gravity.adjoint(solver.context(solver.new_parameters(2)), ones, bars)
     np.testing.assert_array_equal(bar["gravity"].numpy(), [[[0.5] * 3, [0.5 + 2 * n] * 3]])
 
 

@@ -19,7 +19,7 @@ class ParticleTangent:
     def __init__(self, solver: ParticleSolver, parameters_dot: Parameters):
         self._solver = solver
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
-        self.dot = Tangents(fields, parameters_dot)
+        self.dot = Tangents(fields, solver.new_fractions(), parameters_dot)
         """Of the sorted particles, once `sort` has been called, and of the parameters."""
         self.carried_dot = Carried(solver.carried_fields, solver.layout)
         self.density = solver.density.new_tangent()
@@ -82,6 +82,7 @@ class ParticleAdjoint:
         self._solver = solver
         self.bar = Adjoints(
             Fields.zeros(layout.all_particles, layout.precision, layout.device),
+            solver.new_fractions(),
             solver.new_parameters(steps),
             Shares(names, layout),
             SolidShares(solver.search.moving, layout),
@@ -95,6 +96,7 @@ class ParticleAdjoint:
 
     def begin(self) -> None:
         """Set the adjoints of the parameters to 0, before a backward pass."""
+        self.bar.fractions.zero_()
         self.bar.shares.clear()
         self.bar.parameters.clear()
         self.bar.solids.clear()

@@ -105,6 +105,9 @@ class ParticleSolver(Staying):
         check_fields(self.state_fields, layout.known)
         self.fields = Fields.zeros(particles, precision, device, requires_grad)
         self._requires_grad = requires_grad
+        self.fractions = self.new_fractions()
+        if layout.phases == 1:
+            self.fractions.fill_(1.0)
         self.accelerations = [self.vectors() for _ in range(len(self.forces) + 1)]
         """``accelerations[t]``: of the first t forces; the first is 0 and never written."""
         self.loops: tuple[Loop, ...] = ()
@@ -137,6 +140,10 @@ class ParticleSolver(Staying):
     def numbers(self) -> wp.array:
         """Make an array (n,) of zeros for a step or its derivative to work in."""
         return self._array(self.discretisation.precision.real)
+
+    def new_fractions(self) -> wp.array:
+        """Make an array (n,) of zero vectors with one number for each phase."""
+        return self._array(self.discretisation.precision.fractions(self.layout.phases))
 
     def _array(self, dtype: Any) -> wp.array:
         return wp.zeros(self.layout.all_particles, dtype=dtype, device=self.device, requires_grad=self._requires_grad)
@@ -196,8 +203,8 @@ class ParticleSolver(Staying):
     def context(self, parameters: Parameters) -> StepContext:
         if self._context is None or self._context.parameters is not parameters:
             order, step, particles = self.search.order, self.step_number, self.layout.particles
-            own = (self.launch, particles, self._neighbourhood, order, step, self.lattice.cell, self.fields)
-            self._context = StepContext(*own, parameters)
+            own = (self.launch, particles, self._neighbourhood, order, step, self.lattice.cell)
+            self._context = StepContext(*own, self.fields, self.fractions, parameters)
         return self._context
 
     def sort(self, state: State, parameters: Parameters) -> StepContext:

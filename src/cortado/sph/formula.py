@@ -6,7 +6,7 @@ import inspect
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from math import prod
 from tempfile import TemporaryFile
@@ -22,6 +22,7 @@ from cortado.errors import InputError
 from cortado.particles.state import Layout, Parameters
 from cortado.scene.parameters import Axis, Parameter
 from cortado.sph.function_meaning import (
+    FRACTIONS,
     PLACE,
     READ,
     READ_OF,
@@ -190,7 +191,7 @@ MOST_TURNS, MOST_AXES = 256, 3
 TYPES = re.compile(r"'[^']*' \(aka '[^']*'\)")
 """Finds the types of vectors and numbers as a compiler writes them."""
 INPUTS = {
-    "Body": Inputs(("x", "v"), fields=("density", "shear_rate", "velocity_gradient"), arrays=True),
+    "Body": Inputs(("x", "v"), fields=("density", FRACTIONS, "shear_rate", "velocity_gradient"), arrays=True),
     "Pair": Inputs(("x_ij", "v_ij")),
     "Rheology": Inputs(("shear_rate", "viscosity"), "number"),
 }
@@ -218,6 +219,21 @@ class Formula:
     """A text of everything that `text` refers to: the functions under ``@wp.func`` that it calls, and values."""
     scope: Mapping[str, Any] = field(compare=False, repr=False)
     """Values of the names in the text."""
+    phases: int = 0
+    """Number of mass fractions that it takes."""
+
+    def of_phases(self, what: str, phases: int) -> "Formula":
+        """Return it for a scene of so many phases; raise `InputError` for mass fractions that this has not."""
+        if FRACTIONS not in self.fields:
+            return self
+        if phases == 1:
+            raise InputError(f"{what} takes {FRACTIONS}, but must take them in scenes of several phases alone.")
+        for node in ast.walk(ast.parse(self.text)):
+            is_read = isinstance(node, ast.Subscript) and ast.unparse(node.value) == FRACTIONS
+            if is_read and ast.literal_eval(node.slice) not in range(-phases, phases):
+                wanted = f"an index from {-phases} to {phases - 1} there, as there are {phases} phases"
+                raise InputError(f"{what} has {ast.unparse(node)}, but must have {wanted}.")
+        return replace(self, phases=phases)
 
     def function(self, precision: Precision, types: tuple[Any, ...], module: Any) -> Any:
         """Make the Warp function in a precision, with the types of its parameters; it has the name of the user's."""
@@ -234,9 +250,14 @@ class Formula:
         made.__annotations__ |= dict(zip(self.parameters, types, strict=True)) | self.reads(precision) | {"return": own}
         return wp.Function(func=made, key=self.name, namespace="", module=module, source=self.text)
 
+    def fractions(self, precision: Precision) -> Any:
+        """Return the type of mass fractions; of one number where it takes none."""
+        return precision.fractions(max(self.phases, 1))
+
     def takes(self, precision: Precision) -> dict[str, Any]:
         """Return the types of its fields by name."""
-        return {name: matrix_type(precision) if "gradient" in name else precision.real for name in self.fields}
+        kinds = {"velocity_gradient": matrix_type(precision), FRACTIONS: self.fractions(precision)}
+        return {name: kinds.get(name, precision.real) for name in self.fields}
 
     def reads(self, precision: Precision) -> dict[str, Any]:
         """Return the types, by name, of the last arguments of the compiled function, by which it reads arrays."""

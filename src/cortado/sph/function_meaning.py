@@ -61,6 +61,8 @@ PLACE, READ, READ_OF = "cortado_place", "cortado_read", ("cortado_e", "cortado_w
 _TYPES = {float: REAL, wp.float32: REAL, wp.float64: REAL, wp.vec3f: VECTOR, wp.vec3d: VECTOR}
 _OPERATORS: Mapping[type[ast.operator], str] = {ast.Mod: REMAINDER, ast.FloorDiv: QUOTIENT}
 _CALLS = {"round": NEAREST, "int": WHOLE}
+FRACTIONS = "mass_fractions"
+"""The argument that has as many numbers as a scene has phases, which is known when a force is made for a scene."""
 Lines = ast.AST | list[ast.stmt]
 
 
@@ -85,7 +87,7 @@ class InPrecision(ast.NodeTransformer):
         """Arguments, of which vectors have three components."""
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
-        self._given = {one.arg for one in node.args.args}
+        self._given = {one.arg for one in node.args.args} - {FRACTIONS}
         node.args.args = [one for one in node.args.args if one.arg not in self._arrays]
         if self._arrays:
             node.args.args += [ast.arg(name) for name in READ_OF]

@@ -83,7 +83,7 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKe
             power_dot += c_dot_i[k] * logarithm(mu_k) + c_i[k] * viscosity_dot[member, k] / (mu_k + tiny)
         return -rho_0_i * rho_0_i * change, mu_i * power_dot
 
-    @particle_kernel(mixture_module(precision, phases, False), "+rest_density_bar +viscosity_bar c_bar")
+    @particle_kernel(mixture_module(precision, phases, False), "+rest_density_bar +viscosity_bar +c_bar")
     def blend_adjoint(
         member: int,
         order_i: wp.int32,
@@ -147,10 +147,8 @@ class Mixture(Part):
         """Explicit steps of diffusion within a time step."""
         self._layout = layout
         self._options = {"device": layout.device, "requires_grad": requires_grad}
-        self.c: list[wp.array] = [self.fractions()]
-        """Sorted fractions (n,) before each substep, and after the last; 1 for a single phase, never sorted."""
-        if phases.count == 1:
-            self.c[0].fill_(1.0)
+        self.c: list[wp.array] = []
+        """Sorted fractions (n,) before each substep; those after the last are the step's."""
         self.chi: list[wp.array] = []
         """Chemical potentials (n,) of each substep [-]."""
         self.w: list[wp.array] = []
@@ -167,37 +165,42 @@ class Mixture(Part):
 
     def set_substeps(self, substeps: int) -> None:
         self.substeps = substeps
-        while len(self.chi) < substeps:
+        while len(self.c) < substeps:
             self.c.append(self.fractions())
             self.chi.append(self.fractions())
             self.w.append(self.numbers())
+
+    def course(self, step: StepContext) -> list[wp.array]:
+        """Return the sorted fractions (n,) before each substep, and after the last."""
+        return [*self.c[: self.substeps], step.fractions]
 
     def sort(self, step: StepContext, state: State) -> None:
         """Sort the mass fractions, and without diffusion compute the materials."""
         with step.aside():
             if self.phases.count > 1:
-                step.launch(self.kernels.order.sort, a_scene=state.mass_fractions, a=self.c[0])
+                step.launch(self.kernels.order.sort, a_scene=state.mass_fractions, a=self.course(step)[0])
             if not self.substeps:
                 self._blend(step)
 
     def settle(self, step: StepContext) -> None:
         """Take the substeps of diffusion and compute the materials after them."""
+        course = self.course(step)
         for k in range(self.substeps):
             assert self.diffusion is not None
-            now = {"c": self.c[k], "chi": self.chi[k], "w": self.w[k]}
+            now = {"c": course[k], "chi": self.chi[k], "w": self.w[k]}
             step.launch(self.diffusion.potential.forward, strength=self.phases.strength, **now)
-            step.launch(self.diffusion.flux.forward, substeps=self.substeps, c_new=self.c[k + 1], **now)
+            step.launch(self.diffusion.flux.forward, substeps=self.substeps, c_new=course[k + 1], **now)
         if self.substeps:
             self._blend(step)
 
     def _blend(self, step: StepContext) -> None:
         """Compute rest densities and viscosities from the mass fractions."""
-        step.launch(self.kernels.blend.forward, c=self.c[self.substeps])
+        step.launch(self.kernels.blend.forward, c=step.fractions)
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
         """Write the mass fractions after the last substep of diffusion to the new state."""
         if self.phases.count > 1:
-            step.launch(self.kernels.order.unsort, a=self.c[self.substeps], a_scene=state.mass_fractions)
+            step.launch(self.kernels.order.unsort, a=step.fractions, a_scene=state.mass_fractions)
 
     def new_tangent(self) -> "MixtureTangent":
         return MixtureTangent(self)
@@ -211,17 +214,18 @@ class MixtureAdjoint(PartAdjoint):
 
     def __init__(self, mixture: Mixture):
         self._mixture = mixture
-        self._c_bar, self._y, self._z = (mixture.fractions() for _ in range(3))
+        self._y, self._z = (mixture.fractions() for _ in range(2))
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Replace the adjoint of the new fractions, in scene order, by that of the old ones, to which materials add."""
+        """Replace the adjoint of the new fractions, in scene order, by that of the old ones, to which materials and
+        forces add."""
         with step.aside() if not self._mixture.substeps else nullcontext():
             self._unmix(step, bar, state_bar.mass_fractions)
 
     def _unmix(self, step: StepContext, bar: Adjoints, fractions_bar: wp.array) -> None:
         mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, bar.named
-        substeps, strength, c_bar, y, z = mixture.substeps, mixture.phases.strength, self._c_bar, self._y, self._z
-        step.launch(kernels.blend.adjoint, *known, c=mixture.c[substeps], c_scene_bar=fractions_bar, c_bar=c_bar)
+        substeps, strength, c_bar, y, z = mixture.substeps, mixture.phases.strength, bar.fractions, self._y, self._z
+        step.launch(kernels.blend.adjoint, *known, c=step.fractions, c_scene_bar=fractions_bar, c_bar=c_bar)
         for k in reversed(range(substeps)):
             assert diffusion is not None
             scale, flux = diffusion.flux.adjoint
@@ -231,6 +235,7 @@ class MixtureAdjoint(PartAdjoint):
             step.launch(diffusion.potential.adjoint, *known, c=c, z=z, c_bar=c_bar)
         if mixture.phases.count > 1:
             step.launch(kernels.order.unsort, a=c_bar, a_scene=fractions_bar)
+            c_bar.zero_()
 
 
 class MixtureTangent(PartTangent):
@@ -246,11 +251,12 @@ class MixtureTangent(PartTangent):
         """Take the tangent of the old fractions, in scene order, on to those of the materials."""
         mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, dot.named
         substeps, now = mixture.substeps, {"chi_dot": self._chi_dot, "w_dot": self._w_dot}
+        course = [*(self._c_dot[k % 2] for k in range(substeps)), dot.fractions]
         if mixture.phases.count > 1:
-            step.launch(kernels.order.sort, a_scene=state_dot.mass_fractions, a=self._c_dot[0])
+            step.launch(kernels.order.sort, a_scene=state_dot.mass_fractions, a=course[0])
         for k in range(substeps):
             assert diffusion is not None
-            c_dot, c_new_dot = self._c_dot[k % 2], self._c_dot[(k + 1) % 2]
+            c_dot, c_new_dot = course[k : k + 2]
             step.launch(
                 diffusion.potential.tangent,
                 *known,
@@ -261,10 +267,9 @@ class MixtureTangent(PartTangent):
             )
             flux = {"chi": mixture.chi[k], "w": mixture.w[k], "c_dot": c_dot, "c_new_dot": c_new_dot}
             step.launch(diffusion.flux.tangent, *known, substeps=substeps, **flux, **now)
-        step.launch(kernels.blend.tangent, *known, c=mixture.c[substeps], c_dot=self._c_dot[substeps % 2])
+        step.launch(kernels.blend.tangent, *known, c=step.fractions, c_dot=dot.fractions)
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         """Write the tangent of the new fractions."""
         if self._mixture.phases.count > 1:
-            last = self._c_dot[self._mixture.substeps % 2]
-            step.launch(self._mixture.kernels.order.unsort, a=last, a_scene=state_dot.mass_fractions)
+            step.launch(self._mixture.kernels.order.unsort, a=dot.fractions, a_scene=state_dot.mass_fractions)

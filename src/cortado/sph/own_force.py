@@ -145,6 +145,10 @@ class OwnFunction(ABC):
         """Make the force in a solver; raise `InputError` for a function that Warp cannot compile."""
 
     @property
+    def _what(self) -> str:
+        return f"{self.kind} function {self._formula.name}"
+
+    @property
     def _ranks(self) -> tuple[int, ...]:
         """Return the ranks of the parameters that are no arrays, and of time if the function takes that."""
         return tuple(p.rank for p in self.parameters if p.axis is not Axis.ARRAY)
@@ -154,15 +158,13 @@ class OwnForce(OwnFunction):
     """A user's function that returns a force or an acceleration, with kernels for it alone."""
 
     @abstractmethod
-    def kernels(self, discretisation: Discretisation, dimension: int) -> Kernels:
-        """Make the kernels of the force in a precision, in a scene of 2 or 3 dimensions."""
+    def kernels(self, discretisation: Discretisation, dimension: int, phases: int = 1) -> Kernels:
+        """Make the kernels of the force in a precision, in a scene of 2 or 3 dimensions and so many phases."""
 
     def force(self, setting: Setting) -> "FunctionForce":
         """Make the force in a solver; raise `InputError` for a function that Warp cannot compile."""
-        kernels = self.kernels(setting.discretisation, setting.scene.dimension)
-        made = FunctionForce(
-            f"{self.kind} function {self._formula.name}", kernels, self.parameters, self._formula.fields, setting
-        )
+        kernels = self.kernels(setting.discretisation, setting.scene.dimension, setting.layout.phases)
+        made = FunctionForce(self._what, kernels, self.parameters, self._formula.fields, setting)
         made.compile(kernels.forward)
         return made
 
@@ -219,7 +221,7 @@ class FunctionForce:
 
 def topic(kind: str, text: Formula, ranks: tuple[int, ...], dimension: int) -> str:
     """Return the part of a Warp module's name that tells one user function from another."""
-    words = "\n".join((text.text, text.outside, str(ranks), str(dimension)))
+    words = "\n".join((text.text, text.outside, str(ranks), str(dimension), str(text.phases)))
     return f"{kind}_{text.name}_{sha256(words.encode()).hexdigest()[:12]}"
 
 
@@ -260,10 +262,11 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
     precision, modules = discretisation.precision, discretisation.modules(topic("body", text, ranks, dimension))
     gradient, rate = gradient_functions(precision, dimension)
     types: dict[str, Any] = {"x_i": precision.vector, "v_i": precision.vector, "theta": theta_of(precision, ranks)}
+    kinds = dict.fromkeys(("M_i", "A_i"), matrix_type(precision)) | {"fractions_i": text.fractions(precision)}
     given = [*types]
     for name in text.fields:
-        value, kind = FIELDS[name]
-        types |= dict.fromkeys(kind, precision.real if name == "density" else matrix_type(precision))
+        value, entries = FIELDS[name]
+        types |= {entry: kinds.get(entry, precision.real) for entry in entries}
         given.append(value)
     reads = dict(zip(("e", "table", "member", "row"), text.reads(precision).values(), strict=False))
     types |= reads
@@ -288,6 +291,7 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
 
 FIELDS = {
     "density": ("m_i * n_i", ("m_i", "n_i")),
+    "mass_fractions": ("fractions_i", ("fractions_i",)),
     "velocity_gradient": ("gradient(M_i, A_i)", ("M_i", "A_i")),
     "shear_rate": ("rate(M_i, A_i)", ("M_i", "A_i")),
 }
@@ -297,12 +301,13 @@ FIELDS = {
 class Body(OwnForce):
     """A force on each particle: ``function(x, v, t, ...)`` returns its acceleration [m/s2], as gravity is one, from the
     position [m], the velocity [m/s] and the time [s] of the particle. Time may be left out. After it come, by their
-    names, what else it takes: ``density`` [kg/m3], ``shear_rate`` [1/s], ``velocity_gradient`` [1/s]."""
+    names, what else it takes: ``density`` [kg/m3], ``mass_fractions`` [-], ``shear_rate`` [1/s], ``velocity_gradient``
+    [1/s]."""
 
     kind = "Body"
 
-    def kernels(self, discretisation: Discretisation, dimension: int) -> Kernels:
-        return body_kernels(discretisation, self._formula, self._ranks, dimension)
+    def kernels(self, discretisation: Discretisation, dimension: int, phases: int = 1) -> Kernels:
+        return body_kernels(discretisation, self._formula.of_phases(self._what, phases), self._ranks, dimension)
 
 
 def term(
@@ -350,7 +355,7 @@ class Pair(OwnForce):
 
     kind = "Pair"
 
-    def kernels(self, discretisation: Discretisation, dimension: int) -> Kernels:
+    def kernels(self, discretisation: Discretisation, dimension: int, phases: int = 1) -> Kernels:
         return pair_kernels(discretisation, self._formula, self._ranks, dimension)
 
 
@@ -376,10 +381,6 @@ class Rheology(OwnFunction):
         """Raise `InputError` where the law returns no valid viscosity with these values of parameters, by name."""
         if "viscosity" in values or any(one.name in values for one in self.parameters):
             self._try(values, simulation.scene, simulation.precision, simulation.device)
-
-    @property
-    def _what(self) -> str:
-        return f"{self.kind} function {self._formula.name}"
 
     def _law(self, scene: Scene) -> Law:
         topic_of_law = topic("rheology", self._formula, self._ranks, scene.dimension)

@@ -54,12 +54,14 @@ class StepContext:
     step: wp.array
     cell: float
     fields: Fields
+    fractions: wp.array
+    """Mass fractions of the sorted particles, of which the rest of the step is made: after its diffusion."""
     parameters: Parameters
 
     @cached_property
     def _known(self) -> tuple[Named, ...]:
         own = {"s": self.neighbourhood, "particles": self.particles, "order": self.order, "step": self.step}
-        return {**own, "cell": self.cell}, self.fields.named(), self.parameters.named()
+        return {**own, "cell": self.cell, "fractions": self.fractions}, self.fields.named(), self.parameters.named()
 
     def launch(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
         """Launch a kernel over the particles; what is not among ``arguments`` and ``groups`` is the step's.
@@ -83,12 +85,13 @@ class Tangents:
     """Tangents of the sorted particles and of the parameters."""
 
     fields: Fields
+    fractions: wp.array
     parameters: Parameters
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
         """Return the tangents as kernels call them: ``x_dot``, ``viscosity_dot`` and so on."""
-        return self.fields.named("_dot"), self.parameters.named("_dot")
+        return self.fields.named("_dot"), {"fractions_dot": self.fractions}, self.parameters.named("_dot")
 
 
 class Shares(Arrays):
@@ -123,6 +126,8 @@ class Adjoints:
     """The adjoints that parts of a step add to: of sorted particles, of parameters, and particles' shares of these."""
 
     fields: Fields
+    fractions: wp.array
+    """The mixture adds what forces have added to the adjoint of the new fractions, and sets it to 0."""
     parameters: Parameters
     shares: Shares
     solids: SolidShares
@@ -134,7 +139,8 @@ class Adjoints:
         and particles' shares of the parameters that a part names in its ``shares``."""
         over_time = [name for name in self.parameters.names if self.shares.known[name].axis is Axis.STEP]
         whole = {f"{argument(name)}_bar": self.parameters[name] for name in over_time}
-        return self.fields.named("_bar"), self.shares.named("_bar"), whole
+        fractions = {"fractions_bar": self.fractions}
+        return self.fields.named("_bar"), fractions, self.shares.named("_bar"), whole
 
 
 @dataclass(frozen=True)

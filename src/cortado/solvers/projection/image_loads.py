@@ -7,6 +7,7 @@ over the images by one solid, or by all walls, with gamma_m of its wall particle
 momentum the fluid loses to them. Loads are read now and then, so that h is differentiated on its own here.
 """
 
+from dataclasses import replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -148,7 +149,7 @@ class ImageLoads:
         self._walls.adjoint(step, bar, solid, total_bar, total_bar, known)
         self._faces.add(step, bar, known, over=solid, u=total_bar, spread=p)
         fields = Fields.zeros(self._layout.all_particles, self._layout.precision, self._layout.device)
-        around.measure(step, Adjoints(fields, bar.parameters, bar.shares, bar.solids))
+        around.measure(step, replace(bar, fields=fields))
         for given, total in zip(fields.arrays(), bar.fields.arrays(), strict=True):
             add(given, total)
 
