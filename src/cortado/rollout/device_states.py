@@ -382,22 +382,14 @@ def _kernels(precision: Precision) -> tuple[Any, Any]:
     module = kernel_module(f"device_rows_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
-    def spread(
-        given: wp.array3d(dtype=real),
-        # out
-        rows: wp.array3d(dtype=real),
-    ):
+    def spread(given: wp.array3d(dtype=real), rows: wp.array3d(dtype=real)):
         b, n, c = wp.tid()
         rows[b, n, c] = real(0.0)
         if c < given.shape[2]:
             rows[b, n, c] = given[b % given.shape[0], n % given.shape[1], c]
 
     @wp.kernel(module=module, enable_backward=False)
-    def fold(
-        bars: wp.array3d(dtype=real),
-        # out
-        sums: wp.array3d(dtype=real),
-    ):
+    def fold(bars: wp.array3d(dtype=real), sums: wp.array3d(dtype=real)):
         b, n, c = wp.tid()
         found = real(0.0)
         for member in range(b, bars.shape[0], sums.shape[0]):

@@ -19,7 +19,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_and_maximum
 from cortado.particles.state import Parameters, State
 from cortado.scene.restart import Clock, RecordedClock
@@ -131,19 +131,11 @@ def compression_kernels(precision: Precision) -> tuple[Any, Any]:
     no derivatives: a chosen step is held constant."""
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"compressions_{precision.name}")
+    typed = TypesByName(real, {pair: "added greatest", vector: "x", wp.int32: "order step"})
 
     @wp.kernel(module=module, enable_backward=False)
-    def compare(
-        particles: int,
-        first_waiting: int,
-        order: wp.array(dtype=wp.int32),
-        n: wp.array(dtype=real),
-        excess: wp.array(dtype=real),
-        x_free: wp.array(dtype=vector),
-        x: wp.array(dtype=vector),
-        # out
-        added: wp.array(dtype=pair),
-    ):
+    @typed.arrays
+    def compare(particles: int, first_waiting: int, order, n, excess, x_free, x, added):
         """Write to ``added`` a pair (0, growth of compression) per sorted particle: (n - 1)+ as the last repair finds
         it less its value before the step. Particles moved by a nozzle, perhaps inside walls, add nothing."""
         i = wp.tid()
@@ -157,12 +149,8 @@ def compression_kernels(precision: Precision) -> tuple[Any, Any]:
         added[i] = pair(real(0.0), more)
 
     @wp.kernel(module=module, enable_backward=False)
-    def record(
-        greatest: wp.array(dtype=pair),
-        step: wp.array(dtype=wp.int32),
-        # out
-        added: wp.array2d(dtype=real),
-    ):
+    @typed.arrays
+    def record(greatest, step, added: wp.array2d(dtype=real)):
         b = wp.tid()
         added[step[b] - 1, b] = greatest[b][1]
 

@@ -34,6 +34,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import Kernels
+from cortado.device.precision import TypesByName
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
@@ -57,7 +58,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> Kernels:
     pair = pair_functions(discretisation)
     weight, gradient = pair.weight, pair.gradient
     module, tangent_module, adjoint_module = discretisation.modules("density_ratio")
-    a = wp.constant(real(SOFTNESS))
+    a, typed = wp.constant(real(SOFTNESS)), TypesByName(real, {neighbourhood: "s", vector: "x"})
 
     @fluid_sum(discretisation)
     def density_ratio_sum(x_ij: vector, m_i: real, m_j: real, s: neighbourhood) -> real:
@@ -66,18 +67,16 @@ def density_ratio_kernels(discretisation: Discretisation) -> Kernels:
 
     @tangent_of(density_ratio_sum)
     @fluid_sum(discretisation, ahead=False)
-    def density_ratio_sum_tangent(
-        x_ij: vector, x_dot_ij: vector, m_i: real, m_j: real, m_dot_i: real, m_dot_j: real, s: neighbourhood
-    ) -> real:
+    @typed
+    def density_ratio_sum_tangent(x_ij, x_dot_ij, m_i, m_j, m_dot_i, m_dot_j, s) -> real:
         ratio = m_i / m_j
         change = wp.dot(gradient(x_ij, s), x_dot_ij) * (ratio - real(1.0))
         return change + weight(x_ij, s) * ratio * (m_dot_i / m_i - m_dot_j / m_j)
 
     @adjoint_of(density_ratio_sum)
     @fluid_sum(discretisation)
-    def density_ratio_sum_adjoint(
-        x_ij: vector, m_i: real, m_j: real, t_bar_i: real, t_bar_j: real, s: neighbourhood
-    ) -> tuple[vector, real]:
+    @typed
+    def density_ratio_sum_adjoint(x_ij, m_i, m_j, t_bar_i, t_bar_j, s) -> tuple[vector, real]:
         own = t_bar_i * m_i / m_j
         other = t_bar_j * m_j / m_i
         return (own - t_bar_i + other - t_bar_j) * gradient(x_ij, s), weight(x_ij, s) * (own - other) / m_i
@@ -124,7 +123,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
     sums = wall_slope_sums(discretisation)
     slope, change, LANES = sums.slope, sums.change, discretisation.lanes
     module, tangent_module, adjoint_module = discretisation.modules("pcisph")
-    lane = discretisation.lane
+    lane, typed = discretisation.lane, TypesByName(real, {neighbourhood: "s", vector: "x slope"})
 
     @particle_kernel(module, "y", [over(slope, "total")])
     def wall_relaxation(total: vector, s: neighbourhood) -> real:
@@ -137,16 +136,8 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         return real(-2.0) * y_i * y_i * along
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
-    def wall_relaxation_adjoint(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        y: wp.array(dtype=real),
-        y_bar: wp.array(dtype=real),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        # out
-        slope_bar: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def wall_relaxation_adjoint(s, x, y, y_bar, x_bar, slope_bar):
         """Add to the adjoint of positions from that of y; ``slope_bar`` gets the adjoint of S."""
         i = s.first + wp.tid() // LANES
         total = s.response_scale * slope(i, x, s)
@@ -164,21 +155,16 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
 def begin_adjoint_kernel(discretisation: Discretisation) -> Any:
     """Make the kernel that begins the adjoint of a step, with PCISPH's own (see `cortado.sph.integration`)."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    adjoin_new_state, vectors = new_state_adjoint(discretisation.precision), wp.array(dtype=vector)
+    adjoin_new_state = new_state_adjoint(discretisation.precision)
+    typed = TypesByName(real, {vector: "v", wp.array(dtype=vector): "x_scene v_scene", wp.int32: "order"})
 
     @particle_kernel(
         discretisation.module(False, "pcisph"),
         "x_bar v_bar time_step_bar scaled_bar n_bar m_bar rho_0_bar mu_bar y_bar p_bar",
     )
+    @typed
     def begin_adjoint(
-        order_i: wp.int32,
-        time_step: real,
-        m_i: real,
-        v_i: vector,
-        v_star_i: vector,
-        x_scene_bar: vectors,
-        v_scene_bar: vectors,
-        time_step_bar_i: real,
+        order_i, time_step, m_i, v_i, v_star_i, x_scene_bar, v_scene_bar, time_step_bar_i
     ) -> tuple[vector, vector, real, vector, real, real, real, real, real, real]:
         x_bar, v_bar, dt_bar = adjoin_new_state(
             x_scene_bar[order_i], v_scene_bar[order_i], time_step_bar_i, v_i, v_star_i, time_step
