@@ -192,7 +192,7 @@ def kernels_of(discretisation):
         wall_kernels(discretisation),
         viscosity_kernels(discretisation, True),
         viscous.moments,
-        density_ratio_kernels(discretisation),
+        density_ratio_kernels(discretisation).total,
         normal_kernels(discretisation),
         surface_tension_kernels(discretisation),
         *(curved.colour, curved.normal, curved.bend),

@@ -54,7 +54,6 @@ SHARED = {
     "losses.distances": {"matching_kernels.difference"},
     "render.absorption": {"brightness_functions.brightness_derivative", "absorption_kernels.gather"},
     "render.rays": {"interpolation_functions.trilinear_weight"},
-    "solvers.pcisph.steps": {"density_ratio_kernels.excess_derivative"},
     "sph.free_energy": {"_double_well.hessian_product", "_miscible.hessian_product", "_degenerate.gradient"},
     "sph.moving_solids": {"rotations.further"},
     "particles.moving_walls": {"turn_functions.turning", "turn_functions.leaning"},

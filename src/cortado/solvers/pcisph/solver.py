@@ -56,16 +56,10 @@ class PcisphAdjoint(ParticleAdjoint):
         solver = self._solver
         context = solver.context(parameters)
         free_bar = self.unsort(context, state_bar)
-        context.launch(
-            solver.kernels.begin_adjoint,
-            *self.bar.named,
-            v_star=solver.iterates.v_star[iterations],
-            x_scene_bar=free_bar.positions,
-            v_scene_bar=free_bar.velocities,
-            scaled_bar=self._scaled_bar,
-            y_bar=self._y_bar,
-            p_bar=self._p_bar,
-        )
+        self.begin_step(context, free_bar, solver.iterates.v_star[iterations])
+        context.launch(solver.kernels.scale_adjoint, *self.bar.named, scaled_bar=self._scaled_bar)
+        self._y_bar.zero_()
+        self._p_bar.zero_()
 
     def _go_back(
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
@@ -98,10 +92,10 @@ class PcisphAdjoint(ParticleAdjoint):
             self.bar.solids.add(context.launch, densities, going, *known, x=it.x_star[k], bar=self._r)
         self.predict(context, within)
         if kernels.density_ratio:
-            factors = {"t": solver.density_ratio, "y": solver.pressure_relaxation, "y_bar": self._y_bar}
-            factor, total = kernels.density_ratio.adjoint
-            context.launch(factor, **factors, t_bar=self._t_bar)
-            context.launch(total, *known, t_bar=self._t_bar)
+            ratio, own = kernels.density_ratio, {"t": solver.density_ratio, "wall_y": solver.wall_relaxation}
+            bars = {"wall_y_bar": self._y_bar, "t_bar": self._t_bar}
+            context.launch(ratio.relaxation.adjoint, own, bars)
+            context.launch(ratio.total.adjoint, *known, bars)
         self.relax_beside_walls(context)
         self.mix(context, state_bar)
         self.sort(context, state_bar)
@@ -126,8 +120,8 @@ class PcisphTangent(ParticleTangent):
         super().__init__(solver, parameters_dot)
         self._solver = solver
         self._x_star_dot, self._v_star_dot = solver.vectors(), solver.vectors()
-        scalars = (solver.numbers() for _ in range(6))
-        self._zero_pressure, *self._p_dot, self._c_dot, self._y_dot, self._wall_y_dot = scalars
+        scalars = (solver.numbers() for _ in range(7))
+        self._zero_pressure, *self._p_dot, self._c_dot, self._y_dot, self._wall_y_dot, self._t_dot = scalars
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
         """Replace the tangent of the replayed step's state by that of its result."""
@@ -176,13 +170,10 @@ class PcisphTangent(ParticleTangent):
         y_dot = self._wall_y_dot if kernels.density_ratio else self._y_dot
         context.launch(kernels.wall_relaxation.tangent, *known, y=solver.wall_relaxation, y_dot=y_dot)
         if kernels.density_ratio:
-            factors = {
-                "t": solver.density_ratio,
-                "y": solver.pressure_relaxation,
-                "wall_y_dot": y_dot,
-                "y_dot": self._y_dot,
-            }
-            context.launch(kernels.density_ratio.tangent, *known, **factors)
+            ratio, t_dot = kernels.density_ratio, {"t_dot": self._t_dot}
+            own = {"t": solver.density_ratio, "wall_y": solver.wall_relaxation, "wall_y_dot": y_dot}
+            context.launch(ratio.total.tangent, *known, t_dot)
+            context.launch(ratio.relaxation.tangent, own, t_dot, y_dot=self._y_dot)
 
 
 class Pcisph(PcisphSteps):

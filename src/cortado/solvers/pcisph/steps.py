@@ -37,13 +37,12 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
-from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
+from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernels
 from cortado.particles.state import Parameters, State
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
 from cortado.solvers.solver import Counts
-from cortado.sph.integration import new_state_adjoint
 from cortado.sph.parts import StepContext
 from cortado.sph.walls import wall_slope_sums
 
@@ -51,13 +50,23 @@ SOFTNESS = 0.2
 """The softness a of the density-ratio relaxation [-]."""
 
 
+@dataclass(frozen=True)
+class DensityRatio:
+    """The kernels of the density-ratio relaxation."""
+
+    total: Kernels
+    """t"""
+    relaxation: Kernels
+    """y from t and the relaxation beside walls, whose adjoints are written."""
+
+
 @cache
-def density_ratio_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the density-ratio relaxation; the adjoint is two, of the factor and of the sum."""
+def density_ratio_kernels(discretisation: Discretisation) -> DensityRatio:
+    """Make the kernels of the density-ratio relaxation."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, gradient = pair.weight, pair.gradient
-    module, tangent_module, adjoint_module = discretisation.modules("density_ratio")
+    modules = discretisation.modules("density_ratio")
     a, typed = wp.constant(real(SOFTNESS)), TypesByName(real, {neighbourhood: "s", vector: "x"})
 
     @fluid_sum(discretisation)
@@ -81,39 +90,19 @@ def density_ratio_kernels(discretisation: Discretisation) -> Kernels:
         other = t_bar_j * m_j / m_i
         return (own - t_bar_i + other - t_bar_j) * gradient(x_ij, s), weight(x_ij, s) * (own - other) / m_i
 
-    @wp.func
-    def excess(t: real) -> real:
-        """Return e(t) = t^2 / (2 (t + a)) for t > 0, else 0."""
-        if t > real(0.0):
-            return real(0.5) * t * t / (t + a)
-        return real(0.0)
+    def relaxation(wall_y_i: real, t_i: real) -> real:
+        """Return the wall relaxation over 1 + e(t), with e(t) = t^2 / (2 (t + a)) for t > 0, else 0."""
+        excess = real(0.0)
+        if t_i > real(0.0):
+            excess = real(0.5) * t_i * t_i / (t_i + a)
+        return wall_y_i / (real(1.0) + excess)
 
-    @wp.func
-    def excess_derivative(t: real) -> real:
-        """Return the derivative e'(t) of `excess`."""
-        if t > real(0.0):
-            return real(0.5) * t * (t + real(2.0) * a) / ((t + a) * (t + a))
-        return real(0.0)
-
-    @particle_kernel(module, "t y", [over(density_ratio_sum, "total")])
-    def density_ratio(total: real, wall_y_i: real, s: neighbourhood) -> tuple[real, real]:
-        return s.volume * total, wall_y_i / (real(1.0) + excess(s.volume * total))
-
-    @particle_kernel(tangent_module, "y_dot", [over(density_ratio_sum_tangent, "total_dot")])
-    def density_ratio_tangent(total_dot: real, t_i: real, y_i: real, wall_y_dot_i: real, s: neighbourhood) -> real:
-        part = real(1.0) / (real(1.0) + excess(t_i))
-        return part * (wall_y_dot_i - y_i * excess_derivative(t_i) * s.volume * total_dot)
-
-    @particle_kernel(adjoint_module, "y_bar t_bar")
-    def factor_adjoint(t_i: real, y_i: real, y_bar_i: real) -> tuple[real, real]:
-        """Turn the adjoint of the relaxation y into those of the wall relaxation and of t."""
-        part = real(1.0) / (real(1.0) + excess(t_i))
-        return y_bar_i * part, -y_bar_i * y_i * part * excess_derivative(t_i)
-
-    density_ratio_adjoint = sum_kernel(
-        "density_ratio_adjoint", adjoint_module, "+x_bar +m_bar", density_ratio_sum_adjoint, times="s.volume"
+    sums = density_ratio_sum, density_ratio_sum_tangent, density_ratio_sum_adjoint
+    precision, replaced = discretisation.precision, {"y": "wall_y"}
+    return DensityRatio(
+        sum_kernels("density_ratio", modules, sums, "t", times="s.volume"),
+        pointwise_kernels(precision, modules, lambda _: relaxation, ["y"], replaced, written=["t"]),
     )
-    return Kernels(density_ratio, density_ratio_tangent, (factor_adjoint, density_ratio_adjoint))
 
 
 @cache
@@ -152,27 +141,15 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
 
 
 @cache
-def begin_adjoint_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel that begins the adjoint of a step, with PCISPH's own (see `cortado.sph.integration`)."""
+def scaling_kernel(discretisation: Discretisation) -> Any:
+    """Make the kernel of the adjoint of the pressure acceleration over m, with which the way back begins."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    adjoin_new_state = new_state_adjoint(discretisation.precision)
-    typed = TypesByName(real, {vector: "v", wp.array(dtype=vector): "x_scene v_scene", wp.int32: "order"})
 
-    @particle_kernel(
-        discretisation.module(False, "pcisph"),
-        "x_bar v_bar time_step_bar scaled_bar n_bar m_bar rho_0_bar mu_bar y_bar p_bar",
-    )
-    @typed
-    def begin_adjoint(
-        order_i, time_step, m_i, v_i, v_star_i, x_scene_bar, v_scene_bar, time_step_bar_i
-    ) -> tuple[vector, vector, real, vector, real, real, real, real, real, real]:
-        x_bar, v_bar, dt_bar = adjoin_new_state(
-            x_scene_bar[order_i], v_scene_bar[order_i], time_step_bar_i, v_i, v_star_i, time_step
-        )
-        no = real(0.0)
-        return x_bar, v_bar, dt_bar, (time_step / m_i) * v_bar, no, no, no, no, no, no
+    @particle_kernel(discretisation.module(False, "pcisph"), "scaled_bar")
+    def scale_adjoint(time_step: real, m_i: real, v_bar_i: vector) -> vector:
+        return (time_step / m_i) * v_bar_i
 
-    return begin_adjoint
+    return scale_adjoint
 
 
 @dataclass(frozen=True)
@@ -180,12 +157,11 @@ class PcisphKernels:
     """The kernels that only PCISPH needs, by topic, each with its forward, tangent and adjoint."""
 
     wall_relaxation: Kernels
-    density_ratio: Kernels | None
+    density_ratio: DensityRatio | None
     """Only where there are several phases."""
     pressure: Kernels
     force: Kernels
-    begin_adjoint: wp.Kernel
-    """With which the way back through a step begins."""
+    scale_adjoint: wp.Kernel
 
     @classmethod
     def of(cls, discretisation: Discretisation, phases: int) -> "PcisphKernels":
@@ -195,7 +171,7 @@ class PcisphKernels:
             density_ratio_kernels(discretisation) if phases > 1 else None,
             pressure_kernels(discretisation),
             pressure_force_kernels(discretisation),
-            begin_adjoint_kernel(discretisation),
+            scaling_kernel(discretisation),
         )
 
 
@@ -278,12 +254,9 @@ class PcisphSteps(ParticleSolver):
         kernels = self.kernels
         context.launch(kernels.wall_relaxation.forward, y=self.wall_relaxation)
         if kernels.density_ratio:
-            context.launch(
-                kernels.density_ratio.forward,
-                wall_y=self.wall_relaxation,
-                t=self.density_ratio,
-                y=self.pressure_relaxation,
-            )
+            found = {"t": self.density_ratio, "wall_y": self.wall_relaxation, "y": self.pressure_relaxation}
+            context.launch(kernels.density_ratio.total.forward, t=found["t"])
+            context.launch(kernels.density_ratio.relaxation.forward, found)
 
     def iterate(self, k: int, slot: int, context: StepContext) -> None:
         """Take pressure iteration k, from the predicted state of the slot before to ``slot`` (0: the only one)."""
