@@ -61,8 +61,7 @@ _total_{n} = _kind_{n}()
         {unit}[{entry}] = _one
         {gradient}
         _total_{n} += ({change}) * {unit}"""
-"""The text of the tangent of a vector or a matrix. The number of components is a variable, as Warp would write each
-gradient out."""
+"""The text of the tangent of a vector or a matrix. The number of components is a variable, so that Warp loops."""
 
 
 def made_kernel(name: str, types: Types, body: Iterable[str], scope: Types, module: Any) -> Any:
