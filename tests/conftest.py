@@ -23,7 +23,6 @@ collect_ignore = ["test_reference.py", "test_reference_projection.py", "test_stu
 collect_ignore += ["test_study_figures.py", "test_study_growth.py"]
 collect_ignore = collect_ignore if WITHOUT_ENGINE else []
 
-
 wp.config.cpu_compiler_flags = "-march=native"
 """LLVM's own limits of inlining: kernels compile in two thirds of the time, and long gradients take a fifth more."""
 gc.set_threshold(100_000, 20, 20)
@@ -46,7 +45,6 @@ VALIDATION = {
     "test_validation_rayleigh_taylor",
 }
 """Files: physics against published data and closed forms, studies, walls that hold, and every plant."""
-
 
 COLLECTED = pytest.StashKey[set[tuple[str, str]]]()
 """Files and names of all cases, and of their tests, before any is left out."""

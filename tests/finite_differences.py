@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from cortado.gradients import Tape
-
 PLATEAU = 3
 """Neighbouring steps that must all agree: a chance crossing of zero by the error is none."""
 
@@ -22,23 +20,6 @@ def both_modes(problem: Any, point: Mapping[str, Any], directions: Mapping[str, 
     gradient, tangent = problem.value_and_gradient(point)[1], problem.tangent(point, directions)
     assert abs(directional(gradient, directions) - tangent) <= tolerance * abs(tangent)
     return gradient, tangent
-
-
-def all_ways_agree(
-    problem: Any, point: Mapping[str, Any], seed: int, step: Callable[[str], float], rtol: float, atol: float = 0.0
-) -> None:
-    """Of each parameter alone, along a random direction of its size: reverse mode, forward mode, Warp's tape, and
-    central differences over a step relative to that size, to tolerances."""
-    random = np.random.default_rng(seed)
-    found, taped = (problem.value_and_gradient(point, estimator)[1] for estimator in (None, Tape()))
-    for name, value in point.items():
-        direction = {name: random.standard_normal(np.shape(value)) * np.abs(value).max()}
-        slope = directional(found, direction)
-        assert slope != 0.0, name
-        np.testing.assert_allclose(problem.tangent(point, direction), slope, rtol=1e-9, err_msg=name)
-        np.testing.assert_allclose(taped[name], found[name], rtol=1e-9, atol=1e-12 * np.abs(found[name]).max())
-        difference = central_difference(problem.value, point, direction, step(name))
-        np.testing.assert_allclose(difference, slope, rtol=rtol, atol=atol, err_msg=name)
 
 
 def plateau(errors: Sequence[float]) -> float:

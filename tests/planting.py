@@ -164,8 +164,6 @@ def plant_all(package: Path, copy: Path, functions: dict[str, set[str]]) -> list
 
 
 # ---- in the copy -------------------------------------------------------------------------------------------------
-
-
 def map_address() -> None:
     """From now on there is memory at `ADDRESS`."""
     libc = ctypes.CDLL(None, use_errno=True)

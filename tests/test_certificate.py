@@ -134,8 +134,6 @@ def test_within_the_horizon_the_exact_gradient_is_advised():
 
 
 # ---- in float32 --------------------------------------------------------------------------------------------------
-
-
 class Spread:
     """Mean of the fourth power of the distance to a place and of the square of the speed, in float32."""
 
@@ -232,8 +230,6 @@ def test_what_is_certified_in_float32_is_what_is_in_float64():
 
 
 # ---- what is asked, and answered ---------------------------------------------------------------------------------
-
-
 def test_parameters_may_be_values_and_many_numbers():
     problem = problem_of(plane(), 20)
     velocities = problem.simulation.velocities + [0.3, 0.0]
@@ -334,8 +330,6 @@ def test_a_sign_flipped_is_found_on_a_corner(in_both_modes, monkeypatch):
 
 
 # ---- verdicts ----------------------------------------------------------------------------------------------------
-
-
 def comparison(adjoint=1.0, tangents=(0.5, 1.0), differences=((0.5, 1.0),) * 3, loss=1.0, sides=0.0):
     return Consistency(
         sample_steps=np.array([1, 2]),

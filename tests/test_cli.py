@@ -93,8 +93,6 @@ def metrics(run):
 
 
 # ---- run ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.usefixtures("rendered")
 def test_run_writes_its_folder(run, folder):
     code, out, err = run("--steps", 4)
@@ -232,8 +230,6 @@ def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command,
 
 
 # ---- wrong input -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("line", "words"),
     [
@@ -299,8 +295,6 @@ def test_a_process_of_its_own_says_no_more_than_the_sentence(folder):
 
 
 # ---- optimise ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.usefixtures("rendered")
 def test_optimise_writes_its_folder(optimise, folder):
     code, out, err = optimise()
@@ -471,7 +465,6 @@ def test_a_bad_file_is_refused(cortado_command, folder, command, file, good, bad
 
 
 # ---- resume ------------------------------------------------------------------------------------------------------
-
 LONG = sets("optimise.iterations=60", "problem.steps=20")
 
 
@@ -641,8 +634,6 @@ def test_a_finished_optimisation_goes_on(optimise):
 
 
 # ---- images ------------------------------------------------------------------------------------------------------
-
-
 def figures(run):
     """Names of the pictures, each of them one that is removed when the run is overwritten."""
     names = {path.name for path in (Path(run) / "figures").iterdir()}
@@ -746,8 +737,6 @@ def test_a_wrong_task_of_images_is_refused(optimise, folder, override, words):
 
 
 # ---- gradients and bench -----------------------------------------------------------------------------------------
-
-
 def test_a_right_gradient_passes_the_check_in_words_and_in_json(cortado_command):
     code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 3)
     assert (code, err) == (0, "") and "64 particles, 3 steps" in out

@@ -136,8 +136,6 @@ def test_mistakes_are_sentences(capsys, arguments, words):
 
 
 # ---- times -------------------------------------------------------------------------------------------------------
-
-
 def positions_at(name, time):
     trajectory = Trajectory.load(f"{name}/trajectory.vtkhdf")
     (k,) = np.flatnonzero(np.isclose(trajectory.times, time))

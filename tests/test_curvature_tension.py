@@ -7,14 +7,13 @@ import warnings
 import numpy as np
 import pytest
 
-import cortado
-from cortado import CortadoWarning, Problem, Scene, Simulation, gradients, losses
+from cortado import CortadoWarning, Problem, Scene, Simulation, losses
 from cortado.discretise.smoothing import KERNELS
 from cortado.scene.stability import stability_limits
 from cortado.sph.curvature import CurvatureConstants
 from cortado.sph.surface_tension import CurvatureTension, SurfaceTension
-from finite_differences import both_modes, central_difference, directional
-from oscillating_drops import C2, C4, CUBIC
+from finite_differences import central_difference, directional
+from oscillating_drops import C2, CUBIC
 from reference_terms import Curvature
 from scenes import box, plane
 
@@ -112,45 +111,6 @@ def test_one_particle_a_pair_and_two_lines_feel_nothing():
         assert np.abs(run.velocities[-1]).max() < 1e-12, name
 
 
-WALLS = box([-0.05, -0.05], [4.2, 1.2])
-PIECES = {
-    "plane": (stirred(grid(6, 6)), C2, {}),
-    "plane, at walls": (stirred(grid(6, 6)), C4, {"container": WALLS}),
-    "space": (stirred(grid(4, 4, 4)), C2, {}),
-    "cubic spline": (stirred(grid(6, 6)), CUBIC, {}),
-}
-
-
-@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
-@pytest.mark.parametrize("pressure", [True, False])
-@pytest.mark.parametrize("name", PIECES)
-def test_reverse_mode_is_forward_mode_is_the_limit_of_differences(name, pressure):
-    points, discretisation, tables = PIECES[name]
-    problem, point = problem_of(points, 3, discretisation=discretisation, pressure=pressure, tension=80.0, **tables)
-    random = np.random.default_rng(2)
-    point["initial_velocities"] = 0.3 * random.standard_normal(points.shape)  # nothing is at a corner of the pressure
-    ways = {key: 0.03 * random.standard_normal(value.shape) for key, value in point.items()}
-    gradient, tangent = both_modes(problem, point, ways, 1e-11)
-    assert abs(gradient["surface_tension"]) > 1e-12
-    errors = [abs(central_difference(problem.value, point, ways, h) - tangent) for h in (1e-4, 1e-5, 1e-6)]
-    assert min(errors) <= 1e-6 * abs(tangent)
-    if not pressure:  # a tape cannot go through the projection
-        _, tape = problem.value_and_gradient(point, gradients.Tape())
-        for key in point:
-            np.testing.assert_allclose(tape[key], gradient[key], rtol=0.0, atol=1e-11 * np.abs(gradient[key]).max())
-
-
-@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
-def test_float32_follows_float64():
-    points, found = stirred(grid(8, 8)), {}
-    for precision in ("float64", "float32"):
-        problem, point = problem_of(points, 5, precision=precision, tension=8.0)
-        ways = {"surface_tension": np.array(1.0), "initial_positions": np.ones_like(points)}
-        gradient, tangent = both_modes(problem, point, ways, 2e-4)
-        found[precision] = np.r_[gradient["surface_tension"], tangent]
-    np.testing.assert_allclose(found["float32"], found["float64"], rtol=2e-3)
-
-
 def disc(radius, turned):
     """Particles of a drop in concentric rings, a spacing apart, the last ones half a spacing below its surface."""
     rings = []
@@ -223,11 +183,3 @@ def test_drops_that_are_apart_do_not_feel_each_other():
     assert np.abs(a).max() > 1e-5
     np.testing.assert_allclose(b[: len(one)], a, atol=1e-12)
     np.testing.assert_allclose(b[len(one) :], a, atol=1e-12)
-
-
-def test_the_certificate():
-    points = stirred(grid(5, 5))
-    problem, point = problem_of(points, 4, tension=8.0)
-    point["initial_velocities"] = 0.3 * np.random.default_rng(3).standard_normal(points.shape)
-    certificate = cortado.certify(problem, point)
-    assert certificate.right and certificate.loss_changes["surface_tension"] > 0.0

@@ -52,8 +52,6 @@ def simulation(precision="float64"):
 
 
 # ---- what is drawn -----------------------------------------------------------------------------------------------
-
-
 def test_samples_are_of_their_seed_and_number_alone():
     one = table(seed=3)
     assert Sample(one, 5).values == Sample(one, 5).values
@@ -91,8 +89,6 @@ def test_the_purpose_of_a_run_does_not_depend_on_how_many_there_are(valid, test)
 
 
 # ---- one run -----------------------------------------------------------------------------------------------------
-
-
 def test_tangents_are_the_derivatives_along_their_directions():
     """Against central differences, so small that no pressure is clamped between their ends."""
     one, made = table(tangents=2, tangent_frames="all", seed=1), simulation()
@@ -198,8 +194,6 @@ def test_what_crosses_a_period_moves_the_shorter_way():
 
 
 # ---- the command -------------------------------------------------------------------------------------------------
-
-
 def arrays_of(path):
     """All arrays of a file by their names."""
     found = {}
@@ -342,8 +336,6 @@ def test_a_folder_of_something_else_is_kept(file, tmp_path, cortado_command, qui
 
 
 # ---- growing -----------------------------------------------------------------------------------------------------
-
-
 def content_of(folder):
     """All arrays and metadata of a data set, with the attributes of its runs."""
     found = {"metadata": json.loads((Path(folder) / "metadata.json").read_text())}

@@ -205,8 +205,6 @@ def test_every_limit_is_one_of_those_of_the_time_step():
 
 
 # ---- the closing line --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("make", [plane, two_layers])
 def test_energies_are_those_of_the_particles(make):
     simulation = cortado.Simulation(make(), precision="float64")

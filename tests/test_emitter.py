@@ -13,7 +13,6 @@ from twins import nozzle_of
 
 STEPS = 30
 
-
 MAKERS = {"jet": jet, "pour": pour}
 scenes = pytest.mark.parametrize("name", MAKERS)
 SIZES = {"nozzle_path": 0.01, "nozzle_path over time": 0.01, "flow_rate": 0.1, "time_step": 1e-4}
@@ -172,17 +171,6 @@ def test_without_forces_the_column_goes_straight_on(direction):
         trajectory.positions[:, emitter.first :], sample.positions + travelled, rtol=0, atol=1e-13
     )
     np.testing.assert_allclose(trajectory.velocities[:, emitter.first :] - sample.speed * unit, 0.0, rtol=0, atol=1e-12)
-
-
-def test_float32_is_near_float64():
-    wide, narrow = (Simulation(jet(), precision=precision) for precision in ("float64", "float32"))
-    point = point_of(problem_of("jet"))
-    (loss, exact), (found, gradient) = (
-        Problem(simulation, STEPS, Motion(wide)).value_and_gradient(point) for simulation in (wide, narrow)
-    )
-    assert found == pytest.approx(loss, rel=1e-5)
-    for key in ("nozzle_path", "flow_rate", "time_step"):
-        assert np.linalg.norm(gradient[key] - exact[key]) < 2e-3 * np.linalg.norm(exact[key]), key
 
 
 def supplied(**emitter):

@@ -223,8 +223,6 @@ def test_a_batch_is_cut_where_it_is_too_large_for_a_graph_and_too_small_for_a_la
 
 
 # ---- planning --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["Carry", "Latte", "Raft", "Timed"])
 def test_a_twin_begins_where_a_state_is(name):
     """Its loss is minus the rewards from there on, and its gradient that of differences."""
@@ -257,8 +255,6 @@ def test_twins_of_a_batch_share_a_simulation(batches):
 
 
 # ---- bad uses --------------------------------------------------------------------------------------------------------
-
-
 def test_states_of_others_are_refused_in_a_sentence(batches):
     envs, single = batches("Carry"), FluidEnv("Carry")
     envs.reset(seed=3)

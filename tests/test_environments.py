@@ -120,8 +120,6 @@ def test_each_scene_of_a_batch_has_the_bits_of_a_single_one(environments, name):
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", TASKS)
 def test_the_loss_of_the_twin_is_minus_the_return(environments, name):
     """And its gradient that of differences."""
@@ -188,8 +186,6 @@ def test_actuators_are_their_matrices():
 
 
 # ---- episodes that end -----------------------------------------------------------------------------------------------
-
-
 def test_an_episode_has_as_many_steps_as_it_is_made_with():
     """Also more than its task has; one that is made without Gymnasium has those."""
     horizon = TASKS["Splash"].horizon
@@ -270,8 +266,6 @@ def test_in_a_batch_the_others_go_on():
 
 
 # ---- bad uses --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
@@ -338,8 +332,6 @@ def test_gymnasium_is_optional():
 
 
 # ---- terms of rewards, by NumPy --------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def carried():
     """The end of a step of two scenes, whose cups have leant."""
@@ -438,8 +430,6 @@ def test_terms_in_space_are_what_numpy_finds_with_derivatives_of_differences():
 
 
 # ---- the tasks in space are neither solved by doing nothing nor too hard ---------------------------------------------
-
-
 def played(name, policy):
     """The rewards of an episode, and its goal."""
     env, found = cortado.environments.FluidEnv(name), []

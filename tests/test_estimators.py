@@ -79,8 +79,6 @@ def point_of(simulation, seed=0):
 
 
 # ---- against the slow twin ------------------------------------------------------------------------------------------
-
-
 STEPS, DT = 4, 0.0021
 BLOCKS = {2: [0.15, 0.2], 3: [0.1, 0.1, 0.15]}
 
@@ -201,8 +199,6 @@ def test_gradients_equal_those_of_the_twin(estimator, dimension):
 
 
 # ---- smoothing ------------------------------------------------------------------------------------------------------
-
-
 def filtered(simulation, coefficient, point=None):
     """An adjoint before and after the viscosity of the first step, with the strengths (n,) in the scene's order."""
     solver, point = simulation.solver, point or point_of(simulation)
@@ -325,8 +321,6 @@ def test_the_same_bits_twice_and_float32_is_near(kind):
 
 
 # ---- long runs ------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def chaotic():
     simulation = Simulation(splash(), precision="float64")
@@ -343,8 +337,6 @@ def test_a_viscosity_keeps_the_adjoint_of_a_long_run_from_growing(chaotic):
 
 
 # ---- observers ------------------------------------------------------------------------------------------------------
-
-
 def test_every_adjoint_of_a_state_can_be_observed():
     simulation = simulation_of("2-D")
     problem, point = Problem(simulation, 7, Mixed(simulation)), point_of(simulation)
@@ -365,8 +357,6 @@ def test_every_adjoint_of_a_state_can_be_observed():
 
 
 # ---- ensembles ------------------------------------------------------------------------------------------------------
-
-
 class Stub:
     """A function of two parameters in place of a problem."""
 
@@ -762,8 +752,6 @@ def test_averaged_and_smoothed_differentiate_the_same_loss():
 
 
 # ---- centre of mass -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("masses", [None, np.linspace(1.0, 2.0, 64)])
 @pytest.mark.parametrize("make", [losses.CentreOfMass, losses.CentreOfMassAlong])
 def test_centres_of_mass_and_their_gradients(make, masses):
@@ -783,8 +771,6 @@ def test_centres_of_mass_and_their_gradients(make, masses):
 
 
 # ---- estimators of one's own ----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Halved(AdjointEstimator):
     """The adjoint of velocities halved after every step, in NumPy, or on the device as one that a graph may repeat."""
@@ -850,8 +836,6 @@ def test_an_estimate_comes_in_float64():
 
 
 # ---- mistakes -------------------------------------------------------------------------------------------------------
-
-
 def estimated(estimator, **parameters):
     return lambda problem: problem.estimate(parameters, estimator)
 

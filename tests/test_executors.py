@@ -62,8 +62,6 @@ def answer(function, number=0):
 
 
 # ---- in this process ---------------------------------------------------------------------------------------------
-
-
 def test_in_process_items_are_taken_one_after_the_other_as_they_are_needed_and_the_first_error_ends_it():
     told, taken, seen = [], [], []
     assert InProcess().map(square, iter(range(4)), lambda *pair: told.append(pair)) == [0, 1, 4, 9]
@@ -81,8 +79,6 @@ def test_in_process_items_are_taken_one_after_the_other_as_they_are_needed_and_t
 
 
 # ---- errors and functions in transit -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "error",
     [
@@ -161,8 +157,6 @@ def test_an_executor_is_asked_for_by_its_type_and_is_no_part_of_what_an_estimato
 
 
 # ---- two worker processes ----------------------------------------------------------------------------------------
-
-
 def test_estimators_have_the_bits_that_they_have_alone(problem, workers):
     for made in (RandomizedSmoothing(samples=2), EnsembleMean(estimator=Exact())):
         wanted = problem.estimate(POINTS[1], made)
@@ -298,8 +292,6 @@ def test_warnings_and_observers_of_workers_are_heard(problem, workers):
 
 
 # ---- what is lost ------------------------------------------------------------------------------------------------
-
-
 def test_a_worker_that_is_killed_half_way_changes_nothing(problem, processes, workers):
     """Afterwards the scheduler is lost too."""
     arrived = []
@@ -394,8 +386,6 @@ def test_what_is_launched_at_a_time_follows_the_workers():
 
 
 # ---- local workers -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.filterwarnings("ignore:The worker .* was lost")
 def test_each_process_has_one_gpu_also_when_it_is_started_again(monkeypatch):
     monkeypatch.setattr("cortado.executors.visible_gpus", lambda: ["3", "GPU-5f1c"])

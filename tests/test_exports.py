@@ -87,8 +87,6 @@ def same_points(found, wanted):
 
 
 # ---- for USD -----------------------------------------------------------------------------------------------------
-
-
 def test_usd_has_all_of_it_over_time(tmp_path):
     usd, geometry = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
     path = trajectory().export(tmp_path / "usd", to="usd")
@@ -331,8 +329,6 @@ def test_a_surface_that_does_not_enclose_the_fluid_is_told(tmp_path, capsys, mon
 
 
 # ---- for series --------------------------------------------------------------------------------------------------
-
-
 def test_paraview_reads_times_parts_and_fields(tmp_path):
     vtk, support = pytest.importorskip("vtkmodules.vtkIOXML"), pytest.importorskip("vtkmodules.util.numpy_support")
     path = trajectory().export(tmp_path, to="vtp")
@@ -425,8 +421,6 @@ def test_the_command_line_writes_every_other_frame_of_a_run(tmp_path, cortado_co
 
 
 # ---- for xarray --------------------------------------------------------------------------------------------------
-
-
 def test_a_dataset_has_names_and_units(tmp_path):
     xarray = pytest.importorskip("xarray")
     found = trajectory().to_xarray()
@@ -448,8 +442,6 @@ def test_a_dataset_has_names_and_units(tmp_path):
 
 
 # ---- what goes wrong ---------------------------------------------------------------------------------------------
-
-
 def test_wrong_calls_are_sentences(tmp_path):
     new, run = tmp_path / "new", trajectory()
     (tmp_path / "mine.txt").write_text("kept")

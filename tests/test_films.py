@@ -281,8 +281,6 @@ def test_an_option_says_the_kind_of_a_camera_and_set_the_rest():
 
 
 # ---- spilt drops ---------------------------------------------------------------------------------------------------
-
-
 def spilt(dimension, drops, frames=11):
     """(frames, n, d) [m] a block of 1000 particles that moves aside by a tenth of its size, but for some that fall."""
     generator = np.random.default_rng(3)

@@ -40,8 +40,6 @@ def without_pictures(monkeypatch):
 
 
 # ---- what there is -----------------------------------------------------------------------------------------------
-
-
 def commands():
     """Every command of the command line, as one types it."""
     return {*app._subcommands, *(f"gradients {name}" for name in gradients._subcommands)} - {"gradients"}
@@ -80,8 +78,6 @@ def test_the_help_of_each_is_named_where_it_is_misused(name, cortado_command):
 
 
 # ---- new ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("dimension", "pictures"), [(2, True), (3, False)])
 def test_a_new_scene_runs_at_once(cortado_command, request, dimension, pictures):
     """With its pictures in the plane."""
@@ -174,8 +170,6 @@ def test_a_folder_that_may_not_be_written(cortado_command):
 
 
 # ---- examples ----------------------------------------------------------------------------------------------------
-
-
 def test_examples_are_listed_and_copied(cortado_command):
     code, out, err = cortado_command("examples")
     shown = [path.name for path in (ROOT / "examples").iterdir() if path.suffix in (".toml", ".py")]
@@ -212,8 +206,6 @@ def test_what_is_copied_is_a_name_and_no_path(cortado_command, name):
 
 
 # ---- schema ------------------------------------------------------------------------------------------------------
-
-
 def test_the_schema_that_is_shipped_is_that_of_the_tables(cortado_command):
     assert SCHEMA.read_text("utf-8") == file_schema_text(), "renew it: cortado schema > src/cortado/scene.schema.json"
     assert json.loads(cortado_command("schema")[1]) == file_schema()
@@ -246,8 +238,6 @@ def test_it_refuses_what_cortado_refuses(old, new):
 
 
 # ---- completion and --quiet --------------------------------------------------------------------------------------
-
-
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
 @pytest.mark.parametrize(
     ("typed", "found"),

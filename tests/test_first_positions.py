@@ -113,8 +113,6 @@ def test_a_search_refuses_steps_that_crowd_particles():
 
 
 # ---- limits of stability -----------------------------------------------------------------------------------------
-
-
 def test_each_limit_of_stability_is_told_once():
     problem, _ = problem_of(plane())
 

@@ -34,8 +34,6 @@ SCENE = cortado.Scene(
 
 
 # ---- error bars --------------------------------------------------------------------------------------------------
-
-
 def design(frames, rows, columns):
     """(frames, m, 2): a front that moves, seen by two parameters."""
     t = np.linspace(0.1, 1.0, frames)[:, None, None]
@@ -116,8 +114,6 @@ def test_products_are_what_they_say():
 
 
 # ---- numbers -----------------------------------------------------------------------------------------------------
-
-
 def test_coordinates_leave_fixed_numbers_alone():
     start = {"viscosity": [1.0, 2.0], "gravity": [0.5, -9.0]}
     own = Coordinates.of(start, ["viscosity"], {"viscosity": (1.0, [1.0, 9.0])})
@@ -143,8 +139,6 @@ def test_frames_between_steps_are_interpolated():
 
 
 # ---- experiments -------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def simulation():
     return cortado.Simulation(SCENE, precision="float64")
@@ -431,7 +425,6 @@ def test_what_cannot_be_told_is_said(simulation, shaken):
 
 
 # ---- mistakes ----------------------------------------------------------------------------------------------------
-
 TIMES = [0.0, 0.01, 0.02, 0.03]
 
 

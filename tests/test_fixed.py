@@ -91,8 +91,6 @@ def test_first_particles_and_walls_cannot_be_written(simulation, name):
 
 
 # ---- what is given -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("make", "name"),
     [

@@ -37,7 +37,6 @@ def disturbed(positions):
 
 ITERATIONS = {"fixed": {}, "tolerance": {"minimum_iterations": 2, "maximum_iterations": 40, "density_tolerance": 0.001}}
 
-
 WHAT = ("gravity", "gravity over time", "initial_positions", "initial_velocities", "viscosity")
 FIXED, TOLERANCE = ITERATIONS
 LONG = zip(WHAT, (FIXED, TOLERANCE, FIXED, TOLERANCE, FIXED), strict=True)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-import cortado
-from cortado import CortadoError, CortadoWarning, Problem, Simulation, gradients, losses
+from cortado import CortadoWarning, Problem, Simulation, losses
 from cortado.cli import main
 from cortado.scene.stability import is_implicit, stability_limits, viscous_limit
 from cortado.sph.viscous_stress import ImplicitViscousStress
@@ -50,9 +49,6 @@ def syrups():
     return thick(phase=phases, fluid=bodies)
 
 
-MADE = {"in the plane, without slip": thick, "in space": cube, "two phases": syrups}
-
-
 def problem(made, **options):
     simulation = Simulation(made, precision="float64", **options)
     target = simulation.positions + 0.02 * np.sin(7.0 * simulation.positions)
@@ -86,46 +82,6 @@ def test_it_comes_to_the_explicit_flow_with_the_first_order_of_the_time_step():
     exact = 2.0 * end("explicit", 400) - end("explicit", 200)
     coarse, fine = (np.abs(end("implicit", steps) - exact).max() for steps in (20, 40))
     assert 1.7 < coarse / fine < 2.3
-
-
-@pytest.mark.parametrize("make", MADE.values(), ids=MADE)
-def test_reverse_and_forward_mode_and_differences_agree(make):
-    judged, random = problem(make()), np.random.default_rng(3)
-    names = ("viscosity", "gravity", "time_step", "initial_velocities", "initial_positions", "rest_density")
-    point = {name: judged.simulation.parameters()[name] for name in names}
-    found = judged.value_and_gradient(point)[1]
-    for name, value in point.items():
-        size = 0.01 if name == "initial_positions" else np.abs(value).max()
-        direction = size * random.standard_normal(np.shape(value))
-        along = float(np.sum(found[name] * direction))
-        assert judged.tangent(point, {name: direction}) == pytest.approx(along, rel=1e-10), name
-        moved = [judged.value({**point, name: value + s * 1e-5 * direction}) for s in (1.0, -1.0)]
-        assert (moved[0] - moved[1]) / 2e-5 == pytest.approx(along, rel=2e-5), name
-
-
-def test_steps_that_are_cut_and_scenes_of_a_batch_have_the_bits_of_one_run():
-    simulation = Simulation(thick())
-    whole = simulation.run(STEPS)
-    state = simulation.state()
-    for _ in range(2):
-        state = simulation.step(state, {}, steps=STEPS // 2)
-    np.testing.assert_array_equal(state["velocities"], whole.velocities[-1])
-    several = Simulation(thick(), batch=3)
-    gravities = np.array([[0.3, -9.81], [1.0, -3.0], [0.0, 0.0]])
-    for gravity, found in zip(gravities, several.run(STEPS, {"gravity": gravities[:, None]}), strict=True):
-        np.testing.assert_array_equal(found.velocities, simulation.run(STEPS, {"gravity": gravity}).velocities)
-
-
-def test_it_is_certified_and_float32_is_near_float64():
-    judged = problem(thick())
-    with pytest.raises(CortadoError, match=r"implicit viscosity has no tape: try gradients\.Exact"):
-        judged.value_and_gradient({"viscosity": 20.0}, gradients.Tape())
-    assert cortado.certify(judged, ["viscosity", "gravity", "initial_positions"]).right
-    positions = judged.simulation.positions
-    single = Problem(Simulation(thick()), STEPS, losses.FinalPositions(positions + 0.02 * np.sin(7.0 * positions)))
-    found = [one.value_and_gradient({"viscosity": 20.0, "gravity": [0.3, -9.81]})[1] for one in (single, judged)]
-    for name, wanted in found[1].items():
-        assert np.linalg.norm(found[0][name] - wanted) < 1e-2 * np.linalg.norm(wanted), name
 
 
 def test_fluid_at_rest_needs_no_iteration():

@@ -59,8 +59,6 @@ def point(jax, simulation):
 
 
 # ---- derivatives -------------------------------------------------------------------------------------------------
-
-
 def test_compiled_scanned_and_recomputed_segments_have_the_same_gradient(jax, layer, simulation, point):
     first = {**layer.state(simulation), "velocities": point[1]}
 
@@ -146,8 +144,6 @@ def test_a_gradient_is_taken_twice_from_one_forward_run(jax, problem, layer):
 
 
 # ---- maps --------------------------------------------------------------------------------------------------------
-
-
 GONE = np.array([[0.4, -9.0], [9e5, 0.0], [-1.0, -8.0]])
 """Gravities, the second of which throws the fluid through the wall."""
 
@@ -235,8 +231,6 @@ def test_constant_rows_of_a_map_are_no_rows_of_steps(jax, layer, simulation):
 
 
 # ---- searches, threads, what is looked at ------------------------------------------------------------------------
-
-
 def test_a_descent_finds_the_gravity_that_made_a_target(jax, layer, simulation):
     """As optimisers of other libraries do: a compiled step of a loss and its gradient, again and again."""
     target = simulation.run(20, {"gravity": [1.0, -9.0]}).positions[-1]
@@ -334,8 +328,6 @@ def test_a_picture_has_the_derivatives_of_differences_in_reverse_mode(jax, layer
 
 
 # ---- bad uses ----------------------------------------------------------------------------------------------------
-
-
 BAD_STATES = {
     **layered.BAD_STATES,
     "float32": (lambda s: {**s, "positions": s["positions"].astype("float32")}, "state positions is float32, but"),

@@ -78,8 +78,6 @@ def cloud(count: int = 4000, reach: float = 0.6) -> np.ndarray:
 
 
 # ---- good ones ---------------------------------------------------------------------------------------------------
-
-
 def test_a_box_of_triangles_is_a_box():
     half, points = np.array([0.2, 0.3, 0.1]), cloud()
     mesh, same = solid(box(-half, half)), Box(half)
@@ -292,7 +290,6 @@ def test_balls_that_overlap_are_a_lens_lighter(tmp_path):
 
 
 # ---- far from the origin -----------------------------------------------------------------------------------------
-
 FAR = {"1e5 m": [1e5, 1e5, 1e5], "on a map": [512345.0, 5412345.0, 100.0]}
 
 
@@ -421,8 +418,6 @@ def test_points_inside_are_on_the_lattice_from_the_lower_corner(mesh, volume):
 
 
 # ---- points of a surface -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["torus", "box", "ball"])
 @pytest.mark.parametrize("depth", [0.0, 0.5, -0.5])
 def test_points_of_a_surface_are_even(name, depth):
@@ -456,8 +451,6 @@ def test_feet_stand_for_equal_areas_and_point_outwards():
 
 
 # ---- bad ones ----------------------------------------------------------------------------------------------------
-
-
 def without(mesh: trimesh.Trimesh, count: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices, mesh.faces[count:], process=False)
 
@@ -592,8 +585,6 @@ def test_files_that_are_cut_off_are_a_sentence(tmp_path, cut):
 
 
 # ---- a large one -------------------------------------------------------------------------------------------------
-
-
 def test_two_hundred_thousand_triangles_are_read_sampled_and_asked_a_million_times(tmp_path):
     """In seconds of one core, compiling left out."""
     solid(torus(20, 12)).holds(cloud(10))

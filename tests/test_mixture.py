@@ -11,7 +11,7 @@ import warp as wp
 from cortado import InputError, Problem, Simulation, Trajectory, gradients, losses
 from cortado.scene.parameter_values import reference_density
 from cortado.sph.free_energy import FreeEnergy
-from finite_differences import both_modes, decades, directional, distance
+from finite_differences import both_modes, decades, distance
 from scenes import MIXING, OIL, plane, plane_of_three, scene, two_layers
 
 MAKERS = {"two layers": two_layers, "plane of three": plane_of_three}
@@ -70,51 +70,21 @@ def directions_of(point, seed=5):
 
 @cache
 def case(name):
-    """A problem with its point, directions, and gradient in all parameters together."""
+    """A problem with its point, and the gradient there in all parameters together."""
     simulation = simulation_of(name)
     problem, point = Problem(simulation, STEPS[name], Everything(simulation)), point_of(simulation)
-    return problem, point, directions_of(point), problem.value_and_gradient(point)
-
-
-@scenes
-@pytest.mark.parametrize("what", [*SIZES, "all"])
-def test_gradient_equals_tangent_and_differences(name, what):
-    problem, point, directions, (_, gradient) = case(name)
-    chosen = {key: value for key, value in directions.items() if what in (key, "all")}
-    tangent = problem.tangent(point, chosen)
-    assert abs(directional(gradient, chosen) - tangent) <= 1e-10 * abs(tangent)
-    assert distance(problem.value, point, chosen, tangent, decades(3.0, 7.0), enough=1e-6) < 1e-6
+    return problem, point, problem.value_and_gradient(point)
 
 
 @scenes
 @pytest.mark.parametrize("what", SIZES)
 def test_a_parameter_alone_has_the_gradient_that_it_has_among_all(name, what):
     """Not given are only those at which the scene's own value is taken."""
-    problem, point, _, _ = case(name)
+    problem, point, _ = case(name)
     own = {key: value for key, value in problem.simulation.parameters().items() if key in SIZES}
     _, wanted = problem.value_and_gradient({**own, what: point[what]})
     _, found = problem.value_and_gradient({what: point[what]})
     assert found.keys() == {what} and found[what].tobytes() == wanted[what].tobytes()
-
-
-@scenes
-def test_gradient_equals_warps_tape(name):
-    problem, point, _, (loss, gradient) = case(name)
-    taped_loss, taped = problem.value_and_gradient(point, gradients.Tape())
-    assert loss == taped_loss
-    for key in SIZES:
-        assert np.linalg.norm(gradient[key] - taped[key]) <= 1e-9 * np.linalg.norm(gradient[key]), key
-
-
-def test_float32_is_near_float64():
-    wide, narrow = (simulation_of("two layers", precision) for precision in ("float64", "float32"))
-    (loss, exact), (found, gradient) = (
-        Problem(simulation, 30, Everything(simulation)).value_and_gradient(point_of(wide))
-        for simulation in (wide, narrow)
-    )
-    assert found == pytest.approx(loss, rel=1e-5)
-    for key in SIZES:
-        assert np.linalg.norm(gradient[key] - exact[key]) < 2e-3 * np.linalg.norm(exact[key]), key
 
 
 @scenes
@@ -175,7 +145,7 @@ def test_two_equal_phases_behave_like_one():
 
 
 def test_problems_with_different_substeps_share_a_simulation():
-    problem, point, _, (loss, gradient) = case("two layers")
+    problem, point, (loss, gradient) = case("two layers")
     other = Problem(problem.simulation, 5, problem.loss)
     for mobility in (0.0, 0.5):
         other.value_and_gradient({"mobility": mobility}, gradients.Tape())

@@ -1,7 +1,5 @@
 """Forces that a user gives, also with a field that is kept: run, differentiated, certified, searched for."""
 
-import pickle
-
 import numpy as np
 import pytest
 
@@ -12,36 +10,16 @@ from cortado.particles.state import Entry, StateField
 from cortado.scene.parameters import Axis, Parameter
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Carried, Part
-from finite_differences import all_ways_agree, both_modes, central_difference
+from finite_differences import both_modes, central_difference
 from own_forces import Breeze
 from remembering_force import TAU, Memory, MemoryForce, U
-from scenes import aimed, jet, plane, splash, two_layers
+from scenes import aimed, plane, splash
 
 STEPS = 8
-POINT = {
-    "breeze.k": np.array(2.0),
-    "breeze.wind": np.array([0.5, 1.0, -0.4]),
-    "time_step": np.array(0.002),
-    "gravity": np.array([0.5, -9.0, 0.3]),
-}
 
 
 def problem(forces, made=None, steps=STEPS, **options):
     return aimed(Simulation(made or splash(), **{"precision": "float64", **options}, forces=forces), steps)
-
-
-def test_reverse_forward_tape_and_differences_agree():
-    all_ways_agree(problem([Breeze()]), POINT, 5, lambda name: 1e-6, rtol=3e-5)
-
-
-def test_a_run_that_goes_on_has_the_same_bits_and_its_own_time():
-    simulation = Simulation(splash(), forces=[Breeze()])
-    whole = simulation.run(STEPS)
-    first = simulation.run(3)
-    rest = simulation.run(STEPS - 3, state=first.last_state)
-    np.testing.assert_array_equal(rest.positions[-1], whole.positions[-1])
-    late = simulation.run(STEPS - 3)
-    assert np.abs(late.velocities[-1] - rest.velocities[-1]).max() > 0.0
 
 
 def test_what_the_force_does_is_what_it_says():
@@ -52,18 +30,6 @@ def test_what_the_force_does_is_what_it_says():
     for step in range(5):
         v = v + dt * (gravity + 4.0 * np.sin(step * dt) * (wind - v))
     np.testing.assert_allclose(simulation.run(5).velocities[-1], np.tile(v, (64, 1)), rtol=1e-12)
-
-
-def test_scenes_of_a_batch_have_their_own():
-    judged, values = problem([Breeze()], batch=2), {"breeze.k": [1.0, 3.0], "time_step": [0.002, 0.001]}
-    loss, gradient = judged.value_and_gradient(values)
-    alone = problem([Breeze()])
-    for b in range(2):
-        one = {name: value[b] for name, value in values.items()}
-        single, found = alone.value_and_gradient(one)
-        assert single == loss[b]
-        for name in values:
-            np.testing.assert_array_equal(found[name], gradient[name][b])
 
 
 def test_one_that_has_no_batches_is_refused():
@@ -77,23 +43,12 @@ def test_one_that_has_no_batches_is_refused():
         problem([Alone()], batch=2)
 
 
-def test_it_is_certified_in_float32():
-    assert cortado.certify(problem([Breeze()], precision="float32"), ["breeze.k", "breeze.wind", "time_step"]).right
-
-
 def test_it_is_searched_for():
     judged = problem([Breeze()])
     goal = judged.end({"breeze.k": 5.0}).positions
     judged = Problem(judged.simulation, STEPS, cortado.losses.FinalPositions(goal))
     found = cortado.optimise(judged, {"breeze.k": 3.0}, optimiser=cortado.optimisers.LBFGS(), iterations=12)
     np.testing.assert_allclose(found.parameters["breeze.k"], 5.0, rtol=1e-3)
-
-
-def test_it_goes_to_other_processes():
-    judged = problem([Breeze()])
-    again = pickle.loads(pickle.dumps(judged))
-    assert again.value({"breeze.k": 1.5}) == judged.value({"breeze.k": 1.5})
-    assert again.fingerprint == judged.fingerprint
 
 
 class Gusts(Breeze):
@@ -164,18 +119,6 @@ def test_a_scene_without_them_has_no_more_parameters():
     assert "time" not in problem([Breeze()]).simulation.parameters()
 
 
-SCENES = {"plane": plane, "two layers": two_layers, "jet": jet}
-
-
-def remembering(make, **options):
-    return problem([Memory()], make(), 6, **options)
-
-
-def point_of(simulation):
-    velocities = 0.3 * np.random.default_rng(4).standard_normal(simulation.positions.shape)
-    return {"memory.k": 40.0, "time_step": 0.002, "initial_velocities": velocities}
-
-
 def test_what_it_does_is_what_it_says():
     """Without pressure and viscosity a step is exact."""
     free = plane(forces={"gravity": [0.0, -9.81], "viscosity": "none", "pressure": False})
@@ -188,31 +131,6 @@ def test_what_it_does_is_what_it_says():
     np.testing.assert_allclose(run.velocities[-1], np.tile(v, (simulation.particles, 1)), rtol=1e-12)
     np.testing.assert_allclose(run.last_state[U.name], np.tile(u, (simulation.particles, 1)), rtol=1e-12)
     assert np.abs(u).max() > 0.0
-
-
-@pytest.mark.parametrize("make", SCENES)
-def test_a_field_that_is_kept_has_right_derivatives(make):
-    judged = remembering(SCENES[make])
-    all_ways_agree(judged, point_of(judged.simulation), 5, lambda name: 1e-6, rtol=1e-4)
-
-
-def test_a_run_that_is_cut_has_the_same_bits():
-    simulation = Simulation(two_layers(), forces=[Memory()])
-    state = simulation.state({"initial_velocities": simulation.velocities + 0.1})
-    whole, halves = simulation.step(state, steps=6), simulation.step(simulation.step(state, steps=2), steps=4)
-    for name in (U.name, "positions", "velocities"):
-        np.testing.assert_array_equal(halves[name], whole[name])
-    assert np.abs(np.asarray(whole[U.name]) - whole["velocities"]).max() > 0.0
-
-
-def test_it_is_certified_and_runs_in_a_batch():
-    judged = remembering(plane)
-    point = point_of(judged.simulation)
-    assert cortado.certify(judged, point).right
-    many = remembering(plane, batch=2)
-    values, found = many.value_and_gradient({**point, "memory.k": [40.0, 10.0]})
-    value, gradient = judged.value_and_gradient({**point, "memory.k": 10.0})
-    assert values[1] == value and found["memory.k"][1] == gradient["memory.k"]
 
 
 class Made:

@@ -204,7 +204,6 @@ SCENES = {
     "a picture of a volume": (VOLUME, "squares"),
 }
 
-
 IN_EVERY_RUN = ("sph.density", "sph.viscosity", "solvers.pcisph.pressure")
 """Modules of adjoints whose plants are looked for in the scene "one phase" alone, but for those of solids' work."""
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import CortadoWarning, InputError, Problem, SceneError, Simulation, gradients, losses
+from cortado import CortadoWarning, InputError, Problem, SceneError, Simulation, losses
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.rollout.outcome import divergence_sentence
 from cortado.solvers.projection.coarse_levels import Levels
 from finite_differences import both_modes, central_difference
 from reference_projection import Projection
-from scenes import box, jet, plane, plane_of_three, pour, scene, thrown, two_layers
+from scenes import box, plane, plane_of_three, scene, thrown
 
 SOLVER = {"kind": "projection", "time_step": 0.002}
 PERIODIC = box([0.0, 0.0], [0.4, 0.8], periodic=[True, False])
@@ -217,48 +217,11 @@ def test_pressures_keep_both_momenta(make):
     assert np.abs(impulses).max() > 0.01
 
 
-TENSE = {"gravity": [0.0, -9.81, 0.0], "surface_tension": 3.0}
-HONEY = [{"name": "water", "rest_density": 1000.0, "viscosity": 50.0}]
-IMPLICIT = {"gravity": [0.0, -9.81], "viscosity": "stress", "viscous_solve": "implicit"}
-DERIVED = {
-    **CASES,
-    "mixture": lambda: two_layers(solver=SOLVER),
-    "nozzle": lambda: jet(solver=SOLVER, forces={"gravity": [0.7, -9.81]}),
-    "nozzle in space": lambda: pour(solver=SOLVER),
-    "surface tension": lambda: plane(solver=SOLVER, forces={"gravity": [0.0, -9.81], "surface_tension": 3.0}),
-    "surface tension in space": lambda: scene(solver=SOLVER, discretisation=C2, forces=TENSE),
-    "thick": lambda: plane(solver={**SOLVER, "time_step": 0.005}, phase=HONEY, forces=IMPLICIT),
-}
-
-
 def problem_of(make, steps=8, **options):
     simulation = Simulation(make(), **{"precision": "float64", **options})
     x = simulation.positions
     target = losses.FinalPositions(x + 0.05 * np.sin(np.arange(x.size)).reshape(x.shape))
     return Problem(simulation, steps, losses.Frames({5: target, steps: target}))
-
-
-def direction(values, seed=1):
-    random = np.random.default_rng(seed)
-    return {name: np.abs(value).max() * random.standard_normal(value.shape) for name, value in values.items()}
-
-
-@pytest.mark.parametrize("case", DERIVED)
-def test_reverse_mode_is_forward_mode_is_the_limit_of_differences(case):
-    problem = problem_of(DERIVED[case])
-    simulation = problem.simulation
-    names = ["gravity", "viscosity", "rest_density", "time_step"]
-    at = {name: np.array(value) for name, value in simulation.parameters().items() if name in names}
-    if simulation.scene.emitter is None:
-        at |= begun(case, simulation)
-    value, gradient = problem.value_and_gradient(at)
-    for name, along in direction(at).items():
-        slope = problem.tangent(at, {name: along})
-        scale = max(np.abs(gradient[name] * along).sum(), 1e-6 * value)
-        assert abs(np.sum(gradient[name] * along) - slope) < 1e-11 * scale, name
-        steps = 10.0 ** np.arange(-8.0, -2.4, 0.5)  # the clamp of a pressure may be near
-        errors = [abs(central_difference(problem.value, at, {name: along}, h) - slope) / scale for h in steps]
-        assert min(errors) < 1e-6, (name, errors)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -274,43 +237,6 @@ def test_fluid_that_moves_as_a_whole_resists_a_strain(precision):
     _, slope = both_modes(problem, still, strained, 1e-4 if precision == "float32" else 1e-11)
     step = 1e-7  # what is faster is corrected before the first iteration too
     assert slope == pytest.approx(central_difference(double.value, still, strained, step), rel=0.002)
-
-
-def test_in_float32_the_gradient_is_near_that_of_float64():
-    single, double = (problem_of(CASES["plane"], precision=name) for name in ("float32", "float64"))
-    at = {"gravity": np.array([0.4, -9.0])}
-    wanted = double.value_and_gradient(at)[1]["gravity"]
-    found = single.value_and_gradient(at)[1]["gravity"]
-    np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=2e-3 * np.abs(wanted).max())
-    along = np.array([1.0, -2.0])
-    assert single.tangent(at, {"gravity": along}) == pytest.approx(np.sum(found * along), rel=2e-3)
-
-
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_a_run_goes_on_bit_for_bit_and_has_the_same_bits_twice(precision):
-    simulation = Simulation(plane(solver=SOLVER), precision=precision)
-    whole = simulation.run(20)
-    assert simulation.run(20).positions.tobytes() == whole.positions.tobytes()
-    rest = simulation.run(9, state=simulation.run(11).last_state)
-    for name in ("positions", "velocities"):
-        assert getattr(rest, name).tobytes() == getattr(whole, name)[11:].tobytes()
-    one, again = (problem_of(CASES["plane"], precision=precision).value_and_gradient({"viscosity": 0.05}) for _ in "12")
-    assert one[1]["viscosity"].tobytes() == again[1]["viscosity"].tobytes()
-
-
-def test_each_scene_of_a_batch_is_that_run_alone():
-    tilts = np.array([[[0.0, -9.81]], [[3.0, -9.0]], [[-2.0, -9.5]]])
-    batch = problem_of(CASES["plane"], batch=3)
-    alone = problem_of(CASES["plane"])
-    values, found = batch.value_and_gradient({"gravity": tilts})
-    for value, gradient, tilt in zip(values, found["gravity"], tilts, strict=True):
-        one, wanted = alone.value_and_gradient({"gravity": tilt[0]})
-        assert value == one and gradient.tobytes() == wanted["gravity"].tobytes()
-
-
-def test_it_has_no_tape_and_says_so():
-    with pytest.raises(InputError, match=r'solver.kind "projection" has no '):
-        problem_of(CASES["plane"]).value_and_gradient({"gravity": np.array([0.0, -9.81])}, gradients.Tape())
 
 
 def test_a_scene_without_pressure_has_nothing_to_project():

@@ -19,7 +19,6 @@ SCENES = {
     "projection": lambda: plane(solver={"kind": "projection", "time_step": 0.0021}),
 }
 
-
 SIZES = [1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7]
 
 

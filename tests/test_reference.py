@@ -88,8 +88,6 @@ def gradients_agree(simulation, point, steps, tolerance):
 
 
 # ---- against the Warp engine ---------------------------------------------------------------------------------------
-
-
 @scenes
 def test_positions_are_those_of_the_warp_engine(made):
     steps = 100 if made is SCENES["splash"] else 40
@@ -136,8 +134,6 @@ def test_float32_is_as_near_to_float64_as_the_warp_engine_is():
 
 
 # ---- methods against each other ------------------------------------------------------------------------------------
-
-
 @scenes
 @pytest.mark.parametrize("method", ["dual", "complex_step"])
 def test_methods_agree_in_float64(made, method):
@@ -214,8 +210,6 @@ def test_terms_make_a_difference():
 
 
 # ---- the report's equations as they are printed --------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("method", ["as_printed", "as_printed_right_viscosity", "as_printed_predicted_density"])
 def test_printed_equations_against_numpy(method):
     """One step with one iteration, compressed, in free space; the twin differentiates factors by complex step."""
@@ -269,8 +263,6 @@ def test_printed_equations_against_numpy(method):
 
 
 # ---- bits, digits, histories ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_same_bits_with_any_number_of_threads(precision):
     found = []
@@ -324,8 +316,6 @@ def test_an_observer_may_stop_a_run():
 
 
 # ---- mistakes ------------------------------------------------------------------------------------------------------
-
-
 def stirred(motion, **changes):
     """A simulation of the splash with a block below it that moves."""
     block = box([0.25, 0.0, 0.05], [0.4, 0.1, 0.2], name="block", motion=motion, **changes)

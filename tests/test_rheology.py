@@ -60,26 +60,6 @@ def test_every_number_of_a_law_is_certified(kind, solve):
     assert cortado.certify(judged, [*names, "viscosity", "initial_velocities", "initial_positions", "time_step"]).right
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_forward_and_reverse_mode_agree_and_the_tape(kind):
-    judged = problem(thick({"kind": kind, **KINDS[kind]}, "explicit"))
-    point = judged.simulation.parameters()
-    found = judged.value_and_gradient(point)[1]
-    taped = judged.value_and_gradient(point, cortado.gradients.Tape())[1]
-    for name in (name for name in point if "." in name):
-        assert found[name] != 0.0
-        assert judged.tangent(point, {name: 1.0}) == pytest.approx(float(found[name]), rel=1e-10)
-        assert float(taped[name]) == pytest.approx(float(found[name]), rel=1e-10)
-
-
-def test_in_float32_the_gradient_is_near_that_of_float64():
-    made = thick({"kind": "bingham", **KINDS["bingham"]})
-    found = [problem(made, precision) for precision in ("float32", "float64")]
-    single, double = (one.value_and_gradient(one.simulation.parameters())[1] for one in found)
-    for name in ("bingham.yield_stress", "bingham.regularisation", "viscosity"):
-        assert float(single[name]) == pytest.approx(float(double[name]), rel=2e-2), name
-
-
 def test_a_law_that_is_newton_s_changes_nothing():
     newtonian = Simulation(thick(), precision="float64").run(STEPS).positions[-1]
     for rheology in (

@@ -23,7 +23,6 @@ NEAR = SMALL**0.5
 SIZES = [0.0, 1e-9, 1e-3, 0.9 * NEAR, 0.999 * NEAR, 1.001 * NEAR, 0.3, 3.0]
 """Of turns [rad]: on both sides of where a series ends."""
 
-
 ROTATION = SPACE.rotation
 
 

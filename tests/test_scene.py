@@ -64,8 +64,6 @@ def full_data() -> dict:
 
 
 # ---- good scenes -------------------------------------------------------------------------------------------------
-
-
 def test_a_scene_keeps_what_its_file_says(scene_file):
     scene = load_scene(scene_file)
     assert scene.dimension == 3 and scene.discretisation.support_radius == 0.1
@@ -123,8 +121,6 @@ def test_the_tables_of_others_are_ignored(scene_file):
 
 
 # ---- overrides ---------------------------------------------------------------------------------------------------
-
-
 def test_overrides_replace_values(scene_file):
     overrides = ["solver.time_step=0.002", "forces.gravity=[0,-5,0]", "fluid.0.upper=[0.1,0.1,0.1]"]
     overrides += ["fluid[1].radius = 0.08", "name=a drop", "container.periodic[0]=false"]
@@ -144,8 +140,6 @@ def test_a_bad_override_is_a_sentence(scene_file, override):
 
 
 # ---- bad scenes --------------------------------------------------------------------------------------------------
-
-
 def test_there_are_enough_bad_scenes():
     assert len({name for name, *_ in BAD_SCENES}) == len(BAD_SCENES) >= 40
 
@@ -262,7 +256,6 @@ def test_bad_json_is_a_sentence(text):
 
 
 # ---- any scene ---------------------------------------------------------------------------------------------------
-
 ODD_VALUES = st.one_of(
     st.sampled_from(
         [None, True, "", "box", "none", "water", "\n", [], {}, [[]], [{}], {"shape": "box"}, b"x", 10**400]
@@ -329,8 +322,6 @@ def test_a_scene_may_be_given_by_its_path(scene_file):
 
 
 # ---- stability ---------------------------------------------------------------------------------------------------
-
-
 def test_the_stability_limit_is_the_smallest_of_three():
     still, water = {"gravity": [0, 0], "viscosity": "none"}, {"name": "water", "rest_density": 500, "viscosity": 5000}
     fluid, thick = plane()["fluid"], {"phase": [water], "solver": {"kind": "pcisph", "time_step": 1e-5}}

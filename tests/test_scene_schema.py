@@ -37,7 +37,6 @@ def _tables(table: type[Table] = Table) -> list[type[Table]]:
 TABLES = [table for table in _tables() if table.model_fields]
 FIELDS = [pytest.param(table, name, id=f"{table.__name__}.{name}") for table in TABLES for name in table.model_fields]
 
-
 json_schema = cache(lambda table: table.model_json_schema())
 
 

@@ -35,8 +35,6 @@ def jetting(**schedule):
 
 
 # ---- the course itself -------------------------------------------------------------------------------------------
-
-
 def test_a_course_is_linear_between_its_times_and_constant_beyond():
     course = Course(**SWAY)
     np.testing.assert_allclose(course.at(np.array([0.0, 0.003, 0.0115, 0.02, 0.025, 9.0])), [
@@ -104,8 +102,6 @@ def test_the_limit_of_stability_is_that_of_the_strongest_gravity():
 
 
 # ---- runs --------------------------------------------------------------------------------------------------------
-
-
 def rows(table, moment, steps=STEPS, time_step=None):
     made = plane()
     return Course(**table).at((np.arange(steps) + moment) * (time_step or made.solver.time_step))
@@ -198,8 +194,6 @@ def test_energies_are_in_the_gravity_of_their_time():
 
 
 # ---- derivatives -------------------------------------------------------------------------------------------------
-
-
 def problem_of(made, batch=None):
     simulation = Simulation(made, precision="float64", batch=batch)
     return Problem(simulation, STEPS, losses.FinalPositions(simulation.positions))
@@ -264,8 +258,6 @@ def test_the_certificate_is_that_of_the_scheduled_run(name):
 
 
 # ---- what does not know schedules --------------------------------------------------------------------------------
-
-
 def test_the_reference_engine_refuses_them():
     with pytest.raises(InputError, match="scene has a schedule, but must leave it out for the reference engine"):
         reference.Simulation(scene(schedule={"gravity": {"times": [0.0], "values": [[0.0, -9.0, 0.0]]}}))

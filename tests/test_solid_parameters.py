@@ -45,7 +45,6 @@ def periodic():
 BOTH = {"phase": [WATER, OIL], "fluid": [body("water", upper=(0.6, 0.2)), body("oil", lower=(0.0, 0.2))]}
 SPOUT = {"phase": "water", "outlet": [0.8, 0.5], "radius": 0.08, "length": 0.2, "flow_rate": 0.2}
 
-
 SCENES = {
     "projection": lambda: plane(ROTOR),
     "pcisph": lambda: plane(ROTOR, solver=PCISPH),

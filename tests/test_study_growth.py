@@ -25,8 +25,6 @@ EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
 
 # ---- numbers with their uncertainty ------------------------------------------------------------------------------
-
-
 def test_an_estimate_is_a_mean_with_its_standard_error():
     """Errors of a ratio add up as independent ones."""
     samples = np.random.default_rng(0).normal(3.0, 0.5, size=400)
@@ -58,8 +56,6 @@ def test_growth_is_the_rate_of_an_exponential_and_what_cannot_be_squared_has_an_
 
 
 # ---- Lyapunov exponents ------------------------------------------------------------------------------------------
-
-
 def test_exponents_of_the_cat_map():
     matrix = np.array([[2.0, 1.0], [1.0, 1.0]])
     logarithms = growth_by_segment(lambda state, v: (state, v @ matrix.T), None, np.eye(2), 60)
@@ -107,7 +103,6 @@ def test_growth_in_segments_of_the_engine_is_that_of_one_run():
 
 
 # ---- spatial scales ----------------------------------------------------------------------------------------------
-
 LOWER, UPPER = (0.0, 0.0, 0.0), (0.4, 0.6, 0.25)
 
 
@@ -173,7 +168,6 @@ def test_a_picture_changes_as_its_particles_move():
 
 
 # ---- runs, and whole experiments ---------------------------------------------------------------------------------
-
 FREE = {"minimum_iterations": 3, "maximum_iterations": 3, "density_tolerance": 0.01}
 SCENE = {
     "name": "drop",

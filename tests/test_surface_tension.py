@@ -8,7 +8,7 @@ from scipy.optimize import curve_fit
 from scipy.spatial import ConvexHull
 
 import cortado
-from cortado import CortadoWarning, Problem, Scene, Simulation, gradients, losses
+from cortado import CortadoWarning, Problem, Scene, Simulation, losses
 from cortado.optimisation.optimisers import Adam
 from cortado.render.scene_renderer import scene_renderer
 from scenes import bodies, box
@@ -162,56 +162,6 @@ def test_a_drop_across_a_periodic_boundary():
     offset = there - here - [2.0 * RADIUS, 0.0]
     offset[:, 0] -= np.rint(offset[:, 0] / (4.0 * RADIUS)) * 4.0 * RADIUS
     assert np.abs(offset).max() < 1e-9 * RADIUS
-
-
-def test_float32_follows_float64():
-    one, other = (Simulation(drop(2, 12), precision=p).run(20).positions[-1] for p in ("float32", "float64"))
-    assert np.abs(one - other).max() < 1e-4 * RADIUS
-
-
-def two_phases(**changes) -> Scene:
-    """A drop of two fluids side by side."""
-    phases = [
-        {"name": "water", "rest_density": 1000.0, "viscosity": 0.3},
-        {"name": "oil", "rest_density": 1200.0, "viscosity": 0.6},
-    ]
-    halves = [box([low, -0.03], [low + 0.03, 0.03], phase=name) for low, name in ((-0.03, "water"), (0.0, "oil"))]
-    return drop(2, 10, phase=phases, fluid=halves, **changes)
-
-
-def disturbed(scene: Scene, steps: int, **options) -> tuple[Problem, dict[str, np.ndarray]]:
-    simulation, random = Simulation(scene, **options), np.random.default_rng(0)
-    x = simulation.positions
-    point = {"initial_positions": x + 0.05 * scene.discretisation.spacing * random.standard_normal(x.shape)}
-    target = x + 0.1 * scene.discretisation.spacing * random.standard_normal(x.shape)
-    return Problem(simulation, steps, losses.FinalPositions(target)), point
-
-
-SCENES = {
-    "two phases": two_phases,
-    "space": lambda: cube(3, 4),
-    "Wendland C2": lambda: drop(2, 8, discretisation={"spacing": RADIUS / 4, "support": 2.6, "kernel": "wendland_c2"}),
-    "Wendland C4": lambda: drop(2, 8, discretisation={"spacing": RADIUS / 4, "support": 3.0, "kernel": "wendland_c4"}),
-}
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_the_certificate(name):
-    problem, point = disturbed(SCENES[name](), steps=4, precision="float64")
-    certificate = cortado.certify(problem, point)
-    assert certificate.right and certificate.loss_changes["surface_tension"] > 0.0
-
-
-def test_the_tape_agrees():
-    problem, point = disturbed(two_phases(), steps=4, precision="float64")
-    own = problem.simulation.parameters()
-    point |= {name: own[name] for name in ("surface_tension", "rest_density", "initial_velocities")}
-    _, exact = problem.value_and_gradient(point)
-    _, tape = problem.value_and_gradient(point, gradients.Tape())
-    for name in point:
-        scale = np.abs(exact[name]).max()
-        assert scale > 0.0
-        np.testing.assert_allclose(tape[name], exact[name], rtol=0.0, atol=1e-12 * scale)
 
 
 def test_surface_tension_is_found_from_frames():

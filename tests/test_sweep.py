@@ -62,8 +62,6 @@ def rows(out):
 
 
 # ---- combinations ------------------------------------------------------------------------------------------------
-
-
 def test_the_first_key_changes_slowest():
     found = combinations(["a=1,2", "b.c=[0, -9.81],[1,2]", "name='x,y'"])
     wanted = [[f"a={a}", f"b.c={c}", "name='x,y'"] for a in (1, 2) for c in ("[0, -9.81]", "[1,2]")]
@@ -151,8 +149,6 @@ def test_the_table_keeps_the_order_whatever_has_ended(tmp_path):
 
 
 # ---- in this process ---------------------------------------------------------------------------------------------
-
-
 def test_a_task_is_optimised_with_every_combination(alone, folder):
     found = rows(alone)
     chosen = [(row["optimise.learning_rate"], row["problem.steps"]) for row in found]
@@ -280,8 +276,6 @@ def test_a_sweep_has_no_more_processes_than_combinations(sweep, monkeypatch):
 
 
 # ---- on workers --------------------------------------------------------------------------------------------------
-
-
 def test_a_worker_that_is_killed_half_way_changes_nothing(alone, sweep, folder):
     with scheduler(folder, workers=2) as processes:
         with Distributed(processes.address) as executor:
@@ -318,8 +312,6 @@ def test_a_search_with_an_ensemble_has_the_same_bits_on_workers(folder, cortado_
 
 
 # ---- several time steps ------------------------------------------------------------------------------------------
-
-
 def ends(folder):
     return {path.parent.name: float(Trajectory.load(path).times[-1]) for path in Path(folder).glob("*/*.vtkhdf")}
 

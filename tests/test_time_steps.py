@@ -47,8 +47,6 @@ def sizes_of(run):
 
 
 # ---- the choice --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", SOLVERS)
 def test_steps_are_as_long_as_the_speed_lets_them(kind):
     scene = plane(solver={**SOLVERS[kind], **CHOSEN, "courant": 0.15})
@@ -126,8 +124,6 @@ def test_a_scheduled_tilt_bounds_each_step_by_the_depth_that_it_makes():
 
 
 # ---- the same bits -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("kind", SOLVERS)
 def test_fixed_steps_of_the_same_lengths_have_the_same_bits(kind, precision):
@@ -212,8 +208,6 @@ def test_quantities_and_sensors_are_of_the_step_that_follows():
 
 
 # ---- derivatives -------------------------------------------------------------------------------------------------
-
-
 class Spread:
     """A loss of last positions and velocities."""
 
@@ -309,8 +303,6 @@ def test_warps_tape_goes_through_the_recorded_steps():
 
 
 # ---- what is refused ---------------------------------------------------------------------------------------------
-
-
 def test_what_cannot_be_is_said_in_a_sentence(tmp_path):
     simulation, still = Simulation(drop(CHOSEN)), {"gravity": [0.0, 0.0], "viscosity": "none"}
     held = "time_step is given, but must be left out, as the scene chooses its time steps, .* hold them constant"
@@ -367,8 +359,6 @@ def test_the_reference_engine_refuses_steps_that_are_chosen():
 
 
 # ---- a time in the place of steps --------------------------------------------------------------------------------
-
-
 def test_a_run_of_so_many_seconds():
     chosen, fixed = chosen_and_fixed(precision="float32")
     run = chosen.run(time=0.1, record_every=7)
@@ -485,8 +475,6 @@ def test_a_time_that_is_none_is_refused(run_command, tmp_path, words, what):
 
 
 # ---- steps that are taken again ----------------------------------------------------------------------------------
-
-
 def wedge(gap, **tables):
     """A column in the plane that collapses and flows under a disc, so far above the floor [m]."""
     disc = {"name": "disc", "shape": "sphere", "centre": [0.75, 0.14 + gap], "radius": 0.14}

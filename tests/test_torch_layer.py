@@ -52,8 +52,6 @@ def wanted_of(values):
 
 
 # ---- derivatives -------------------------------------------------------------------------------------------------
-
-
 def test_dual_numbers_have_the_tangent_of_the_problem_and_no_graph_is_kept_where_none_is_asked_for(layer, problem):
     parameters, along = ({name: tensor(one) for name, one in own.items()} for own in (POINT, ALONG))
     with torch.autograd.forward_ad.dual_level():
@@ -102,8 +100,6 @@ def test_a_state_may_be_a_view_and_be_written_to_afterwards(layer, simulation):
 
 
 # ---- maps, modules, compiled functions, threads ------------------------------------------------------------------
-
-
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
 def test_a_lost_scene_of_a_map_adds_nothing_where_its_cotangent_is_0(layer, simulation, problem):
     """To the derivatives of what the scenes share: of values, and of chained steps, through which it passes."""
@@ -193,8 +189,6 @@ def test_what_is_measured_and_drawn_has_the_derivatives_of_differences(layer):
 
 
 # ---- bad uses ----------------------------------------------------------------------------------------------------
-
-
 BAD_STATES = {
     **layered.BAD_STATES,
     "float32": (lambda s: {**s, "positions": s["positions"].float()}, "state positions is torch.float32, but must be"),

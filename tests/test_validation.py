@@ -34,8 +34,6 @@ MORRIS = "poiseuille_morris_1997.csv"
 
 
 # ---- water at rest -----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Rest:
     """A column 1 m high, averaged per particle over the last half second."""
@@ -104,8 +102,6 @@ def test_water_at_rest_with_the_cubic_spline():
 
 
 # ---- a dam breaks ------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Front:
     """Z = front / L at the times T = t sqrt(2 g / L)."""
@@ -207,7 +203,6 @@ def test_front_of_a_dam_break_has_converged(front):
 
 
 # ---- a channel ---------------------------------------------------------------------------------------------------
-
 CHANNEL, KINEMATIC, PUSH = 1e-3, 1e-6, 2e-4
 """Width [m], kinematic viscosity [m2/s] and body force [m/s2] of Morris et al. (1997)."""
 FASTEST = PUSH * CHANNEL**2 / (8.0 * KINEMATIC)
@@ -299,8 +294,6 @@ def test_poiseuille_flow():
 
 
 # ---- vortices decay ----------------------------------------------------------------------------------------------
-
-
 def square_lattice(across: int) -> np.ndarray:
     """Points (across^2, 2) [m] that fill the unit square."""
     lattice = (np.arange(across) + 0.5) / across

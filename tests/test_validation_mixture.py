@@ -105,7 +105,6 @@ class Energy:
 
 
 # ---- an even mixture falls apart -------------------------------------------------------------------------------------
-
 RATIOS = np.array([0.25, 0.5, 0.75, 1.0])
 """Wave numbers in that of the fastest growing wave, k* = 1 / (2 epsilon)."""
 
@@ -135,8 +134,6 @@ def test_an_even_mixture_falls_apart_as_fast_as_it_should():
 
 
 # ---- an interface ----------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Interface:
     """Two interfaces across a periodic box, after they have settled."""
@@ -175,8 +172,6 @@ def test_an_interface_is_as_wide_as_it_should_be():
 
 
 # ---- miscible phases mix ---------------------------------------------------------------------------------------------
-
-
 def mixing(wavelength: int, steps: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """2 k^2 t, and the variance of a wave of 0.2 in that of the start, which is to be exp(-2 k^2 t)."""
     simulation = resting(2 * wavelength, 8, width=1e-6, free_energy="miscible")
@@ -201,8 +196,6 @@ def test_miscible_phases_mix_as_fast_as_they_should():
 
 
 # ---- what may not change, and what may not rise ----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("form", ["constant", "degenerate"])
 def test_the_free_energy_never_rises_and_phases_keep_their_mass(form):
     """On particles off the lattice, one phase 1.8 times as dense as the other, at every one of 1,000 substeps."""
@@ -227,8 +220,6 @@ def test_the_free_energy_never_rises_and_phases_keep_their_mass(form):
 
 
 # ---- coarsening ------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Coarsening:
     """An even mixture of two phases that has parted, and goes on to have less and less interface."""
@@ -278,8 +269,6 @@ def test_regions_grow_by_a_third_power_of_the_time():
 
 
 # ---- more phases -----------------------------------------------------------------------------------------------------
-
-
 def separating(
     phases: int, until: float, across: int = 32, steps: int = 20, advance: Callable[[], None] | None = None
 ) -> np.ndarray:

@@ -33,8 +33,6 @@ def weight(r: real) -> real:
 
 
 # ---- the adjoint of a kernel with a neighbour loop: x (n,) positions, t (n,) a field, near lists of count neighbours
-
-
 SUM = "s += weight(x[i] - x[near[i, k]])"
 VECTOR = "weight(x[i] - x[near[i, k]]) * wp.vec2d(t[near[i, k]], x[near[i, k]])"
 LOOPS = {
@@ -149,8 +147,6 @@ def function_returns_square(x: reals, t: reals, near: lists, count: integers, ou
 
 
 # ---- arrays on the tape
-
-
 ARRAYS = {
     "copy_to": "b[i] = a[i]",
     "multiply_in_place": "b[i] *= a[i]",
@@ -169,8 +165,6 @@ KERNELS = {
 
 
 # ---- the harness
-
-
 def array(values: Any, grad: bool = True) -> Any:
     return wp.array(np.asarray(values, dtype=np.float64), dtype=wp.float64, device="cpu", requires_grad=grad)
 
@@ -266,7 +260,6 @@ def launched(*steps: Any) -> Program:
 
 SQUARES = ("add_square_to x out", "add_square_to t out")
 WITHOUT_GRADIENT = launched("square_to x plain", "square_to plain out")
-
 
 ROWS = [
     *loops(True, "s += W, then out = s or constant * s", "raw_sum constant_times_sum"),

@@ -51,8 +51,6 @@ def simulation(
 
 
 # ---- waves of shear ----------------------------------------------------------------------------------------------
-
-
 def disordered(one: Simulation, disorder: float | None) -> np.ndarray:
     """Positions (n, d) [m] of the particles of a periodic box: those of the lattice, each coordinate changed by up to
     ``disorder`` spacings, or, if that is None, those of fluid without viscosity that was stirred for 60 steps."""
@@ -85,8 +83,6 @@ def acceleration(one: Simulation, x: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 # ---- bodies that turn --------------------------------------------------------------------------------------------
-
-
 def turning(dimension: int, across: int, form: str = "stress", pressure: bool = False, time: float = 2.0) -> np.ndarray:
     """(11,) the angular momentum over the first, at equal times, of a disc or ball of 1 m that turns with 0.1 rad/s
     in empty space. Without pressure its particles fly straight on, which takes them 1.02 times as far apart."""
@@ -107,8 +103,6 @@ def turning(dimension: int, across: int, form: str = "stress", pressure: bool = 
 
 
 # ---- channels ----------------------------------------------------------------------------------------------------
-
-
 def band(x: Any, v: Any, t: Any, push: Any, low: Any, high: Any) -> Any:
     """A force along x in a band of y."""
     return wp.vec3(wp.where(x[1] > low and x[1] < high, push, 0.0), 0.0, 0.0)

@@ -1,0 +1,237 @@
+"""What holds whatever a scene has: derivatives in each way, float32 near float64, the same bits in batches, in runs
+that go on and in copies, and that the certificate finds gradients right."""
+
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import pytest
+
+import cortado
+import test_own_arrays as arrays
+from cortado import CortadoError, Problem, Scene, Simulation, gradients
+from cortado.forces import Body
+from finite_differences import central_difference, decades, plateau
+from own_forces import Breeze
+from remembering_force import Memory
+from scenes import MIXING, jet, plane, plane_of_three, pour, scene, splash, two_layers
+from test_implicit_viscosity import cube, syrups, thick
+from test_own_functions import FORCES
+from test_projection import C2, CASES, SOLVER, begun
+from test_ranges import Weighed
+from test_rheology import KINDS
+from test_rheology import thick as yielding
+
+STEPS = 6
+
+
+@dataclass(frozen=True)
+class Feature:
+    """Of a scene and forces of a user."""
+
+    make: Callable[[], Scene]
+    forces: Callable[[int], Any] | None = None
+    """A force in so many dimensions, or a list of them."""
+    case: str = ""
+    """In tests/test_projection.py, which throws fluid."""
+    has_tape: bool = True
+
+    def simulation(self, precision: str = "float64", batch: int | None = None) -> Simulation:
+        made = self.make()
+        forces = self.forces(made.dimension) if self.forces else []
+        forces = forces if isinstance(forces, list) else [forces]
+        return Simulation(made, precision=precision, batch=batch, forces=forces)
+
+
+def tense(make: Callable[..., Scene], pressure: bool = True, **changes: Any) -> Scene:
+    """A fluid in which surface tension matters."""
+    phases = [{**phase.model_dump(), "viscosity": 0.5} for phase in make().phase]
+    forces = {"gravity": [0.3, -9.81, 0.1][: make().dimension], "surface_tension": 3.0, "pressure": pressure}
+    return make(phase=phases, forces=forces, **changes)
+
+
+C4 = {"spacing": 0.05, "support": 3.0, "kernel": "wendland_c4"}
+LONG = {**SOLVER, "time_step": 0.005}
+PASTE = [{"name": "water", "rest_density": 1000.0, "viscosity": 50.0}]
+IMPLICIT = {"gravity": [0.0, -9.81], "viscosity": "stress", "viscous_solve": "implicit"}
+CLOSURE = np.array([0.5, 0.3, 0.2, 0.1])
+MISCIBLE = {**MIXING, "free_energy": "miscible"}
+FEATURES = {
+    "two layers": Feature(two_layers),
+    "three fluids": Feature(plane_of_three),
+    "miscible fluids": Feature(lambda: two_layers(mixture=MISCIBLE)),
+    "a jet": Feature(jet),
+    "a nozzle over a pool": Feature(pour),
+    "surface tension": Feature(lambda: tense(plane)),
+    "surface tension of two fluids": Feature(lambda: tense(two_layers)),
+    "surface tension in space": Feature(lambda: tense(scene)),
+    "surface tension by curvature": Feature(lambda: tense(plane, solver=SOLVER), has_tape=False),
+    "surface tension by curvature in space": Feature(
+        lambda: tense(scene, solver=SOLVER, discretisation=C2), has_tape=False
+    ),
+    "surface tension by curvature alone": Feature(lambda: tense(plane, solver=SOLVER, pressure=False)),
+    "surface tension by curvature with a wide support": Feature(
+        lambda: tense(plane, solver=SOLVER, discretisation=C4), has_tape=False
+    ),
+    "implicit viscosity, no slip": Feature(thick, has_tape=False),
+    "implicit viscosity in space": Feature(cube, has_tape=False),
+    "implicit viscosity of two fluids": Feature(syrups, has_tape=False),
+    **{f"a {kind} fluid": Feature(lambda k=kind: yielding({"kind": k, **KINDS[k]}, "explicit")) for kind in KINDS},
+    **{f"projection, {case}": Feature(make, case=case, has_tape=False) for case, make in CASES.items()},
+    "projection, mixture": Feature(lambda: two_layers(solver=SOLVER), has_tape=False),
+    "projection, nozzle": Feature(lambda: jet(solver=SOLVER, forces={"gravity": [0.7, -9.81]}), has_tape=False),
+    "projection, nozzle in space": Feature(lambda: pour(solver=SOLVER), has_tape=False),
+    "projection, thick": Feature(lambda: plane(solver=LONG, phase=PASTE, forces=IMPLICIT), has_tape=False),
+    "a body force": Feature(splash, FORCES["a body force"]),
+    "a body force on two fluids": Feature(two_layers, FORCES["a body force"]),
+    "a body force in the plane": Feature(plane, FORCES["a body force"]),
+    "a pair force": Feature(splash, FORCES["a pair force"]),
+    "a pair force in the plane": Feature(plane, FORCES["a pair force"]),
+    "a pair force that is not odd": Feature(two_layers, FORCES["a pair force that is not odd"]),
+    "a force with kernels": Feature(splash, lambda d: Breeze()),
+    "a force that keeps a field": Feature(two_layers, lambda d: Memory()),
+    "one that keeps a field in a jet": Feature(jet, lambda d: Memory()),
+    "a network": Feature(splash, lambda d: arrays.net_force()),
+    "a field on a grid": Feature(splash, lambda d: Body(arrays.wind, nodes=arrays.NODES, size=0.11)),
+    "a closure": Feature(splash, lambda d: Body(arrays.closure, w=CLOSURE, k=0.7)),
+    "forces by mass fractions": Feature(two_layers, lambda d: arrays.of_fractions()),
+    "those of three fluids in a projection": Feature(
+        lambda: plane_of_three(solver=SOLVER), lambda d: arrays.of_fractions(), has_tape=False
+    ),
+    "a closure in two fluids": Feature(two_layers, lambda d: Body(arrays.closure, w=CLOSURE, k=0.7)),
+}
+every = pytest.mark.parametrize("name", FEATURES)
+
+
+def point_of(name: str, simulation: Simulation) -> dict[str, Any]:
+    """All parameters of a scene, of particles that are off the lattice, move, and mix a little."""
+    point = {key: np.array(value) for key, value in simulation.parameters().items() if key != "colours"}
+    c = point["mass_fractions"]
+    if simulation.scene.emitter is None:
+        point |= begun(FEATURES[name].case, simulation)
+    if c.shape[1] > 1:
+        point["mass_fractions"] = 0.8 * c + 0.2 * np.random.default_rng(3).dirichlet(np.ones(c.shape[1]), len(c))
+    else:
+        del point["mass_fractions"]
+    return point
+
+
+@cache
+def case(name: str) -> tuple[Problem, dict[str, Any], float, dict[str, Any]]:
+    """A problem, a point, and its value and gradient there."""
+    simulation = FEATURES[name].simulation()
+    problem, point = Problem(simulation, STEPS, Weighed(simulation)), point_of(name, simulation)
+    return problem, point, *problem.value_and_gradient(point)
+
+
+@every
+def test_reverse_forward_tape_and_differences_agree(name):
+    problem, point, _, gradient = case(name)
+    random = np.random.default_rng(1)
+    taped = problem.value_and_gradient(point, gradients.Tape())[1] if FEATURES[name].has_tape else gradient
+    along = {key: np.abs(point[key]).max() * random.standard_normal(found.shape) for key, found in gradient.items()}
+    sizes = {key: np.abs(found * along[key]).sum() for key, found in gradient.items()}
+    for key, found in gradient.items():
+        slope, scale = problem.tangent(point, {key: along[key]}), max(sizes[key], 1e-5 * max(sizes.values()))
+        assert abs((found * along[key]).sum() - slope) <= 1e-11 * scale, key
+        assert np.abs(found - taped[key]).max() <= max(
+            1e-9 * np.abs(found).max(), 1e-11 * scale / np.abs(along[key]).max()
+        )
+        errors = []
+        for h in decades(3.0, 8.5):  # the clamp of a pressure may be near
+            errors.append(abs(central_difference(problem.value, point, {key: along[key]}, h) - slope) / scale)
+            if len(errors) > 2 and plateau(errors) < 1e-6:
+                break
+        assert plateau(errors) < 1e-6, (key, errors)
+
+
+NEAR = {
+    **dict.fromkeys(["two layers", "a jet", "projection, plane", "surface tension by curvature"], 5e-3),
+    "those of three fluids in a projection": 1e-2,
+    **dict.fromkeys(["a body force", "a pair force", "a pair force that is not odd", "a network"], 5e-3),
+    "implicit viscosity, no slip": 1e-2,
+    "a bingham fluid": 2e-2,
+}
+"""How near gradients in float32 are to those in float64; over 12 random starts that of "a body force" with respect to
+the rest density, which nearly cancels, was off by up to 3.3e-3."""
+
+
+@pytest.mark.parametrize("name", NEAR)
+def test_float32_is_near_float64(name):
+    problem, point, _, gradient = case(name)
+    single = FEATURES[name].simulation("float32")
+    found = Problem(single, STEPS, Weighed(problem.simulation)).value_and_gradient(point)[1]
+    sizes = {key: np.linalg.norm(bar) * np.abs(point[key]).max() for key, bar in gradient.items()}
+    for key, bar in gradient.items():
+        error = np.linalg.norm(found[key] - bar) * np.abs(point[key]).max()
+        assert error <= NEAR[name] * max(sizes[key], 1e-3 * max(sizes.values())), key
+
+
+def own_rows(point: dict[str, Any]) -> dict[str, Any]:
+    """Gravity and numbers of a point for two scenes, but those that may have rows or that diffusion is cut by."""
+    others = ("mobility", "interface_width", "gust.k", "spring.damping")
+    names = [key for key, one in point.items() if np.ndim(one) == 0 and key not in others]
+    numbers = {key: point[key] * np.array([1.0, 0.98]) for key in names}
+    return {**numbers, "gravity": np.stack([point["gravity"], 0.8 * point["gravity"]])[:, None]}
+
+
+@every
+def test_batches_runs_that_go_on_and_copies_have_the_bits_of_one_run(name):
+    problem, point, _, _ = case(name)
+    simulation, own = problem.simulation, own_rows(point)
+    shared = {key: value for key, value in point.items() if key not in own}
+    together = Problem(FEATURES[name].simulation(batch=2), STEPS, problem.loss)
+    values, gradient = together.value_and_gradient({**shared, **own})
+    for b in range(2):
+        value, bars = problem.value_and_gradient({**shared, **{key: rows[b].squeeze() for key, rows in own.items()}})
+        assert value == values[b]
+        for key, bar in bars.items():
+            assert gradient[key][b].tobytes() == bar.tobytes(), key
+    whole, first = simulation.run(STEPS, point), simulation.run(2, point)
+    constants = {key: value for key, value in point.items() if not key.startswith(("initial", "mass_fractions"))}
+    rest = simulation.run(STEPS - 2, constants, state=first.last_state)
+    assert rest.last_state.clock == whole.last_state.clock
+    for field, wanted in whole.last_state.fields.items():
+        assert rest.last_state[field].tobytes() == wanted.tobytes(), field
+    again = pickle.loads(cloudpickle.dumps(problem))
+    assert again.fingerprint == problem.fingerprint and again.value(point) == problem.value(point)
+
+
+CERTIFIED = {
+    "surface tension of two fluids": ["surface_tension", "initial_positions"],
+    "surface tension in space": ["surface_tension", "initial_positions"],
+    "surface tension by curvature": ["surface_tension", "initial_positions"],
+    "implicit viscosity, no slip": ["viscosity", "gravity", "initial_positions"],
+    "a body force": ["gust.k", "gust.centre", "gust.wind"],
+    "a pair force": ["spring.k", "spring.damping"],
+    "a pair force that is not odd": ["leaning.k", "leaning.damping"],
+    "a force with kernels": ["breeze.k", "breeze.wind", "time_step"],
+    "one that keeps a field in a jet": ["memory.k", "time_step"],
+    "a network": ["net.w", "net.bias"],
+}
+"""Names of parameters that are certified, in float32 and, as problems in float64 are, in float64."""
+
+
+@pytest.mark.parametrize("name", CERTIFIED)
+def test_it_is_certified(name):
+    simulation = FEATURES[name].simulation("float32")
+    problem = Problem(simulation, 4, Weighed(simulation))
+    point = point_of(name, simulation)
+    assert cortado.certify(problem, {key: point[key] for key in CERTIFIED[name]}).right
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("projection, plane", 'solver.kind "projection" has no '),
+        ("implicit viscosity, no slip", r"implicit viscosity has no tape: try gradients\.Exact"),
+    ],
+)
+def test_what_has_no_tape_says_so(name, words):
+    problem, point, _, _ = case(name)
+    with pytest.raises(CortadoError, match=words):
+        problem.value_and_gradient(point, gradients.Tape())
