@@ -144,24 +144,6 @@ class EddyViscosity:
         context.launch(kernels.viscosity, **flow, **fields)
 
 
-class Limit:
-    """A filter that limits each particle's vector in an adjoint to a multiple of the root mean square over all."""
-
-    def __init__(self, solver: Solver, times: float):
-        layout, self._times = solver.layout, times
-        self._launch, self._particles = solver.launch, layout.particles
-        self._kernels = adjoint_filter_kernels(solver.discretisation)
-        self._squares = wp.zeros(layout.all_particles, dtype=wp.vec2d, device=layout.device)
-        self._sum, self._sum_of_strengths = layout.sum_of(wp.vec2d), layout.sum_of(layout.precision.real)
-
-    def __call__(self, bar: State, strengths: wp.array) -> None:
-        """Limit the adjoint of a state; where the ``strengths`` of its `EddyViscosity` are all 0, nothing changes."""
-        squares, fields = self._squares, {"a": bar.positions, "b": bar.velocities}
-        self._launch(self._kernels.squares, **fields, found=squares)
-        sums = {"squares": squares, "sums": self._sum(squares), "strengths": self._sum_of_strengths(strengths)}
-        self._launch(self._kernels.limit, **sums, **fields, times=self._times, particles=self._particles)
-
-
 class AdjointNorms:
     """An observer of the reverse pass that keeps the norms of adjoints, on the device until `numpy` is called."""
 
@@ -398,8 +380,17 @@ class _ViscousStep(Filtered):
     def __init__(self, base: BackwardStep, rollout: Rollout, estimator: AdjointViscosity):
         super().__init__(base)
         self._viscosity = EddyViscosity(base.solver, float(estimator.coefficient))
-        self._limit, self._parameters = Limit(base.solver, float(estimator.limit)), rollout.parameters
+        layout, self._parameters = base.solver.layout, rollout.parameters
+        self._limits = {"times": float(estimator.limit), "particles": layout.particles}
+        self._squares = wp.zeros(layout.all_particles, dtype=wp.vec2d, device=layout.device)
+        self._sum, self._sum_of_strengths = layout.sum_of(wp.vec2d), layout.sum_of(layout.precision.real)
 
     def filter(self, bar: State) -> None:
+        """Blend the adjoint, then limit each particle's vector to a multiple of the root mean square over all; where
+        nothing strains, nothing changes."""
         self._viscosity(bar, self._parameters)
-        self._limit(bar, self._viscosity.strengths)
+        launch, kernels = self.solver.launch, adjoint_filter_kernels(self.solver.discretisation)
+        squares, fields = self._squares, {"a": bar.positions, "b": bar.velocities}
+        launch(kernels.squares, **fields, found=squares)
+        strengths = self._sum_of_strengths(self._viscosity.strengths)
+        launch(kernels.limit, self._limits, **fields, squares=squares, sums=self._sum(squares), strengths=strengths)

@@ -121,9 +121,7 @@ class HostStates:
 
 
 def require_fields(what: str, given: Values, state: State) -> Values:
-    """Return a table of derivatives by field name without its time. Raises `InputError` for other names and types.
-
-    Raises `InputError` for anything but a table, and for names that are not fields of the state."""
+    """Return a table of derivatives by field name without its time. Raises `InputError` for other names and types."""
     if not isinstance(given, Mapping):
         raise InputError(f"{what} is {shown(given)}, but must be a table of arrays by name, {{'positions': ...}}.")
     known = (*state.names, STATE_TIME)
@@ -300,11 +298,7 @@ def _without_lost(lost: OfLost, state: State) -> State:
 class DeviceRows:
     """Parameters with a row for each step that stay on the device, as Warp arrays in the simulation's precision; a
     number has shape (1,). Their values are never checked: neither for being finite, nor for how far a solid moves in a
-    step.
-
-    They are Warp arrays in the simulation's precision and on its device, of the shapes that a parameter may have, (1,)
-    in the place of (). Nobody looks at them: neither whether they are finite, nor how far a solid goes in a step.
-    """
+    step."""
 
     def __init__(self, simulation: Simulated, space: ParameterSpace):
         self._simulation, self._space = simulation, space

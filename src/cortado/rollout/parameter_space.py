@@ -136,14 +136,7 @@ class ParameterSpace:
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         if arrays is not None and self._goes_on(rollout, values, varied, states):
-            rollout.begin_evaluation()
-            rollout.clocks = [state.clock for state in states]
-            for name in arrays.names:
-                if arrays[name] is not self._constants.get(name):
-                    wp.copy(rollout.initial[name], arrays[name])
-            if "gravity" in members[0]:
-                rows = max(self._steps, 1), simulation.dimension
-                rollout.parameters.set({"gravity": np.stack([np.broadcast_to(m["gravity"], rows) for m in members])})
+            self._go_on(rollout, members, states, arrays)
             self._keep(rollout, values, varied, members, arrays)
             return
         sought = parameter_sentence(simulation.scene) if "viscosity" in varied else None
@@ -217,6 +210,17 @@ class ParameterSpace:
             and others == _VARIED.intersection(varied)
             and [state.origin for state in states] == rollout.origins
         )
+
+    def _go_on(self, rollout: Rollout, members: list[Arrays], states: Sequence[RestartState], arrays: State) -> None:
+        """Set only the state and gravity of a rollout of which nothing else has changed."""
+        rollout.begin_evaluation()
+        rollout.clocks = [state.clock for state in states]
+        for name in arrays.names:
+            if arrays[name] is not self._constants.get(name):
+                wp.copy(rollout.initial[name], arrays[name])
+        if "gravity" in members[0]:
+            rows = max(self._steps, 1), self._simulation.dimension
+            rollout.parameters.set({"gravity": np.stack([np.broadcast_to(m["gravity"], rows) for m in members])})
 
     @cached_property
     def _is_still(self) -> bool:

@@ -238,11 +238,7 @@ class StepSizes:
 class ChosenSteps(StepSizes):
     """Step lengths that each scene's state chooses on the device: see `choose` of `step_size_kernels`. They depend on
     the greatest speed, a maximum with bits independent of order, and on the clock's last step, so a resumed run has the
-    steps of an unbroken one.
-
-    The greatest speed is a maximum, so that the same bits come whatever the order; nothing else is read of a state, and
-    the step before is in its clock, so that a run that goes on has the steps of one that did not stop.
-    """
+    steps of an unbroken one."""
 
     def __init__(self, solver: Solver, parameters: Parameters, steps: int, length: float):
         """Prepare the arrays for at most ``steps`` steps; ``length`` is how far a particle may move in one [m]."""

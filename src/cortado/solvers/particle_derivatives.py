@@ -145,19 +145,15 @@ class ParticleAdjoint:
         for part in self._parts:
             part.sort(context, self.bar, state_bar)
 
-    def begin_parts(self, context: StepContext, state_bar: State) -> None:
-        """Apply the adjoint of the parts' work at the beginning of a step."""
-        for part in self._parts:
-            part.begin(context, self.bar, state_bar)
-
     def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
-        """Apply the adjoint of `ParticleSolver.sort`, but for the work of parts."""
+        """Apply the adjoint of `ParticleSolver.sort`, but for the sorting of parts' fields."""
         solver, b = self._solver, self.bar.fields
         self.density.measure(context, self.bar)
         with context.aside():
             m_scene_bar = state_bar["reference_density"]
             context.launch(solver.integration.collect_masses, *self.bar.named, m_scene_bar=m_scene_bar)
-        self.begin_parts(context, state_bar)
+        for part in self._parts:
+            part.begin(context, self.bar, state_bar)
         scene = {"x_scene": state_bar.positions, "v_scene": state_bar.velocities}
         context.launch(solver.integration.unsort, x=b["x"], v=b["v"], **scene)
         self.carried_bar.unsort(context, carried_bar, state_bar)

@@ -8,7 +8,6 @@ from math import inf
 from typing import Self
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import Named
@@ -85,7 +84,8 @@ class PcisphAdjoint(ParticleAdjoint):
                 r=self._r,
                 **pressure_bar,
             )
-            self.push_solids(context, going, it.c[k])
+            pushed = partial(pressure_solid_kernel, solver.discretisation)
+            self.bar.solids.add(context.launch, pushed, going, *known, scaled_bar=scaled_bar, c=it.c[k])
             predicted = {"x_star": it.x_star[k], "v_star": it.v_star[k]}
             context.launch(kernels.pressure.adjoint, going, *known, r=self._r, scaled_bar=scaled_bar, **predicted)
             densities = partial(density_solid_kernel, solver.discretisation, solver.topic, looped=True)
@@ -96,21 +96,12 @@ class PcisphAdjoint(ParticleAdjoint):
             bars = {"wall_y_bar": self._y_bar, "t_bar": self._t_bar}
             context.launch(ratio.relaxation.adjoint, own, bars)
             context.launch(ratio.total.adjoint, *known, bars)
-        self.relax_beside_walls(context)
+        relaxed = {"y": solver.wall_relaxation, "y_bar": self._y_bar, "slope_bar": self._slope_bar}
+        context.launch(kernels.wall_relaxation.adjoint, *known, relaxed)
+        slopes = wall_slope_term(solver.discretisation).solid_kernel
+        self.bar.solids.add(context.launch, slopes, *known, slope_bar=self._slope_bar)
         self.mix(context, state_bar)
         self.sort(context, state_bar)
-
-    def push_solids(self, context: StepContext, going: Named, c: wp.array) -> None:
-        """Add the adjoints that the pressure force of an iteration gives to moving solids."""
-        kernel, pushed = partial(pressure_solid_kernel, self._solver.discretisation), {"scaled_bar": self._scaled_bar}
-        self.bar.solids.add(context.launch, kernel, going, pushed, *self.bar.named, c=c)
-
-    def relax_beside_walls(self, context: StepContext) -> None:
-        """Apply the adjoint of the pressure relaxation beside walls, which depends on positions alone."""
-        solver, y = self._solver, {"y": self._solver.wall_relaxation, "y_bar": self._y_bar}
-        context.launch(solver.kernels.wall_relaxation.adjoint, *self.bar.named, **y, slope_bar=self._slope_bar)
-        slopes = wall_slope_term(solver.discretisation).solid_kernel
-        self.bar.solids.add(context.launch, slopes, *self.bar.named, slope_bar=self._slope_bar)
 
 
 class PcisphTangent(ParticleTangent):

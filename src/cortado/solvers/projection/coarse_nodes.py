@@ -23,11 +23,6 @@ ALONE = 0.01
 """The factor of h^2 in the term that holds the nodes around a particle."""
 
 
-def source_type(precision: Precision) -> Any:
-    """Return the type of the bundle of particle values that are spread to nodes."""
-    return bundle(s_value=precision.real, s_slope=precision.vector, s_bent=precision.vector, s_own=precision.real)
-
-
 @dataclass(frozen=True)
 class NodeFunctions:
     """Warp functions that number the nodes of a grid of some shape, which wraps around."""
@@ -207,7 +202,8 @@ class NodeKernels:
 def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
     """Make the kernels that sum over the particles around nodes, in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    grid_type, source, own = cell_grid_type(precision), source_type(precision), hat_functions(precision, dimension)
+    grid_type, own = cell_grid_type(precision), hat_functions(precision, dimension)
+    source = bundle(s_value=real, s_slope=vector, s_bent=vector, s_own=real)
     hat, held, among = own.hat, own.held, node_functions(dimension)
     beside, corner_step, pair_of = among.beside, among.corner_step, among.pair_of
     module = kernel_module(f"coarse_nodes_{dimension}d_{precision.name}")

@@ -48,8 +48,8 @@ class MeanStress:
     def __init__(self, discretisation: Discretisation, layout: Layout, dimension: int, faces: int):
         self._faces = FaceShares(discretisation, layout, faces)
         self._kernels = mean_stress_kernels(discretisation, dimension)
-        self._reach = WallSums(reach_term(discretisation), layout)
-        self._mirrors = WallSums(mirror_term(discretisation), layout)
+        self._reach = WallSums(WallTerm(discretisation, TOPIC, _reach_work, "reach_bar"), layout)
+        self._mirrors = WallSums(WallTerm(discretisation, TOPIC, _mirror_work, "reach_bar"), layout)
         self._arrays = layout.arrays(q=layout.precision.real, reach_bar=layout.precision.vector)
 
     def impulses(self, context: StepContext, around: Named, at: Named) -> wp.array:
@@ -161,12 +161,8 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     return Kernels(mean_stress, mean_stress_tangent, (own_adjoint, mean_stress_adjoint))
 
 
-def reach_term(discretisation: Discretisation) -> WallTerm:
-    """Return the wall term (r, 0, 0) of the mean stress by a solid's walls, with the adjoint ``reach_bar``."""
-    return WallTerm(discretisation, TOPIC, _reach_work, "reach_bar")
-
-
 def _reach_work(d: Discretisation) -> Any:
+    """Make the work of the wall term (r, 0, 0) of the mean stress by a solid's walls."""
     real, gradient, normal = d.precision.real, pair_functions(d).gradient, normal_part(d)
 
     @types_by_name(d.precision, {d.precision.vector: "reach"})
@@ -178,12 +174,8 @@ def _reach_work(d: Discretisation) -> Any:
     return reach_work
 
 
-def mirror_term(discretisation: Discretisation) -> WallTerm:
-    """Return the wall term (-h r, 0, 0) by which mirroring walls count 1 - h times, with the adjoint ``reach_bar``."""
-    return WallTerm(discretisation, TOPIC, _mirror_work, "reach_bar")
-
-
 def _mirror_work(d: Discretisation) -> Any:
+    """Make the work of the wall term (-h r, 0, 0) by which mirroring walls count 1 - h times."""
     real, gradient, normal = d.precision.real, pair_functions(d).gradient, normal_part(d)
 
     @types_by_name(d.precision, {d.precision.vector: "reach"})

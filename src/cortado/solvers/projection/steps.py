@@ -31,9 +31,8 @@ where x_K are the positions after the last repair, and A is that of the last ite
 The repairs of density begin from x + dt v + delta.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -83,10 +82,13 @@ WEAK = 0.004
 """The c below which a pull counts with its square."""
 
 
-def shift_of_particle(precision: Precision, dimension: int, module: Any) -> Callable[..., Any]:
-    """Make the function of the shift delta by A = sum_j v_ij g_ij^T, k = dt p and surroundings; ``beside`` is gamma."""
+@cache
+def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
+    """Make the kernels of the shift delta, which spreads particles evenly, by A = sum_j v_ij g_ij^T, k = dt p and
+    surroundings; ``beside`` is gamma."""
+    precision, modules = d.precision, d.modules(f"projection_{dimension}d")
     real, vector, typed = precision.real, precision.vector, types_by_name(precision)
-    inverse = effect_functions(precision, dimension, module).inverse
+    inverse = effect_functions(precision, dimension, modules[0]).inverse
     rate, greatest, least = (wp.constant(real(value)) for value in (RATE, GREATEST, LEAST))
     farthest, away = wp.constant(real(FARTHEST)), wp.constant(real(AWAY))
     surface, pulled, weak = (wp.constant(real(value)) for value in (SURFACE**2, PULLED, WEAK))
@@ -106,34 +108,22 @@ def shift_of_particle(precision: Precision, dimension: int, module: Any) -> Call
         most = farthest * spacing
         return wish / wp.sqrt(real(1.0) + wp.dot(wish, wish) / (most * most))
 
-    return shift
+    return pointwise_kernels(precision, modules, lambda _: shift, ["delta"], numbers=["spacing"])
 
 
 @cache
-def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the shift delta, which spreads particles evenly."""
-    make = partial(shift_of_particle, d.precision, dimension)
-    modules = d.modules(f"projection_{dimension}d")
-    return pointwise_kernels(d.precision, modules, make, ["delta"], numbers=["spacing"])
-
-
-def followed_velocity(precision: Precision, dimension: int, module: Any) -> Callable[..., Any]:
-    """Make the function of the velocity v' that follows the shift and the repairs of a particle."""
+def following_kernels(d: Discretisation, dimension: int) -> Kernels:
+    """Make the kernels of velocities v' that follow the shift and the repairs; the adjoint of v' is stored where that
+    of v is written."""
+    precision, modules = d.precision, d.modules(f"projection_following_{dimension}d")
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    inverse = effect_functions(precision, dimension, module).inverse
+    inverse = effect_functions(precision, dimension, modules[0]).inverse
 
     def follow(time_step: real, x_i: vector, M_i: matrix, A_i: matrix, x_now_i: vector, v_new_i: vector) -> vector:
         M = real(0.5) * (M_i + wp.transpose(M_i))  # so that the adjoint of M is symmetric, as M is
         return v_new_i - A_i * (inverse(M) * (x_now_i - x_i - time_step * v_new_i))
 
-    return follow
-
-
-@cache
-def following_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of velocities v' that follow; the adjoint of v' is stored where that of v is written."""
-    make, modules = partial(followed_velocity, d.precision, dimension), d.modules(f"projection_following_{dimension}d")
-    return pointwise_kernels(d.precision, modules, make, ["v_end"], {"v_end": "v_new"})
+    return pointwise_kernels(precision, modules, lambda _: follow, ["v_end"], {"v_end": "v_new"})
 
 
 @cache

@@ -140,12 +140,8 @@ def beside_solid_kernel(discretisation: Discretisation) -> Any:
     return solid_kernel(discretisation, "projection", _work)
 
 
-def normal_term(discretisation: Discretisation) -> WallTerm:
-    """Return the wall term normal / V of a solid, with the adjoint ``push_bar``."""
-    return WallTerm(discretisation, "projection", _normal_work, "push_bar")
-
-
 def _normal_work(d: Discretisation) -> Any:
+    """Make the work of the wall term normal / V of a solid."""
     real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
 
     def normal_work(x_ij: vector, push_bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)) -> real:
@@ -215,7 +211,8 @@ class ProjectionPush:
     ):
         """Prepare the sums over walls, for a particle's ``volume`` at rest [m^d]."""
         self._kernels, self._layout = push_kernels(discretisation, dimension), layout
-        terms = {"normal": normal_term(discretisation), "whole": wall_slope_term(discretisation)}
+        normal_term = WallTerm(discretisation, "projection", _normal_work, "push_bar")
+        terms = {"normal": normal_term, "whole": wall_slope_term(discretisation)}
         self._sums = {name: WallSums(term, layout) for name, term in terms.items()}
         self._all_sums = {f"all_{name}": WallSums(term, layout) for name, term in terms.items()}
         self._least = {"least": constants.least_diagonal / volume**2}
