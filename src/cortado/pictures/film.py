@@ -266,7 +266,7 @@ class ShownRun:
     def _moment(self, k: int) -> Moment:
         places = {table.name: table.middle() for table in self.scene.solid}
         places |= {name: motion.positions[k] for name, motion in self._motions.items()}
-        domain = self.scene.container.domain(self.scene.dimension)
+        domain = self.scene.domain
         places = {name: domain.wrapped(place) for name, place in places.items()}
         up = upright(np.asarray(self.scene.forces.gravity))[1]
         return Moment(k / max(len(self.trajectory) - 1, 1), float(self.times[k]), up, places)

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cortado.discretise.shapes import Points, corners
+from cortado.discretise.shapes import Points, corners, in_space
 from cortado.files.image_encoding import to_srgb
 from cortado.pictures.painter import colours_of
 from cortado.pictures.shown_solids import solid_outline
@@ -146,8 +146,7 @@ def _extent(clouds: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]
 
 def _space(vectors: NDArray[Any]) -> NDArray[Any]:
     """Return vectors (..., d) as (..., 3), with few digits."""
-    missing = 3 - vectors.shape[-1]
-    padded = np.pad(vectors, [(0, 0)] * (vectors.ndim - 1) + [(0, missing)])
+    padded = in_space(vectors)
     return np.array([float(f"{number:.6g}") for number in padded.ravel()]).reshape(padded.shape)
 
 
@@ -227,7 +226,7 @@ def _cup(container: CylinderContainer) -> Points:
 
 def _cloud(scene: Scene, name: str, states: list[MovingState], turn: Points, stride: int) -> Cloud:
     """Make the cloud of a run of states, with one of every ``stride`` particles."""
-    domain = scene.container.domain(scene.dimension)
+    domain = scene.domain
     positions = domain.wrapped(np.stack([state.positions[::stride] for state in states])) @ turn.T
     speeds = np.stack([np.linalg.norm(state.velocities[::stride], axis=1) for state in states])
     particles = positions.shape[1]

@@ -6,7 +6,8 @@ converged, what sensors have read, and whether gradients are right.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -268,35 +269,38 @@ def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float
 
 def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
     """Plot a curve for each number of each sensor, those of one unit in one panel."""
-    each = [(name, own, column, unit) for name, own in found.items() for column, unit in own.units.items()]
-    lines = [(f"{name} {column}", unit, own, column) for name, own, column, unit in each]
-    units = list(dict.fromkeys(unit for _, unit, _, _ in lines))
+    lines = dict[str, list[tuple[str, Readings, str]]]()
+    for name, own in found.items():
+        for column, unit in own.units.items():
+            lines.setdefault(unit, []).append((f"{name} {column}".replace("_", " "), own, column))
+    with _over_time(path, list(lines)) as panels:
+        for panel, shown in zip(panels, lines.values(), strict=True):
+            for k, (label, own, column) in enumerate(shown):
+                panel.plot(own.times, own[column], color=PALETTE[k % len(PALETTE)], linewidth=1.3, label=label)
+    return Path(path)
+
+
+@contextmanager
+def _over_time(path: str | Path, units: Sequence[str]) -> Iterator[Any]:
+    """Yield panels of a plot over time, one below the other, with these units; each gets a legend."""
     with drawing(path, height=1.5 + 2.5 * len(units)) as figure:
         panels = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
+        yield panels
         for panel, unit in zip(panels, units, strict=True):
-            shown = [line for line in lines if line[1] == unit]
-            for k, (label, _, own, column) in enumerate(shown):
-                label = label.replace("_", " ")
-                panel.plot(own.times, own[column], color=PALETTE[k % len(PALETTE)], linewidth=1.3, label=label)
             panel.set_ylabel(f"[{unit}]")
             panel.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
         panels[-1].set_xlabel("time [s]")
-    return Path(path)
 
 
 def beside_measured(found: Mapping[str, Readings], measured: Sequence[MeasuredColumn], path: str | Path) -> Path:
     """Plot a panel for each measured number: its points, the curve of the sensor, and the error in the title."""
-    with drawing(path, height=1.5 + 2.5 * len(measured)) as figure:
-        panels = figure.subplots(len(measured), 1, sharex=True, squeeze=False)[:, 0]
+    with _over_time(path, [one.unit for one in measured]) as panels:
         for panel, one in zip(panels, measured, strict=True):
             name, _, column = one.name.rpartition(".")
             panel.plot(found[name].times, found[name][column], color=PALETTE[0], linewidth=1.3, label="simulated")
             panel.plot(one.times, one.values, "o", color=PALETTE[6], markersize=3.5, label="measured")
             error = f"apart by {one.errors['root_mean_square']:.3g} {one.unit} (root mean square)"
             panel.set_title(f"{name} {column}: {error}".replace("_", " "))
-            panel.set_ylabel(f"[{one.unit}]")
-            panel.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
-        panels[-1].set_xlabel("time [s]")
     return Path(path)
 
 
