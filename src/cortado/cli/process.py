@@ -52,7 +52,9 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
     except BrokenPipeError:
         sys.exit(BROKEN_PIPE)
     except Exception as error:
-        sentence = shortage(error) or _complaint(error)
+        from cortado.device.warp_start import complaint
+
+        sentence = shortage(error) or complaint(error)
         if sentence is None:
             raise
         say(sentence)
@@ -76,12 +78,6 @@ def _understood(program: Program, arguments: Sequence[str]) -> Work:
         if not end.code:
             raise
         raise InputError(usage_sentence(box.getvalue(), arguments, program.name)) from None
-
-
-def _complaint(error: Exception) -> str | None:
-    from cortado.device.warp_start import complaint
-
-    return complaint(error)
 
 
 def _show_warning(message: Warning, category: type[Warning], *rest: object) -> None:

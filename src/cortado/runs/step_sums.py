@@ -2,9 +2,9 @@
 (`cortado.runs.particle_sums`) of all states of a chunk, launched behind it, in float64 and a fixed order."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from math import isqrt
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -53,17 +53,9 @@ class _Region:
     about: wp.vec3d
 
 
-@dataclass(frozen=True)
-class _Kernels:
-    """Kernels of partial sums over every so many particles of a scene in one state, and of the sum of these."""
-
-    weighted: Any
-    within: Any
-    join: Any
-
-
 @cache
-def _kernels(precision: Precision) -> _Kernels:
+def _kernels(precision: Precision) -> SimpleNamespace:
+    """Make kernels of partial sums over every so many particles of a scene in one state, and of the sum of these."""
     real, vector, six = precision.real, precision.vector, SIX
     module = kernel_module(f"particle_sums_{precision.name}")
 
@@ -164,7 +156,7 @@ def _kernels(precision: Precision) -> _Kernels:
             found += partial[wp.tid() * stride + t]
         total[wp.tid()] = found
 
-    return _Kernels(weighted, within, join)
+    return SimpleNamespace(weighted=weighted, within=within, join=join)
 
 
 class StepQuantities:
