@@ -202,6 +202,8 @@ class ShownRun:
     trajectory: Trajectory
     values: NDArray | None = None
     """(frames, n) values by which a scale colours particles; None for the colours of phases."""
+    unit: str | None = None
+    """Unit of values that not all scenes have."""
 
     @cached_property
     def stage(self) -> PlaneStage | Stage:
