@@ -6,6 +6,7 @@ import pytest
 import cortado
 from cortado.device.launching import CapturedGraph
 from cortado.errors import CortadoWarning
+from cortado.runs.quantity_values import QuantityEvaluator
 from cortado.sensors import FlowRate, PressureProbe, SolidLoad, WallForce, WaveGauge
 from scenes import jet, plane, scene
 from test_free_bodies import RAFT
@@ -113,3 +114,44 @@ def test_readings_change_no_bit_and_need_no_capture_in_later_runs(monkeypatch):
     for name, values in readings(first).items():
         assert values.tobytes() == readings(again)[name].tobytes()
     assert bare.positions.tobytes() == first.positions.tobytes() == again.positions.tobytes()
+
+
+def judged(simulation, sensor, steps=STEPS):
+    """A problem of what a sensor reads in every state."""
+    count = len(sensor.columns(simulation.dimension))
+    each = {k: cortado.losses.SensorMatch(sensor, np.full(count, 10.0 * k)) for k in range(steps + 1)}
+    return cortado.Problem(simulation, steps, cortado.losses.Frames(each))
+
+
+OF_LOSSES = {"projection": PressureProbe([0.2, 0.1]), "rotor": SolidLoad("rotor"), "period": WallForce()}
+
+
+@pytest.mark.parametrize("batch", [None, 2])
+@pytest.mark.parametrize("name", OF_LOSSES)
+def test_losses_of_sensors_take_no_step_again_and_have_the_same_bits(name, batch, monkeypatch):
+    solve, solved = QuantityEvaluator._solve, []
+    monkeypatch.setattr(QuantityEvaluator, "_solve", lambda *given: (solved.append(1), solve(*given))[1])
+    made, found = cortado.Simulation(CASES[name][0](), precision="float64", batch=batch), []
+    for sensor in (OF_LOSSES[name], OnHost(OF_LOSSES[name])):
+        problem, point = judged(made, sensor), {"gravity": made.parameters()["gravity"] + 0.1}
+        solved.clear()
+        found.append(problem.value(point))
+        assert len(solved) == (1 if sensor is OF_LOSSES[name] else STEPS + 1)
+        value, gradient = problem.value_and_gradient(point)
+        np.testing.assert_array_equal(value, found[-1])
+        found.append(gradient["gravity"])
+        along = {"gravity": np.ones_like(point["gravity"])}
+        found.append(problem.tangent(point, along))
+        slope = gradient["gravity"].reshape(batch or 1, -1).sum(axis=1)
+        np.testing.assert_allclose(slope, np.atleast_1d(found[-1]), rtol=1e-10)
+    for own, host in zip(found[:3], found[3:], strict=True):
+        np.testing.assert_array_equal(own, host)
+
+
+def test_a_few_losses_of_sensors_let_steps_be_as_they_are():
+    simulation, probe = cortado.Simulation(CASES["projection"][0]()), PressureProbe([0.2, 0.1])
+    for frames, kept in (([3, 20], 0), ([3, 9, 15, 20], 1)):
+        each = {k: cortado.losses.SensorMatch(probe, [0.0]) for k in frames}
+        problem = cortado.Problem(simulation, STEPS, cortado.losses.Frames(each))
+        problem.value({})
+        assert len(problem._rollout.beside) == kept

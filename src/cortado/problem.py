@@ -31,6 +31,7 @@ from cortado.rollout.run_checks import one_for_each
 from cortado.rollout.stepper import BackwardSteps
 from cortado.runs.quantity_values import Moment, add_to_row, row_of
 from cortado.runs.sensor_places import warn_of_places
+from cortado.runs.step_reader import QuantityReader
 from cortado.runs.trajectory import noted
 from cortado.scene.parameter_values import NAMES, UNITS, Arrays, Values, require_points
 from cortado.scene.restart import RestartState
@@ -41,6 +42,8 @@ from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]
 
+SPARSE = 8
+"""From one state in so many on, quantities are read in every step."""
 KEPT = 2
 """Number of batches of a problem, of different sizes, that are kept for the next evaluation."""
 
@@ -401,8 +404,20 @@ class Problem:
 
         self._space.begin(self._rollout, values, varied, self._states)
         observe(0, self._rollout.initial)
-        self._rollout.forward(observe, keep)
+        reader = self._reader(wanted)
+        self._rollout.forward(observe, keep, reader=reader)
+        for step, found in () if reader is None else reader.found.items():
+            moment_of(ends[step]).know(found)
         return ends
+
+    def _reader(self, wanted: set[int]) -> QuantityReader | None:
+        """Return what reads the quantities that losses need of states in the run's own steps; None where so few are
+        ``wanted`` that taking their steps again costs less."""
+        each = {k: name for k, name in self._losses.quantities(self.simulation.evaluator).items() if k in wanted}
+        each.pop(self.steps, None)  # no step is behind it
+        if len(each) * SPARSE < self.steps or not each:
+            return None
+        return QuantityReader(self.simulation.evaluator(), self._rollout, each)
 
     @property
     def _going(self) -> list[int] | None:

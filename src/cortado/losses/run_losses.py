@@ -26,6 +26,7 @@ from cortado.losses.loss import (
     moment_of,
 )
 from cortado.particles.state import State
+from cortado.runs.sensor import SensedScene
 from cortado.scene.quantity_names import check_readable
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
@@ -195,7 +196,8 @@ class LossesByStep(dict[int, Loss]):
             if step not in range(steps + 1):
                 raise InputError(f"losses has the frame {step!r}, but must have frames from 0 to {steps}.")
         super().__init__({step: as_loss(one) for step, one in by_step.items()})
-        self.sensors = {repr(one.sensor): one.sensor for one in by_step.values() if hasattr(one, "sensor")}
+        self._sensors = {step: one.sensor for step, one in by_step.items() if hasattr(one, "sensor")}
+        self.sensors = {repr(sensor): sensor for sensor in self._sensors.values()}
         """Those that losses read, by what they are."""
         self._frames = loss if isinstance(loss, Frames) else None
 
@@ -204,6 +206,11 @@ class LossesByStep(dict[int, Loss]):
         if self._frames is not None:
             end = next(iter(ends.values()))
             self._frames.check(np.ravel(moment_of(end).parameters["time_step"]))
+
+    def quantities(self, scene: Callable[[], SensedScene]) -> dict[int, str]:
+        """Return the quantities that sensors of Cortado's read of particles, by the numbers of states."""
+        sums = {step: one.summed(scene()) for step, one in self._sensors.items() if hasattr(one, "summed")}
+        return {step: one.quantity for step, one in sums.items() if one.quantity is not None}
 
     def total(self, ends: Mapping[int, Any], going: Sequence[int] | None) -> Any:
         """Return the sum of the losses, given states by the number of steps before them; of a batch (batch,), NaN

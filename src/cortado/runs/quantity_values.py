@@ -17,6 +17,7 @@ from cortado.device.threads import Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Fields, Parameters, State
 from cortado.rollout.rollout import Rollout
+from cortado.runs.particle_sums import in_the_scene
 from cortado.runs.quantity_formulas import (
     Density,
     OnDevice,
@@ -88,6 +89,10 @@ class Moment:
                 found.flags.writeable = False
                 self._values[own] = found
         return self._values[name]
+
+    def know(self, values: Arrays) -> None:
+        """Take quantities, by name, that the run itself has computed."""
+        self._values.update(values)
 
     def adjoint(self, bars: Mapping[str, NDArray]) -> tuple[Arrays, Arrays]:
         """Turn adjoints of quantities into those of the state's fields and of the step's parameters."""
@@ -302,6 +307,19 @@ class QuantityEvaluator:
             return values[0] if self.solver.layout.batch is None else values
         found = np.empty(values.shape)
         found[self._order] = values
+        return self._by_scene(found)
+
+    def of_scene(self, name: str, values: NDArray) -> NDArray:
+        """Return as `values` does a quantity that a step has left in the scene's order, or six numbers of a load."""
+        wide = values.astype(np.float64)
+        if is_load(name):
+            found = self._shown(name, in_the_scene(wide, self.dimension))
+        else:
+            found = self._by_scene(wide if wide.ndim == 1 else wide[:, : self.dimension])
+        found.flags.writeable = False
+        return found
+
+    def _by_scene(self, found: NDArray) -> NDArray:
         batch = self.solver.layout.batch
         return found if batch is None else found.reshape(batch, -1, *found.shape[1:])
 

@@ -15,6 +15,7 @@ from cortado.rollout.rollout import Rollout
 from cortado.runs.particle_sums import Summed
 from cortado.runs.quantity_values import QuantityEvaluator
 from cortado.runs.step_sums import SIX, ChunkSums, StepQuantities
+from cortado.scene.parameter_values import Arrays
 from cortado.scene.parameters import Axis
 
 
@@ -48,6 +49,32 @@ class _Poses(Mapping[str, NDArray[Any]]):
         return len(self._fields)
 
 
+def kept_by_steps(scene: QuantityEvaluator, rollout: Rollout, names: tuple[str, ...]) -> StepQuantities:
+    """Return what keeps quantities of steps by their names, made once for a rollout."""
+    kept: dict[tuple[str, ...], Any] = rollout.beside
+    if names not in kept:
+        kept[names] = StepQuantities(scene.within(names), scene.solver, rollout.longest_chunk)
+    found: StepQuantities = kept[names]
+    return found
+
+
+class QuantityReader:
+    """A `cortado.rollout.chunk_reader.ChunkReader` of quantities that need the step after a state, which is the run's
+    own."""
+
+    def __init__(self, scene: QuantityEvaluator, rollout: Rollout, wanted: Mapping[int, str]):
+        """Prepare to read of the states with these numbers a quantity each, by its name."""
+        self.found: dict[int, Arrays] = {}
+        """Quantities by name, by the numbers of states."""
+        self.beside = kept_by_steps(scene, rollout, tuple(sorted(set(wanted.values()))))
+        self._scene, self._wanted = scene, wanted
+
+    def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
+        for number in self._wanted.keys() & range(step, end):
+            values = self.beside.of_step(self._wanted[number], number - step).numpy()
+            self.found[number] = {self._wanted[number]: self._scene.of_scene(self._wanted[number], values)}
+
+
 class StepReader:
     """A `cortado.rollout.chunk_reader.ChunkReader` of sensors. What it reads is copied to the host, where `rows` looks
     at it while a GPU takes the next steps."""
@@ -62,7 +89,7 @@ class StepReader:
         self._needs_the_step = {name for name, one in summed.items() if one.quantity is not None}
         self.quantities = tuple(sorted({one.quantity for one in summed.values() if one.quantity is not None}))
         """Names of the quantities that are read."""
-        self._beside = self._kept()
+        self._beside = kept_by_steps(scene, rollout, self.quantities) if self.quantities else None
         moved = any(table.moves for table in scene.solids)
         self._poses = [f for f in first.fields if f.axis is Axis.SCALAR and not f.is_constant] if moved else []
         options = {"device": "cpu", "pinned": first.positions.device.is_cuda}
@@ -76,14 +103,6 @@ class StepReader:
         self._step = self._count = 0
         """The first state of the last chunk, and how many of its states wait to be looked at."""
         self._rows = list[Row]()
-
-    def _kept(self) -> StepQuantities | None:
-        """Return what keeps the quantities of steps, made once for a rollout; None without any."""
-        kept, names = self._rollout.beside, self.quantities
-        if names and names not in kept:
-            kept[names] = StepQuantities(self._scene.within(names), self._scene.solver, self._rollout.longest_chunk)
-        found: Any = kept.get(names)
-        return found
 
     @property
     def beside(self) -> Beside | None:

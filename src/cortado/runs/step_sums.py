@@ -177,11 +177,16 @@ class StepQuantities:
             found = formula.on_device(context, pressures)
             if name not in self.kept:
                 self.kept[name] = wp.zeros(self._length * len(found), dtype=found.dtype, device=found.device)
-            own = self.kept[name][step * len(found) : (step + 1) * len(found)]
+            own = self.of_step(name, step)
             if found.dtype is SIX:
                 wp.copy(own, found)
             else:
                 unsort(context, found, own)
+
+    def of_step(self, name: str, step: int) -> wp.array:
+        """Return a quantity in the scene's order, or a load, of a step of the chunk, counted from 0."""
+        size = len(self.kept[name]) // self._length
+        return self.kept[name][step * size : (step + 1) * size]
 
 
 class ChunkSums:
