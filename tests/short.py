@@ -27,6 +27,9 @@ KEPT = {
     },
     "test_first_commands": {"test_a_new_scene_runs_at_once[2-True]"},
     "test_features": {
+        "test_reverse_forward_tape_and_differences_agree[the cubic spline]",
+        "test_reverse_forward_tape_and_differences_agree[a period]",
+        "test_reverse_forward_tape_and_differences_agree[a face that mirrors]",
         "test_reverse_forward_tape_and_differences_agree[two layers]",
         "test_reverse_forward_tape_and_differences_agree[a nozzle over a pool]",
         "test_reverse_forward_tape_and_differences_agree[surface tension]",

@@ -5,7 +5,7 @@ import pytest
 
 import cortado
 from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation, Trajectory, certify
-from cortado.gradients import AdjointViscosity, ImplicitPressure
+from cortado.gradients import AdjointViscosity
 from cortado.losses import CentreOfMass
 from cortado.pictures.film import ShownRun
 from cortado.pictures.run_pictures import run_page
@@ -14,7 +14,6 @@ from cortado.scene.motions import greatest_speed
 from cortado.scene.scene_warnings import standing_sentences
 from cortado.scene.stability import stability_limits
 from cortado.scene.tables import rotation_matrix
-from finite_differences import both_modes, central_difference
 from scenes import box, jet, pool
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 1.0}
@@ -25,8 +24,6 @@ PADDLE = {
     "positions": [[0.2, 0.35, 0.2], [0.22, 0.35, 0.2], [0.2, 0.35, 0.25]],
     "rotations": [[0.0, 0.0, 0.0], [0.0, 0.3, 0.1], [0.4, 0.3, 0.0]],
 }
-CONVERGED = {"kind": "projection", "time_step": 0.001, "iterations": 8}
-"""Two iterations are not at the fixed point: there the cosine of gravity's gradient is 0.998, with 8 it is 0.99996."""
 
 
 def plane(*solids, **tables):
@@ -144,43 +141,6 @@ def test_a_belt_moves_fluid_and_stays():
     near = run.positions[-1][:, 1] < 0.05
     far = run.positions[-1][:, 1] > 0.25
     assert run.velocities[-1][near, 0].mean() > 0.4 > run.velocities[-1][far, 0].mean() + 0.2
-
-
-@pytest.mark.parametrize(
-    ("made", "estimator"),
-    [
-        (lambda: plane(ROTOR), None),
-        (lambda: plane(ROTOR, solver=CONVERGED), ImplicitPressure()),
-        (lambda: plane(ROTOR, solver={"kind": "pcisph", "time_step": 0.001}), None),
-        (lambda: plane(ROTOR, forces={"viscous_solve": "implicit"}), None),
-        (lambda: plane(ROTOR, forces={"viscosity": "pairwise"}, solver={"kind": "pcisph", "time_step": 0.001}), None),
-        (space, None),
-    ],
-    ids=["projection", "fixed point", "pcisph", "implicit", "pairwise", "space"],
-)
-def test_derivatives_beside_solids_that_move(made, estimator):
-    """Reverse and forward mode to round-off, and differences: of the first state, gravity and viscosity."""
-    simulation = Simulation(made(), precision="float64")
-    random = np.random.default_rng(1)
-    x, d = simulation.positions, simulation.dimension
-    values = {
-        "initial_positions": x + 0.005 * random.uniform(-1.0, 1.0, x.shape),
-        "initial_velocities": 0.1 * random.normal(size=x.shape),
-        "gravity": np.array([0.5, -9.81, 0.2][:d]),
-        "viscosity": np.float64(1.0),
-    }
-    scales = {"initial_positions": 0.05, "initial_velocities": 1.0, "gravity": 1.0, "viscosity": 0.3}
-    along = {name: scale * random.normal(size=np.shape(values[name])) for name, scale in scales.items()}
-    problem = Problem(simulation, 12, CentreOfMass([0.5, 0.3, 0.1][:d]))
-    if estimator is None:
-        _, forward = both_modes(problem, values, along)
-    else:
-        forward = problem.tangent(values, along)
-        _, gradient = problem.value_and_gradient(values, gradient=estimator)
-        exact = problem.value_and_gradient(values)[1]["gravity"]
-        assert gradient["gravity"] @ exact > 0.999 * np.linalg.norm(gradient["gravity"]) * np.linalg.norm(exact)
-    differences = [central_difference(problem.value, values, along, h) for h in (1e-5, 1e-6, 1e-7)]
-    assert min(abs(one / forward - 1.0) for one in differences) < 1e-6
 
 
 def test_a_certificate_and_an_estimator_beside_a_rotor():

@@ -1,4 +1,4 @@
-"""Forces that a user gives, also with a field that is kept: run, differentiated, certified, searched for."""
+"""Forces that a user gives as classes, also with a field that is kept: what they do, what is refused, what is seen."""
 
 import numpy as np
 import pytest
@@ -41,14 +41,6 @@ def test_one_that_has_no_batches_is_refused():
 
     with pytest.raises(InputError, match="batch is 2, but must be left out, as the force BreezeForce has no"):
         problem([Alone()], batch=2)
-
-
-def test_it_is_searched_for():
-    judged = problem([Breeze()])
-    goal = judged.end({"breeze.k": 5.0}).positions
-    judged = Problem(judged.simulation, STEPS, cortado.losses.FinalPositions(goal))
-    found = cortado.optimise(judged, {"breeze.k": 3.0}, optimiser=cortado.optimisers.LBFGS(), iterations=12)
-    np.testing.assert_allclose(found.parameters["breeze.k"], 5.0, rtol=1e-3)
 
 
 class Gusts(Breeze):
