@@ -23,7 +23,6 @@ UNNAMED = {
         *("curvature_sums.colour_back", "curvature_sums.average_back"),
         *("curvature_sums.bend_back", "curvature_sums.mean_back"),
     },
-    "sph.surface_tension": {"tension_functions.stress_derivative"},
     "sph.viscous_stress": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
     "solvers.projection.effects": {f"image_sums.{name}_back" for name in ("lift", "mirror_walls", "behind")},
     "solvers.projection.coarse_residual": {"coarse_sums.push_back"},
@@ -39,7 +38,7 @@ UNNAMED = {
     "sph.density": {"_density_work.density_work"},
     "sph.viscosity": {"viscosity_term.made.viscosity_work"},
     "sph.walls": {"_work.wall_slope_work"},
-    "sph.formula": {"packing_kernels.add_number"},
+    "sph.own_arrays": {"packing_kernels.add"},
     "sph.stress_kernels": {*("moments_work.moments_work", "moment_sums.moments_back", "moment_sums.wall_moments_back")},
     "sph.stress_forces": {
         *("stress_sums.traction_back", "stress_sums.wall_traction_back"),
@@ -57,7 +56,7 @@ SHARED = {
     "sph.free_energy": {"_double_well.hessian_product", "_miscible.hessian_product", "_degenerate.gradient"},
     "sph.moving_solids": {"rotations.further"},
     "particles.moving_walls": {"turn_functions.turning", "turn_functions.leaning"},
-    "sph.surface_tension": {"normal_kernels.change", "tension_functions.pull_derivative"},
+    "sph.surface_tension": {"normal_kernels.change"},
     "sph.viscosity": {"viscosity_kernels.pair_viscosity_derivative"},
     "sph.stress_forces": {"contact_functions.hold_gradient"},
 }

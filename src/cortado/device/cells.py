@@ -4,16 +4,16 @@ The grid of cells wraps around in every direction, so that no position lies outs
 the cells divide the period, elsewhere cells that share a number are told apart by the distance test.
 """
 
-from dataclasses import dataclass
 from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from cortado.device.grid import Grid
 from cortado.device.launching import launch, launch_together
-from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.modules import by_name, kernel_module
+from cortado.device.precision import Precision, TypesByName
 
 FURTHEST = 2.0**24
 """Greatest distance from the grid, in cells: a position further away counts as lost."""
@@ -36,20 +36,10 @@ def cell_grid_type(precision: Precision) -> Any:
     return wp.struct(CellGrid)
 
 
-@dataclass(frozen=True)
-class CellFunctions:
-    """Warp functions of a grid of cells."""
-
-    wrap: Any
-    cell_of: Any
-    below: Any
-    """First relative cell to visit along an axis; ``above`` is behind the last."""
-    above: Any
-
-
 @cache
-def cell_functions(precision: Precision) -> CellFunctions:
-    """Return the Warp functions of a grid of cells in a precision."""
+def cell_functions(precision: Precision) -> SimpleNamespace:
+    """Make the Warp functions of a grid of cells: ``wrap`` and ``cell_of``, and ``below`` and ``above``, between which
+    are the relative cells to visit along an axis."""
     vector = precision.vector
     grid_type = cell_grid_type(precision)
 
@@ -79,28 +69,19 @@ def cell_functions(precision: Precision) -> CellFunctions:
         """Return the relative cell behind the last to visit along an axis of n cells."""
         return wp.where(n > 1, 2, 1)
 
-    return CellFunctions(wrap=wrap, cell_of=cell_of, below=below, above=above)
-
-
-@dataclass(frozen=True)
-class _CellKernels:
-    """The kernels of a sort by cell, in the order of their launches. Between the first two, sums of the counts give the
-    start of each cell."""
-
-    count: Any
-    place: Any
-    rank: Any
+    return by_name(wrap, cell_of, below, above)
 
 
 @cache
-def cell_kernels(precision: Precision) -> _CellKernels:
-    """Return the kernels of a counting sort: atomic additions count each cell's particles, and assign places in the
-    cell. That order differs from run to run, so each particle then counts those of its cell before it in the given
-    order, and takes the place of that number."""
+def cell_kernels(precision: Precision) -> SimpleNamespace:
+    """Make the kernels ``count``, ``place`` and ``rank`` of a counting sort: atomic additions count each cell's
+    particles, and sums of the counts assign places in the cell. That order differs from run to run, so each particle
+    then counts those of its cell before it in the given order, and takes the place of that number."""
     vector, real = precision.vector, precision.real
     grid_type = cell_grid_type(precision)
     cell_of = cell_functions(precision).cell_of
     module = kernel_module(f"cells_{precision.name}")
+    typed = TypesByName(wp.int32, {grid_type: "grid", vector: "x", wp.vec2i: "arrivals"})
 
     @wp.func
     def is_astray(x: vector, grid: grid_type) -> bool:
@@ -110,15 +91,8 @@ def cell_kernels(precision: Precision) -> _CellKernels:
         return not (wp.abs(s[0]) < furthest and wp.abs(s[1]) < furthest and wp.abs(s[2]) < furthest)
 
     @wp.kernel(module=module, enable_backward=False)
-    def count(
-        grid: grid_type,
-        particles: int,
-        x: wp.array(dtype=vector),
-        # in and out
-        counts: wp.array(dtype=wp.int32),
-        # out
-        arrivals: wp.array(dtype=wp.vec2i),
-    ):
+    @typed.arrays
+    def count(grid, particles: int, x, counts, arrivals):
         """Write to ``arrivals`` each particle's cell and its number of earlier arrivals; ``counts`` begins at 0."""
         i = wp.tid()
         member = i // particles
@@ -131,14 +105,8 @@ def cell_kernels(precision: Precision) -> _CellKernels:
         arrivals[i] = wp.vec2i(cell, wp.atomic_add(counts, cell, 1))
 
     @wp.kernel(module=module, enable_backward=False)
-    def place(
-        arrivals: wp.array(dtype=wp.vec2i),
-        starts: wp.array(dtype=wp.int32),
-        # out
-        counts: wp.array(dtype=wp.int32),
-        placed: wp.array(dtype=wp.int32),
-        before: wp.array(dtype=wp.int32),
-    ):
+    @typed.arrays
+    def place(arrivals, starts, counts, placed, before):
         """Write to ``placed`` the particle at each place, and to ``before`` the number of its cell's before it; clear
         ``counts``."""
         i = wp.tid()
@@ -149,12 +117,8 @@ def cell_kernels(precision: Precision) -> _CellKernels:
         counts[arrival[0]] = 0
 
     @wp.kernel(module=module, enable_backward=False)
-    def rank(
-        placed: wp.array(dtype=wp.int32),
-        before: wp.array(dtype=wp.int32),
-        # out
-        order: wp.array(dtype=wp.int32),
-    ):
+    @typed.arrays
+    def rank(placed, before, order):
         """Sort the particles of each cell by given order; ``before`` is -1 behind the last cell."""
         p = wp.tid()
         i = placed[p]
@@ -167,7 +131,7 @@ def cell_kernels(precision: Precision) -> _CellKernels:
             q += 1
         order[first + smaller] = i
 
-    return _CellKernels(count=count, place=place, rank=rank)
+    return by_name(count, place, rank)
 
 
 class CellSort:

@@ -8,13 +8,14 @@ of which every lane gets the same bits, and the first one writes. On a CPU, and 
 
 import inspect
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from cortado.arrays import whole_number
+from cortado.device.modules import by_name
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 
@@ -79,27 +80,13 @@ def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
     return wanted or next((lanes for most, lanes in BY_SIZE if particles <= most), 1)
 
 
-@dataclass(frozen=True)
-class LaneFunctions:
-    """Warp functions for kernels made for lanes: see `lane_functions`."""
-
-    lane: Any
-    """Function that returns the number of a thread's lane."""
-    add_up: Any
-    """Function that sums a number over the lanes."""
-    add_up_vectors: Any
-    """Function that sums a vector over the lanes."""
-    vote: Any
-    """Function that returns a number whose bit k is set where lane k says yes."""
-    ones: Any
-    """Function that counts the bits set in a vote."""
-    before: Any
-    """Function that counts the bits set in a vote by lanes before one's own."""
-
-
 @cache
-def lane_functions(precision: Precision, lanes: int) -> LaneFunctions:
-    """Return the Warp functions for a number of lanes, a power of 2 up to 32."""
+def lane_functions(precision: Precision, lanes: int) -> SimpleNamespace:
+    """Make the Warp functions of kernels for a number of lanes, a power of 2 up to 32.
+
+    ``lane`` returns the number of a thread's lane, ``add_up`` and ``add_up_vectors`` sums over the lanes. ``vote``
+    returns a number whose bit k is set where lane k says yes; ``ones`` counts the bits of a vote, and ``before`` those
+    of lanes before one's own."""
     return _of_one(precision) if lanes == 1 else _of_several(precision, lanes)
 
 
@@ -127,7 +114,7 @@ def sum_over_lanes(kind: Any, precision: Precision, lanes: int) -> Any:
     return same if lanes == 1 else add_up_components
 
 
-def _of_one(precision: Precision) -> LaneFunctions:
+def _of_one(precision: Precision) -> SimpleNamespace:
     real, vector = precision.real, precision.vector
 
     @wp.func
@@ -154,10 +141,10 @@ def _of_one(precision: Precision) -> LaneFunctions:
     def before(votes: int) -> int:
         return 0
 
-    return LaneFunctions(lane, add_up, add_up_vectors, vote, ones, before)
+    return by_name(lane, add_up, add_up_vectors, vote, ones, before)
 
 
-def _of_several(precision: Precision, lanes: int) -> LaneFunctions:
+def _of_several(precision: Precision, lanes: int) -> SimpleNamespace:
     """Return CUDA functions of lanes: threads of a particle are neighbours in one warp, and wait for each other."""
     real, vector = precision.real, precision.vector
     first, group = f"(threadIdx.x % 32u / {lanes}u * {lanes}u)", f"{(1 << lanes) - 1}u"
@@ -183,4 +170,4 @@ def _of_several(precision: Precision, lanes: int) -> LaneFunctions:
     @wp.func_native(f"return __popc(votes & ((1u << threadIdx.x % {lanes}u) - 1u));")
     def before(votes: int) -> int: ...
 
-    return LaneFunctions(lane, add_up, add_up_vectors, vote, ones, before)
+    return by_name(lane, add_up, add_up_vectors, vote, ones, before)

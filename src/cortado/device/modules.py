@@ -52,6 +52,11 @@ class Kernels:
     """Kernel of reverse mode: from adjoints of the outputs, adds to those of the inputs, ``x_bar``."""
 
 
+def by_name(*made: Any) -> SimpleNamespace:
+    """Return Warp functions or kernels as attributes, by the names of their Python functions."""
+    return SimpleNamespace(**{one.func.__name__.rpartition("__")[2]: one for one in made})
+
+
 def kind_of(forward: bool, taped: bool) -> str:
     """Return the part of a Warp module's name that tells its kernels: "forward", "taped" or "derivative".
 

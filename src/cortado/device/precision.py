@@ -5,11 +5,13 @@ types of parameters by their names.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from cortado.device.modules import by_name
 from cortado.errors import InputError, shown
 
 
@@ -104,22 +106,14 @@ class TypesByName:
         return self._types.get(name, self._usual)
 
 
-@dataclass(frozen=True)
-class Arithmetic:
-    """Warp functions (roots and reciprocal) of a positive number that is neither subnormal nor infinite."""
-
-    root: Any
-    inverse_root: Any
-    reciprocal: Any
-
-
 @cache
-def arithmetic(precision: Precision, taped: bool) -> Arithmetic:
-    """Return roots and reciprocal in a precision; ``taped`` ones have derivatives, and round as IEEE 754 asks."""
+def arithmetic(precision: Precision, taped: bool) -> SimpleNamespace:
+    """Make the Warp functions ``root``, ``inverse_root`` and ``reciprocal`` of a positive number that is neither
+    subnormal nor infinite; ``taped`` ones have derivatives, and round as IEEE 754 asks."""
     return _of_the_gpu() if precision == FLOAT32 and not taped else _plain(precision)
 
 
-def _plain(precision: Precision) -> Arithmetic:
+def _plain(precision: Precision) -> SimpleNamespace:
     real = precision.real
 
     @wp.func
@@ -134,10 +128,10 @@ def _plain(precision: Precision) -> Arithmetic:
     def reciprocal(x: real) -> real:
         return real(1.0) / x
 
-    return Arithmetic(root, inverse_root, reciprocal)
+    return by_name(root, inverse_root, reciprocal)
 
 
-def _of_the_gpu() -> Arithmetic:
+def _of_the_gpu() -> SimpleNamespace:
     """Return approximate float32 roots and reciprocal of CUDA; on the CPU they are the plain ones."""
 
     def native(cuda: str, cpu: str) -> str:
@@ -154,4 +148,4 @@ def _of_the_gpu() -> Arithmetic:
     @wp.func_native(native(approximate.format("rcp", "y"), "return 1.0f / x;"))
     def reciprocal(x: wp.float32) -> wp.float32: ...
 
-    return Arithmetic(root, inverse_root, reciprocal)
+    return by_name(root, inverse_root, reciprocal)

@@ -44,11 +44,8 @@ def helpers() -> ThreadPoolExecutor:
 
 def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int) -> None:
     """Call ``work`` for each item on several cores: this thread and its helpers take one item after the other. After a
-    failure, which is raised, no further item is begun.
-
-    Returns once all of them have ended, also after an interruption: nothing may go on behind the back of what comes
-    next. After that, and after a failure, which is raised, nobody takes another item.
-    """
+    failure, which is raised, and after an interruption no further item is begun. Returns once all have ended, as
+    nothing may go on behind the back of what comes next."""
     waiting = iter(items)
 
     def take() -> None:

@@ -32,10 +32,7 @@ VERBOSE = "CORTADO_VERBOSE"
 @contextmanager
 def silenced() -> Iterator[None]:
     """Keep Warp silent in the block, as it starts; afterwards it prints warnings and errors alone. A log level chosen
-    by the user is kept, and one below Warp's own keeps the start audible.
-
-    A level that the user has chosen is left as it is; below Warp's own, where all is wanted, so is the start.
-    """
+    by the user is kept, and one below Warp's own keeps the start audible."""
     chosen = wp.config.log_level
     if os.environ.get(VERBOSE, "0") not in ("", "0") or chosen < wp.LOG_INFO:
         yield

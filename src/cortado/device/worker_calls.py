@@ -96,11 +96,7 @@ def versions() -> str:
 
 def call(payload: Payload, item: bytes) -> Answer | Lacking:
     """Call the payload's function for an item, in a worker process, one call at a time. Its exceptions become part of
-    the answer, to be raised again by the caller, also one that would end the process.
-
-    What the function raises is part of the answer, so that it is raised again where the function came from. So is that
-    it wants to end the process, which would take the worker with it.
-    """
+    the answer, to be raised again by the caller, also one that would end the process."""
     with _one_at_a_time, warnings.catch_warnings(record=True) as caught:
         if payload.content is None and payload.digest not in _functions:
             return Lacking()

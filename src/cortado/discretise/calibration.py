@@ -21,10 +21,6 @@ round-off would choose the pressure's derivative, and no finite difference could
 """
 RATE_LIMIT = 1.5
 """Bound on `greatest_rate`, as the iteration converges below 2; the margin is for particles off the lattice."""
-DIFFUSION_SAFETY = 0.5
-"""Part of the lattice's limit on a step of diffusion that is taken; the rest is for particles off the lattice
-(eigenvalues were at most 1.08 times those of the lattice on random particles) and for fractions that stray out of [0,
-1]."""
 
 
 def lattice_offsets(spacing: float, support: float, dimension: int) -> np.ndarray:
@@ -161,25 +157,3 @@ def stress_rate(kernel: SmoothingKernel, spacing: float, support: float, dimensi
     squares = ((np.sin(phases) @ (-volume * slopes[:, None] * offsets) / second) ** 2).sum(axis=1)
     remainders = (1.0 - np.cos(phases)) @ (-2.0 * volume * slopes) - second * squares
     return float((2.0 * squares + stress_control(kernel, spacing, support, dimension) * remainders).max())
-
-
-def diffusion_limit(
-    kernel: SmoothingKernel,
-    spacing: float,
-    support: float,
-    dimension: int,
-    greatest_mobility: float,
-    interface_width: float,
-    curvature: float,
-    density_ratio: float,
-) -> float:
-    """Return the longest explicit step [s] of Cahn-Hilliard diffusion, infinite without mobility:
-
-    dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian,
-
-    with the mobility M [m2/s], the width eps [m] and the curvature max f'' [-] of the free energy. Beside a particle
-    ``density_ratio`` times as heavy a light one diffuses up to (1 + ratio) / 2 times as fast.
-    """
-    rate = laplacian_rate(kernel, spacing, support, dimension) * 0.5 * (1.0 + density_ratio)
-    speed = greatest_mobility * rate * (interface_width**2 * rate + curvature)
-    return 2.0 * DIFFUSION_SAFETY / speed if speed > 0.0 else np.inf

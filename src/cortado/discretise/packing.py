@@ -81,11 +81,6 @@ class PointsAround:
         """Return the volume of a particle [m^d], with which the sum of kernels on the lattice gives its density."""
         return rest_volume(self.lattice.kernel, self.lattice.spacing, self.lattice.support, self.lattice.dimension)
 
-    @property
-    def own_weight(self) -> float:
-        """Return the kernel of a particle at its own place [1 / m^d]."""
-        return float(self.lattice.weights(np.zeros((1, self.lattice.dimension)))[0])
-
     @cached_property
     def kernels(self) -> Any:
         """Make the `packing_kernels` for the lattice's smoothing kernel."""
@@ -126,18 +121,13 @@ class PointsAround:
         placed, grid = self.kernels.placed(), self.kernels.grid()
         placed.x, placed.numbers = shared(self.in_space[order]), shared(order)
         grid.origin, grid.frequency, grid.shape = cells.origin, 1.0 / cells.cell, cells.shape
-        grid.starts = shared(starts_of(np.bincount(own, minlength=cells.cells)))
+        grid.starts = shared(np.append(0, np.cumsum(np.bincount(own, minlength=cells.cells))).astype(np.int32))
         return placed, grid
 
 
 def in_space(points: Points) -> Points:
     """Return points (..., d) as (..., 3), with 0 along a missing axis."""
     return np.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, 3 - points.shape[-1])])
-
-
-def starts_of(counts: Numbers | Int32s) -> Int32s:
-    """Return the starts (n + 1,) of lists of these lengths (n,), one behind the other, and the end."""
-    return np.append(0, np.cumsum(counts)).astype(np.int32)
 
 
 HIGHEST, AIM, LOWEST = 0.5 * SLACK, (-6e-3, -1e-3), -9e-3
@@ -242,7 +232,8 @@ class Relaxation:
     def linearised(self, close: float) -> Linearised:
         """Return the derivatives where the particles are now, and those of distances below ``close`` [m]."""
         kernels, count, most = self._around.kernels, len(self._free), self._most
-        sums, distances = np.full(count, self._around.own_weight), np.empty(most)
+        at_its_place = self._around.lattice.weights(np.zeros((1, self._around.lattice.dimension)))[0]
+        sums, distances = np.full(count, at_its_place), np.empty(most)
         close_starts = np.zeros(count + 1, dtype=np.int32)
         arrays: dict[str, NDArray[Any]] = {
             "starts": np.zeros(count + 1, dtype=np.int32),

@@ -5,14 +5,13 @@ so in a fixed order. They add by reading and writing, as ``+=`` is an atomic add
 that is around a particle are gathers, which cores may share.
 """
 
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from types import SimpleNamespace
 
 import warp as wp
 
 from cortado.device.cells import cell_functions, cell_grid_type
-from cortado.device.modules import kernel_module
+from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import FLOAT64, TypesByName
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
@@ -85,23 +84,10 @@ def separation(x_i: vector, x_j: vector, around: Around) -> vector:
     return x_ij
 
 
-@dataclass(frozen=True)
-class PackingKernels:
-    """The Warp kernels of a packing, made by `packing_kernels`."""
-
-    look_around: Any
-    linearise: Any
-    multiply: Any
-    multiply_back: Any
-    around: Any = Around
-    placed: Any = Placed
-    grid: Any = grid_type
-    equations: Any = Equations
-
-
 @cache
-def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
-    """Make the kernels of a packing for a smoothing kernel."""
+def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
+    """Make the kernels of a packing for a smoothing kernel, with the structs ``around``, ``placed``, ``grid`` and
+    ``equations`` that they take."""
     functions = smoothing_functions(smoothing, FLOAT64)
     weight, slope = functions.weight, functions.slope
     module = kernel_module(f"packing_{smoothing.name}")
@@ -214,4 +200,5 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
             moves[equations.close_others[k]] = moves[equations.close_others[k]] - both
         moves[i] = moves[i] + move
 
-    return PackingKernels(look_around, linearise, multiply, multiply_back)
+    kernels = by_name(look_around, linearise, multiply, multiply_back)
+    return SimpleNamespace(**vars(kernels), around=Around, placed=Placed, grid=grid_type, equations=Equations)

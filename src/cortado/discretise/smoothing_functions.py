@@ -9,12 +9,13 @@ divided by q is multiplied with 1 / q. Pieces are chosen between and not branche
 pair have in common is computed once.
 """
 
-from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import by_name
 from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C2, WENDLAND_C4, SmoothingKernel
 
@@ -97,23 +98,10 @@ RADIAL_FUNCTIONS = {
 """Makers of the `Radial` functions in a precision, by the kernel's name."""
 
 
-@dataclass(frozen=True)
-class SmoothingFunctions:
-    """Warp functions of W, and of parts of its derivatives, at a separation x."""
-
-    weight: Any
-    slope: Any
-    """a of grad W = a x."""
-    slope_change: Any
-    """The derivative of a along a vector u, grad a . u; with it H u = a u + (grad a . u) x."""
-    slope_gradient: Any
-    """grad a."""
-    gradient: Any
-
-
 @cache
-def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bool = False) -> SmoothingFunctions:
-    """Make Warp functions of a separation x [m]: ``weight``, ``slope``, ``slope_change``, ``slope_gradient`` and
+def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bool = False) -> SimpleNamespace:
+    """Make Warp functions of a separation x [m]: ``weight`` (W), ``slope`` (a of grad W = a x), ``slope_change`` (the
+    derivative of a along a vector u, with which H u = a u + (grad a . u) x), ``slope_gradient`` (grad a) and
     ``gradient``.
 
     Each takes 1 / h, h being the support radius [m], and the normalisation sigma [1 / m^d]. A tape can differentiate
@@ -158,4 +146,4 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bo
     def gradient(x: vector, per_h: real, sigma: real) -> vector:
         return slope(x, per_h, sigma) * x
 
-    return SmoothingFunctions(weight, slope, slope_change, slope_gradient, gradient)
+    return by_name(weight, slope, slope_change, slope_gradient, gradient)

@@ -7,6 +7,7 @@ which the first has triangles ``starts[0]`` to ``starts[1]``.
 import warp as wp
 
 from cortado.device.modules import kernel_module
+from cortado.device.precision import TypesByName
 
 DEPTH = 32
 """Number of nodes that may wait on the way down, more than a tree has levels."""
@@ -15,6 +16,9 @@ box = wp.types.vector(length=6, dtype=wp.float64)
 """The type of a box: its lower and upper corner."""
 waiting_nodes, waiting_squares = wp.types.vector(length=DEPTH, dtype=wp.int32), wp.types.vector(DEPTH, wp.float64)
 _module = kernel_module("triangle_tree")
+_kinds = {vector: "points nearest", box: "boxes", real: "squares", wp.vec3i: "names"}
+typed = TypesByName(wp.int32, {**_kinds, wp.array2d(dtype=vector): "corners"})
+"""Types of the kernels' arrays by name."""
 
 
 @wp.func
@@ -58,18 +62,8 @@ def nearest_of_triangle(p: vector, a: vector, b: vector, c: vector) -> vector:
 
 
 @wp.kernel(module=_module, enable_backward=False)
-def find_nearest(
-    first: wp.int32,
-    points: wp.array(dtype=vector),
-    boxes: wp.array(dtype=box),
-    starts: wp.array(dtype=wp.int32),
-    corners: wp.array2d(dtype=vector),
-    leaves: wp.int32,
-    reach: real,
-    # out
-    nearest: wp.array(dtype=vector),
-    squares: wp.array(dtype=real),
-):
+@typed.arrays
+def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach: real, nearest, squares):
     """Find the nearest point of the triangles, and the square of its distance; the point itself and ``reach`` squared
     where none is nearer than that."""
     i = first + wp.tid()
@@ -147,16 +141,8 @@ def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
 
 
 @wp.kernel(module=_module, enable_backward=False)
-def find_windings(
-    first: wp.int32,
-    points: wp.array(dtype=vector),
-    boxes: wp.array(dtype=box),
-    starts: wp.array(dtype=wp.int32),
-    corners: wp.array2d(dtype=vector),
-    leaves: wp.int32,
-    # out
-    windings: wp.array(dtype=wp.int32),
-):
+@typed.arrays
+def find_windings(first: int, points, boxes, starts, corners, leaves: int, windings):
     """Compute winding numbers of closed surfaces about points: 1 within one with outward normals, 0 outside."""
     i = first + wp.tid()
     p = points[i]
@@ -219,19 +205,9 @@ def some_edge_pierces(
 
 
 @wp.kernel(module=_module, enable_backward=False)
+@typed.arrays
 def find_crossings(
-    first: wp.int32,
-    points: wp.array(dtype=vector),
-    boxes: wp.array(dtype=box),
-    starts: wp.array(dtype=wp.int32),
-    corners: wp.array2d(dtype=vector),
-    leaves: wp.int32,
-    names: wp.array(dtype=wp.vec3i),
-    tolerance: real,
-    places: wp.array(dtype=wp.int32),
-    # out
-    counts: wp.array(dtype=wp.int32),
-    others: wp.array(dtype=wp.int32),
+    first: int, points, boxes, starts, corners, leaves: int, names, tolerance: real, places, counts, others
 ):
     """Find the triangles behind one that cross it, written to ``others`` from ``places`` on as far as there is room;
     all have ``names`` of vertices. ``points`` are not looked at."""

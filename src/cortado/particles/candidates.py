@@ -58,7 +58,7 @@ def scan_by_bits(discretisation: Discretisation) -> Any:
     """Make the Warp function for one lane that appends particles first ... last - 1 within reach, without particle
     ``own``."""
     separation = pair_functions(discretisation).separation
-    load = loads(discretisation.precision, discretisation.taped).vector
+    load = loads(discretisation.precision, discretisation.taped).load_vector
 
     @wp.func
     @scan_types(discretisation)
@@ -101,7 +101,7 @@ def scan_by_bits(discretisation: Discretisation) -> Any:
 def scan_by_lanes(discretisation: Discretisation) -> Any:
     """Make the Warp function for several lanes that appends particles first ... last - 1 within reach but ``own``."""
     separation = pair_functions(discretisation).separation
-    load = loads(discretisation.precision, discretisation.taped).vector
+    load = loads(discretisation.precision, discretisation.taped).load_vector
     LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
 
     @wp.func
@@ -164,7 +164,7 @@ def scan_at_once(discretisation: Discretisation) -> Any:
     cells = cell_functions(discretisation.precision)
     wrap, below, above = cells.wrap, cells.below, cells.above
     separation = pair_functions(discretisation).separation
-    load = loads(discretisation.precision, discretisation.taped).vector
+    load = loads(discretisation.precision, discretisation.taped).load_vector
     LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
     scan_rows = scan_by_rows(discretisation)
     one_of_each_row = wp.types.vector(length=ROWS, dtype=wp.int32)

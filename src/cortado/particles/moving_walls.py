@@ -21,9 +21,9 @@ from cortado.device.cells import CellSort, cell_grid_type
 from cortado.device.grid import Grid
 from cortado.device.launching import bundle, launch
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.shapes import Rows
-from cortado.particles.state import Layout
+from cortado.particles.state import Layout, zeros
 
 
 @dataclass(frozen=True)
@@ -47,21 +47,17 @@ class WallArrays(Rows):
     """(b,) number of the flat face that each is behind, of those that mirror the fluid, or -1"""
 
 
-@dataclass(frozen=True)
-class Poses:
-    """The positions and rotations of solids, for each scene of a batch, or tangents of these."""
-
-    positions: wp.array
-    """(members, solids) vectors, of the middles [m]"""
-    turns: wp.array
-    """(members, solids) matrices, from the frame of a solid to space; of tangents vectors: the rotation vector by which
-    solids turn further, over the change"""
-
-    @classmethod
-    def zeros(cls, members: int, solids: int, precision: Precision, device: Any, tangents: bool = False) -> "Poses":
-        """Allocate poses that are still to be written, or their ``tangents``."""
-        kinds = precision.vector, precision.vector if tangents else matrix_of(precision)
-        return cls(*(wp.zeros((members, solids), dtype=kind, device=device) for kind in kinds))
+def pose_arrays(members: int, solids: int, precision: Precision, device: Any) -> dict[str, wp.array]:
+    """Make arrays (members, solids) of the poses of solids before and after a step, with tangents, by kernels' names:
+    positions of their middles [m], rotations from the frame of a solid to space, and scales. The tangent of a rotation
+    is the rotation vector by which a solid turns further, over the change."""
+    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    kinds = {"before": vector, "turns_before": matrix, "after": vector, "turns": matrix}
+    kinds |= dict.fromkeys(("before_dot", "turned_before_dot", "after_dot", "turned_dot"), vector)
+    kinds |= {"scales": real, "scales_dot": real}
+    made = zeros({name: ((members, solids), kind) for name, kind in kinds.items()}, device)
+    made["scales"].fill_(1.0)
+    return made
 
 
 @cache
@@ -119,6 +115,9 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
     length_of: Any = bundle(time_step=real, time_step_dot=real)
     vector_dots = {f"wall_{name}_dot": vector for name in ("positions", "velocities", "turns")}
     dots_of: Any = bundle(**vector_dots, wall_growths_dot=real)
+    bundles = {own_of: "of", sizes_of: "sizes", length_of: "length"}
+    poses = {wp.array2d(dtype=vector): "before after turned", wp.array2d(dtype=matrix): "turns turns_before"}
+    typed = TypesByName(real, {wp.int32: "order starts shifted", vector: "x wall_velocities", **bundles, **poses})
 
     @wp.func
     def place_of(b: int, scale: real, of: own_of) -> vector:
@@ -131,36 +130,17 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         return scale * (of.own[b] + of.own_feet[b])
 
     @wp.kernel(module=module, enable_backward=False)
-    def place(
-        count: int,
-        of: own_of,
-        positions: wp.array2d(dtype=vector),
-        turns: wp.array2d(dtype=matrix),
-        sizes: sizes_of,
-        # out
-        x: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def place(count: int, of, after, turns, sizes, x):
         j = wp.tid()
         member = j // count
         b = j - member * count
         k = of.own_solids[b]
-        x[j] = positions[member, k] + turns[member, k] * place_of(b, sizes.scales[member, k], of)
+        x[j] = after[member, k] + turns[member, k] * place_of(b, sizes.scales[member, k], of)
 
     @wp.kernel(module=module, enable_backward=False)
-    def write(
-        count: int,
-        first: int,
-        order: wp.array(dtype=wp.int32),
-        time_step: wp.array(dtype=real),
-        of: own_of,
-        before: wp.array2d(dtype=vector),
-        turns_before: wp.array2d(dtype=matrix),
-        turns: wp.array2d(dtype=matrix),
-        sizes: sizes_of,
-        x: wp.array(dtype=vector),
-        # out
-        walls: walls_of,
-    ):
+    @typed.arrays
+    def write(count: int, first: int, order, time_step, of, before, turns_before, turns, sizes, x, walls: walls_of):
         p = wp.tid()
         j = order[p]
         member = j // count
@@ -179,31 +159,27 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         walls.wall_faces[first + p] = of.own_faces[b]
 
     @wp.kernel(module=module, enable_backward=False)
-    def shift(
-        first: int,
-        starts: wp.array(dtype=wp.int32),
-        # out
-        shifted: wp.array(dtype=wp.int32),
-    ):
+    @typed.arrays
+    def shift(first: int, starts, shifted):
         c = wp.tid()
         shifted[c] = starts[c] + first
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def write_tangent(
         count: int,
         first: int,
-        order: wp.array(dtype=wp.int32),
-        length: length_of,
-        of: own_of,
-        turns_before: wp.array2d(dtype=matrix),
-        turns: wp.array2d(dtype=matrix),
-        sizes: sizes_of,
-        before_dot: wp.array2d(dtype=vector),
-        turned_before_dot: wp.array2d(dtype=vector),
-        after_dot: wp.array2d(dtype=vector),
-        turned_dot: wp.array2d(dtype=vector),
-        wall_velocities: wp.array(dtype=vector),
-        # out
+        order,
+        length,
+        of,
+        turns_before,
+        turns,
+        sizes,
+        before_dot,
+        turned_before_dot,
+        after_dot,
+        turned_dot,
+        wall_velocities,
         walls: dots_of,
     ):
         p = wp.tid()
@@ -237,30 +213,11 @@ class MovingWalls:
         """Take the ``walls`` of ``solids`` moving solids; in the search's arrays they have numbers from ``first``
         on."""
         precision, device, count = layout.precision, layout.device, len(walls)
-        sizes = (layout.members, solids, precision, device)
-        self.sizes, each = sizes_type(precision)(), {"dtype": precision.real, "device": device}
-        """How large they are, which others may write."""
-        self.sizes.scales, self.sizes.scales_dot = (
-            make((layout.members, solids), **each) for make in (wp.ones, wp.zeros)
-        )
+        self.solids, self.named = solids, pose_arrays(layout.members, solids, precision, device)
+        """How many solids, and their poses by the names of kernels' arguments, which somebody else writes."""
+        self.sizes = sizes_type(precision)()
+        self.sizes.scales, self.sizes.scales_dot = self.named["scales"], self.named["scales_dot"]
         self.sizes.power = precision.real(dimension - 1)
-        self.solids, self.before, self.after = solids, Poses.zeros(*sizes), Poses.zeros(*sizes)
-        """How many solids, and their poses before and after a step, which somebody else writes."""
-        self.before_dot, self.after_dot = (Poses.zeros(*sizes, tangents=True) for _ in range(2))
-        """The tangents of these, likewise."""
-        self.named: dict[str, wp.array] = {
-            "before": self.before.positions,
-            "turns_before": self.before.turns,
-            "after": self.after.positions,
-            "turns": self.after.turns,
-            "before_dot": self.before_dot.positions,
-            "turned_before_dot": self.before_dot.turns,
-            "after_dot": self.after_dot.positions,
-            "turned_dot": self.after_dot.turns,
-            "scales": self.sizes.scales,
-            "scales_dot": self.sizes.scales_dot,
-        }
-        """Poses and sizes as kernels call them, and their tangents."""
         self.each = [{name: array[:, k] for name, array in self.named.items()} for k in range(solids)]
         """Of each solid, views (members,) of these."""
         self.slides = wp.zeros(solids, dtype=precision.vector, device=device)
@@ -290,8 +247,8 @@ class MovingWalls:
 
     def write(self, time_step: wp.array, walls: Mapping[str, wp.array]) -> None:
         """Write the wall particles to the arrays of a search, given the length (members,) of the step [s]."""
-        (place, write, shift, _), after = self._kernels, self.after
-        launch(place, self._all, self._device, self._own, self.named, positions=after.positions)
+        place, write, shift, _ = self._kernels
+        launch(place, self._all, self._device, self._own, self.named)
         self._sort(self._own["x"])
         starts, shifted = self._sort.grid.starts, self.grid.starts
         launch(shift, starts.size, self._device, first=self._first, starts=starts, shifted=shifted)
@@ -300,10 +257,6 @@ class MovingWalls:
 
     def write_tangent(self, time_step: wp.array, time_step_dot: wp.array, walls: Mapping[str, wp.array]) -> None:
         """Write the tangents of the wall particles that `write` has written last."""
-        known = {
-            "first": self._first,
-            "order": self._sort.order,
-            "time_step": time_step,
-            "time_step_dot": time_step_dot,
-        }
+        lengths = {"time_step": time_step, "time_step_dot": time_step_dot}
+        known = {"first": self._first, "order": self._sort.order, **lengths}
         launch(self._kernels[3], self._all, self._device, self._own, known, self.named, walls)

@@ -13,38 +13,26 @@ from typing import Any
 import warp as wp
 
 from cortado.device.lanes import lane_functions, set_lanes
-from cortado.device.modules import kernel_module, kind_of
+from cortado.device.modules import by_name, kernel_module, kind_of
 from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
 from cortado.particles.mirrors import mirror_functions
 
 
-@dataclass(frozen=True)
-class Loads:
-    """Warp functions that read one element of an array, at indices that are not negative."""
-
-    neighbour: Any
-    """Reads a list [neighbour, particle]."""
-    vector: Any
-    """Reads an array of vectors, one after the other in memory."""
-    number: Any
-    """Reads an array of numbers, one after the other in memory."""
-    six: Any
-    """Reads an array of six numbers each, one after the other in memory: in three loads on a GPU, and not in six."""
-
-
 @cache
-def loads(precision: Precision, taped: bool) -> Loads:
-    """Make the functions that read array elements in a precision; a tape can differentiate ``taped`` ones."""
+def loads(precision: Precision, taped: bool) -> SimpleNamespace:
+    """Make the Warp functions that read one element of an array, at indices that are not negative: ``load_neighbour``
+    of a list [neighbour, particle], and ``load_vector``, ``load_number`` and ``load_six`` of an array of such, one
+    after the other in memory. Six numbers take three loads on a GPU. A tape can differentiate ``taped`` functions."""
     return _of_warp(precision) if taped else _direct(precision)
 
 
-def _of_warp(precision: Precision) -> Loads:
+def _of_warp(precision: Precision) -> SimpleNamespace:
     real, vector, six = precision.real, precision.vector, precision.six
 
     @wp.func
-    def neighbour(lists: wp.array2d(dtype=wp.int32), k: int, i: int) -> int:
+    def load_neighbour(lists: wp.array2d(dtype=wp.int32), k: int, i: int) -> int:
         return lists[k, i]
 
     @wp.func
@@ -59,10 +47,10 @@ def _of_warp(precision: Precision) -> Loads:
     def load_six(a: wp.array(dtype=six), j: int) -> six:
         return a[j]
 
-    return Loads(neighbour, load_vector, load_number, load_six)
+    return by_name(load_neighbour, load_vector, load_number, load_six)
 
 
-def _direct(precision: Precision) -> Loads:
+def _direct(precision: Precision) -> SimpleNamespace:
     real, vector, six = precision.real, precision.vector, precision.six
     two = {4: "float2", 8: "double2"}[precision.bytes]
     by_two = f"const {two}* p = (const {two}*)(a.data + j); {two} u = p[0], v = p[1], w = p[2]; "
@@ -70,7 +58,7 @@ def _direct(precision: Precision) -> Loads:
     place = "(long long)i * lists.strides[1] + (long long)k * lists.strides[0]"
 
     @wp.func_native(f"return *(const int*)((const char*)lists.data + {place});")
-    def neighbour(lists: wp.array2d(dtype=wp.int32), k: int, i: int) -> int: ...
+    def load_neighbour(lists: wp.array2d(dtype=wp.int32), k: int, i: int) -> int: ...
 
     @wp.func_native("return a.data[j];")
     def load_vector(a: wp.array(dtype=vector), j: int) -> vector: ...
@@ -81,66 +69,7 @@ def _direct(precision: Precision) -> Loads:
     @wp.func_native(f"#if defined(__CUDA_ARCH__)\n{by_two}\n#else\nreturn a.data[j];\n#endif\n")
     def load_six(a: wp.array(dtype=six), j: int) -> six: ...
 
-    return Loads(neighbour, load_vector, load_number, load_six)
-
-
-@cache
-def wall_functions(precision: Precision, taped: bool, neighbourhood: Any) -> dict[str, Any]:
-    """Make Warp functions, by name, that read the data of a wall particle by its number b and the neighbourhood."""
-    real, vector = precision.real, precision.vector
-    load = loads(precision, taped)
-    load_vector, load_number = load.vector, load.number
-
-    @wp.func
-    def wall_position(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_positions, b)
-
-    @wp.func
-    def wall_weight(b: int, s: neighbourhood) -> real:
-        return load_number(s.wall_weights, b)
-
-    @wp.func
-    def wall_grip(b: int, s: neighbourhood) -> real:
-        return load_number(s.wall_grips, b)
-
-    @wp.func
-    def wall_foot(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_feet, b)
-
-    @wp.func
-    def wall_velocity(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_velocities, b)
-
-    @wp.func
-    def wall_solid(b: int, s: neighbourhood) -> int:
-        return s.wall_solids[b]
-
-    @wp.func
-    def weight_in(b: int, solid: int, s: neighbourhood) -> real:
-        weight = real(0.0)
-        if s.wall_solids[b] == solid:
-            weight = load_number(s.wall_weights, b)
-        return weight
-
-    @wp.func
-    def wall_position_dot(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_positions_dot, b)
-
-    @wp.func
-    def wall_velocity_dot(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_velocities_dot, b)
-
-    @wp.func
-    def wall_turn_dot(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_turns_dot, b)
-
-    @wp.func
-    def wall_growth_dot(b: int, s: neighbourhood) -> real:
-        return load_number(s.wall_growths_dot, b)
-
-    own = (wall_position, wall_weight, wall_grip, wall_foot, wall_velocity, wall_solid, weight_in)
-    dots = (wall_position_dot, wall_velocity_dot, wall_turn_dot, wall_growth_dot)
-    return {one.func.__name__: one for one in (*own, *dots)}
+    return by_name(load_neighbour, load_vector, load_number, load_six)
 
 
 UNROLL = 4
@@ -306,8 +235,7 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x);
     ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
     per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
-    list of i), ``several`` (the numbers of `UNROLL` of them from the k-th on), ``wall_position`` and others, which load
-    what a wall particle has, ``weight_in`` (its weight if it is of the given moving solid, and 0 if not), those of
+    list of i), ``several`` (the numbers of `UNROLL` of them from the k-th on), those of `loads` and of
     `mirror_functions`; and ``vectors``, ``numbers`` and ``sixes``, which load what several neighbours have before any
     of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
     """
@@ -318,7 +246,8 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     smooth_slope_gradient = smooth.slope_gradient
     reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
     load = loads(discretisation.precision, discretisation.taped)
-    load_neighbour, load_vector, load_number, load_six = load.neighbour, load.vector, load.number, load.six
+    load_neighbour, load_vector, load_number = load.load_neighbour, load.load_vector, load.load_number
+    load_six = load.load_six
     six, six_rows = discretisation.precision.six, wp.types.matrix(shape=(UNROLL, 6), dtype=real)
     rows = wp.types.matrix(shape=(UNROLL, 3), dtype=real)
     row = wp.types.vector(length=UNROLL, dtype=real)
@@ -409,10 +338,10 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
         factor,
         factor_gradient,
     )
-    own = (*of_kernel, neighbour, several, vectors, numbers, sixes)
+    own = by_name(*of_kernel, neighbour, several, vectors, numbers, sixes)
     return SimpleNamespace(
         separation=nearest_image if discretisation.periodic else difference,
-        **{one.func.__name__: one for one in own},
-        **wall_functions(discretisation.precision, discretisation.taped, neighbourhood),
+        **vars(own),
+        **vars(load),
         **mirror_functions(discretisation.precision, discretisation.moving, neighbourhood),
     )

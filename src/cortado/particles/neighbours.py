@@ -87,18 +87,16 @@ def image_kernel(discretisation: Discretisation) -> Any:
     pair, load = pair_functions(discretisation), loads(discretisation.precision, discretisation.taped)
     separation, sees, shows, sides = pair.separation, pair.sees, pair.shows, pair.sides
     reflection, turned, last_reflection = pair.reflection, pair.turned, pair.last_reflection
-    load_vector, neighbour, REFLECTIONS = load.vector, pair.neighbour, wp.constant(reflections(discretisation.moving))
+    load_vector, neighbour, REFLECTIONS = (
+        load.load_vector,
+        pair.neighbour,
+        wp.constant(reflections(discretisation.moving)),
+    )
     LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
 
     @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
-    def fill_images(
-        s: neighbourhood,
-        bad_step: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vector),
-        # in and out
-        all_count: wp.array(dtype=wp.int32),
-        needed: wp.array(dtype=wp.int32),
-    ):
+    @TypesByName(wp.int32, {neighbourhood: "s", vector: "x"}).arrays
+    def fill_images(s, bad_step, x, all_count, needed):
         """Append images to lists; ``needed`` becomes the longest list, as in `fill_kernel`."""
         i = s.first + wp.tid() // LANES
         x_i, limit, found = x[i], s.reach * s.reach, int(s.count[i])
@@ -169,10 +167,8 @@ class NeighbourSearch:
         self._mirrored = mirrored
         self._sort = CellSort(grid, layout.particles, precision, device, layout.members)
         self.order = self._sort.order
-        self.fluid_count = wp.zeros(particles, dtype=wp.int32, device=device)
-        self.filling = wp.zeros(particles, dtype=wp.int32, device=device)
-        self.count = wp.zeros(particles, dtype=wp.int32, device=device)
-        self.all_count = wp.zeros(particles, dtype=wp.int32, device=device)
+        lists = (wp.zeros(particles, dtype=wp.int32, device=device) for _ in range(4))
+        self.fluid_count, self.filling, self.count, self.all_count = lists
         self._launch = KernelLauncher(particles, device, record_tape=False)
         self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
         self._seen = HostCopy(self._needed)
@@ -230,30 +226,18 @@ class NeighbourSearch:
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:
         """List the neighbours of sorted positions (members n,) [m], but none where the ``bad_step`` (members,) of a
         scene is not -1; `needed` tells whether the lists were long enough."""
-        self._launch(
-            self._fill,
-            s=neighbourhood,
-            grid=self._sort.grid,
-            wall_grid=self._wall_sort.grid,
-            moving_grid=self._wall_sort.grid if self.moving is None else self.moving.grid,
-            near_walls=self._near_walls,
-            bad_step=bad_step,
-            x=positions,
-            fluid_count=self.fluid_count,
-            filling=self.filling,
-            count=self.count,
-            all_count=self.all_count,
-            needed=self._needed,
-        )
+        given = {"s": neighbourhood, "bad_step": bad_step, "x": positions, "needed": self._needed}
+        grids = {"grid": self._sort.grid, "wall_grid": self._wall_sort.grid, "near_walls": self._near_walls}
+        lists = {
+            "fluid_count": self.fluid_count,
+            "filling": self.filling,
+            "count": self.count,
+            "all_count": self.all_count,
+        }
+        moving = self._wall_sort.grid if self.moving is None else self.moving.grid
+        self._launch(self._fill, given, lists, grids, moving_grid=moving)
         if self._mirrored:
-            self._launch(
-                self._fill_images,
-                s=neighbourhood,
-                bad_step=bad_step,
-                x=positions,
-                all_count=self.all_count,
-                needed=self._needed,
-            )
+            self._launch(self._fill_images, given, lists)
 
     @property
     def needed(self) -> int:

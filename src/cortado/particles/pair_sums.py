@@ -151,13 +151,20 @@ OVER_WALLS = """\
     for _place in range(s.fluid_count[i] + _lane(), s.count[i], _LANES):
         _b = _neighbour(_place, i, s)
         _w_b = {weight}
-        _x_ij = _separation(_x_i, _wall_position(_b, s), s)
+        _x_ij = _separation(_x_i, _load_vector(s.wall_positions, _b), s)
         {more}
         {body}
 """
-ALL, RUBBING = "_wall_weight(_b, s)", "_wall_grip(_b, s)"
+ALL, RUBBING = "_load_number(s.wall_weights, _b)", "_load_number(s.wall_grips, _b)"
 """Texts of the weights of wall particles, and of those along which fluid does not slip."""
-MOVING = {"v": "_wall_velocity(_b, s)", "x_dot": "_wall_position_dot(_b, s)", "v_dot": "_wall_velocity_dot(_b, s)"}
+PLACE, FOOT = "_load_vector(s.wall_positions, _b)", "_load_vector(s.wall_feet, _b)"
+TURN, GROWTH = "_load_vector(s.wall_turns_dot, _b)", "_load_number(s.wall_growths_dot, _b)"
+"""Texts of what else a wall particle has."""
+MOVING = {
+    "v": "_load_vector(s.wall_velocities, _b)",
+    "x_dot": "_load_vector(s.wall_positions_dot, _b)",
+    "v_dot": "_load_vector(s.wall_velocities_dot, _b)",
+}
 """Texts of the entries of arrays that wall particles have where they move."""
 
 Function = Callable[..., Any]
@@ -209,12 +216,12 @@ def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str
     both."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
     of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays}
-    turned = "_wall_turn_dot(_b, s)" if d.moving else zero(d.precision.vector, d)
-    more = {"foot": "_foot = _wall_foot(_b, s)", "turn_dot": f"_turn_dot = {turned}"}
+    turned = TURN if d.moving else zero(d.precision.vector, d)
+    more = {"foot": f"_foot = {FOOT}", "turn_dot": f"_turn_dot = {turned}"}
     return OVER_WALLS.format(
         weight=weight,
         more=_lines(8, (text for name, text in more.items() if name in known)),
-        body=_lines(8, body({**of_b, "x": "_wall_position(_b, s)"})),
+        body=_lines(8, body({**of_b, "x": PLACE})),
     )
 
 
@@ -286,6 +293,22 @@ def _lines(indent: int, lines: Iterable[str]) -> str:
     return ("\n" + " " * indent).join(lines)
 
 
+def _summing(
+    d: Discretisation,
+    loops: Callable[[Term, Term], str],
+    walls: Function | None = None,
+    module: Any = None,
+    grows: Any = None,
+) -> Decorator:
+    """Return a decorator that turns a term into the sum over some ``loops``, given that term and that of walls."""
+
+    def make(function: Function) -> Any:
+        term, wall = Term.of(function), Term.of(walls or function)
+        return _made(term, d, loops(term, wall), wall, module, grows)
+
+    return make
+
+
 def pair_sum(
     d: Discretisation, walls: Function | None = None, ahead: bool = True, rubs: bool = False, grows: Any = None
 ) -> Decorator:
@@ -294,40 +317,23 @@ def pair_sum(
     ``rubs`` has nothing of walls that slip freely. A tangent is given the sum that it is of, which ``grows`` with the
     weights of walls: their tangents count as many times as the term of that."""
 
-    def make(function: Function) -> Any:
-        term, wall = Term.of(function), Term.of(walls or function)
+    def loops(term: Term, wall: Term) -> str:
         _check_walls(wall, term)
-        return _made(
-            term,
-            d,
-            _over_fluid(term, d, ahead) + _over_walls(wall, d, grows, RUBBING if rubs else ALL),
-            wall,
-            grows=grows,
-        )
+        return _over_fluid(term, d, ahead) + _over_walls(wall, d, grows, RUBBING if rubs else ALL)
 
-    return make
+    return _summing(d, loops, walls, grows=grows)
 
 
 def fluid_sum(d: Discretisation, ahead: bool = True, module: Any = None) -> Decorator:
     """Return a decorator that turns the term of a pair into its sum over the fluid alone. ``module`` is the Warp module
     of the function, if not that of the file."""
-
-    def make(function: Function) -> Any:
-        term = Term.of(function)
-        return _made(term, d, _over_fluid(term, d, ahead), term, module)
-
-    return make
+    return _summing(d, lambda term, _: _over_fluid(term, d, ahead), module=module)
 
 
 def image_sum(d: Discretisation) -> Decorator:
     """Return a decorator that turns the term of a pair into its sum over the images of the fluid in mirroring walls
     (`cortado.particles.neighbourhood`)."""
-
-    def make(function: Function) -> Any:
-        term = Term.of(function)
-        return _made(term, d, over_images(d, term.of_neighbours, _adding_up(term)), term)
-
-    return make
+    return _summing(d, lambda term, _: over_images(d, term.of_neighbours, _adding_up(term)))
 
 
 def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
@@ -342,22 +348,17 @@ def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
 
 def wall_sum(d: Discretisation, grows: Any = None, weight: str = ALL) -> Decorator:
     """Return a decorator that turns a term into its sum over the walls alone, with the text of a ``weight``."""
-
-    def make(function: Function) -> Any:
-        term = Term.of(function)
-        return _made(term, d, _over_walls(term, d, grows, weight), term, grows=grows)
-
-    return make
+    return _summing(d, lambda _, wall: _over_walls(wall, d, grows, weight), grows=grows)
 
 
 def solid_sum(d: Discretisation) -> Decorator:
     """Return a decorator that turns a term into its sum over the walls of one moving ``solid``, told by its number."""
-    return wall_sum(d, weight="_weight_in(_b, solid, s)")
+    return wall_sum(d, weight=f"wp.where(s.wall_solids[_b] == solid, {ALL}, _real(0.0))")
 
 
 def mirror_sum(d: Discretisation, grows: Any = None) -> Decorator:
     """Return a decorator that turns a term into its sum over the walls that mirror about a particle (``mirrors``)."""
-    return wall_sum(d, grows, "wp.where(_mirrors_in(_b, mirrors, s), _wall_weight(_b, s), _real(0.0))")
+    return wall_sum(d, grows, f"wp.where(_mirrors_in(_b, mirrors, s), {ALL}, _real(0.0))")
 
 
 def _check_walls(wall: Term, term: Term) -> None:
@@ -389,7 +390,7 @@ def _over_walls(wall: Term, d: Discretisation, grows: Any, weight: str) -> str:
         if grows is None or not d.moving:
             return []
         lines = added("_grown_term", grows.wall, "_w_b * _growth", of_b)
-        return ["_growth = _wall_growth_dot(_b, s)", "if _growth != _real(0.0):", *(f"    {line}" for line in lines)]
+        return [f"_growth = {GROWTH}", "if _growth != _real(0.0):", *(f"    {line}" for line in lines)]
 
     def added(called: str, term: Term, weight: str, of_b: Mapping[str, str]) -> list[str]:
         call = f"{_terms(term)} = {called}({term.seen_from_i(of_b, '-1')})"

@@ -183,6 +183,15 @@ def sum_kernels(
     )
 
 
+def _arrays(read: Types, written: Types, taped: bool) -> tuple[dict[str, Any], list[str]]:
+    """Return a kernel's arguments for arrays, and lines that name those in bundles."""
+    if taped or len(read) + len(written) <= MOST_ARRAYS:
+        return {each: wp.array(dtype=kind) for each, kind in {**read, **written}.items()}, []
+    groups = {label: kinds for label, kinds in (("at", read), ("to", written)) if kinds}
+    lines = [f"{each} = {label}.{each}" for label, kinds in groups.items() for each in kinds]
+    return {label: bundle(**kinds) for label, kinds in groups.items()}, lines
+
+
 class _Arguments:
     """The arguments of a kernel that is being made, collected as the function's parameters are read."""
 
@@ -232,12 +241,8 @@ class _Arguments:
         body = [f"i = s.first + wp.tid(){' // LANES' * bool(self._sums)}" if self._around else "i = wp.tid()"]
         if self._scenes or self._numbered:
             body.append(f"member = i // {'s.' * bool(self._around)}particles")
-        if len(own) + len(written) > MOST_ARRAYS and not module.options["enable_backward"]:
-            arrays = {label: bundle(**kinds) for label, kinds in (("at", own), ("to", written)) if kinds}
-            body += [f"{each} = {label}.{each}" for label, kinds in (("at", own), ("to", written)) for each in kinds]
-        else:
-            arrays = {each: wp.array(dtype=kind) for each, kind in (own | written).items()}
-        body += [*self._calls, *(["if lane() > 0:", "    return"] if self._sums else []), *lines]
+        arrays, names = _arrays(own, written, module.options["enable_backward"])
+        body += [*names, *self._calls, *(["if lane() > 0:", "    return"] if self._sums else []), *lines]
         body += [f"{array}[i] = {f'{other}[i] + ' * bool(other)}{value}" for array, other, value in stored]
         types = {**first, **self._numbers, **of_scenes, **arrays}
         known = {f"_sum_{n}": one.function for n, one in enumerate(self._sums)}
@@ -397,13 +402,8 @@ class _Pointwise:
     def _kernel(self, others: Types, more: Types, lines: Iterable[str]) -> tuple[Types, Iterable[str]]:
         """Types and lines of a kernel with so many other arrays and ``more`` arguments."""
         own, body = {name: kind for name, kind in self._arrays.items() if name not in others}, ["i = wp.tid()"]
-        if len(own) + len(others) > MOST_ARRAYS and not self._taped:
-            groups = {"at": own, "to": others}
-            arrays: Types = {label: bundle(**kinds) for label, kinds in groups.items() if kinds}
-            body += [f"{each} = {label}.{each}" for label, kinds in groups.items() for each in kinds]
-        else:
-            arrays = {name: wp.array(dtype=kind) for name, kind in (*own.items(), *others.items())}
-        body += ["_row = -1"] if self._kinds.read else []
+        arrays, names = _arrays(own, others, self._taped)
+        body += [*names, *(["_row = -1"] if self._kinds.read else [])]
         return {"particles": int, **self._numbers, **arrays, **more}, [*body, *lines]
 
     def _change(self, name: str, kind: Any) -> Any:

@@ -103,10 +103,13 @@ def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array
 
 
 def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
-    """Return the memory of numbers, vectors or matrices as an array of numbers of a shape, which keeps it alive."""
+    """Return the memory of numbers, vectors or matrices, and that of their adjoints, as an array of numbers of a shape,
+    which keeps it alive."""
     real = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
     view = wp.array(ptr=array.ptr, dtype=real, shape=shape, device=array.device)
     view._ref = array
+    if array.requires_grad:
+        view.grad = components(array.grad, shape)
     return view
 
 
@@ -366,9 +369,10 @@ class Layout:
         """Make a function that sums numbers, vectors or matrices of a Warp type over the particles of each scene."""
         return sum_of(dtype, self.particles, self.device, self.members)
 
-    def arrays(self, suffix: str = "", **kinds: Any) -> dict[str, wp.array]:
+    def arrays(self, suffix: str = "", requires_grad: bool = False, **kinds: Any) -> dict[str, wp.array]:
         """Make arrays (n,) over all particles, all 0, of Warp types by name, to which a ``suffix`` is added."""
-        return zeros({f"{name}{suffix}": (self.all_particles, kind) for name, kind in kinds.items()}, self.device)
+        sizes = {f"{name}{suffix}": (self.all_particles, kind) for name, kind in kinds.items()}
+        return zeros(sizes, self.device, requires_grad)
 
     def state(self, fields: tuple[StateField, ...], requires_grad: bool = False) -> State:
         """Make a state of these fields, all 0."""

@@ -32,15 +32,15 @@ import warp as wp
 
 from cortado.device.launching import Named, bundle
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import add
 from cortado.particles.made_derivatives import dot_of
 from cortado.particles.mirrors import ALL_WALLS
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
-from cortado.particles.pair_sums import Term, scope_of
+from cortado.particles.pair_sums import ALL, FOOT, GROWTH, MOVING, PLACE, RUBBING, TURN, Term, scope_of
 from cortado.particles.particle_kernels import MADE, made_kernel
-from cortado.particles.state import Layout
+from cortado.particles.state import Layout, zeros
 
 NAMES = ("force", "torque", "force_before", "torque_before", "growth")
 """f, t, f_0, t_0 and g / sigma."""
@@ -54,11 +54,11 @@ _x_i = at.x[i]
     {own}
     for _place in range(s.fluid_count[i], s.count[i]):
         _b = _neighbour(_place, i, s)
-        if solid == _ALL or _wall_solid(_b, s) == solid:
-            _w_b = {weight}(_b, s)
-            _x_b = _wall_position(_b, s)
-            _v_b = _wall_velocity(_b, s)
-            _foot = _wall_foot(_b, s)
+        if solid == _ALL or s.wall_solids[_b] == solid:
+            _w_b = {weight}
+            _x_b = {place}
+            _v_b = {velocity}
+            _foot = {foot}
             _x_ij = _separation(_x_i, _x_b, s)
             _mirrored = wp.where(_mirrors_in(_b, _mirrors, s), _real(1.0), _real(0.0))
             {body}"""
@@ -102,7 +102,7 @@ class _Loop:
         entries = [f"_{name}_i = at.{name}[i]" for name in self.read if name not in given]
         return LOOP.format(
             own="\n    ".join((*entries, *own)),
-            weight="_wall_grip" if self.rubs else "_wall_weight",
+            **{"weight": RUBBING if self.rubs else ALL, "place": PLACE, "velocity": MOVING["v"], "foot": FOOT},
             body="\n            ".join(body),
         )
 
@@ -163,15 +163,15 @@ def _kernels(of: WallTerm) -> Kernels:
 
     dots = {name: f"_{name}_i_dot" for name in kinds}
     changes = {
-        "x_ij": f"{dots['x']} - {'_wall_position_dot(_b, s)' if d.moving else zero}",
-        "v_ij": f"{dots.get('v')} - {'_wall_velocity_dot(_b, s)' if d.moving else zero}",
-        "foot": f"wp.cross({'_wall_turn_dot(_b, s)' if d.moving else zero}, _foot)",
+        "x_ij": f"{dots['x']} - {MOVING['x_dot'] if d.moving else zero}",
+        "v_ij": f"{dots.get('v')} - {MOVING['v_dot'] if d.moving else zero}",
+        "foot": f"wp.cross({TURN if d.moving else zero}, _foot)",
         **{f"{name}_i": dots[name] for name in kinds if name != "x"},
     }
     moved = [name for name in term.parameters if name in changes]
     terms = [product(name) for name in moved]
     if d.moving:  # W is linear in the unit vector, of which its gradient is all that the wall does
-        terms.append(f"_wall_growth_dot(_b, s) * _by_{of.bar}_i[_k]")
+        terms.append(f"{GROWTH} * _by_{of.bar}_i[_k]")
     along = [
         *(f"_change_{name} = {changes[name]}" for name in moved),
         "for _k in range(_three):",
@@ -215,9 +215,8 @@ class SolidShares:
         solids = range(0 if walls is None else walls.solids)
         self._arrays = [{name: wp.zeros(size, dtype=kinds[name], device=device) for name in NAMES} for _ in solids]
         self._sums = [{name: layout.sum_of(kinds[name]) for name in NAMES} for _ in solids]
-        self._whole = [
-            {name: wp.zeros(layout.members, dtype=kinds[name], device=device) for name in WHOLE} for _ in solids
-        ]
+        whole = {name: (layout.members, kinds[name]) for name in WHOLE}
+        self._whole = [zeros(whole, device) for _ in solids]
         """What was given by others than particles."""
 
     def add(
@@ -233,15 +232,8 @@ class SolidShares:
         ``over`` the walls of one solid, to that one alone."""
         if self._walls is None:
             return
-        sizes = {"scales": self._walls.sizes.scales, "power": self._walls.sizes.power}
-        known = {
-            **self._walls.named,
-            **sizes,
-            "slides": self._walls.slides,
-            "constants": self._pair(*constants),
-            "k": 0,
-            "rounds": None,
-        }
+        own = {"power": self._walls.sizes.power, "slides": self._walls.slides, "constants": self._pair(*constants)}
+        known = {**self._walls.named, **own, "k": 0, "rounds": None}
         for solid in range(self._walls.solids):
             if over in (ALL_WALLS, solid):
                 launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
@@ -298,22 +290,27 @@ def solid_kernel(
     bars = bundle(**share_kinds(precision), time_step=real)
     LOOPED = wp.constant(looped)
 
+    poses = {wp.array2d(dtype=vector): "after", wp.array2d(dtype=matrix): "turns", wp.array2d(dtype=real): "scales"}
+    typed = TypesByName(
+        real, {neighbourhood: "s", wp.int32: "rounds", vector: "slides", seen: "at", bars: "bar", **poses}
+    )
+
+    @typed.arrays
     def share(
-        s: neighbourhood,
+        s,
         k: int,
-        rounds: wp.array(dtype=wp.int32),
+        rounds,
         solid: int,
         constants: pair,
-        time_step: wp.array(dtype=real),
-        after: wp.array2d(dtype=vector),
-        turns: wp.array2d(dtype=matrix),
-        turns_before: wp.array2d(dtype=matrix),
-        scales: wp.array2d(dtype=real),
-        slides: wp.array(dtype=vector),
+        time_step,
+        after,
+        turns,
+        turns_before,
+        scales,
+        slides,
         power: real,
-        at: seen,
-        # in and out
-        bar: bars,
+        at,
+        bar,
     ):
         i = s.first + wp.tid()
         member = i // s.particles

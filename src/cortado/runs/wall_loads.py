@@ -176,8 +176,7 @@ class WallLoads:
         if len(arrays) == 1:
             return arrays[0]
         total = self._vectors[name]
-        if arrays:  # else it is 0 from the start
-            total.zero_()
+        total.zero_()
         for array in arrays:
             add(array, total)
         return total
@@ -201,7 +200,7 @@ class SolidLoadQuantity:
         """Return F and T (scenes,), six numbers each, on the device, which the next call overwrites."""
         solver, number, vector = self.solver, self.solid.number, self.solver.layout.precision.vector
         moving = None if number < 0 else solver.search.moving
-        moved = self._no_middles if moving is None else moving.after.positions
+        moved = self._no_middles if moving is None else moving.named["after"]
         middles = {"rest": vector(*self.solid.middle), "number": number, "moved": moved}
         middles["period"] = vector(*solver.system.periods)
         found, own = (
@@ -227,7 +226,7 @@ class SolidLoadQuantity:
         number, cell, forces = self.solid.number, self.loads.cell, self._forces(at, sums)
         forces_dot = vectors(self.loads.tangent(sums.context, at.push, dot.push, along, number))
         moving = self.solver.search.moving
-        shift = self._each(None if moving is None else moving.after_dot.positions, np.zeros(3))
+        shift = self._each(None if moving is None else moving.named["after_dot"], np.zeros(3))
         turned = np.cross(dot["x"] - shift, forces) + np.cross(self._arms(at), forces_dot)
         turned += cell * dot["m"][:, None] * vectors(self.loads.twists(sums.context, number))
         turned += cell * at["m"][:, None] * vectors(self.loads.twists_tangent(sums.context, along, number))
@@ -256,7 +255,7 @@ class SolidLoadQuantity:
     def _arms(self, at: Particles) -> NDArray:
         """Return the arms (n, 3) [m] from the solid to particles, along a periodic axis the shorter way."""
         moving = self.solver.search.moving
-        arms = at["x"] - self._each(None if moving is None else moving.after.positions, self.solid.middle)
+        arms = at["x"] - self._each(None if moving is None else moving.named["after"], self.solid.middle)
         periods = np.array(self.solver.system.periods)
         around = np.round(np.divide(arms, periods, out=np.zeros_like(arms), where=periods > 0.0))
         return np.asarray(arms - periods * around)

@@ -16,7 +16,7 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.discretise.room import TOLERANCE
 from cortado.discretise.shapes import Points
-from cortado.particles.moving_walls import MovingWalls, Poses, matrix_of
+from cortado.particles.moving_walls import MovingWalls, matrix_of, pose_arrays
 from cortado.particles.state import Layout, State, padded
 from cortado.solvers.obstacles import FURTHEST, Obstacle, Walled, middle_of, obstacle_mesh
 
@@ -259,11 +259,8 @@ class Containment:
         members, device = layout.members, layout.device
         self._obstacles = (*walled.solids, *walled.moving)
         self._meshes = [obstacle_mesh(one, walled.spacing, device) for one in self._obstacles]
-        nothing = Poses.zeros(members, 0, layout.precision, device)
-        self._poses = (nothing, nothing) if moving is None else (moving.before, moving.after)
+        self._poses = pose_arrays(members, 0, layout.precision, device) if moving is None else moving.named
         """Poses of moving solids before and after a step."""
-        none = wp.zeros((members, 0), dtype=layout.precision.real, device=device)
-        self._scales = none if moving is None else moving.sizes.scales
         self._constants: dict[str, Any] = {
             "bounds": self._made_bounds(),
             "solids": self._made_solids(device),
@@ -354,8 +351,7 @@ class Containment:
     def _solids(self, member: int) -> Iterator[tuple[Obstacle, Distance]]:
         """Yield the solids of a scene as they are after the last step, each with a function of distance from it."""
         yield from ((one, one.solid.distance) for one in self.walled.solids)
-        after = self._poses[1]
-        poses = (after.positions.numpy()[member], after.turns.numpy()[member], self._scales.numpy()[member])
+        poses = (self._poses[name].numpy()[member] for name in ("after", "turns", "scales"))
         for one, *pose in zip(self.walled.moving, *poses, strict=True):
             yield one, partial(_moved_distance, one, *pose)
 
@@ -370,9 +366,8 @@ class Containment:
         solids.sides = wp.array(sides, dtype=precision.real, device=device)
         tolerances = [walled.tolerance(one) for one in self._obstacles]
         solids.tolerances = wp.array(tolerances, dtype=precision.real, device=device)
-        before, after = self._poses
-        solids.before, solids.turns_before = before.positions, before.turns
-        solids.after, solids.turns, solids.scales = after.positions, after.turns, self._scales
+        for name in ("before", "turns_before", "after", "turns", "scales"):
+            setattr(solids, name, self._poses[name])
         solids.reach, solids.still = REACH * walled.spacing, len(walled.solids)
         solids.period = precision.vector(*periods)
         solids.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))

@@ -5,44 +5,28 @@ measured here. Each scene of a batch goes on until |r| has fallen to a part of t
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from cortado.device.modules import kernel_module
+from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import FLOAT32, Precision, TypesByName
 from cortado.device.reduction import type_name
-from cortado.particles.state import Layout
+from cortado.particles.state import Layout, zeros
 from cortado.sph.parts import StepContext
 
 
-@dataclass(frozen=True)
-class SolveKernels:
-    """The kernels of conjugate gradients, which need no neighbours."""
-
-    begin: Any
-    """p = r, y = 0."""
-    start: Any
-    """Tells for each scene whether there is anything to solve."""
-    descend: Any
-    """y and r after a step along p."""
-    turn: Any
-    """The next p."""
-    decide: Any
-    """Tells for each scene whether to go on."""
-
-
 @cache
-def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
-    """Make the kernels of conjugate gradients for numbers or vectors; ``going`` (members,) is 1 for a scene to go
-    on."""
+def solve_kernels(precision: Precision, kind: Any) -> SimpleNamespace:
+    """Make the kernels of conjugate gradients for numbers or vectors; ``going`` (members,) is 1 for a scene to go on.
+    ``begin`` and ``start`` begin a solve; ``descend`` takes a step along p, ``turn`` gives the next p, and ``decide``
+    which scenes go on."""
     real = precision.real
     module = kernel_module(f"conjugate_gradients_{type_name(kind)}")
-    square = _square_of_numbers(real, module) if kind is real else _square_of_vectors(kind, real, module)
-
     typed = TypesByName(real, {kind: "r p y product", wp.int32: "count going active"})
+    dot = wp.mul if kind is real else wp.dot
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
@@ -50,7 +34,7 @@ def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
         i = wp.tid()
         p[i] = r[i]
         y[i] = kind(real(0.0))
-        share[i] = w[i] * square(r[i])
+        share[i] = w[i] * dot(r[i], r[i])
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
@@ -76,7 +60,7 @@ def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
         left = r[i] - step * product[i]
         y[i] = y[i] + step * p[i]
         r[i] = left
-        share[i] = w[i] * square(left)
+        share[i] = w[i] * dot(left, left)
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
@@ -98,23 +82,7 @@ def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
             going[b] = 0
             wp.atomic_sub(active, 0, 1)
 
-    return SolveKernels(begin, start, descend, turn, decide)
-
-
-def _square_of_numbers(real: Any, module: Any) -> Any:
-    @wp.func(module=module)
-    def square(a: real) -> real:
-        return a * a
-
-    return square
-
-
-def _square_of_vectors(vector: Any, real: Any, module: Any) -> Any:
-    @wp.func(module=module)
-    def square(a: vector) -> real:
-        return wp.dot(a, a)
-
-    return square
+    return by_name(begin, start, descend, turn, decide)
 
 
 def round_off(precision: Precision) -> float:
@@ -132,12 +100,10 @@ class ConjugateGradients:
         self._kernels, self._layout = solve_kernels(layout.precision, kind), layout
         self._limits = {"tolerance": tolerance, "most": most}
         self._sizes = {"particles": layout.particles}
-        sizes = {"shape": layout.all_particles, "device": layout.device}
-        self._p, self._product = (wp.zeros(dtype=kind, **sizes) for _ in range(2))
-        self._share = wp.zeros(dtype=real, **sizes)
-        scenes = {"shape": layout.members, "device": layout.device}
-        self._first, self._size = (wp.zeros(dtype=real, **scenes) for _ in range(2))
-        self.count, self._going = (wp.zeros(dtype=wp.int32, **scenes) for _ in range(2))
+        self._own = layout.arrays(p=kind, product=kind, share=real)
+        kinds = {"first": real, "size": real, "count": wp.int32, "going": wp.int32}
+        self._scenes = zeros({name: (layout.members, one) for name, one in kinds.items()}, layout.device)
+        self.count = self._scenes["count"]
         """(members,) iterations of the last solve."""
         self._active = wp.zeros(1, dtype=wp.int32, device=layout.device)
         self._sums = layout.sum_of(real), layout.sum_of(real)
@@ -157,20 +123,18 @@ class ConjugateGradients:
         """
         kernels, members, (sum_shares, sum_curvatures) = self._kernels, self._layout.members, self._sums
         n = self._layout.all_particles
-        step.launch(kernels.begin, w=w, r=r, p=self._p, y=y, share=self._share, threads=n)
+        own, scene = {**self._own, "w": w, "r": r, "y": y}, {**self._scenes, "active": self._active}
+        p, product, share = self._own.values()
+        step.launch(kernels.begin, own, threads=n)
         self._active.zero_()
-        scene = {"size": self._size, "count": self.count, "going": self._going, "active": self._active}
-        total = sum_shares(self._share)
-        step.launch(kernels.start, scene, total=total, first=self._first, threads=members)
+        step.launch(kernels.start, scene, total=sum_shares(share), threads=members)
 
         def iterate() -> None:
-            multiply(self._p, {"product": self._product, "share": self._share})
-            curvature = sum_curvatures(self._share)
-            own = {"w": w, "p": self._p, "product": self._product, "r": r, "y": y, "share": self._share}
-            step.launch(kernels.descend, scene, own, self._sizes, curvature=curvature, threads=n)
-            total = sum_shares(self._share)
+            multiply(p, {"product": product, "share": share})
+            step.launch(kernels.descend, scene, own, self._sizes, curvature=sum_curvatures(share), threads=n)
+            total = sum_shares(share)
             step.launch(kernels.turn, scene, own, self._sizes, total=total, threads=n)
-            step.launch(kernels.decide, scene, self._limits, total=total, first=self._first, threads=members)
+            step.launch(kernels.decide, scene, self._limits, total=total, threads=members)
 
         step.join()  # a loop of a graph cannot begin while something is computed aside
         wp.capture_while(self._active, iterate)

@@ -18,12 +18,13 @@ Functions of Warp for these sums, and for what follows from them, are here too.
 
 from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from cortado.device.modules import Kernels
+from cortado.device.modules import Kernels, by_name
 from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.calibration import lattice_offsets, rest_volume
 from cortado.discretise.smoothing import SmoothingKernel
@@ -87,24 +88,9 @@ HOLLOW = 0.25
 a radius below 3 delta, which the divisor 1 + delta kappa would be 0 in."""
 
 
-@dataclass(frozen=True)
-class CurvatureFunctions:
-    """Warp functions of one particle for the normal and the curvature of a fluid's surface."""
-
-    normal: Any
-    """The indicator w and the normal e of q and the spacing."""
-    normal_work: Any
-    """w w_bar + e . e_bar of q, the spacing, w_bar and e_bar. Its gradient by q is the adjoint of q; with 0 for w_bar
-    it is also the change of e along e_bar, as that is symmetric."""
-    curvature: Any
-    """The curvature kappa of B and D."""
-    outermost: Any
-    """The curvature k at the surface of a, b and delta."""
-
-
 @cache
-def curvature_functions(precision: Precision, dimension: int, module: Any) -> CurvatureFunctions:
-    """Make the Warp functions of a surface's curvature in 2 or 3 dimensions, in a Warp module."""
+def curvature_functions(precision: Precision, dimension: int, module: Any) -> SimpleNamespace:
+    """Make the Warp functions of one particle for the normal and the curvature of a surface, in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     smoothstep = moment_functions(precision, dimension).smoothstep
     faint, clear = wp.constant(real(FAINT)), wp.constant(real(CLEAR))
@@ -121,6 +107,8 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Cu
 
     @wp.func(module=module)
     def normal_work(q: vector, spacing: real, w_bar: real, e_bar: vector) -> real:
+        """Return w w_bar + e . e_bar. Its gradient by q is the adjoint of q; with 0 for w_bar it is also the change of
+        e along e_bar, as that is symmetric."""
         w, e = normal(q, spacing)
         return w * w_bar + wp.dot(e, e_bar)
 
@@ -139,38 +127,30 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Cu
 
     @wp.func(module=module)
     def outermost(a: real, b: real, depth: real) -> real:
+        """Return the curvature k at the surface."""
         mean = a / (b + lone)
         more = depth * mean
         rest = wp.clamp(real(3.0) * hollow + more, real(0.0), real(2.0) * hollow)
         divisor = real(1.0) - real(2.0) * hollow + rest * rest / (real(4.0) * hollow) + wp.max(more + hollow, real(0.0))
         return mean / divisor
 
-    return CurvatureFunctions(normal, normal_work, curvature, outermost)
-
-
-@dataclass(frozen=True)
-class CurvatureSums:
-    """Warp functions of the curvature's sums over the fluid; symmetric matrices are diagonals and entries yz, xz,
-    xy."""
-
-    colour: Kernels
-    """g and z, without W(0); from their adjoints that of x."""
-    average: Kernels
-    """V sum W_ij g_j; from the adjoint r of the average V sum W_ij r_j, and the adjoint of x."""
-    bend: Kernels
-    """B and the symmetric part of D; from symmetric adjoints of both to those of e, w and x."""
-    mean: Kernels
-    """V sum W_ij c_j and V sum W_ij w_j; from their adjoints a and b V sum W_ij a_j, V sum W_ij b_j, and that of x."""
+    return by_name(normal, normal_work, curvature, outermost)
 
 
 @cache
-def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
-    """Make the sums over neighbours of the curvature, for a discretisation."""
+def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
+    """Make the Warp functions of the curvature's sums over the fluid, with derivatives. Symmetric matrices are
+    diagonals and entries yz, xz, xy.
+
+    ``colour``: g and z, without W(0). ``average``: V sum W_ij g_j. ``bend``: B and the symmetric part of D. ``mean``:
+    V sum W_ij c_j and V sum W_ij w_j."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
     neighbourhood, matrix = neighbourhood_type(precision), matrix_type(precision)
     pair, cross_terms = pair_functions(discretisation), cross_terms_function(precision)
     weight, slope, gradient, hessian_product = pair.weight, pair.slope, pair.gradient, pair.hessian_product
+
+    typed = TypesByName(real, {vector: "x e g r", neighbourhood: "s", matrix: "B D"})
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
@@ -200,21 +180,18 @@ def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
         return s.volume * (weight(x_ij, s) * g_dot_j + wp.dot(gradient(x_ij, s), x_dot_ij) * g_j)
 
     @fluid_sum(discretisation)
-    def average_back(
-        x_ij: vector, g_i: vector, g_j: vector, r_i: vector, r_j: vector, s: neighbourhood
-    ) -> tuple[vector, vector]:
+    @typed
+    def average_back(x_ij, g_i, g_j, r_i, r_j, s) -> tuple[vector, vector]:
+        """Return a pair's terms of V sum W_ij r_j for the adjoint r of the average, and of the adjoint of x."""
         both = wp.dot(r_i, g_j) + wp.dot(r_j, g_i)
         return (s.volume * weight(x_ij, s)) * r_j, (s.volume * both) * gradient(x_ij, s)
 
     @fluid_sum(discretisation)
-    def bend(
-        x_ij: vector, e_i: vector, e_j: vector, w_j: real, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector]:
+    @typed
+    def bend(x_ij, e_i, e_j, w_j, s) -> tuple[vector, vector, vector, vector]:
         g = (s.volume * w_j) * gradient(x_ij, s)
         turn = e_j - e_i
         return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(turn, g), even_terms(turn, g)
-
-    typed = TypesByName(real, {vector: "x e", neighbourhood: "s", matrix: "B D"})
 
     @tangent_of(bend)
     @fluid_sum(discretisation, ahead=False)
@@ -251,9 +228,8 @@ def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
 
     @tangent_of(mean)
     @fluid_sum(discretisation, ahead=False)
-    def mean_tangent(
-        x_ij: vector, x_dot_ij: vector, c_j: real, c_dot_j: real, w_j: real, w_dot_j: real, s: neighbourhood
-    ) -> tuple[real, real]:
+    @typed
+    def mean_tangent(x_ij, x_dot_ij, c_j, c_dot_j, w_j, w_dot_j, s) -> tuple[real, real]:
         W, W_dot = s.volume * weight(x_ij, s), s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
         return W_dot * c_j + W * c_dot_j, W_dot * w_j + W * w_dot_j
 
@@ -263,9 +239,9 @@ def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
         W, both = s.volume * weight(x_ij, s), a_i * c_j + a_j * c_i + b_i * w_j + b_j * w_i
         return W * a_j, W * b_j, (s.volume * both) * gradient(x_ij, s)
 
-    return CurvatureSums(
-        Kernels(colour, colour_tangent, colour_back),
-        Kernels(average, average_tangent, average_back),
-        Kernels(bend, bend_tangent, bend_back),
-        Kernels(mean, mean_tangent, mean_back),
+    return SimpleNamespace(
+        colour=Kernels(colour, colour_tangent, colour_back),
+        average=Kernels(average, average_tangent, average_back),
+        bend=Kernels(bend, bend_tangent, bend_back),
+        mean=Kernels(mean, mean_tangent, mean_back),
     )

@@ -23,8 +23,8 @@ Tangents go the way of the sums, adjoints from the last one to the first: what t
 e, c, g and z, the next one takes up.
 """
 
-from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -44,22 +44,13 @@ def entries(precision: Precision) -> dict[str, Any]:
     return {**vectors, **matrices, **numbers}
 
 
-@dataclass(frozen=True)
-class CurvatureKernels:
-    """The kernels of the four sums, each with its tangent and its adjoint, which comes after those of the later sums.
-    The adjoint of ``mean`` has a first part without neighbours."""
-
-    colour: Kernels
-    normal: Kernels
-    bend: Kernels
-    mean: Kernels
-
-
 @cache
-def curvature_kernels(discretisation: Discretisation, dimension: int) -> CurvatureKernels:
-    """Make the kernels of tension by curvature, in 2 or 3 dimensions; ``depth`` is delta and ``per_width`` 1 / J."""
-    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
-    matrix, sums = matrix_type(precision), curvature_sums(discretisation)
+def curvature_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
+    """Make the kernels of the four sums ``colour``, ``normal``, ``bend`` and ``mean``, in 2 or 3 dimensions, each with
+    its tangent and its adjoint, which comes after those of the later sums. The adjoint of ``mean`` has a first part
+    without neighbours. ``depth`` is delta and ``per_width`` 1 / J."""
+    precision, (real, vector, _) = discretisation.precision, discretisation.types
+    matrix, sums, typed = matrix_type(precision), curvature_sums(discretisation), types_of(discretisation)
     moments = moment_functions(precision, dimension)
     whole, even = moments.whole, moments.change
     topic = f"surface_curvature_{dimension}d"
@@ -67,66 +58,62 @@ def curvature_kernels(discretisation: Discretisation, dimension: int) -> Curvatu
     own = curvature_functions(precision, dimension, module)
     normal_of, curvature_of, outermost = own.normal, own.curvature, own.outermost
 
-    @particle_kernel(module, "g z", [over(sums.colour.forward, "g others")])
-    def colour(i: int, g: vector, others: real, s: neighbourhood) -> tuple[vector, real]:
-        return g, others + real(1 - s.filling[i]) * s.self_weight * s.volume
+    @particle_kernel(module, "g z", [over(sums.colour.forward, "g z_part")])
+    @typed
+    def colour(i: int, g, z_part, s) -> tuple[vector, real]:
+        return g, z_part + real(1 - s.filling[i]) * s.self_weight * s.volume
 
     @particle_kernel(module, "q w e", [over(sums.average.forward, "others")], numbers=["spacing"])
-    def normal(
-        i: int, others: vector, spacing: real, g_i: vector, z_i: real, s: neighbourhood
-    ) -> tuple[vector, real, vector]:
+    @typed
+    def normal(i: int, others, spacing, g_i, z_i, s) -> tuple[vector, real, vector]:
         q = (others + (real(1 - s.filling[i]) * s.self_weight * s.volume) * g_i) / z_i
         w, e = normal_of(q, spacing)
         return q, w, e
 
     @particle_kernel(module, "B D c", [over(sums.bend.forward, "diagonal others turned mixed")])
-    def bend(diagonal: vector, others: vector, turned: vector, mixed: vector, w_i: real) -> tuple[matrix, matrix, real]:
+    @typed
+    def bend(diagonal, others, turned, mixed, w_i) -> tuple[matrix, matrix, real]:
         B, D = whole(diagonal, others), even(turned, mixed)
         return B, D, w_i * curvature_of(B, D)
 
-    @particle_kernel(
-        module,
-        "a b acceleration:acceleration_in",
-        [over(sums.mean.forward, "others_a others_b")],
-        numbers=["depth", "per_width"],
-    )
+    means, constants = over(sums.mean.forward, "a_part b_part"), ["depth", "per_width"]
+
+    @particle_kernel(module, "a b acceleration:acceleration_in", [means], numbers=constants)
+    @typed
     def mean(
-        i: int,
-        others_a: real,
-        others_b: real,
-        depth: real,
-        per_width: real,
-        surface_tension: real,
-        m_i: real,
-        q_i: vector,
-        w_i: real,
-        c_i: real,
-        s: neighbourhood,
+        i: int, a_part, b_part, depth, per_width, surface_tension, m_i, q_i, w_i, c_i, s
     ) -> tuple[real, real, vector]:
         self_weight = real(1 - s.filling[i]) * s.self_weight * s.volume
-        a, b = others_a + self_weight * c_i, others_b + self_weight * w_i
+        a, b = a_part + self_weight * c_i, b_part + self_weight * w_i
         strength = surface_tension * per_width / m_i
         return a, b, (strength * outermost(a, b, depth) * w_i) * q_i
 
     made = discretisation, dimension, topic
     three = zip((colour, normal, bend, mean), curvature_tangents(*made), curvature_adjoints(*made), strict=True)
-    return CurvatureKernels(*(Kernels(*each) for each in three))
+    names = ("colour", "normal", "bend", "mean")
+    return SimpleNamespace(**{name: Kernels(*each) for name, each in zip(names, three, strict=True)})
+
+
+def types_of(discretisation: Discretisation) -> TypesByName:
+    """Return the Warp types, by name, of what kernels of tension by curvature compute with."""
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    vectors = "q g r x e diagonal others turned mixed acceleration"
+    return TypesByName(real, {vector: vectors, matrix_type(precision): "B D", neighbourhood: "s"})
 
 
 @cache
 def curvature_tangents(discretisation: Discretisation, dimension: int, topic: str) -> tuple[Any, ...]:
     """Make the tangents of the four curvature kernels, in 2 or 3 dimensions, in the Warp module of a topic."""
-    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
-    matrix, sums = matrix_type(precision), curvature_sums(discretisation)
+    precision, (real, vector, _) = discretisation.precision, discretisation.types
+    sums, typed = curvature_sums(discretisation), types_of(discretisation)
     even = moment_functions(precision, dimension).change
     module = discretisation.tangent_module(topic)
     own = curvature_functions(precision, dimension, module)
     normal_work, curvature_of, outermost = own.normal_work, own.curvature, own.outermost
 
     @particle_kernel(module, "q_dot w_dot e_dot", [over(sums.average.tangent, "others")], numbers=["spacing"])
-    def normal_tangent(
-        i: int, others: vector, spacing: real, g_dot_i: vector, z_i: real, z_dot_i: real, q_i: vector, s: neighbourhood
-    ) -> tuple[vector, real, vector]:
+    @typed
+    def normal_tangent(i: int, others, spacing, g_dot_i, z_i, z_dot_i, q_i, s) -> tuple[vector, real, vector]:
         own_part = (real(1 - s.filling[i]) * s.self_weight * s.volume) * g_dot_i
         q_dot = (others + own_part - z_dot_i * q_i) / z_i
         w_by_q, _spacing, _w, _e = wp.grad(normal_work)(q_i, spacing, real(1.0), vector())
@@ -134,47 +121,37 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
         return q_dot, wp.dot(w_by_q, q_dot), e_dot
 
     @particle_kernel(module, "c_dot", [over(sums.bend.tangent, "diagonal others turned mixed")])
-    def bend_tangent(
-        diagonal: vector,
-        others: vector,
-        turned: vector,
-        mixed: vector,
-        w_i: real,
-        w_dot_i: real,
-        B_i: matrix,
-        D_i: matrix,
-    ) -> real:
+    @typed
+    def bend_tangent(diagonal, others, turned, mixed, w_i, w_dot_i, B_i, D_i) -> real:
         by_B, by_D = wp.grad(curvature_of)(B_i, D_i)
         kappa_dot = wp.ddot(by_B, even(diagonal, others)) + wp.ddot(by_D, even(turned, mixed))
         return w_dot_i * curvature_of(B_i, D_i) + w_i * kappa_dot
 
-    @particle_kernel(
-        module,
-        "acceleration_dot:acceleration_in_dot",
-        [over(sums.mean.tangent, "others_a others_b")],
-        numbers=["depth", "per_width"],
-    )
+    means, constants = over(sums.mean.tangent, "a_part b_part"), ["depth", "per_width"]
+
+    @particle_kernel(module, "acceleration_dot:acceleration_in_dot", [means], numbers=constants)
+    @typed
     def mean_tangent(
         i: int,
-        others_a: real,
-        others_b: real,
-        depth: real,
-        per_width: real,
-        surface_tension: real,
-        surface_tension_dot: real,
-        m_i: real,
-        m_dot_i: real,
-        q_i: vector,
-        q_dot_i: vector,
-        w_i: real,
-        w_dot_i: real,
-        c_dot_i: real,
-        a_i: real,
-        b_i: real,
-        s: neighbourhood,
+        a_part,
+        b_part,
+        depth,
+        per_width,
+        surface_tension,
+        surface_tension_dot,
+        m_i,
+        m_dot_i,
+        q_i,
+        q_dot_i,
+        w_i,
+        w_dot_i,
+        c_dot_i,
+        a_i,
+        b_i,
+        s,
     ) -> vector:
         self_weight = real(1 - s.filling[i]) * s.self_weight * s.volume
-        a_dot, b_dot = others_a + self_weight * c_dot_i, others_b + self_weight * w_dot_i
+        a_dot, b_dot = a_part + self_weight * c_dot_i, b_part + self_weight * w_dot_i
         k = outermost(a_i, b_i, depth)
         by_a, by_b, _by_depth = wp.grad(outermost)(a_i, b_i, depth)
         k_dot = by_a * a_dot + by_b * b_dot
@@ -194,13 +171,11 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
 @cache
 def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: str) -> tuple[Any, ...]:
     """Make the adjoints of the four curvature kernels; the last has two, the first of which has no neighbours."""
-    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
-    matrix, sums = matrix_type(precision), curvature_sums(discretisation)
+    precision, (real, vector, _) = discretisation.precision, discretisation.types
+    matrix, sums, typed = matrix_type(precision), curvature_sums(discretisation), types_of(discretisation)
     module = discretisation.module(False, topic)
     own = curvature_functions(precision, dimension, module)
     normal_work, curvature_of, outermost = own.normal_work, own.curvature, own.outermost
-
-    typed = TypesByName(real, {vector: "q acceleration x e", matrix: "B D", neighbourhood: "s"})
 
     @particle_kernel(module, "+m_bar +surface_tension_bar q_bar w_bar a_bar b_bar", numbers=["depth", "per_width"])
     @typed
@@ -244,7 +219,8 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
         return x_part, r, -wp.dot(q_i, r)
 
     @particle_kernel(module, "g_bar +x_bar", [over(sums.average.adjoint, "g_part x_part")])
-    def normal_adjoint(i: int, g_part: vector, x_part: vector, r_i: vector, s: neighbourhood) -> tuple[vector, vector]:
+    @typed
+    def normal_adjoint(i: int, g_part, x_part, r_i, s) -> tuple[vector, vector]:
         return g_part + (real(1 - s.filling[i]) * s.self_weight * s.volume) * r_i, x_part
 
     colour_adjoint = sum_kernel("colour_adjoint", module, "+x_bar", sums.colour.adjoint)

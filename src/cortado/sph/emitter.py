@@ -26,15 +26,6 @@ from cortado.sph.integration import integration_module
 from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tangents
 
 
-@dataclass(frozen=True)
-class EmitterKernels(Kernels):
-    """The kernels of an emitter at the end of a step, in scene order."""
-
-    begin: Kernels
-    """The motion of the column of fluid in the step, with a thread for each scene. The adjoint takes the sums of the
-    adjoints of prescribed positions and velocities."""
-
-
 @cache
 def nozzle_type(precision: Precision) -> Any:
     """Make the Warp struct of an emitter's constants; its arrays are of the particles of one scene from ``first``
@@ -62,13 +53,16 @@ def nozzle_type(precision: Precision) -> Any:
 
 
 @cache
-def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
-    """Make the kernels of an emitter for a precision. Of each scene, (members,), ``outlet`` is q_n [m], ``drift`` the
-    velocity of prescribed particles [m/s], and ``emitted`` l at the end of the step [m]."""
+def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels]:
+    """Make the kernels of the motion of the column of fluid in a step, with a thread for each scene, and those of
+    particles at its end, in scene order. The adjoint of the motion takes sums of the adjoints of prescribed positions
+    and velocities. Of each scene, (members,), ``outlet`` is q_n [m], ``drift`` the velocity of prescribed particles
+    [m/s], and ``emitted`` l at the end of the step [m]."""
     real, vector, nozzle_of = precision.real, precision.vector, nozzle_type(precision)
     module, derivatives = integration_module(precision, True, taped), integration_module(precision, False)
     numbers, path = ["nozzle", "particles"], wp.array2d(dtype=vector)
-    typed = TypesByName(real, {vector: "outlet drift x v", wp.float64: "emitted", nozzle_of: "nozzle"})
+    own = {nozzle_of: "nozzle", path: "nozzle_path", wp.int32: "step", wp.float64: "emitted"}
+    typed = TypesByName(real, {vector: "outlet drift x v", **own})
 
     @wp.func
     def advance(flow_rate: real, area: real, time_step: real) -> wp.float64:
@@ -85,7 +79,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
     @particle_kernel(module, "outlet drift emitted", numbers=["nozzle"])
     @typed
     def begin(
-        i: int, nozzle, nozzle_path: path, step_i: wp.int32, flow_rate_i, time_step_i, outlet_in_i, emitted_in_i
+        i: int, nozzle, nozzle_path, step_i, flow_rate_i, time_step_i, outlet_in_i, emitted_in_i
     ) -> tuple[vector, vector, wp.float64]:
         q = nozzle_path[i, step_i]
         drift = (q - outlet_in_i) / time_step_i + (flow_rate_i / nozzle.area) * nozzle.direction
@@ -96,8 +90,8 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
     def begin_tangent(
         i: int,
         nozzle,
-        nozzle_path_dot: path,
-        step_i: wp.int32,
+        nozzle_path_dot,
+        step_i,
         flow_rate_i,
         flow_rate_dot_i,
         time_step_i,
@@ -117,8 +111,8 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
     def begin_adjoint(
         i: int,
         nozzle,
-        nozzle_path_bar: path,
-        step_i: wp.int32,
+        nozzle_path_bar,
+        step_i,
         flow_rate_i,
         time_step_i,
         drift_i,
@@ -165,9 +159,8 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         x_free_bar, v_free_bar = wp.where(led, no, x_bar_i), wp.where(led, no, v_bar_i)
         return x_free_bar, v_free_bar, wp.where(led, x_bar_i, no), wp.where(led, v_bar_i, no)
 
-    return EmitterKernels(
-        *(prescribe, prescribe_tangent, prescribe_adjoint), Kernels(begin, begin_tangent, begin_adjoint)
-    )
+    begins = Kernels(begin, begin_tangent, begin_adjoint)
+    return begins, Kernels(prescribe, prescribe_tangent, prescribe_adjoint)
 
 
 OUTLET = StateField("outlet", "m", Entry.VECTOR, Axis.SCALAR, first="nozzle_path")
@@ -211,7 +204,7 @@ class Emitter(Part):
         self.free = layout.state((POSITIONS, VELOCITIES), requires_grad)
         """Room for the end of a step if no particle were prescribed."""
         precision, device = layout.precision, layout.device
-        self.kernels = emitter_kernels(precision, requires_grad)
+        self.begins, self.ends = emitter_kernels(precision, requires_grad)
         constants = nozzle_type(precision)()
         constants.first, constants.area = nozzle.first, nozzle.area
         constants.upstream = wp.array(nozzle.upstream, dtype=precision.real, device=device)
@@ -226,14 +219,14 @@ class Emitter(Part):
     def begin(self, step: StepContext, state: State) -> None:
         """Compute the motion of the column in the step, from the state before it, which the end may write over."""
         before = {"outlet_in": state["outlet"], "emitted_in": state["emitted"]}
-        step.launch(self.kernels.begin.forward, self.constants, **before, threads=self.layout.members)
+        step.launch(self.begins.forward, self.constants, **before, threads=self.layout.members)
 
     def target(self, moved: State) -> State:
         return self.free
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
         free = {"x_free": self.free.positions, "v_free": self.free.velocities}
-        step.launch(self.kernels.forward, self.constants, **free, x=moved.positions, v=moved.velocities)
+        step.launch(self.ends.forward, self.constants, **free, x=moved.positions, v=moved.velocities)
         for field in self.fields:
             wp.copy(state[field.name], self.constants[field.name])
 
@@ -253,10 +246,10 @@ class EmitterTangent(PartTangent):
         self._dot = {"drift_dot": drift_dot, **emitter.layout.state(emitter.fields).named("_dot")}
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        kernels, known = self._emitter.kernels, (self._emitter.constants, self._dot, dot.parameters.named("_dot"))
+        known = self._emitter.constants, self._dot, dot.parameters.named("_dot")
         before = {f"{field.name}_in_dot": state_dot[field.name] for field in self._emitter.fields}
-        step.launch(kernels.begin.tangent, *known, **before, threads=self._emitter.layout.members)
-        step.launch(kernels.tangent, *known, x_dot=state_dot.positions, v_dot=state_dot.velocities)
+        step.launch(self._emitter.begins.tangent, *known, **before, threads=self._emitter.layout.members)
+        step.launch(self._emitter.ends.tangent, *known, x_dot=state_dot.positions, v_dot=state_dot.velocities)
         for field in self._emitter.fields:
             wp.copy(state_dot[field.name], self._dot[f"{field.name}_dot"])
 
@@ -277,7 +270,7 @@ class EmitterAdjoint(PartAdjoint):
         nozzle, which becomes that before the step."""
         emitter, free, prescribed = self._emitter, self._free, self._prescribed
         step.launch(
-            emitter.kernels.adjoint,
+            emitter.ends.adjoint,
             emitter.constants,
             x_bar=moved_bar.positions,
             v_bar=moved_bar.velocities,
@@ -290,5 +283,5 @@ class EmitterAdjoint(PartAdjoint):
         own = {"outlet_bar": state_bar["outlet"], "emitted_bar": state_bar["emitted"]}
         totals = {"x_total": x_total, "v_total": v_total}
         collected = {**own, **totals, "threads": emitter.layout.members}
-        step.launch(emitter.kernels.begin.adjoint, emitter.constants, bar.named("_bar"), **collected)
+        step.launch(emitter.begins.adjoint, emitter.constants, bar.named("_bar"), **collected)
         return free

@@ -7,7 +7,6 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from math import prod
 from tempfile import TemporaryFile
 from types import FunctionType, MappingProxyType
@@ -16,10 +15,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision
 from cortado.device.warp_start import c_stderr_to
 from cortado.errors import InputError
-from cortado.particles.state import Layout, Parameters
+from cortado.particles.state import Layout, Parameters, components
 from cortado.scene.parameters import Axis, Parameter
 from cortado.sph.function_meaning import (
     FRACTIONS,
@@ -35,134 +34,45 @@ from cortado.sph.function_meaning import (
     meanings,
 )
 from cortado.sph.function_text import DerivativeCheck, Frozen, SizesWritten, check_names, check_returns, definition
-from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type
-from cortado.sph.own_arrays import MOST_NUMBERS, reading, table_type
+from cortado.sph.own_arrays import MOST_NUMBERS, WIDTH, Numbers, reading, table_type
 from cortado.sph.parts import Adjoints, StepContext
-
-WIDTH = (1, 3)
-"""How many numbers of theta a parameter takes, by its rank."""
-
-
-@dataclass(frozen=True)
-class PackingKernels:
-    """Kernels, by a parameter's rank, that write its value in a step into theta and add theta's adjoint to its own."""
-
-    pack: tuple[Any, Any]
-    add: tuple[Any, Any]
-
-
-@cache
-def packing_kernels(precision: Precision, taped: bool) -> PackingKernels:
-    """Make the kernels that pack parameters (members, steps) into the vector theta; constant ones are (members, 1)."""
-    real, vector = precision.real, precision.vector
-    forward, backward = integration_module(precision, True, taped), integration_module(precision, False)
-
-    typed = TypesByName(real, {wp.int32: "step"})
-
-    @wp.kernel(module=forward)
-    @typed.arrays
-    def pack_number(first: int, step, values: wp.array2d(dtype=real), theta: wp.array2d(dtype=real)):
-        member = wp.tid()
-        theta[member, first] = values[member, wp.min(step[member], values.shape[1] - 1)]
-
-    @wp.kernel(module=forward)
-    @typed.arrays
-    def pack_vector(first: int, step, values: wp.array2d(dtype=vector), theta: wp.array2d(dtype=real)):
-        member = wp.tid()
-        value = values[member, wp.min(step[member], values.shape[1] - 1)]
-        theta[member, first] = value[0]
-        theta[member, first + 1] = value[1]
-        theta[member, first + 2] = value[2]
-
-    @wp.kernel(module=backward, enable_backward=False)
-    @typed.arrays
-    def add_number(first: int, step, total: wp.array2d(dtype=real), values_bar: wp.array2d(dtype=real)):
-        member = wp.tid()
-        row = wp.min(step[member], values_bar.shape[1] - 1)
-        values_bar[member, row] = values_bar[member, row] + total[member, first]
-
-    @wp.kernel(module=backward, enable_backward=False)
-    @typed.arrays
-    def add_vector(first: int, step, total: wp.array2d(dtype=real), values_bar: wp.array2d(dtype=vector)):
-        member = wp.tid()
-        row = wp.min(step[member], values_bar.shape[1] - 1)
-        bar = vector(total[member, first], total[member, first + 1], total[member, first + 2])
-        values_bar[member, row] = values_bar[member, row] + bar
-
-    return PackingKernels((pack_number, pack_vector), (add_number, add_vector))
 
 
 class Packed:
     """The parameters of a user's function as one vector theta for every scene, with its tangent and its adjoint."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
-        self._parameters, self._layout = tuple(p for p in parameters if p.axis is not Axis.ARRAY), layout
-        self._kernels = packing_kernels(layout.precision, taped)
-        self.dtype = theta_of(layout.precision, [p.rank for p in self._parameters])
+        own = [one for one in parameters if one.axis is not Axis.ARRAY]
+        self._numbers, members = Numbers(own, layout, taped), layout.members
+        self.dtype = theta_of(layout.precision, [one.rank for one in own])
         """A Warp vector."""
-        self._size = self.dtype._length_
-        self._flat, self._flat_dot = self._numbers(taped), self._numbers(False)
-        self._theta, self._theta_dot = self._vectors(self._flat), self._vectors(self._flat_dot)
-        self.shares = wp.zeros(layout.all_particles, dtype=self.dtype, device=layout.device)
+        options = {"dtype": self.dtype, "device": layout.device}
+        self._theta = wp.zeros(members, **options, requires_grad=taped)
+        self._theta_dot = wp.zeros(members, **options)
+        self.shares = wp.zeros(layout.all_particles, **options)
         """(n,) for what every particle adds to the adjoint of theta in a step."""
-        self._sum = layout.sum_of(self.dtype) if self._parameters else None
+        self._sum = layout.sum_of(self.dtype) if own else None
 
     def theta(self, step: StepContext) -> wp.array:
         """Return theta (members,), the packed parameters in a step."""
-        return self._pack(step, step.parameters, self._flat, self._theta)
+        return self._packed(step, step.parameters, self._theta)
 
     def theta_dot(self, step: StepContext, parameters_dot: Parameters) -> wp.array:
         """Return the tangent (members,) of theta, the packed parameters in a step."""
-        return self._pack(step, parameters_dot, self._flat_dot, self._theta_dot)
+        return self._packed(step, parameters_dot, self._theta_dot)
 
     def collect(self, step: StepContext, bar: Adjoints) -> None:
         """Add up the particles' shares in the adjoint of theta, the packed parameters, into parameters' adjoints."""
-        if self._sum is None:
-            return
-        total = self._sum(self.shares)
-        flat = self._view(total, self._layout.precision.real, (self._layout.members, self._size))
-        for first, parameter in self._places():
-            values_bar = self._rows(bar.parameters[parameter.name])
-            given = {"first": first, "total": flat, "values_bar": values_bar}
-            step.launch(self._kernels.add[parameter.rank], **given, threads=self._layout.members)
+        if self._sum is not None:
+            self._numbers.add(step, self._table(self._sum(self.shares)), bar.parameters)
 
-    def _pack(self, step: StepContext, values: Parameters, flat: wp.array, vectors: wp.array) -> wp.array:
-        for first, parameter in self._places():
-            given = {"first": first, "values": self._rows(values[parameter.name]), "theta": flat}
-            step.launch(self._kernels.pack[parameter.rank], **given, threads=self._layout.members)
-        return vectors
+    def _packed(self, step: StepContext, values: Parameters, theta: wp.array) -> wp.array:
+        self._numbers.pack(step, values, self._table(theta))
+        return theta
 
-    def _places(self) -> list[tuple[int, Parameter]]:
-        """Return the parameters with the indices in theta at which they begin."""
-        places, first = [], 0
-        for parameter in self._parameters:
-            places.append((first, parameter))
-            first += WIDTH[parameter.rank]
-        return places
-
-    def _rows(self, array: wp.array) -> wp.array:
-        """Return a parameter as an array with an axis of steps, which has one entry where it is constant."""
-        return array if array.ndim == 2 else array.reshape((self._layout.members, 1))
-
-    def _numbers(self, requires_grad: bool) -> wp.array:
-        layout = self._layout
-        options = {"device": layout.device, "requires_grad": requires_grad}
-        return wp.zeros((layout.members, self._size), dtype=layout.precision.real, **options)
-
-    def _vectors(self, flat: wp.array) -> wp.array:
-        """Return an array of numbers as vectors in the memory of that array, with its adjoint."""
-        shape = (self._layout.members,)
-        vectors = self._view(flat, self.dtype, shape)
-        if flat.requires_grad:
-            vectors.grad = self._view(flat.grad, self.dtype, shape)
-        return vectors
-
-    @staticmethod
-    def _view(array: wp.array, dtype: Any, shape: tuple[int, ...]) -> wp.array:
-        view = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device)
-        view._ref = array  # keeps the memory
-        return view
+    def _table(self, theta: wp.array) -> wp.array:
+        return components(theta, (len(theta), self.dtype._length_))
 
 
 def theta_of(precision: Precision, ranks: Sequence[int]) -> Any:

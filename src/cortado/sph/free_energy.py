@@ -16,6 +16,7 @@ excursion. It leaves a pure phase delta / 2, and z <= 1 / 4 for two phases is ha
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ import warp as wp
 from cortado.arrays import as_one_number, require_function
 from cortado.calls import public
 from cortado.code_words import code_words
-from cortado.device.modules import kernel_module
+from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 from cortado.sph.formula import compiled
@@ -90,16 +91,8 @@ class Mobility:
     """Warp functions ``value`` and ``gradient`` (grad m) of fractions."""
 
 
-@dataclass(frozen=True)
-class EnergyFunctions:
-    """Warp functions of a free energy: grad f, and its Hessian times a vector."""
-
-    gradient: Any
-    hessian_product: Any
-
-
 @cache
-def _double_well(precision: Precision, phases: int) -> EnergyFunctions:
+def _double_well(precision: Precision, phases: int) -> SimpleNamespace:
     real, fractions = precision.real, precision.fractions(phases)
 
     @wp.func
@@ -111,11 +104,11 @@ def _double_well(precision: Precision, phases: int) -> EnergyFunctions:
     def hessian_product(c: fractions, u: fractions) -> fractions:
         return u - real(6.0) * wp.cw_mul(c, u) + real(6.0) * wp.cw_mul(wp.cw_mul(c, c), u)
 
-    return EnergyFunctions(gradient=gradient, hessian_product=hessian_product)
+    return by_name(gradient, hessian_product)
 
 
 @cache
-def _miscible(precision: Precision, phases: int) -> EnergyFunctions:
+def _miscible(precision: Precision, phases: int) -> SimpleNamespace:
     fractions = precision.fractions(phases)
 
     @wp.func
@@ -126,19 +119,11 @@ def _miscible(precision: Precision, phases: int) -> EnergyFunctions:
     def hessian_product(c: fractions, u: fractions) -> fractions:
         return u
 
-    return EnergyFunctions(gradient=gradient, hessian_product=hessian_product)
-
-
-@dataclass(frozen=True)
-class MobilityFunctions:
-    """Warp functions of a mobility: m, and its gradient."""
-
-    value: Any
-    gradient: Any
+    return by_name(gradient, hessian_product)
 
 
 @cache
-def _constant(precision: Precision, phases: int) -> MobilityFunctions:
+def _constant(precision: Precision, phases: int) -> SimpleNamespace:
     real, fractions = precision.real, precision.fractions(phases)
 
     @wp.func
@@ -149,11 +134,11 @@ def _constant(precision: Precision, phases: int) -> MobilityFunctions:
     def gradient(c: fractions) -> fractions:
         return fractions()
 
-    return MobilityFunctions(value=value, gradient=gradient)
+    return by_name(value, gradient)
 
 
 @cache
-def _degenerate(precision: Precision, phases: int) -> MobilityFunctions:
+def _degenerate(precision: Precision, phases: int) -> SimpleNamespace:
     real, fractions = precision.real, precision.fractions(phases)
     floor = wp.constant(real(FLOOR))
 
@@ -184,7 +169,7 @@ def _degenerate(precision: Precision, phases: int) -> MobilityFunctions:
             along[k] = t - c[k]
         return (real(0.5) + real(0.5) * z / wp.sqrt(z * z + floor * floor)) * along
 
-    return MobilityFunctions(value=value, gradient=gradient)
+    return by_name(value, gradient)
 
 
 def _double_well_value(c: np.ndarray) -> np.ndarray:  # a lambda would not be pickled

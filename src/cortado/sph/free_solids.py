@@ -23,7 +23,7 @@ import warp as wp
 
 from cortado.device.launching import Named
 from cortado.device.modules import Kernels, kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import add
 from cortado.discretise.solid import Mass
 from cortado.errors import MissingDerivativeError
@@ -54,19 +54,11 @@ def rate_function(precision: Precision) -> Any:
     return rate
 
 
-@dataclass(frozen=True)
-class FreeKernels:
-    """Kernels of one free body's motion in a step, with a thread for each scene."""
-
-    predict: Kernels
-    """The pose in which its walls are, and V, W and L."""
-    end: Kernels
-    """The state after the step, from V_1, W_1 and L_1; its adjoint stands where that of the state before is written."""
-
-
 @cache
-def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
-    """Make the kernels of a free body's motion, in 2 or 3 dimensions."""
+def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
+    """Make the kernels of a free body in 2 or 3 dimensions, with a thread for each scene: of the pose in which its
+    walls are, with V, W and L, and of the state after the step, from V_1, W_1 and L_1. The adjoint of the latter stands
+    where that of the state before is written."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     flat, rotation, rate = rotations(precision, dimension), rotations(precision, 3).rotation, rate_function(precision)
     angle, begun_rotation, modules = flat.angle, flat.rotation, [free_module(precision)] * 3
@@ -92,52 +84,56 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
             return w
 
     @wp.func
-    def unit() -> matrix:
-        one, no = real(1.0), real(0.0)
-        return matrix(one, no, no, no, one, no, no, no, one)
-
-    @wp.func
     def column(Q: matrix, k: int) -> vector:
         return vector(Q[0, k], Q[1, k], Q[2, k])
 
     @wp.func
     def evened(Q: matrix) -> matrix:
         """Return Q - I of a Q without round-off that would make its axes longer or let them lean."""
-        return real(0.5) * Q * (real(3.0) * unit() - wp.transpose(Q) * Q) - unit()
+        return real(0.5) * Q * (real(3.0) * wp.identity(n=3, dtype=real) - wp.transpose(Q) * Q) - wp.identity(
+            n=3, dtype=real
+        )
 
+    numbers = "time_step density" + " rotation angular_velocity" * (dimension == 2)
+    typed = TypesByName(vector, {real: numbers, matrix: "inertia inverse turns_before"})
+
+    @typed
     def predict(
-        time_step_i: real,
-        position_i: vector,
-        turn_x_i: vector,
-        turn_y_i: vector,
-        turn_z_i: vector,
-        rotation_i: angle,
-        velocity_i: vector,
-        angular_velocity_i: angle,
-        density_i: real,
-        inertia: matrix,
+        time_step_i,
+        position_i,
+        turn_x_i,
+        turn_y_i,
+        turn_z_i,
+        rotation_i,
+        velocity_i,
+        angular_velocity_i,
+        density_i,
+        inertia,
     ) -> tuple[vector, matrix, vector, matrix, vector, vector, vector]:
-        R = (unit() + wp.matrix_from_cols(turn_x_i, turn_y_i, turn_z_i)) * begun_rotation(rotation_i)
+        R = (wp.identity(n=3, dtype=real) + wp.matrix_from_cols(turn_x_i, turn_y_i, turn_z_i)) * begun_rotation(
+            rotation_i
+        )
         w = about(angular_velocity_i)
         ahead, turned = position_i + time_step_i * velocity_i, rotation(time_step_i * w) * R
         return position_i, R, ahead, turned, velocity_i, w, density_i * rate(R, inertia, w)
 
+    @typed
     def end(
-        time_step_i: real,
-        position_i: vector,
-        turn_x_i: vector,
-        turn_y_i: vector,
-        turn_z_i: vector,
-        rotation_i: angle,
-        turns_before_i: matrix,
-        V_i: vector,
-        W_i: vector,
-        L_i: vector,
-        density_i: real,
-        inverse: matrix,
+        time_step_i,
+        position_i,
+        turn_x_i,
+        turn_y_i,
+        turn_z_i,
+        rotation_i,
+        turns_before_i,
+        V_i,
+        W_i,
+        L_i,
+        density_i,
+        inverse,
     ) -> tuple[vector, vector, vector, vector, angle, vector, angle]:
         turning = rotation(time_step_i * W_i)
-        Q = evened(turning * (unit() + wp.matrix_from_cols(turn_x_i, turn_y_i, turn_z_i)))
+        Q = evened(turning * (wp.identity(n=3, dtype=real) + wp.matrix_from_cols(turn_x_i, turn_y_i, turn_z_i)))
         spin = angle_of(rate(turning * turns_before_i, inverse, L_i) / density_i)
         return position_i + time_step_i * V_i, column(Q, 0), column(Q, 1), column(Q, 2), rotation_i, V_i, spin
 
@@ -162,7 +158,7 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
         written=["V", "W", "L", "turns_before"],
         turned=turned,
     )
-    return FreeKernels(begins, ends)
+    return begins, ends
 
 
 NAMES = {
@@ -272,14 +268,14 @@ class FreeSolidsPart(Part):
         poses = made_of.walls.each
         self.bodies = [FreeBody(table, poses[table.number], made_of.dimension, layout) for table in made_of.tables]
         self.fields = tuple(field for body in self.bodies for field in body.fields)
-        self.kernels = free_kernels(layout.precision, made_of.dimension)
+        self.begins, self.ends = free_kernels(layout.precision, made_of.dimension)
         self.touch = made_of.contacts(self)
 
     def begin(self, step: StepContext, state: State) -> None:
         for body in self.bodies:
             for field in body.fields:
                 wp.copy(body.begun[field.name], state[field.name])
-            step.launch(self.kernels.predict.forward, body.before, *body.known(step), threads=self.layout.members)
+            step.launch(self.begins.forward, body.before, *body.known(step), threads=self.layout.members)
 
     def sort(self, step: StepContext, state: State) -> None:
         self.touch.look(step)
@@ -287,7 +283,7 @@ class FreeSolidsPart(Part):
     def end(self, step: StepContext, state: State, moved: State) -> None:
         for body in self.bodies:
             new = body.state(state, "_new")
-            step.launch(self.kernels.end.forward, new, body.moved, *body.known(step), threads=self.layout.members)
+            step.launch(self.ends.forward, new, body.moved, *body.known(step), threads=self.layout.members)
 
     def new_tangent(self) -> "FreeSolidsTangent":
         return FreeSolidsTangent(self)
@@ -322,13 +318,13 @@ class FreeSolidsTangent(PartTangent):
         self._touch = part.touch.tangent(self.bodies)
 
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        self._launch(self._part.kernels.predict.tangent, step, dot, state_dot, begins=True)
+        self._launch(self._part.begins.tangent, step, dot, state_dot, begins=True)
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         self._touch.look(step, dot)
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        self._launch(self._part.kernels.end.tangent, step, dot, state_dot, begins=False)
+        self._launch(self._part.ends.tangent, step, dot, state_dot, begins=False)
 
     def _launch(self, kernel: Any, step: StepContext, dot: Tangents, state_dot: State, begins: bool) -> None:
         part = self._part
@@ -354,7 +350,7 @@ class FreeSolidsAdjoint(PartAdjoint):
         for own in self.bodies:
             bars, body = {**self._bars(own, bar, state_bar), "turned_before_bar": own.turned_end}, own.body
             known = (own.moved, body.moved, *body.known(step))
-            step.launch(part.kernels.end.adjoint, bars, *known, threads=part.layout.members)
+            step.launch(part.ends.adjoint, bars, *known, threads=part.layout.members)
         return moved_bar
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
@@ -366,7 +362,7 @@ class FreeSolidsAdjoint(PartAdjoint):
             body, bars = own.body, {**self._bars(own, bar.parameters, state_bar), **own.before}
             given = bar.solids.collect(body.table.number)
             add(own.turned_end, given["turned_before_bar"])
-            step.launch(part.kernels.predict.adjoint, bars, given, *body.known(step), threads=part.layout.members)
+            step.launch(part.begins.adjoint, bars, given, *body.known(step), threads=part.layout.members)
             own.clear()
 
     def _bars(self, own: Changes, bar: Any, state_bar: State) -> dict[str, wp.array]:

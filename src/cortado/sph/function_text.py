@@ -186,10 +186,6 @@ class Frozen:
         return made
 
 
-REAL, VECTOR = "cortado_real", "cortado_vector"
-"""What the compiled text calls the types of a number and of a vector."""
-
-
 class DerivativeCheck(ast.NodeVisitor):
     """A check that refuses code which Warp would differentiate wrongly without a word: loops that it does not unroll,
     and vectors that are changed in part."""

@@ -25,12 +25,7 @@ def gravity_kernels(precision: Precision, taped: bool) -> Kernels:
         return gravity[member, step]
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
-    def adjoint(
-        total: wp.array(dtype=vector),
-        step: wp.array(dtype=wp.int32),
-        # in and out
-        gravity_bar: wp.array2d(dtype=vector),
-    ):
+    def adjoint(total: wp.array(dtype=vector), step: wp.array(dtype=wp.int32), gravity_bar: wp.array2d(dtype=vector)):
         member = wp.tid()
         n = step[member]
         gravity_bar[member, n] = gravity_bar[member, n] + total[member]

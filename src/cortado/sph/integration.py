@@ -2,29 +2,20 @@
 and back.
 """
 
-from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from cortado.device.modules import kernel_module, kind_of
+from cortado.device.modules import by_name, kernel_module, kind_of
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import particle_kernel
 
 
-@dataclass(frozen=True)
-class OrderKernels:
-    """Kernels that bring an array of particles from the scene's order to the sorted one, and back."""
-
-    sort: Any
-    unsort: Any
-
-
 @cache
-def order_kernels(dtype: Any, module: Any) -> OrderKernels:
-    """Make the kernels that sort and unsort entries of a Warp type, in a Warp module."""
-
+def order_kernels(dtype: Any, module: Any) -> SimpleNamespace:
+    """Make the kernels that ``sort`` an array of entries of a Warp type from the scene's order, and ``unsort`` it."""
     typed = TypesByName(dtype, {wp.int32: "order"})
 
     @wp.kernel(module=module)
@@ -39,7 +30,7 @@ def order_kernels(dtype: Any, module: Any) -> OrderKernels:
         i = wp.tid()
         a_scene[order[i]] = a[i]
 
-    return OrderKernels(sort, unsort)
+    return by_name(sort, unsort)
 
 
 def integration_module(precision: Precision, forward: bool, taped: bool = False) -> Any:
@@ -74,24 +65,11 @@ def new_state_adjoint(precision: Precision) -> Any:
     return adjoint
 
 
-@dataclass(frozen=True)
-class IntegrationKernels:
-    """The kernels of the time step."""
-
-    sort: Any
-    unsort: Any
-    predict: Any
-    predict_tangent: Any
-    acceleration_adjoint: Any
-    collect_masses: Any
-
-
 @cache
-def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels:
+def integration_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
     """Make kernels that ``sort`` and ``unsort`` a state and ``predict`` without pressure, with derivatives; a tape can
     differentiate ``taped`` ones."""
     real, vector = precision.real, precision.vector
-
     typed = TypesByName(real, {wp.int32: "order", vector: "x v acceleration"})
 
     @wp.kernel(module=integration_module(precision, True, taped))
@@ -133,14 +111,7 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
         i = wp.tid()
         m_scene_bar[order[i]] = m_scene_bar[order[i]] + m_bar[i]
 
-    return IntegrationKernels(
-        sort=sort,
-        unsort=unsort,
-        predict=predict,
-        predict_tangent=predict_tangent,
-        acceleration_adjoint=acceleration_adjoint,
-        collect_masses=collect_masses,
-    )
+    return by_name(sort, unsort, predict, predict_tangent, acceleration_adjoint, collect_masses)
 
 
 @cache
@@ -148,18 +119,13 @@ def begin_adjoint_kernel(precision: Precision) -> Any:
     """Make the kernel that turns the adjoint of the new state, in scene order, into the prediction's."""
     real, vector = precision.real, precision.vector
     adjoin_new_state = new_state_adjoint(precision)
-
     vectors = wp.array(dtype=vector)
+    typed = TypesByName(real, {wp.int32: "order", vector: "v", vectors: "x_scene v_scene"})
 
     @particle_kernel(integration_module(precision, False), "x_bar v_bar n_bar m_bar rho_0_bar mu_bar time_step_bar")
+    @typed
     def begin_adjoint(
-        order_i: wp.int32,
-        time_step: real,
-        v_i: vector,
-        v_star_i: vector,
-        x_scene_bar: vectors,
-        v_scene_bar: vectors,
-        time_step_bar_i: real,
+        order_i, time_step, v_i, v_star_i, x_scene_bar, v_scene_bar, time_step_bar_i
     ) -> tuple[vector, vector, real, real, real, real, real]:
         x_bar, v_bar, dt_bar = adjoin_new_state(
             x_scene_bar[order_i], v_scene_bar[order_i], time_step_bar_i, v_i, v_star_i, time_step

@@ -13,17 +13,18 @@ first in a step, on the particles at rest at x(t); what it makes of a particle h
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from cortado.device.modules import Kernels, kernel_module, kind_of
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import Entry, Layout, State, StateField
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import FREE_ENERGIES
-from cortado.sph.integration import OrderKernels, order_kernels
+from cortado.sph.integration import order_kernels
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 
 
@@ -33,18 +34,11 @@ def mixture_module(precision: Precision, phases: int, forward: bool, taped: bool
     return kernel_module(f"mixture_{kind_of(forward, taped)}_{phases}_{precision.name}", forward and taped)
 
 
-@dataclass(frozen=True)
-class MixtureKernels:
-    """The kernels that carry mass fractions into a step and out of it, and those of densities and viscosities."""
-
-    order: OrderKernels
-    blend: Kernels
-
-
 @cache
-def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKernels:
-    """Make the kernels of mixtures with a number of phases; their materials are arrays (members, phases). A tape can
-    differentiate ``taped`` ones."""
+def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNamespace:
+    """Make the kernels of a number of phases: ``order`` carries mass fractions into a step and out of it, ``blend`` are
+    those of densities and viscosities. Materials are arrays (members, phases). A tape can differentiate ``taped``
+    ones."""
     real, fractions = precision.real, precision.fractions(phases)
     tiny, numbers = wp.constant(real(precision.tiny)), wp.array2d(dtype=real)
 
@@ -53,8 +47,12 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKe
         """Return ln(mu + tiny) of a viscosity mu: any amount of a phase without viscosity makes a mixture thin."""
         return wp.log(viscosity + tiny)
 
+    materials = {numbers: "rest_density viscosity", wp.array(dtype=fractions): "c_scene"}
+    typed = TypesByName(real, {fractions: "c", wp.int32: "order", **materials})
+
     @particle_kernel(mixture_module(precision, phases, True, taped), "rho_0 mu")
-    def blend(member: int, c_i: fractions, rest_density: numbers, viscosity: numbers) -> tuple[real, real]:
+    @typed
+    def blend(member: int, c_i, rest_density, viscosity) -> tuple[real, real]:
         specific_volume = real(0.0)
         power = real(0.0)
         for k in range(wp.static(phases)):
@@ -63,16 +61,9 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKe
         return real(1.0) / specific_volume, wp.exp(power)
 
     @particle_kernel(mixture_module(precision, phases, False), "rho_0_dot mu_dot")
+    @typed
     def blend_tangent(
-        member: int,
-        c_i: fractions,
-        c_dot_i: fractions,
-        rest_density: numbers,
-        rest_density_dot: numbers,
-        viscosity: numbers,
-        viscosity_dot: numbers,
-        rho_0_i: real,
-        mu_i: real,
+        member: int, c_i, c_dot_i, rest_density, rest_density_dot, viscosity, viscosity_dot, rho_0_i, mu_i
     ) -> tuple[real, real]:
         change = real(0.0)
         power_dot = real(0.0)
@@ -84,17 +75,9 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKe
         return -rho_0_i * rho_0_i * change, mu_i * power_dot
 
     @particle_kernel(mixture_module(precision, phases, False), "+rest_density_bar +viscosity_bar +c_bar")
+    @typed
     def blend_adjoint(
-        member: int,
-        order_i: wp.int32,
-        c_i: fractions,
-        rest_density: numbers,
-        viscosity: numbers,
-        rho_0_i: real,
-        mu_i: real,
-        rho_0_bar_i: real,
-        mu_bar_i: real,
-        c_scene_bar: wp.array(dtype=fractions),
+        member: int, order_i, c_i, rest_density, viscosity, rho_0_i, mu_i, rho_0_bar_i, mu_bar_i, c_scene_bar
     ) -> tuple[fractions, fractions, fractions]:
         """Return adjoints of densities, viscosities and fractions; ``c_scene_bar`` is of the new fractions."""
         c_bar = fractions(c_scene_bar[order_i])  # a copy: what follows writes to its components
@@ -108,7 +91,7 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKe
         return rest_density_bar, viscosity_bar, c_bar
 
     order = order_kernels(fractions, mixture_module(precision, phases, True, taped))
-    return MixtureKernels(order, Kernels(blend, blend_tangent, blend_adjoint))
+    return SimpleNamespace(order=order, blend=Kernels(blend, blend_tangent, blend_adjoint))
 
 
 MASS_FRACTIONS = StateField("mass_fractions", "", Entry.FRACTIONS, first="mass_fractions")

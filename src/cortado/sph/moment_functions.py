@@ -6,13 +6,14 @@ a flat surface, and 0 where neighbours lie on a line or are missing. On a line I
 `ROUNDING` (tr M)^2 is added to I_2, so that H is 0 there in float32 too.
 """
 
-from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from cortado.device.modules import by_name
 from cortado.device.precision import Precision
 
 ROUNDING = 64.0
@@ -37,23 +38,11 @@ def cross_terms_function(precision: Precision) -> Any:
     return cross_terms
 
 
-@dataclass(frozen=True)
-class Symmetric:
-    """A type of symmetric matrices as six numbers that neighbours load: diagonal and entries yz, xz and xy."""
-
-    kind: Any
-    """The Warp type."""
-    pack: Any
-    """The Warp function from a 3 x 3 matrix to six numbers."""
-    times: Any
-    """The Warp function of the product with a vector."""
-
-
 @cache
-def symmetric(precision: Precision) -> Symmetric:
-    """Make the type and the functions of symmetric matrices as six numbers, in a precision."""
-    vector, matrix = precision.vector, matrix_type(precision)
-    six = precision.six
+def symmetric(precision: Precision) -> SimpleNamespace:
+    """Make what kernels need of symmetric matrices as six numbers that neighbours load: diagonal and entries yz, xz and
+    xy. ``kind`` is their Warp type, ``pack`` makes one of a 3 x 3 matrix, ``times`` is the product with a vector."""
+    vector, matrix, six = precision.vector, matrix_type(precision), precision.six
 
     @wp.func
     def pack(M: matrix) -> six:
@@ -67,27 +56,11 @@ def symmetric(precision: Precision) -> Symmetric:
             M[4] * v[0] + M[3] * v[1] + M[2] * v[2],
         )
 
-    return Symmetric(six, pack, times)
-
-
-@dataclass(frozen=True)
-class MomentFunctions:
-    """Warp functions of one particle's moment matrix."""
-
-    whole: Any
-    """M, invertible in the plane too, from its diagonal and its entries yz, xz and xy."""
-    change: Any
-    """A tangent of M, or any symmetric matrix, from its diagonal and its entries yz, xz and xy."""
-    fullness: Any
-    """The fullness H of a neighbourhood."""
-    inverse: Any
-    """M^-1, by cofactors."""
-    smoothstep: Any
-    """0 below a first number, 1 above a second one, and a cubic between them."""
+    return SimpleNamespace(kind=six, pack=pack, times=times)
 
 
 @cache
-def moment_functions(precision: Precision, dimension: int) -> MomentFunctions:
+def moment_functions(precision: Precision, dimension: int) -> SimpleNamespace:
     """Make the Warp functions of a particle's moment matrix, in a precision and in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     plane, tiny = wp.constant(real(float(dimension == 2))), wp.constant(real(1e-12))
@@ -95,6 +68,7 @@ def moment_functions(precision: Precision, dimension: int) -> MomentFunctions:
 
     @wp.func
     def change(diagonal: vector, others: vector) -> matrix:
+        """Return a tangent of M, or any symmetric matrix, from its diagonal and its entries yz, xz and xy."""
         x, y, z = others[0], others[1], others[2]
         return matrix(diagonal[0], z, y, z, diagonal[1], x, y, x, diagonal[2])
 
@@ -125,7 +99,8 @@ def moment_functions(precision: Precision, dimension: int) -> MomentFunctions:
 
     @wp.func
     def smoothstep(value: real, first: real, second: real) -> real:
+        """Return 0 below the first number, 1 above the second, and a cubic between them."""
         t = wp.clamp((value - first) / (second - first), real(0.0), real(1.0))
         return t * t * (real(3.0) - real(2.0) * t)
 
-    return MomentFunctions(whole, change, fullness, inverse, smoothstep)
+    return by_name(whole, change, fullness, inverse, smoothstep)

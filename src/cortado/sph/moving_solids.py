@@ -16,12 +16,13 @@ in which [w] u is the cross product w x u; J(w)^T is J(-w).
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.errors import MissingDerivativeError
 from cortado.particles.moving_walls import MovingWalls, matrix_of, turn_functions
 from cortado.particles.neighbours import NeighbourSearch
@@ -36,19 +37,10 @@ SMALL = 1e-3
 """|w|^2 below which the factors of J are series, to which three terms are enough."""
 
 
-@dataclass(frozen=True)
-class Rotations:
-    """Warp functions of rotations by angles, which are vectors in 3-D and numbers in 2-D."""
-
-    angle: Any
-    """The type of an angle."""
-    rotation: Any
-    """R(w), a 3 x 3 matrix, of which Warp knows the derivative by J."""
-
-
 @cache
-def rotations(precision: Precision, dimension: int) -> Rotations:
-    """Make the Warp functions of rotations, in 2 or 3 dimensions."""
+def rotations(precision: Precision, dimension: int) -> SimpleNamespace:
+    """Make the type ``angle`` of angles, numbers in 2 dimensions and vectors in 3, and the Warp function ``rotation``,
+    R(w), of which Warp knows the derivative by J."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
 
     @wp.func
@@ -58,12 +50,10 @@ def rotations(precision: Precision, dimension: int) -> Rotations:
 
     @wp.func
     def rotation(turn: vector) -> matrix:
-        size, no, one = wp.length(turn), real(0.0), real(1.0)
-        unit = matrix(one, no, no, no, one, no, no, no, one)
+        size, unit = wp.length(turn), wp.identity(n=3, dtype=real)
         if size == real(0.0):
             return unit
-        n = turn / size
-        cross = matrix(no, -n[2], n[1], n[2], no, -n[0], -n[1], n[0], no)
+        cross = wp.skew(turn / size)
         return unit + wp.sin(size) * cross + (real(1.0) - wp.cos(size)) * (cross * cross)
 
     @wp.func
@@ -86,7 +76,8 @@ def rotations(precision: Precision, dimension: int) -> Rotations:
         """Apply J(w)^T, which is J(-w): Warp's own adjoint would be 0 at 0."""
         wp.adjoint[turn] += further(-turn, turning(rotation(turn), adj_ret))
 
-    return Rotations(real, about_z) if dimension == 2 else Rotations(vector, rotation)
+    angle, found = (real, about_z) if dimension == 2 else (vector, rotation)
+    return SimpleNamespace(angle=angle, rotation=found)
 
 
 FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_name, "scale": scale_name}
@@ -100,21 +91,17 @@ def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
     real, vector, matrix, of = precision.real, precision.vector, matrix_of(precision), rotations(precision, dimension)
     angle, rotation = of.angle, of.rotation
 
+    typed = TypesByName(angle, {vector: "position place displacements", real: "scale"})
+
+    @typed
     def pose(
-        position_i: vector,
-        turn_i: angle,
-        rotation_i: angle,
-        scale_i: real,
-        place_i: vector,
-        displacements_i: vector,
-        turns_told_i: angle,
+        position_i, turn_i, rotation_i, scale_i, place_i, displacements_i, turns_told_i
     ) -> tuple[vector, matrix, vector, matrix, real]:
         begun = rotation(rotation_i)
         return position_i, rotation(turn_i) * begun, place_i + displacements_i, rotation(turns_told_i) * begun, scale_i
 
-    def end(
-        rotation_i: angle, scale_i: real, place_i: vector, displacements_i: vector, turns_told_i: angle
-    ) -> tuple[vector, angle, angle, real]:
+    @typed
+    def end(rotation_i, scale_i, place_i, displacements_i, turns_told_i) -> tuple[vector, angle, angle, real]:
         return place_i + displacements_i, turns_told_i, rotation_i, scale_i
 
     modules, told = [integration_module(precision, False)] * 3, ["displacements", "turns_told"]

@@ -11,20 +11,22 @@ to a row of its own. The rows are summed in a fixed order.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache, cached_property
 from math import prod
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from cortado.device.modules import kernel_module, kind_of
-from cortado.device.precision import Precision
+from cortado.device.modules import by_name, kernel_module, kind_of
+from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_of
-from cortado.particles.state import Layout, Parameters
+from cortado.particles.state import Layout, Parameters, components
 from cortado.scene.parameters import Axis, Parameter
 from cortado.sph.parts import Adjoints, StepContext
 
+WIDTH = (1, 3)
+"""How many numbers a parameter takes that is no array, by its rank."""
 MOST_NUMBERS = 2**24
 """Greatest number of numbers of a force's arrays, so that float32 has each whole index."""
 ROWS, MOST_PARTIAL = {"cpu": 16, "cuda": 2**15}, 2**24
@@ -48,25 +50,16 @@ def arrays_module(precision: Precision, forward: bool, taped: bool = False) -> A
     return kernel_module(f"arrays_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 
-@dataclass(frozen=True)
-class Reading:
-    """The Warp functions by which a user's function reads arrays."""
-
-    place: Any
-    """Returns an index, from the end where it is negative, for an axis of a size; NaN where there is no such place."""
-    read: Any
-    """Returns a number of the table, NaN where there is none."""
-
-
 @cache
-def reading(precision: Precision, taped: bool) -> Reading:
-    """Make the functions that read arrays; Warp's tape differentiates ``taped`` ones by itself."""
+def reading(precision: Precision, taped: bool) -> SimpleNamespace:
+    """Make the functions by which a user's function reads arrays; Warp's tape differentiates ``taped`` ones."""
     real, table = precision.real, table_type(precision)
     module = arrays_module(precision, True, taped)
     none, nothing = wp.constant(real(0.0)), wp.constant(real(float("nan")))
 
     @wp.func(module=module)
     def place(k: real, size: real) -> real:
+        """Return an index, from the end where it is negative, for an axis of a size; NaN where there is no place."""
         found = k
         if k < none:
             found = k + size
@@ -76,6 +69,7 @@ def reading(precision: Precision, taped: bool) -> Reading:
 
     @wp.func(module=module)
     def read(e: real, w: table, member: int, row: int, k: real) -> real:
+        """Return a number of the table, NaN where there is none."""
         found = nothing
         if k >= none:
             found = w.values[member, int(k)]
@@ -90,42 +84,64 @@ def reading(precision: Precision, taped: bool) -> Reading:
             elif k >= none and w.dots.shape[0] > 0:
                 wp.adjoint[e] += bar * w.dots[member, int(k)]
 
-    return Reading(place, read)
-
-
-@dataclass(frozen=True)
-class TableKernels:
-    """Kernels that write a parameter's numbers into a table, and add adjoints of a table to those of a parameter."""
-
-    pack: Any
-    add: Any
+    return by_name(place, read)
 
 
 @cache
-def table_kernels(precision: Precision, taped: bool) -> TableKernels:
-    """Make the kernels of tables, with a thread for each number of each scene."""
-    real, numbers = precision.real, wp.array2d(dtype=precision.real)
+def packing_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
+    """Make the kernels that write a parameter's values in a step into a table, and add the adjoint of a table to that
+    of the parameter. Values are numbers (members, steps x size), or the same in all steps (members, size)."""
+    typed = TypesByName(wp.array2d(dtype=precision.real), {wp.int32: "step"})
 
     @wp.kernel(module=arrays_module(precision, True, taped))
-    def pack_array(first: int, values: numbers, table: numbers):
-        member, k = wp.tid() // values.shape[1], wp.tid() % values.shape[1]
-        table[member, first + k] = values[member, k]
+    @typed.arrays
+    def pack(first: int, size: int, step, values, table):
+        member, k = wp.tid() // size, wp.tid() % size
+        row = wp.min(step[member], values.shape[1] // size - 1)
+        table[member, first + k] = values[member, row * size + k]
 
     @wp.kernel(module=arrays_module(precision, False), enable_backward=False)
-    def add_array(first: int, total: wp.array(dtype=real), values_bar: numbers):
-        member, k = wp.tid() // values_bar.shape[1], wp.tid() % values_bar.shape[1]
-        values_bar[member, k] = values_bar[member, k] + total[(first + k) * values_bar.shape[0] + member]
+    @typed.arrays
+    def add(first: int, size: int, step, table, values):
+        member, k = wp.tid() // size, wp.tid() % size
+        column = wp.min(step[member], values.shape[1] // size - 1) * size + k
+        values[member, column] = values[member, column] + table[member, first + k]
 
-    return TableKernels(pack_array, add_array)
+    return by_name(pack, add)
+
+
+class Numbers:
+    """The numbers of some parameters, one parameter behind the other in a table (members, numbers)."""
+
+    def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
+        self._kernels, self._members = packing_kernels(layout.precision, taped), layout.members
+        sizes = [prod(one.shape) if one.axis is Axis.ARRAY else WIDTH[one.rank] for one in parameters]
+        self._places = [(one.name, sum(sizes[:k]), sizes[k]) for k, one in enumerate(parameters)]
+        self.size = sum(sizes)
+
+    def pack(self, step: StepContext, values: Parameters, table: wp.array) -> None:
+        """Write the parameters' values in a step to a table."""
+        self._launch(self._kernels.pack, step, values, table)
+
+    def add(self, step: StepContext, table: wp.array, bar: Parameters) -> None:
+        """Add the adjoint of a table to those of the parameters."""
+        self._launch(self._kernels.add, step, bar, table)
+
+    def _launch(self, kernel: Any, step: StepContext, values: Parameters, table: wp.array) -> None:
+        for name, first, size in self._places:
+            count = values[name].size * getattr(values[name].dtype, "_length_", 1)
+            numbers = components(values[name], (self._members, count // self._members))
+            given = {"first": first, "size": size, "values": numbers, "table": table}
+            step.launch(kernel, threads=self._members * size, **given)
 
 
 class Tables:
     """The arrays of a user's function as one table in each scene, with its tangent and its adjoint."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
-        self._layout, self._kernels = layout, table_kernels(layout.precision, taped)
-        self._arrays = [one for one in parameters if one.axis is Axis.ARRAY]
-        self._size = sum(prod(one.shape) for one in self._arrays)
+        self._layout = layout
+        self._arrays = Numbers([one for one in parameters if one.axis is Axis.ARRAY], layout, taped)
+        self._size = self._arrays.size
         most = min(ROWS["cpu" if layout.device.is_cpu else "cuda"], layout.particles)
         self.rows = max(min(most, MOST_PARTIAL // (layout.members * max(self._size, 1))), 1)
         """Number of threads that share the particles of a scene in the adjoint."""
@@ -134,47 +150,33 @@ class Tables:
     @property
     def threads(self) -> int | None:
         """Return the number of threads of the adjoint, None where there is one for each particle."""
-        return self._layout.members * self.rows if self._arrays else None
+        return self._layout.members * self.rows if self._size else None
 
     def now(self, step: StepContext) -> dict[str, Any]:
         """Return the arguments of a forward kernel for the arrays of a step; none without arrays."""
-        return self._packed(step, self._table) if self._arrays else {}
+        return self._packed(step, self._table) if self._size else {}
 
     def along(self, step: StepContext, parameters_dot: Parameters) -> dict[str, Any]:
         """Return the arguments of a tangent kernel for the arrays of a step and their tangents."""
-        if not self._arrays:
+        if not self._size:
             return {}
-        self._pack(step, parameters_dot, self._along.dots)
+        self._arrays.pack(step, parameters_dot, self._along.dots)
         return self._packed(step, self._along)
 
     def back(self, step: StepContext) -> dict[str, Any]:
         """Return the arguments of an adjoint kernel, which adds to rows of the arrays' adjoints."""
-        return {**self._packed(step, self._back), "rows": self.rows} if self._arrays else {}
+        return {**self._packed(step, self._back), "rows": self.rows} if self._size else {}
 
     def collect(self, step: StepContext, bar: Adjoints) -> None:
         """Add the rows up into the adjoints of the arrays, and set them to 0."""
-        if self._arrays:
-            total = self._sum(self._back.rows.flatten())
-            for first, bars in self._each(bar.parameters):
-                step.launch(self._kernels.add, first=first, total=total, values_bar=bars, threads=bars.size)
+        if self._size:
+            total = self._sum(self._back.rows.flatten()).reshape((self._size, self._layout.members))
+            self._arrays.add(step, total.transpose((1, 0)), bar.parameters)
             self._back.rows.zero_()
 
     def _packed(self, step: StepContext, table: Any) -> dict[str, Any]:
-        self._pack(step, step.parameters, table.values)
+        self._arrays.pack(step, step.parameters, table.values)
         return {"table": table}
-
-    def _pack(self, step: StepContext, values: Parameters, table: wp.array) -> None:
-        for first, own in self._each(values):
-            step.launch(self._kernels.pack, first=first, values=own, table=table, threads=own.size)
-
-    def _each(self, values: Parameters) -> list[tuple[int, wp.array]]:
-        """Return where each array begins in the table, and its values (members, numbers)."""
-        sizes = [prod(one.shape) for one in self._arrays]
-        firsts = [sum(sizes[:k]) for k in range(len(sizes))]
-        shapes = ((self._layout.members, size) for size in sizes)
-        return [
-            (f, values[one.name].reshape(shape)) for f, one, shape in zip(firsts, self._arrays, shapes, strict=True)
-        ]
 
     @cached_property
     def _along(self) -> Any:

@@ -37,7 +37,7 @@ from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameter_values import argument
 from cortado.scene.parameters import Axis
 from cortado.scene.scene import Scene
-from cortado.sph.integration import OrderKernels, order_kernels
+from cortado.sph.integration import order_kernels
 
 
 @dataclass(frozen=True)
@@ -293,6 +293,6 @@ def unsort(step: StepContext, a: wp.array, a_scene: wp.array) -> None:
     step.launch(_kernels(a).unsort, a=a, a_scene=a_scene)
 
 
-def _kernels(a: wp.array) -> OrderKernels:
+def _kernels(a: wp.array) -> Any:
     module = kernel_module(f"order_{kind_of(True, a.requires_grad)}_{type_name(a.dtype)}", a.requires_grad)
     return order_kernels(a.dtype, module)

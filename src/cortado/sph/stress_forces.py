@@ -12,43 +12,30 @@ another face of an edge, and then b does not count: with a weight below 0 it wou
 the derivative has a corner. Functions know n by the ``foot``, the vector from x_b to the surface.
 """
 
-from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from cortado.device.precision import TypesByName
+from cortado.device.modules import by_name
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.sph.moment_functions import matrix_type
 
 
-@dataclass(frozen=True)
-class ContactFunctions:
-    """Warp functions of the viscous contact between a particle and a wall, by x_ib and the foot on the surface."""
-
-    weight: Any
-    """s of a separation of two particles, -V a of grad W = a x."""
-    fall: Any
-    """The vector y from the surface to the particle."""
-    fall_change: Any
-    """The derivative of y along a change of x, which is symmetric."""
-    hold: Any
-    """s_w / w_b"""
-    hold_gradient: Any
-    """The gradient of s_w / w_b."""
-
-
 @cache
-def contact_functions(discretisation: Discretisation) -> ContactFunctions:
-    """Return the Warp functions by which walls and particles hold each other in the viscous stress."""
+def contact_functions(discretisation: Discretisation) -> SimpleNamespace:
+    """Make the Warp functions of the viscous contact between a particle and a wall, by x_ib and the foot on the
+    surface."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     slope, slope_gradient = pair.slope, pair.slope_gradient
 
     @wp.func
     def weight(x: vector, s: neighbourhood) -> real:
+        """Return s of a separation of two particles, -V a of grad W = a x."""
         return -s.volume * slope(x, s)
 
     @wp.func
@@ -63,14 +50,17 @@ def contact_functions(discretisation: Discretisation) -> ContactFunctions:
 
     @wp.func
     def fall(x_ib: vector, foot: vector) -> vector:
+        """Return the vector y from the surface to the particle."""
         return (wp.max(height(x_ib, foot), real(0.0)) / wp.length(foot)) * foot
 
     @wp.func
     def hold(x_ib: vector, foot: vector, least: real, s: neighbourhood) -> real:
+        """Return s_w / w_b."""
         return weight(x_ib, s) * wp.max(rise(x_ib, foot), real(0.0)) / wp.max(height(x_ib, foot), least)
 
     @wp.func
     def fall_change(x_ib: vector, u: vector, foot: vector) -> vector:
+        """Return the derivative of y along a change u of x, which is symmetric."""
         square = wp.dot(foot, foot)
         return wp.where(height(x_ib, foot) > real(0.0), wp.dot(u, foot) / square, real(0.0)) * foot
 
@@ -83,26 +73,14 @@ def contact_functions(discretisation: Discretisation) -> ContactFunctions:
         along = weight(x_ib, s) * per * (real(1.0) - wp.where(d > least, above * per, real(0.0)))
         return (-s.volume * above * per) * slope_gradient(x_ib, s) + (along / wp.length(foot)) * foot
 
-    return ContactFunctions(weight, fall, fall_change, hold, hold_gradient)
-
-
-@dataclass(frozen=True)
-class StressSums:
-    """Warp functions of the viscous stress's sums over neighbours."""
-
-    force: Any
-    """The acceleration."""
-    tangent: Any
-    """Its tangent."""
-    traction_back: Any
-    """From the adjoint of the acceleration to those of the rows of T and of mu."""
-    back: Any
-    """From the adjoint of the acceleration to those of x, v and m."""
+    return by_name(weight, fall, fall_change, hold, hold_gradient)
 
 
 @cache
-def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
-    """Make the viscous acceleration's sums, with walls without slip if fluid ``sticks``; ``control`` is C."""
+def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace:
+    """Make the sums of the viscous acceleration, ``force`` and ``force_tangent``, and from its adjoint those of the
+    rows of T and of mu, ``traction_back``, and of x, v and m, ``force_back``. Walls have no slip if fluid ``sticks``;
+    ``control`` is C."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
@@ -135,24 +113,25 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
 
     @tangent_of(force)
     @summed(wall_force_tangent, ahead=False, grows=force)
+    @typed
     def force_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        v_ij: vector,
-        v_dot_ij: vector,
-        m_i: real,
-        m_dot_i: real,
-        T_i: matrix,
-        T_j: matrix,
-        T_dot_i: matrix,
-        T_dot_j: matrix,
-        mu_i: real,
-        mu_j: real,
-        mu_dot_i: real,
-        mu_dot_j: real,
-        control: real,
-        least: real,
-        s: neighbourhood,
+        x_ij,
+        x_dot_ij,
+        v_ij,
+        v_dot_ij,
+        m_i,
+        m_dot_i,
+        T_i,
+        T_j,
+        T_dot_i,
+        T_dot_j,
+        mu_i,
+        mu_j,
+        mu_dot_i,
+        mu_dot_j,
+        control,
+        least,
+        s,
     ) -> vector:
         w = weight(x_ij, s)
         w_dot = -s.volume * wp.dot(slope_gradient(x_ij, s), x_dot_ij) - w * m_dot_i / m_i
@@ -192,27 +171,23 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
         x_part = (s.volume * wp.dot(u, pull)) * slope_gradient(x_ij, s) - w * (wp.transpose(T) * u)
         return x_part, (-w * mu) * u, w * wp.dot(own_u, pull) / m_i
 
-    return StressSums(force, force_tangent, traction_back, force_back)
+    return by_name(force, force_tangent, traction_back, force_back)
+
+
+def work_types(precision: Precision) -> TypesByName:
+    """Return the Warp types, by name, of what the works of viscous stress on solids compute with."""
+    kinds = {precision.vector: "x v foot acceleration couple", matrix_type(precision): "T M A"}
+    return TypesByName(precision.real, {**kinds, precision.pair: "constants", neighbourhood_type(precision): "s"})
 
 
 def stress_work(d: Discretisation) -> Any:
     """Make the work of the viscous sum on solids, for the adjoint ``acceleration_bar``, with ``least`` and ``control``
     as ``constants`` (`cortado.particles.wall_terms.solid_kernel`)."""
-    precision, contact = d.precision, contact_functions(d)
-    real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
+    precision, real, contact = d.precision, d.precision.real, contact_functions(d)
     fall, hold = contact.fall, contact.hold
 
-    def stress_work(
-        x_ij: vector,
-        v_ij: vector,
-        m_i: real,
-        T_i: matrix,
-        eta_i: real,
-        acceleration_bar_i: vector,
-        constants: pair,
-        foot: vector,
-        s: neighbourhood_type(precision),
-    ) -> real:
+    @work_types(precision)
+    def stress_work(x_ij, v_ij, m_i, T_i, eta_i, acceleration_bar_i, constants, foot, s) -> real:
         pull = T_i * fall(x_ij, foot) + (constants[1] * eta_i) * v_ij
         return (-hold(x_ij, foot, constants[0], s) / m_i) * wp.dot(pull, acceleration_bar_i)
 
@@ -221,20 +196,10 @@ def stress_work(d: Discretisation) -> Any:
 
 def stress_couple_work(d: Discretisation) -> Any:
     """Make the Warp function of a wall's viscous couple on a particle, y_ib x a_ib, times its adjoint."""
-    precision, fall, force = d.precision, contact_functions(d).fall, wp.func(stress_work(d))
-    real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
+    real, fall, force = d.precision.real, contact_functions(d).fall, wp.func(stress_work(d))
 
-    def stress_couple_work(
-        x_ij: vector,
-        v_ij: vector,
-        m_i: real,
-        T_i: matrix,
-        eta_i: real,
-        couple_bar_i: vector,
-        constants: pair,
-        foot: vector,
-        s: neighbourhood_type(precision),
-    ) -> real:
+    @work_types(d.precision)
+    def stress_couple_work(x_ij, v_ij, m_i, T_i, eta_i, couple_bar_i, constants, foot, s) -> real:
         return force(x_ij, v_ij, m_i, T_i, eta_i, wp.cross(couple_bar_i, fall(x_ij, foot)), constants, foot, s)
 
     return stress_couple_work

@@ -32,26 +32,30 @@ missing: M has no inverse there, and the particle takes no part in the stress. W
 H is 1 inside, about 0.6 at a flat surface and 0 on a line. Where S is not 0, det M is at least 0.008, so that the
 inverse needs no guard of its own.
 
+Functions of users may ask for velocity gradients, S G, with sums over fluid alone: exact where velocities are linear,
+also at a free surface, and 0 in spray.
+
 Walls without slip: `cortado.sph.stress_forces`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, cached_property, partial
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernel
 from cortado.particles.wall_terms import solid_kernel
 from cortado.sph.formula import theta_of
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions
-from cortado.sph.stress_forces import contact_functions, stress_sums, stress_work
-from cortado.sph.viscosity_law import Law
+from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
+from cortado.sph.stress_forces import contact_functions, stress_sums, stress_work, work_types
+from cortado.sph.viscosity_law import Law, newtonian_law
 
 LEAST_VISCOSITY = 1e-12
 """The number added to viscosities [Pa s]: the mean of their reciprocals is finite where there is none."""
@@ -91,9 +95,7 @@ def part_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
         """Return M, or the unit matrix where S is 0 and nothing depends on M."""
         result = M
         if part(M) == real(0.0):
-            result = matrix(
-                real(1.0), real(0.0), real(0.0), real(0.0), real(1.0), real(0.0), real(0.0), real(0.0), real(1.0)
-            )
+            result = wp.identity(n=3, dtype=real)
         return result
 
     return part, regular
@@ -152,69 +154,53 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
     fluidity, matrix = fluidity_function(precision), matrix_type(precision)
     cross_terms = cross_terms_function(precision)
 
+    typed = TypesByName(real, {vector: "x v foot turn", neighbourhood: "s", matrix: "M A"})
+
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
         """Return the entries yz, xz and xy of the symmetric matrix a b^T + b a^T."""
         return cross_terms(a, b) + cross_terms(b, a)
 
-    def wall_moments(
-        x_ij: vector, v_ij: vector, mu_i: real, least: real, foot: vector, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector, vector, real]:
-        w, y = hold(x_ij, foot, least, s), fall(x_ij, foot)
+    @wp.func
+    def terms(w: real, y: vector, v: vector, thin: real):
+        """Return the terms of M in two parts, of the rows of A, and of R, for a weight w and a fluidity."""
         z = w * y
-        rub = wp.dot(z, y) * fluidity(mu_i)
-        return wp.cw_mul(z, y), cross_terms(z, y), v_ij[0] * z, v_ij[1] * z, v_ij[2] * z, rub
+        return wp.cw_mul(z, y), cross_terms(z, y), v[0] * z, v[1] * z, v[2] * z, wp.dot(z, y) * thin
 
-    @summed(wall_moments)
-    def moments(
-        x_ij: vector, v_ij: vector, mu_i: real, mu_j: real, least: real, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector, vector, real]:
-        """Return a pair's terms of M in two parts, of the rows of A, and of R."""
-        z = weight(x_ij, s) * x_ij
-        rub = wp.dot(z, x_ij) * fluidity(mu_j)
-        return wp.cw_mul(z, x_ij), cross_terms(z, x_ij), v_ij[0] * z, v_ij[1] * z, v_ij[2] * z, rub
+    @wp.func
+    def changes(w: real, w_dot: real, y: vector, u: vector, v: vector, v_dot: vector, thin: real, thin_dot: real):
+        """Return the changes of the terms, where y changes by u."""
+        z, z_dot, even = w * y, w_dot * y + w * u, w_dot * y + real(2.0) * w * u
+        others = w_dot * cross_terms(y, y) + w * even_terms(y, u)
+        x_row, y_row, z_row = v[0] * z_dot + v_dot[0] * z, v[1] * z_dot + v_dot[1] * z, v[2] * z_dot + v_dot[2] * z
+        return wp.cw_mul(even, y), others, x_row, y_row, z_row, wp.dot(even, y) * thin + wp.dot(z, y) * thin_dot
 
-    typed = TypesByName(real, {vector: "x v foot turn", neighbourhood: "s", matrix: "M A"})
+    six = tuple[vector, vector, vector, vector, vector, real]
 
     @typed
-    def wall_moments_tangent(
-        x_ij, x_dot_ij, v_ij, v_dot_ij, mu_i, mu_dot_i, least, foot, turn_dot, s
-    ) -> tuple[vector, vector, vector, vector, vector, real]:
+    def wall_moments(x_ij, v_ij, mu_i, least, foot, s) -> six:
+        return terms(hold(x_ij, foot, least, s), fall(x_ij, foot), v_ij, fluidity(mu_i))
+
+    @summed(wall_moments)
+    @typed
+    def moments(x_ij, v_ij, mu_i, mu_j, least, s) -> six:
+        return terms(weight(x_ij, s), x_ij, v_ij, fluidity(mu_j))
+
+    @typed
+    def wall_moments_tangent(x_ij, x_dot_ij, v_ij, v_dot_ij, mu_i, mu_dot_i, least, foot, turn_dot, s) -> six:
         """Return the tangent of a wall particle's terms; a turning wall turns y, and the rest moves it."""
         w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
         u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
         w_dot, thin = wp.dot(hold_gradient(x_ij, foot, least, s), rest), fluidity(mu_i)
-        z, z_dot, even = w * y, w_dot * y + w * u, w_dot * y + real(2.0) * w * u
-        rub = wp.dot(even, y) * thin - wp.dot(z, y) * thin * thin * mu_dot_i
-        others = w_dot * cross_terms(y, y) + w * even_terms(y, u)
-        return (
-            wp.cw_mul(even, y),
-            others,
-            v_ij[0] * z_dot + v_dot_ij[0] * z,
-            v_ij[1] * z_dot + v_dot_ij[1] * z,
-            v_ij[2] * z_dot + v_dot_ij[2] * z,
-            rub,
-        )
+        return changes(w, w_dot, y, u, v_ij, v_dot_ij, thin, -thin * thin * mu_dot_i)
 
     @tangent_of(moments)
     @summed(wall_moments_tangent, ahead=False, grows=moments)
     @typed
-    def moments_tangent(
-        x_ij, x_dot_ij, v_ij, v_dot_ij, mu_i, mu_j, mu_dot_i, mu_dot_j, least, s
-    ) -> tuple[vector, vector, vector, vector, vector, real]:
+    def moments_tangent(x_ij, x_dot_ij, v_ij, v_dot_ij, mu_i, mu_j, mu_dot_i, mu_dot_j, least, s) -> six:
         w, w_dot = weight(x_ij, s), -s.volume * wp.dot(slope_gradient(x_ij, s), x_dot_ij)
         thin = fluidity(mu_j)
-        z, z_dot, even = w * x_ij, w_dot * x_ij + w * x_dot_ij, w_dot * x_ij + real(2.0) * w * x_dot_ij
-        rub = wp.dot(even, x_ij) * thin - wp.dot(z, x_ij) * thin * thin * mu_dot_j
-        others = w_dot * cross_terms(x_ij, x_ij) + w * even_terms(x_ij, x_dot_ij)
-        return (
-            wp.cw_mul(even, x_ij),
-            others,
-            v_ij[0] * z_dot + v_dot_ij[0] * z,
-            v_ij[1] * z_dot + v_dot_ij[1] * z,
-            v_ij[2] * z_dot + v_dot_ij[2] * z,
-            rub,
-        )
+        return changes(w, w_dot, x_ij, x_dot_ij, v_ij, v_dot_ij, thin, -thin * thin * mu_dot_j)
 
     @typed
     def wall_moments_back(x_ij, v_ij, mu_i, M_bar_i, A_bar_i, R_bar_i, least, foot, s) -> tuple[vector, vector, real]:
@@ -245,21 +231,11 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
 def moments_work(d: Discretisation) -> Any:
     """Make the work of the moments' sums on solids, for adjoints ``M_bar``, ``A_bar`` and ``R_bar``, with ``least`` the
     first of the ``constants`` (`cortado.particles.wall_terms.solid_kernel`)."""
-    precision, contact = d.precision, contact_functions(d)
-    real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
+    precision, real, contact = d.precision, d.precision.real, contact_functions(d)
     fall, hold, fluidity = contact.fall, contact.hold, fluidity_function(precision)
 
-    def moments_work(
-        x_ij: vector,
-        v_ij: vector,
-        mu_i: real,
-        M_bar_i: matrix,
-        A_bar_i: matrix,
-        R_bar_i: real,
-        constants: pair,
-        foot: vector,
-        s: neighbourhood_type(precision),
-    ) -> real:
+    @work_types(precision)
+    def moments_work(x_ij, v_ij, mu_i, M_bar_i, A_bar_i, R_bar_i, constants, foot, s) -> real:
         y = fall(x_ij, foot)
         bars = wp.dot(y, M_bar_i * y) + wp.dot(v_ij, A_bar_i * y) + R_bar_i * wp.dot(y, y) * fluidity(mu_i)
         return hold(x_ij, foot, constants[0], s) * bars
@@ -267,34 +243,22 @@ def moments_work(d: Discretisation) -> Any:
     return moments_work
 
 
-@dataclass(frozen=True)
-class StressKernels:
-    """The kernels of viscosity as a stress, in the order in which a step needs them."""
-
-    moments: Kernels
-    """M, A and R."""
-    stress: Kernels
-    """T and mu from M, A and R; mu follows from A, and T from ``A_u`` of resisted velocities."""
-    force: Kernels
-    """The acceleration. Its adjoint are two kernels: that of T and mu, and that of particles."""
-
-
 @cache
-def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> StressKernels:
+def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> SimpleNamespace:
     """Make the kernels of the viscous stress in 2 or 3 dimensions, with a law of viscosity; with ``sticks`` walls have
-    no slip. ``control`` of kernels is C, ``eta`` the mu of the formulas above, as ``mu`` of a step is the viscosity of
+    no slip. ``moments`` are those of M, A and R. ``stress`` are those of T and mu from these: mu follows from A, and T
+    from ``A_u`` of resisted velocities. ``force`` are those of the acceleration, with two adjoints: that of T and mu,
+    and that of particles.
+
+    ``control`` of kernels is C, ``eta`` the mu of the formulas above, as ``mu`` of a step is the viscosity of
     the fluid, and ``theta`` are the parameters of the law."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     modules = discretisation.modules(f"viscous_stress_{law.topic}{dimension}d" + "_no_slip" * sticks)
     sums, forces = moment_sums(discretisation, sticks), stress_sums(discretisation, sticks)
     known = moment_functions(precision, dimension)
-    given: dict[str, Any] = {
-        "numbers": ["control", "least"],
-        "mu": "eta",
-        "mu_dot": "eta_dot",
-        "bar": "acceleration_bar",
-    }
+    renamed = {"mu": "eta", "mu_dot": "eta_dot", "bar": "acceleration_bar"}
+    given: dict[str, Any] = {"numbers": ["control", "least"], **renamed}
 
     def moments_of(name: str, module: Any, results: str, total: Any, symmetric: Any) -> Any:
         names = "diagonal others row_x row_y row_z thin"
@@ -313,32 +277,83 @@ def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sti
     def traction_adjoint(row_x: vector, row_y: vector, row_z: vector, mu_bar: real) -> tuple[matrix, real]:
         return wp.matrix_from_rows(row_x, row_y, row_z), mu_bar
 
-    return StressKernels(
-        Kernels(
-            moments_of("moments", modules[0], "M A R", sums.forward, known.whole),
-            moments_of("moments_tangent", modules[1], "M_dot A_dot R_dot", sums.tangent, known.change),
-            sum_kernel("moments_adjoint", modules[2], "+x_bar +v_bar +mu_bar", sums.adjoint, numbers=["least"]),
-        ),
-        pointwise_kernels(
-            precision,
-            modules,
-            partial(stress_of_particle, precision, dimension, law),
-            ["T", "eta"],
-            numbers=["control"],
-            written=["M", "A", "A_u", "R", "theta"],
-        ),
-        Kernels(
-            sum_kernel("force", modules[0], "acceleration:acceleration_in", forces.force, **given),
-            sum_kernel("force_tangent", modules[1], "acceleration_dot:acceleration_in_dot", forces.tangent, **given),
-            (
-                traction_adjoint,
-                sum_kernel("force_adjoint", modules[2], "+x_bar +v_bar +m_bar", forces.back, **given),
-            ),
-        ),
+    moments = Kernels(
+        moments_of("moments", modules[0], "M A R", sums.forward, known.whole),
+        moments_of("moments_tangent", modules[1], "M_dot A_dot R_dot", sums.tangent, known.change),
+        sum_kernel("moments_adjoint", modules[2], "+x_bar +v_bar +mu_bar", sums.adjoint, numbers=["least"]),
     )
+    make, written = partial(stress_of_particle, precision, dimension, law), ["M", "A", "A_u", "R", "theta"]
+    stress = pointwise_kernels(precision, modules, make, ["T", "eta"], numbers=["control"], written=written)
+    force_adjoint = sum_kernel("force_adjoint", modules[2], "+x_bar +v_bar +m_bar", forces.force_back, **given)
+    force = Kernels(
+        sum_kernel("force", modules[0], "acceleration:acceleration_in", forces.force, **given),
+        sum_kernel("force_tangent", modules[1], "acceleration_dot:acceleration_in_dot", forces.force_tangent, **given),
+        (traction_adjoint, force_adjoint),
+    )
+    return SimpleNamespace(moments=moments, stress=stress, force=force)
 
 
 def stress_solid_kernels(discretisation: Discretisation) -> list[Callable[[], Any]]:
     """Return makers of the kernels that add viscous adjoints to those of moving solids without slip."""
     works = (moments_work, stress_work)
     return [partial(solid_kernel, discretisation, "viscous_stress", work, rubs=True) for work in works]
+
+
+@cache
+def gradient_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
+    """Make the Warp functions of the velocity gradient [1/s] and of the shear rate [1/s], by M and A."""
+    real, matrix = precision.real, matrix_type(precision)
+    part, regular = part_functions(precision, dimension)
+    inverse, slowest = moment_functions(precision, dimension).inverse, wp.constant(real(SLOWEST**2))
+
+    @wp.func
+    def velocity_gradient(M_i: matrix, A_i: matrix) -> matrix:
+        M = real(0.5) * (M_i + wp.transpose(M_i))  # so that the adjoint of M is symmetric, as M is
+        return part(M) * (A_i * inverse(regular(M)))
+
+    @wp.func
+    def shear_rate(M_i: matrix, A_i: matrix) -> real:
+        G = velocity_gradient(M_i, A_i)
+        twice_D = G + wp.transpose(G)
+        return wp.sqrt(real(0.5) * wp.ddot(twice_D, twice_D) + slowest)  # with a derivative at rest
+
+    return velocity_gradient, shear_rate
+
+
+class VelocityGradients:
+    """The sums M and A of the particles of one solver, with their tangents and adjoints."""
+
+    def __init__(self, setting: Setting):
+        self._setting = setting
+        self._kernels = stress_kernels(setting.discretisation, setting.scene.dimension, newtonian_law(), False).moments
+        self._sums = self._arrays("", setting.discretisation.taped)
+
+    def measure(self, step: StepContext) -> dict[str, wp.array]:
+        """Write the sums of a step, and return them by the names of kernels' arguments."""
+        step.launch(self._kernels.forward, self._sums, least=0.0)
+        return self._sums
+
+    def tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
+        """Write the tangents of the sums, and return these and the sums."""
+        step.launch(self._kernels.tangent, self._sums, self._dots, *dot.named, least=0.0)
+        return {**self._sums, **self._dots}
+
+    def known(self) -> dict[str, wp.array]:
+        """Return the sums of the step that was taken last, and room for their adjoints."""
+        return {**self._sums, **self._bars}
+
+    def adjoint(self, step: StepContext, bar: Adjoints) -> None:
+        """Add to the adjoints of particles, given those of the sums."""
+        step.launch(self._kernels.adjoint, self._bars, *bar.named, least=0.0)
+
+    @cached_property
+    def _dots(self) -> dict[str, wp.array]:
+        return self._arrays("_dot")
+
+    @cached_property
+    def _bars(self) -> dict[str, wp.array]:
+        return self._arrays("_bar")
+
+    def _arrays(self, suffix: str, requires_grad: bool = False) -> dict[str, wp.array]:
+        layout, matrix = self._setting.layout, matrix_type(self._setting.layout.precision)
+        return layout.arrays(suffix, requires_grad, M=matrix, A=matrix, R=layout.precision.real)

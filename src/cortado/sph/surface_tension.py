@@ -19,7 +19,7 @@ takes up energy from them, see `LEAST_VISCOSITY`. Walls have no part in either, 
 meets them at 180 degrees.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import cache
 from math import pi, sqrt
 from typing import Any
@@ -31,10 +31,11 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
 from cortado.discretise.calibration import lattice_offsets
 from cortado.errors import warn
+from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.particles.particle_kernels import sum_kernel, sum_kernels
-from cortado.particles.state import Layout, zeros
+from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
 from cortado.sph.curvature import CurvatureConstants
 from cortado.sph.curvature_kernels import curvature_kernels, entries
@@ -44,118 +45,46 @@ PART = 2.0 / 3.0
 """The part by which the stress across the surface is less than along it; see above."""
 
 
-@dataclass(frozen=True)
-class TensionFunctions:
-    """Warp functions of the surface stress between two particles at a separation x, where ``h2`` is h^2."""
-
-    pull: Any
-    """s (1 - s)^2"""
-    pull_derivative: Any
-    """The derivative of the pull by |x|^2 / 2, times h^2."""
-    stress: Any
-    """S(n) x"""
-    stress_change: Any
-    """The derivative of S(n) x along a change of n."""
-    stress_derivative: Any
-    """The derivative of w . S(n) x by n."""
-
-
-@cache
-def tension_functions(discretisation: Discretisation) -> TensionFunctions:
-    """Make the Warp functions of the surface stress of pairs, for a precision."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    part, one, two = wp.constant(real(PART)), wp.constant(real(1.0)), wp.constant(real(2.0))
+def tension_term(discretisation: Discretisation) -> Callable[..., Any]:
+    """Make the term of a pair of particles in the acceleration by surface tension, over 1 / (Gamma s^d)."""
+    real, vector, neighbourhood = discretisation.types
+    part, one = wp.constant(real(PART)), wp.constant(real(1.0))
 
     @wp.func
     def pull(x: vector, h2: real) -> real:
+        """Return s (1 - s)^2, where ``h2`` is h^2."""
         s = wp.dot(x, x) / h2
         d = wp.max(one - s, real(0.0))
         return s * d * d
 
     @wp.func
-    def pull_derivative(x: vector, h2: real) -> real:
-        s = wp.dot(x, x) / h2
-        d = wp.max(one - s, real(0.0))
-        return two * d * (d - two * s)
-
-    @wp.func
     def stress(n: vector, x: vector) -> vector:
+        """Return S(n) x."""
         return (wp.dot(n, n) * x - (part * wp.dot(n, x)) * n) / wp.sqrt(one + wp.dot(n, n))
 
-    @wp.func
-    def stress_change(n: vector, n_dot: vector, x: vector) -> vector:
-        size = one + wp.dot(n, n)
-        turn = two * wp.dot(n, n_dot) * x - part * (wp.dot(n_dot, x) * n + wp.dot(n, x) * n_dot)
-        return turn / wp.sqrt(size) - (wp.dot(n, n_dot) / size) * stress(n, x)
+    @TypesByName(real, {vector: "x normals", neighbourhood: "s"})
+    def tension(x_ij, normals_i, normals_j, m_i, sigma, s) -> vector:
+        both = stress(normals_i, x_ij) + stress(normals_j, x_ij)
+        return (-sigma / m_i * pull(x_ij, s.support * s.support)) * both
 
-    @wp.func
-    def stress_derivative(n: vector, w: vector, x: vector) -> vector:
-        size = one + wp.dot(n, n)
-        turn = two * wp.dot(w, x) * n - part * (wp.dot(n, w) * x + wp.dot(n, x) * w)
-        return turn / wp.sqrt(size) - (wp.dot(w, stress(n, x)) / size) * n
-
-    return TensionFunctions(pull, pull_derivative, stress, stress_change, stress_derivative)
+    return tension
 
 
 @cache
 def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
     """Make the kernels of the acceleration by surface tension; ``scale`` is 1 / (Gamma s^d), with the spacing s."""
-    real, vector, neighbourhood = discretisation.types
-    functions = tension_functions(discretisation)
-    pull, pull_derivative = functions.pull, functions.pull_derivative
-    stress, stress_change, stress_derivative = functions.stress, functions.stress_change, functions.stress_derivative
-
-    @fluid_sum(discretisation)
-    def tension(
-        x_ij: vector, normals_i: vector, normals_j: vector, m_i: real, sigma: real, scale: real, s: neighbourhood
-    ) -> vector:
-        both = stress(normals_i, x_ij) + stress(normals_j, x_ij)
-        return (-sigma * scale / m_i * pull(x_ij, s.support * s.support)) * both
-
-    typed = TypesByName(real, {vector: "x normals bar", neighbourhood: "s"})
-
-    @tangent_of(tension)
-    @fluid_sum(discretisation, ahead=False)
-    @typed
-    def tension_tangent(
-        x_ij, x_dot_ij, normals_i, normals_j, normals_dot_i, normals_dot_j, m_i, m_dot_i, sigma, sigma_dot, scale, s
-    ) -> vector:
-        h2 = s.support * s.support
-        g = pull(x_ij, h2)
-        both = stress(normals_i, x_ij) + stress(normals_j, x_ij)
-        turn = stress_change(normals_i, normals_dot_i, x_ij) + stress_change(normals_j, normals_dot_j, x_ij)
-        moved = turn + stress(normals_i, x_dot_ij) + stress(normals_j, x_dot_ij)
-        g_dot = pull_derivative(x_ij, h2) * wp.dot(x_ij, x_dot_ij) / h2
-        total = (sigma_dot - sigma * m_dot_i / m_i) * g * both + sigma * (g_dot * both + g * moved)
-        return (-scale / m_i) * total
-
-    @adjoint_of(tension)
-    @fluid_sum(discretisation)
-    @typed
-    def tension_adjoint(
-        x_ij, normals_i, normals_j, m_i, m_j, bar_i, bar_j, sigma, scale, s
-    ) -> tuple[vector, vector, real, real]:
-        """Return a pair's part in the adjoints of x, the normals, m and sigma of i."""
-        h2 = s.support * s.support
-        w_i = (-scale / m_i) * bar_i
-        w_ij = w_i + (scale / m_j) * bar_j
-        g = pull(x_ij, h2)
-        both = stress(normals_i, x_ij) + stress(normals_j, x_ij)
-        turn = stress(normals_i, w_ij) + stress(normals_j, w_ij)
-        x_part = g * turn + (pull_derivative(x_ij, h2) * wp.dot(both, w_ij) / h2) * x_ij
-        work = g * wp.dot(both, w_i)
-        return sigma * x_part, (sigma * g) * stress_derivative(normals_i, w_ij, x_ij), -sigma * work / m_i, work
-
-    return sum_kernels(
-        "accelerate",
-        discretisation.modules("surface_tension"),
-        (tension, tension_tangent, tension_adjoint),
-        "acceleration",
-        before="acceleration_in",
-        numbers=["scale"],
-        written=["normals"],
-        sigma="surface_tension",
-    )
+    modules = discretisation.modules("surface_tension")
+    total = fluid_sum(discretisation)(tension_term(discretisation))
+    tangent = made_tangent(discretisation, tension_term, modules[1])
+    adjoint = made_adjoint(discretisation, tension_term, modules[2])
+    given: dict[str, Any] = {
+        "before": "acceleration_in",
+        "times": "scale",
+        "numbers": ["scale"],
+        "written": ["normals"],
+    }
+    sums = total, tangent, adjoint
+    return sum_kernels("accelerate", modules, sums, "acceleration", **given, sigma="surface_tension")
 
 
 @cache
@@ -196,14 +125,10 @@ class CurvatureTension:
 
     def __init__(self, discretisation: Discretisation, dimension: int, constants: CurvatureConstants, layout: Layout):
         self._kernels = curvature_kernels(discretisation, dimension)
-        self._constants = {
-            "spacing": constants.spacing,
-            "depth": constants.depth,
-            "per_width": 1.0 / constants.width,
-        }
-        kinds = {name: (layout.all_particles, kind) for name, kind in entries(layout.precision).items()}
-        self._of = zeros(kinds, layout.device, discretisation.taped)
-        self._change = zeros({**kinds, "r": kinds["g"]}, layout.device)
+        self._constants = {"spacing": constants.spacing, "depth": constants.depth, "per_width": 1.0 / constants.width}
+        kinds = entries(layout.precision)
+        self._of = layout.arrays(requires_grad=discretisation.taped, **kinds)
+        self._change = layout.arrays(**kinds, r=kinds["g"])
         """Tangents or adjoints, and r."""
         self._dot, self._bar = ({f"{name}_{kind}": self._change[name] for name in kinds} for kind in ("dot", "bar"))
 
@@ -247,9 +172,8 @@ class SurfaceTension:
         """Prepare the force with ``inverse`` and ``scale`` as `tension_constants` gives them."""
         self._normal, self._kernels = normal_kernels(discretisation), surface_tension_kernels(discretisation)
         self._inverse, self._scale = inverse, scale
-        vectors = {"shape": layout.all_particles, "dtype": layout.precision.vector, "device": layout.device}
-        self._n = wp.zeros(**vectors, requires_grad=True)
-        self._change = wp.zeros(**vectors)
+        vector = layout.precision.vector
+        self._n, self._change = layout.arrays(requires_grad=True, n=vector)["n"], layout.arrays(n=vector)["n"]
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         step.launch(self._normal.forward, inverse=self._inverse, normals=self._n)
@@ -292,7 +216,10 @@ def force(setting: Setting) -> Force:
     """Make the surface tension of a scene, None without any; warn where it is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
     form = "pairs" if scene.solver.kind == "pcisph" else "curvature"
-    _check_support(scene, LEAST_SUPPORT[form])
+    support, least = scene.discretisation.support, LEAST_SUPPORT[form]
+    if support < least:
+        needed = f"surface tension needs at least {least:g} to hold a fluid together"
+        warn(f"discretisation.support is {support:g}, but {needed}.")
     _check_viscosity(scene, setting.layout.particles)
     if form == "curvature":
         cut, smoothing = scene.discretisation, setting.discretisation.smoothing
@@ -300,15 +227,6 @@ def force(setting: Setting) -> Force:
         return CurvatureTension(setting.discretisation, scene.dimension, known, setting.layout)
     constants = tension_constants(scene.discretisation.spacing, lattice.support, scene.dimension)
     return SurfaceTension(setting.discretisation, *constants, setting.layout)
-
-
-def _check_support(scene: Scene, least: float) -> None:
-    support = scene.discretisation.support
-    if support < least:
-        warn(
-            f"discretisation.support is {support:g}, but surface tension needs at least {least:g} to hold a "
-            "fluid together."
-        )
 
 
 def _check_viscosity(scene: Scene, particles: int) -> None:

@@ -10,16 +10,17 @@ b is over walls without slip, where v_ib is against the wall's velocity. phi is 
 that momentum and angular momentum are kept.
 """
 
-from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from cortado.device.modules import Kernels
+from cortado.device.modules import Kernels, by_name
 from cortado.device.precision import TypesByName, arithmetic
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import adjoint_of, rubbing_sum, tangent_of
+from cortado.device.reduction import add
+from cortado.particles.neighbourhood import Discretisation, pair_functions
+from cortado.particles.pair_sums import adjoint_of, fluid_sum, rubbing_sum, tangent_of
 from cortado.particles.particle_kernels import sum_kernels
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
@@ -27,21 +28,10 @@ from cortado.sph.viscous_stress import ViscousStress, stress_of
 from cortado.sph.walls import WallSums
 
 
-@dataclass(frozen=True)
-class PairForce:
-    """The viscous force phi(x, v) of a pair with its derivatives, as Warp functions."""
-
-    force: Any
-    tangent: Any
-    adjoint_x: Any
-    """The transposed derivative with respect to x, applied to a vector."""
-    adjoint_v: Any
-    """The transposed derivative with respect to v, applied to a vector."""
-
-
 @cache
-def pairwise(discretisation: Discretisation) -> PairForce:
-    """Make the Warp functions of the pair force phi: ``force``, ``tangent``, ``adjoint_x`` and ``adjoint_v``."""
+def pairwise(discretisation: Discretisation) -> SimpleNamespace:
+    """Make the Warp functions of the pair force phi(x, v): ``force``, ``tangent``, and ``adjoint_x`` and ``adjoint_v``,
+    the transposed derivatives with respect to x and v applied to a vector."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     slope, slope_change, per_size = pair.slope, pair.slope_change, pair.per_size
@@ -69,19 +59,19 @@ def pairwise(discretisation: Discretisation) -> PairForce:
     def adjoint_v(x: vector, v: vector, w: vector, s: neighbourhood) -> vector:
         return (slope(x, s) * per_size(x, s) * wp.dot(x, w)) * x
 
-    return PairForce(force, tangent, adjoint_x, adjoint_v)
+    return by_name(force, tangent, adjoint_x, adjoint_v)
 
 
 @cache
 def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
     """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration; all walls slip freely unless
-    fluid ``sticks`` to some."""
+    fluid ``sticks`` to some. The derivatives are those of the sum over the fluid: `viscosity_term` has those of
+    walls."""
     real, vector, neighbourhood = discretisation.types
     phi = pairwise(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
     reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
     tiny = wp.constant(real(discretisation.precision.tiny))
-    summed = rubbing_sum(discretisation, sticks)
     name = "pairwise" + "_no_slip" * sticks  # a module for each: their functions have the same names
 
     @wp.func
@@ -110,37 +100,32 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
     def wall_force(x_ij, v_ij, n_i, m_i, mu_i, kappa, s) -> vector:
         return (kappa * s.volume / (m_i * n_i) * mu_i) * phi_force(x_ij, v_ij, s)
 
-    @summed(wall_force)
+    @rubbing_sum(discretisation, sticks)(wall_force)
     @typed
     def force(x_ij, v_ij, n_i, n_j, m_i, mu_i, mu_j, kappa, s) -> vector:
         weight = pair_viscosity(mu_i, mu_j) * reciprocal(n_j)
         return (kappa * s.volume / (m_i * n_i) * weight) * phi_force(x_ij, v_ij, s)
 
-    @typed
-    def wall_tangent(x_ij, x_dot_ij, v_ij, v_dot_ij, n_i, n_dot_i, m_i, m_dot_i, mu_i, mu_dot_i, kappa, s) -> vector:
-        change = mu_dot_i - mu_i * (m_dot_i / m_i + n_dot_i / n_i)
-        total = change * phi_force(x_ij, v_ij, s) + mu_i * phi_tangent(x_ij, v_ij, x_dot_ij, v_dot_ij, s)
-        return (kappa * s.volume / (m_i * n_i)) * total
-
     @tangent_of(force)
-    @summed(wall_tangent, ahead=False, grows=force)
+    @fluid_sum(discretisation, ahead=False)
+    @typed
     def force_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        v_ij: vector,
-        v_dot_ij: vector,
-        n_i: real,
-        n_j: real,
-        n_dot_i: real,
-        n_dot_j: real,
-        m_i: real,
-        m_dot_i: real,
-        mu_i: real,
-        mu_j: real,
-        mu_dot_i: real,
-        mu_dot_j: real,
-        kappa: real,
-        s: neighbourhood,
+        x_ij,
+        x_dot_ij,
+        v_ij,
+        v_dot_ij,
+        n_i,
+        n_j,
+        n_dot_i,
+        n_dot_j,
+        m_i,
+        m_dot_i,
+        mu_i,
+        mu_j,
+        mu_dot_i,
+        mu_dot_j,
+        kappa,
+        s,
     ) -> vector:
         mu_ij = pair_viscosity(mu_i, mu_j)
         own = pair_viscosity_derivative(mu_i, mu_j) * mu_dot_i
@@ -149,16 +134,8 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
         total = change * phi_force(x_ij, v_ij, s) + mu_ij * phi_tangent(x_ij, v_ij, x_dot_ij, v_dot_ij, s)
         return (kappa * s.volume / (m_i * n_i * n_j)) * total
 
-    @typed
-    def wall_adjoint(x_ij, v_ij, n_i, m_i, mu_i, bar_i, kappa, s) -> tuple[vector, vector, real, real, real]:
-        w_i = (kappa * s.volume / (m_i * n_i)) * bar_i
-        work = wp.dot(phi_force(x_ij, v_ij, s), w_i)
-        x_part = phi_adjoint_x(x_ij, v_ij, mu_i * w_i, s)
-        v_part = phi_adjoint_v(x_ij, v_ij, mu_i * w_i, s)
-        return x_part, v_part, -mu_i * work * reciprocal(n_i), -mu_i * work * reciprocal(m_i), work
-
     @adjoint_of(force)
-    @summed(wall_adjoint)
+    @fluid_sum(discretisation)
     @typed
     def force_adjoint(
         x_ij, v_ij, n_i, n_j, m_i, m_j, mu_i, mu_j, bar_i, bar_j, kappa, s
@@ -187,18 +164,11 @@ def viscosity_term(discretisation: Discretisation) -> WallTerm:
     """Make the wall term of the viscous acceleration by a solid's walls; kappa is its first constant."""
 
     def made(d: Discretisation) -> Any:
-        real, vector, pair, phi = d.precision.real, d.precision.vector, d.precision.pair, pairwise(d).force
+        (real, vector, neighbourhood), phi = d.types, pairwise(d).force
+        kinds = {vector: "x v acceleration", d.precision.pair: "constants", neighbourhood: "s"}
 
-        def viscosity_work(
-            x_ij: vector,
-            v_ij: vector,
-            n_i: real,
-            m_i: real,
-            mu_i: real,
-            acceleration_bar_i: vector,
-            constants: pair,
-            s: neighbourhood_type(d.precision),
-        ) -> real:
+        @TypesByName(real, kinds)
+        def viscosity_work(x_ij, v_ij, n_i, m_i, mu_i, acceleration_bar_i, constants, s) -> real:
             scale = constants[0] * s.volume / (m_i * n_i) * mu_i
             return scale * wp.dot(phi(x_ij, v_ij, s), acceleration_bar_i)
 
@@ -227,11 +197,13 @@ class Viscosity:
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         accelerations = {"acceleration_in_dot": before, "acceleration_dot": after}
         step.launch(self._kernels.tangent, *dot.named, **self._constants, **accelerations)
+        if self.wall_action is not None:
+            add(self.wall_action.tangent(step, dot, ALL_WALLS), after)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         step.launch(self._kernels.adjoint, *bar.named, **self._constants, acceleration_bar=acceleration_bar)
         if self.wall_action is not None:
-            self.wall_action.give(step, bar, ALL_WALLS, acceleration_bar)
+            self.wall_action.adjoint(step, bar, ALL_WALLS, acceleration_bar, acceleration_bar)
 
 
 def force(setting: Setting) -> Viscosity | ViscousStress | None:

@@ -13,7 +13,7 @@ import warp as wp
 
 from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.errors import InputError
 from cortado.sph.formula import Formula, applied, formula, theta_of
 from cortado.sph.function_text import plain_function
@@ -97,13 +97,8 @@ def trial_kernel(precision: Precision, law: Law) -> Any:
     real, theta_type, apparent = precision.real, theta_of(precision, law.ranks), law.applied(precision, module)
 
     @wp.kernel(module=module, enable_backward=False)
-    def trial(
-        shear_rates: wp.array(dtype=real),
-        viscosities: wp.array(dtype=real),
-        thetas: wp.array(dtype=theta_type),
-        # out
-        found: wp.array3d(dtype=real),
-    ):
+    @TypesByName(real, {theta_type: "thetas"}).arrays
+    def trial(shear_rates, viscosities, thetas, found: wp.array3d(dtype=real)):
         k, p, t = wp.tid()
         found[k, p, t] = apparent(shear_rates[k], viscosities[p], thetas[t])
 

@@ -15,8 +15,8 @@ adjoint, as B is symmetric in the product weighted with masses.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache, cached_property
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import Named
-from cortado.device.modules import kernel_module
+from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import Precision
 from cortado.device.reduction import add
 from cortado.discretise.calibration import stress_control
@@ -73,9 +73,9 @@ class ViscousStress:
 
     def arrays(self, *names: str, taped: bool = False) -> dict[str, wp.array]:
         """Make arrays (n,) of particles by name, all 0: R and eta are numbers, and all others matrices."""
-        precision, sizes = self._layout.precision, {"shape": self._layout.all_particles, "device": self._layout.device}
+        precision = self._layout.precision
         kinds = {name: precision.real if name in ("R", "eta") else matrix_type(precision) for name in names}
-        return {name: wp.zeros(dtype=kind, **sizes, requires_grad=taped) for name, kind in kinds.items()}
+        return self._layout.arrays(requires_grad=taped, **kinds)
 
     def compile(self, what: str) -> None:
         """Compile the kernels with the law of viscosity; raise `InputError` where Warp cannot."""
@@ -148,11 +148,11 @@ class ViscousStress:
     def _give(self, step: StepContext, bar: Adjoints, which: int, *known: Named) -> None:
         """Add to the adjoints of moving solids by those of the sums (``which`` 0) or of the acceleration (1)."""
         if self._made_for[-1]:
-            constants, kernel = (
-                tuple(self.constants[name] for name in ("least", "control")),
-                stress_solid_kernels(self._made_for[0])[which],
+            constants, kernels = (
+                (self.constants["least"], self.constants["control"]),
+                stress_solid_kernels(self._made_for[0]),
             )
-            bar.solids.add(step.launch, kernel, *known, self._of, constants=constants)
+            bar.solids.add(step.launch, kernels[which], *known, self._of, constants=constants)
 
     def resisted(self, step: StepContext) -> dict[str, wp.array]:
         """Return T, eta, the velocities ``v`` that are resisted, and their A as ``A_u``, in a step."""
@@ -196,9 +196,8 @@ class StressWalls:
     def _bars(self) -> dict[str, wp.array]:
         """Make arrays of adjoints when they are first asked for, as runs do without."""
         own = self._stress.arrays("M", "A", "A_u", "R", "T", "eta")
-        sizes = {"shape": self._layout.all_particles, "device": self._layout.device}
-        v_bar = wp.zeros(dtype=self._layout.precision.vector, **sizes)
-        return {**{f"{name}_bar": array for name, array in own.items()}, "v_bar": v_bar}
+        v_bar = self._layout.arrays("_bar", v=self._layout.precision.vector)
+        return {**{f"{name}_bar": array for name, array in own.items()}, **v_bar}
 
 
 @cache
@@ -227,27 +226,14 @@ def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, s
     return pull, multiply
 
 
-@dataclass(frozen=True)
-class ImplicitKernels:
-    """Kernels of implicit viscosity that need no neighbours."""
-
-    predict: Any
-    """u = v + dt a; with tangents of v and dt that of u, where a does not change."""
-    weigh: Any
-    """r = a_bar / m."""
-    unweigh: Any
-    """r = m y."""
-    end_adjoint: Any
-    """From the adjoint of u to those of v and dt."""
-
-
 @cache
-def implicit_kernels(precision: Precision) -> ImplicitKernels:
+def implicit_kernels(precision: Precision) -> SimpleNamespace:
     """Make the kernels of implicit viscosity that need no neighbours, in a precision."""
     real, vector, module = precision.real, precision.vector, kernel_module(f"implicit_step_derivative_{precision.name}")
 
     @particle_kernel(module, "u")
     def predict(time_step: real, v_i: vector, acceleration_i: vector) -> vector:
+        """Return u = v + dt a; with tangents of v and dt that of u, where a does not change."""
         return v_i + time_step * acceleration_i
 
     @particle_kernel(module, "r")
@@ -260,9 +246,10 @@ def implicit_kernels(precision: Precision) -> ImplicitKernels:
 
     @particle_kernel(module, "+v_bar +time_step_bar")
     def end_adjoint(acceleration_i: vector, u_bar_i: vector) -> tuple[vector, real]:
+        """Return the adjoints of v and dt by that of u."""
         return u_bar_i, wp.dot(u_bar_i, acceleration_i)
 
-    return ImplicitKernels(predict, weigh, unweigh, end_adjoint)
+    return by_name(predict, weigh, unweigh, end_adjoint)
 
 
 MOST = 1_000
@@ -305,9 +292,8 @@ class ImplicitViscousStress(ViscousStress):
         self._implicit = implicit_kernels(layout.precision)
         self._pull = operator_kernels(*self._made_for)[0]
         self.solve = Solve(layout, operator_kernels(discretisation.still, *others))
-        sizes = {"shape": layout.all_particles, "device": layout.device}
-        vectors = (wp.zeros(dtype=layout.precision.vector, **sizes) for _ in range(4))
-        self._u, self._r, self._y, self._still = vectors
+        vectors = layout.arrays(**dict.fromkeys(("u", "r", "y", "still"), layout.precision.vector))
+        self._u, self._r, self._y, self._still = vectors.values()
         self._at_end = self.arrays("A", "T")
         """A and T of u."""
         self._after: Any = None

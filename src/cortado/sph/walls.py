@@ -6,13 +6,14 @@ A particle with the pressure p_i pushes the walls around it with the force V^2 p
 of forward mode is that of reverse mode too.
 """
 
-from dataclasses import dataclass
 from functools import cache, cached_property
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import warp as wp
 
 from cortado.device.launching import Named
+from cortado.device.modules import by_name
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import wall_sum
 from cortado.particles.state import Layout
@@ -20,21 +21,10 @@ from cortado.particles.wall_terms import WallTerm
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 
-@dataclass(frozen=True)
-class WallSlope:
-    """Sums over the walls around a particle, as Warp functions or kernels."""
-
-    slope: Any
-    """The slope g."""
-    change: Any
-    """The sum of H with a vector of each particle."""
-    tangent: Any
-    """The tangent of g."""
-
-
 @cache
-def wall_slope_sums(discretisation: Discretisation) -> WallSlope:
-    """Make the Warp functions of sums over walls ``slope(i, x, s)`` and ``change(i, x, along, s)``."""
+def wall_slope_sums(discretisation: Discretisation) -> SimpleNamespace:
+    """Make the Warp functions of sums over walls: the ``slope`` g, its ``tangent``, and the sum ``change`` of H with a
+    vector ``along`` of each particle."""
     _, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     gradient, hessian_product = pair.gradient, pair.hessian_product
@@ -51,7 +41,7 @@ def wall_slope_sums(discretisation: Discretisation) -> WallSlope:
     def tangent(x_ij: vector, x_dot_ij: vector, s: neighbourhood) -> vector:
         return hessian_product(x_ij, x_dot_ij, s)
 
-    return WallSlope(slope, change, tangent)
+    return by_name(slope, change, tangent)
 
 
 def wall_slope_term(discretisation: Discretisation) -> WallTerm:
@@ -94,8 +84,8 @@ class WallSums:
     @cached_property
     def _arrays(self) -> dict[str, wp.array]:
         """Make the arrays of totals when they are first asked for, as runs do without."""
-        own = {"shape": self._layout.all_particles, "device": self._layout.device}
-        return {name: wp.zeros(dtype=self._layout.precision.vector, **own) for name in ("total", "total_dot")}
+        vector = self._layout.precision.vector
+        return self._layout.arrays(total=vector, total_dot=vector)
 
     def _known(self, solid: int) -> Named:
         return {"solid": solid, "constants": self._layout.precision.pair(*self._constants)}
