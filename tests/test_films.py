@@ -161,7 +161,7 @@ def test_a_scale_covers_nothing_that_is_shown(upper, is_beside):
     trajectory = cortado.Simulation(own).run(2)
     values = trajectory.quantity("speed")
     scale, stage = Scale.of("speed", values), ShownRun(own, trajectory).stage
-    image = run_page(own, trajectory, "cpu", values).image(1)
+    image = run_page(ShownRun(own, trajectory, values), "cpu").image(1)
     narrow, drawn = _with_scale(stage, scale)
     assert image.shape == (90, 160, 3) and (drawn == scale.beside) == is_beside
     assert narrow.on_screen(corners(*narrow.ends))[:, 0].max() < 160 - scale.columns(90)
@@ -260,7 +260,7 @@ def test_water_that_a_solver_keeps_at_rest_does_not_flicker_in_a_film():
         picture=SMALL,
     )
     trajectory = cortado.Simulation(water).run(98, record_every=7)
-    page = run_page(water, trajectory, "cpu")
+    page = run_page(ShownRun(water, trajectory), "cpu")
     frames = range(len(trajectory))
     film, alone = list(page.images(frames, begin=8)), [page.image(k) for k in frames[8:]]
     changed, as_drawn = (
@@ -268,7 +268,7 @@ def test_water_that_a_solver_keeps_at_rest_does_not_flicker_in_a_film():
         for images in (film, alone)
     )
     assert as_drawn > 5e-3 and changed < 1e-3, (as_drawn, changed)
-    (last,) = run_page(water, trajectory, "cpu").images(frames, begin=len(frames) - 1)
+    (last,) = run_page(ShownRun(water, trajectory), "cpu").images(frames, begin=len(frames) - 1)
     np.testing.assert_array_equal(last, film[-1])
 
 

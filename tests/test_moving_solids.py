@@ -7,6 +7,7 @@ import cortado
 from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation, Trajectory, certify
 from cortado.gradients import AdjointViscosity
 from cortado.losses import CentreOfMass
+from cortado.pictures.film import ShownRun
 from cortado.pictures.run_pictures import run_page
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.motions import greatest_speed
@@ -298,7 +299,7 @@ def test_pictures_and_films_show_solids_where_they_are(tmp_path):
     run = simulation.run(120, record_every=60)
     run.save(tmp_path / "run.vtkhdf")
     read = Trajectory.load(tmp_path / "run.vtkhdf")
-    pages = [run_page(simulation.scene, one, "cpu") for one in (run, read)]
+    pages = [run_page(ShownRun(simulation.scene, one), "cpu") for one in (run, read)]
     films = [np.array(list(page.images([0, 1, 2]))) for page in pages]
     np.testing.assert_array_equal(films[0], films[1])
     np.testing.assert_array_equal(films[0][2], simulation.picture(run[2]))

@@ -16,7 +16,6 @@ from cortado.discretise.shapes import apart, pairs_among, pairs_within
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.walls import RestLattice
 from cortado.scene.discrete_scene import DiscreteScene, discretise
-from cortado.scene.fluid_particles import period
 from cortado.scene.tables import rotation_matrix
 from scenes import bodies, box
 
@@ -62,7 +61,7 @@ def near_air(scene: Scene, found: DiscreteScene) -> np.ndarray:
         ends = (np.array(fluid.lower), np.array(fluid.upper)) if fluid.shape == "box" else None
         outside = fluid.distance(places, SPACING) if ends is None else Region.between(*ends).distance(places)
         empty &= outside > 0.0
-    lower, lengths = period(scene)
+    lower, lengths = scene.periods
     return np.isin(np.arange(len(x)), pairs_within(x, places[empty], reach, lower, lengths)[0])
 
 
@@ -95,8 +94,8 @@ def test_a_round_body_has_its_volume_and_the_rest_density(case):
     seen, sees_air = densities(found), near_air(scene, found)
     assert seen.max() < 1.01 and seen[found.fluid.is_packed].max() < 1.0001
     assert np.count_nonzero(~sees_air) > 50 and seen[~sees_air].min() > 0.99
-    i, j = pairs_among(x, SPACING, *period(scene))
-    assert np.linalg.norm(apart(x[i] - x[j], period(scene)[1]), axis=1).min() > 0.7 * SPACING
+    i, j = pairs_among(x, SPACING, *scene.periods)
+    assert np.linalg.norm(apart(x[i] - x[j], scene.periods[1]), axis=1).min() > 0.7 * SPACING
 
 
 @pytest.mark.parametrize(("kernel", "support"), [("wendland_c2", 2.5), ("wendland_c4", 3.0), ("cubic_spline", 3.0)])

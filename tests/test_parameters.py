@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
+from parameter_table import markdown
 
 from cortado import InputError, Problem, Simulation, losses
 from cortado.arrays import as_numbers, as_one_number
@@ -14,7 +15,7 @@ from cortado.gradients import Exact
 from cortado.particles.state import Fields, Layout
 from cortado.particles.wall_terms import SolidShares
 from cortado.scene.parameter_values import scene_values
-from cortado.scene.parameters import BY_NAME, PARAMETERS, Role, markdown, names
+from cortado.scene.parameters import BY_NAME, PARAMETERS, Role, names
 from cortado.solvers.pcisph.solver import PcisphAdjoint
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Adjoints, Shares
@@ -25,7 +26,7 @@ DOCUMENT = Path(__file__).parents[1] / "docs" / "parameters.md"
 
 def test_the_document_has_the_table_of_the_registry():
     written = DOCUMENT.read_text(encoding="utf-8")
-    assert markdown() in written, "put the table there that this prints: python -m cortado.scene.parameters"
+    assert markdown() in written, "put the table there that this prints: python docs/site/parameter_table.py"
 
 
 def test_the_docstring_of_a_problem_names_every_parameter():

@@ -14,16 +14,14 @@ import numpy as np
 import pytest
 
 import cortado.runs.run_folder
-from bad_scenes import plane
 from bad_tasks import TINY_SCENE
-from cortado import InputError, Scene
+from cortado import InputError
 from cortado.cli import main
 from cortado.files.disk import unfinished
 from cortado.files.terminal import track
 from cortado.pictures.pages import Section, write_report, written
 from cortado.pictures.particle_view import Cloud, particle_view, thinned
 from cortado.runs.run_folder import RunFolder
-from cortado.scene.appearance import Picture
 
 SCENE = '{"name": "drop", "dimension": 2}'
 COMMAND = ["cortado", "run", "drop.toml"]
@@ -121,29 +119,6 @@ def test_resume_needs_the_same_scene_and_is_noted(tmp_path):
     assert [session["command"] for session in environment["resumed"]] == [[*COMMAND, "--resume"]]
     with pytest.raises(InputError, match="no run in"):
         RunFolder.resume(tmp_path / "b", SCENE, COMMAND)
-
-
-def test_what_colours_pictures_had_another_name(tmp_path):
-    folder = RunFolder.create(tmp_path / "run", Scene(**plane(picture={"colour": "speed"})).to_json(), [])
-    folder.scene.write_text(folder.scene.read_text().replace('"colour": "speed"', '"colour_by": "speed"'))
-    assert folder.read_scene().picture.colour == "speed"
-    folder.scene.write_text(folder.scene.read_text().replace('"colour_by": "speed"', '"colour_by": null'))
-    assert folder.read_scene().picture.colour == "phase"
-
-
-def test_a_former_default_of_a_scene_was_not_asked_for(tmp_path):
-    """Runs of before wrote 120 as film_frames, the default then, whether or not anybody had asked for it."""
-    scene = Scene(**plane(picture={"film_frames": 120, "width": 100}))
-    folder = RunFolder.create(tmp_path / "run", scene.to_json(), COMMAND)
-    assert folder.read_scene().picture.film_frames == 120
-    noted = json.loads(folder.environment.read_text())
-    folder.environment.write_text(json.dumps({name: value for name, value in noted.items() if name != "format"}))
-    assert folder.read_scene().picture == Picture(width=100)
-    assert folder.read_scene(["picture.film_frames=120"]).picture.film_frames == 120
-    folder.scene.write_text(scene.replaced("picture.film_frames=90").to_json())
-    assert folder.read_scene().picture.film_frames == 90
-    RunFolder.resume(folder.path, scene.to_json(), COMMAND)
-    assert folder.read_scene().picture.film_frames == 120
 
 
 def huge(path):

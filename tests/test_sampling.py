@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from cortado import CortadoWarning, Scene, SceneError, Simulation
 from cortado.errors import InputError, unwarned
 from cortado.scene.discrete_scene import discretise
-from cortado.scene.fluid_particles import fluid_particles, period
+from cortado.scene.fluid_particles import fluid_particles
 from cortado.scene.stability import stability_limits
 from scenes import bodies, box
 from test_packing import densities
@@ -201,7 +201,7 @@ def test_a_periodic_axis_has_no_wall():
     walls = one_layer(scene, 0.03)
     np.testing.assert_allclose(np.unique(walls[:, 0].round(9)), 0.1 + SPACING * (np.arange(8) + 0.5))
     np.testing.assert_allclose(np.unique(walls[:, 1].round(9)), [-0.03, 0.23])
-    lower, lengths = period(scene)
+    lower, lengths = scene.periods
     np.testing.assert_allclose((lower, lengths), ([0.1, 0.0], [0.4, 0.0]))
     everywhere = scene_of(2, [box([0.1, 0.0], [0.5, 0.2])], container | {"upper": [0.5, 0.3], "periodic": [True, True]})
     assert one_layer(everywhere, 0.025).shape == (0, 2)
@@ -210,7 +210,7 @@ def test_a_periodic_axis_has_no_wall():
 def test_free_space_has_no_walls():
     scene = scene_of(3, [box([0, 0, 0], [0.1, 0.1, 0.1])])
     assert one_layer(scene, 0.025).shape == (0, 3)
-    np.testing.assert_array_equal(period(scene), np.zeros((2, 3)))
+    np.testing.assert_array_equal(scene.periods, np.zeros((2, 3)))
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "z"])

@@ -52,7 +52,9 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
     except BrokenPipeError:
         sys.exit(BROKEN_PIPE)
     except Exception as error:
-        sentence = shortage(error) or _complaint(error)
+        from cortado.device.warp_start import complaint
+
+        sentence = shortage(error) or complaint(error)
         if sentence is None:
             raise
         say(sentence)
@@ -76,12 +78,6 @@ def _understood(program: Program, arguments: Sequence[str]) -> Work:
         if not end.code:
             raise
         raise InputError(usage_sentence(box.getvalue(), arguments, program.name)) from None
-
-
-def _complaint(error: Exception) -> str | None:
-    from cortado.device.warp_start import complaint
-
-    return complaint(error)
 
 
 def _show_warning(message: Warning, category: type[Warning], *rest: object) -> None:
@@ -121,20 +117,11 @@ _SENTENCES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"Error parsing (\S+): (.*)", r"\1 cannot be used: \2"),
 )
 """What tyro says, and what we say; where its words are none of these, as of another release, they come as they are."""
-MOVED = {
-    "bench": "python -m benchmarks bench",
-    "gradients figure": "python -m experiments figure",
-    "gradients study": "python -m experiments study",
-}
-"""Commands of before, and their replacements in a clone of the repository."""
 
 
 def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado") -> str:
     """Turn tyro's complaint in its box about the arguments of a program into a sentence of ours."""
     words = " ".join(arguments)
-    for before, now in MOVED.items():
-        if program == "cortado" and f"{words} ".startswith(f"{before} "):
-            return f"cortado {before} is now {now}, in a clone of the repository."
     lines = ["" if set(line) <= set(_EDGES) else line.strip("│| ") for line in box.splitlines()[1:]]
     text = " ".join(line for line in lines if line)
     text = re.split(r" (?:Argument helptext:|For full helptext,)", text)[0].rstrip(". ")

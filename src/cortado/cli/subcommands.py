@@ -71,7 +71,7 @@ def check(
     return partial(check_scene, scene, steps, parameters, loss, perturbation, out, words, device, json, seed)
 
 
-app.command(gradients, name="gradients", help="Check the gradients of a scene; the gradient study.")
+app.command(gradients, name="gradients", help="Check the gradients of a scene.")
 
 
 @command(app)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, in_space
 from cortado.errors import CortadoError, InputError
 from cortado.files.image_encoding import to_srgb
 from cortado.gradients import Exact
@@ -116,7 +116,7 @@ class Window:
 
     def show(self, shown: Shown) -> None:
         """Draw particles instead of those before, along a periodic axis within the period."""
-        domain = self.scene.container.domain(self.scene.dimension)
+        domain = self.scene.domain
         self._shown = replace(shown, positions=domain.wrapped(shown.positions))
         self._draw()
 
@@ -205,7 +205,7 @@ class Window:
 
     def _space(self, points: Points) -> np.ndarray:
         """Return points (..., d) as (..., 3) float32, with y up."""
-        return _padded(np.asarray(points, dtype=np.float32) @ self._turn.T.astype(np.float32))
+        return np.asarray(in_space(np.asarray(points, np.float32) @ self._turn.T.astype(np.float32)))
 
     def _draw_container(self) -> None:
         lines = self._space(container_outline(self.scene))
@@ -216,11 +216,13 @@ class Window:
         """Draw the edges of a solid, and in 3-D its faces unless it is a tank; return the frame that has its pose."""
         pose = {"position": self._space(solid.position), "wxyz": _quaternion(self._turn @ solid.turn)}
         frame = self.server.scene.add_frame(name, show_axes=False, **pose)
-        self.server.scene.add_line_segments(f"{name}/edges", _padded(own_lines(solid)), LINES, **THIN)
+        self.server.scene.add_line_segments(f"{name}/edges", in_space(np.float32(own_lines(solid))), LINES, **THIN)
         if self.scene.dimension == 3 and not solid.is_tank:
             faces, colour = own_faces(solid), tuple(to_srgb(solid.colour[None, None])[0, 0].tolist())
             look = {"color": colour, "opacity": 1.0 - solid.transparency, "flat_shading": True}
-            self.server.scene.add_mesh_simple(f"{name}/faces", _padded(faces.vertices), faces.corners, **look)
+            self.server.scene.add_mesh_simple(
+                f"{name}/faces", in_space(np.float32(faces.vertices)), faces.corners, **look
+            )
         return frame
 
     def look_at(self, positions: Points) -> None:
@@ -233,12 +235,6 @@ class Window:
         camera = self.server.initial_camera
         camera.look_at = middle
         camera.position = middle + DISTANCE * radius * away / np.linalg.norm(away)
-
-
-def _padded(points: np.ndarray) -> np.ndarray:
-    """Return points (..., d) as (..., 3) float32."""
-    found = np.asarray(points, dtype=np.float32)
-    return np.pad(found, [(0, 0)] * (found.ndim - 1) + [(0, 3 - found.shape[-1])])
 
 
 def _quaternion(turn: Points) -> np.ndarray:

@@ -167,6 +167,11 @@ def grid(axes: Sequence[NDArray[Any]]) -> NDArray[Any]:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
+def in_space(vectors: Any) -> Any:
+    """Return vectors (..., d) as (..., 3), with a 0 behind those of the plane."""
+    return np.pad(vectors, [(0, 0)] * (np.ndim(vectors) - 1) + [(0, 3 - np.shape(vectors)[-1])])
+
+
 def corners(lower: Points, upper: Points) -> Points:
     """Return the corners (2^d, d) of a box."""
     return np.array(list(product(*zip(lower, upper, strict=True))), dtype=np.float64)

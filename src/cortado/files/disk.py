@@ -204,6 +204,12 @@ def sentences(path: Path) -> Iterator[None]:
         raise InputError(f"{path} cannot be written: {reason}; choose another place.") from problem
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder with its parents, if it is missing; raise as `sentences`."""
+    with sentences(path):
+        path.mkdir(parents=True, exist_ok=True)
+
+
 BEYOND = 2**30
 """Offset of the byte that Windows locks, far behind the file's content, which others may thus read."""
 

@@ -11,7 +11,7 @@ from fractions import Fraction
 from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -121,16 +121,6 @@ HELPERS = 4
 """Number of threads that convert the parts of a frame."""
 TICKS = 90_000
 """Parts of a second that are the unit of frame times."""
-
-
-class MovingPicture(Protocol):
-    """Protocol of a film that grows by a frame at a time."""
-
-    frames: int
-    """Number of frames so far."""
-
-    def add(self, image: ArrayLike, time: float) -> None:
-        """Add a frame, a linear image (rows, columns, 3), shown from a time [s] on."""
 
 
 class Video:
@@ -320,7 +310,7 @@ class Animation:
 
 
 @contextmanager
-def moving_picture(path: Path, frames_per_second: float, note: str = "", count: int = 0) -> Iterator[MovingPicture]:
+def moving_picture(path: Path, frames_per_second: float, note: str = "", count: int = 0) -> Iterator[Video | Animation]:
     """Open a film for writing: an animated WebP for a path that ends in .webp, else a video as by `writing`. An
     animation appears when the block ends; where it is interrupted, with the frames so far."""
     if path.suffix.lower() != ".webp":

@@ -12,14 +12,14 @@ import os
 import shutil
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cortado.errors import ComputationError, InputError
 from cortado.files.disk import sentences, unfinished, write_fully
@@ -32,69 +32,16 @@ class TrajectoryWriter:
     The file appears at `path` with its first frame, or with those that are `kept`, and can be opened, by ParaView too,
     while it grows. Frames that are not written yet, or never were as the run ended early, have no particles there.
 
-    Args:
-        path: the file, replaced when it exists.
-        times: (frames,) [s] of the frames that will come, as far as it is known.
-        particles: n.
-        dimension: 2 or 3; in 2-D the stored points have z = 0.
-        precision: of the stored positions, velocities and scalars.
-        steps: the most steps of which `append_steps` will be told.
-        scalars: names of further scalar fields of every frame, such as "density" and "pressure", which ParaView shows.
-        vectors: names of further fields of vectors.
-        others: further arrays of every frame by name, as they are in the first: their types and shapes are kept.
-        constants: arrays by name that hold for the whole run.
-        diagnostics: the type of each number that `append_steps` will be told of a step, by name.
-        origin: what the particles are of, as a text of JSON.
-        marks: from which time on [s] frames are due, and how many in a second, where they are chosen so.
-        expected: how many frames are likely to come, which the disk must have room for; all of them if left out.
-        kept: so many frames are those of the file that is there, which is replaced when they are written.
-
     Raises:
         InputError: a size that makes no sense, or a path that cannot be written.
         ComputationError: the disk has not enough room for all frames.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        times: ArrayLike,
-        particles: int,
-        dimension: int,
-        precision: Literal["float32", "float64"] = "float32",
-        steps: int = 0,
-        scalars: Sequence[str] = (),
-        vectors: Sequence[str] = (),
-        others: Mapping[str, ArrayLike] | None = None,
-        constants: Mapping[str, ArrayLike] | None = None,
-        diagnostics: Mapping[str, DTypeLike] | None = None,
-        origin: str = "",
-        marks: tuple[float, float] | None = None,
-        expected: int | None = None,
-        kept: int = 1,
-    ) -> None:
-        moments = np.array(times, dtype=np.float64, ndmin=1)
-        if len(moments) < 1 or particles < 1 or dimension not in (2, 3) or steps < 0:
-            raise InputError(
-                f"A trajectory needs at least 1 frame, 1 particle and dimension 2 or 3, but was given "
-                f"{len(moments)} frames, {particles} particles, dimension {dimension} and {steps} steps."
-            )
-        self.path = Path(path)
-        self.frames_written, self._kept = 0, kept
-        self.steps_written = 0
-        self._layout = FileLayout(
-            moments,
-            (particles, dimension),
-            np.dtype(precision),
-            steps,
-            tuple(scalars),
-            tuple(vectors),
-            {name: np.asarray(value) for name, value in (others or {}).items()},
-            {name: np.asarray(value) for name, value in (constants or {}).items()},
-            {name: np.dtype(dtype) for name, dtype in (diagnostics or {}).items()},
-            origin,
-            tuple(map(float, marks or ())),
-        )
+    def __init__(self, path: str | Path, *, expected: int | None = None, kept: int = 1, **fields: Any) -> None:
+        """Make the file with ``fields`` of a `FileLayout`. The disk must have room for all frames, or for ``expected``
+        ones. A file of that name is replaced when the first ``kept`` frames are written."""
+        self.path, self._layout = Path(path), FileLayout(**fields)
+        self.frames_written, self.steps_written, self._kept = 0, 0, kept
         self._unfinished = unfinished(self.path)
         with sentences(self.path):
             _require_room(self._layout, self.path, expected)

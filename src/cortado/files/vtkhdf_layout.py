@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import io
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.errors import InputError
 from cortado.files.disk import write_fully
 
 FORMAT = 3
@@ -38,25 +39,52 @@ class FileLayout:
     """The fields, types and sizes of a trajectory file, with room for every frame."""
 
     times: NDArray[np.float64]
-    """Times of the frames (frames,) [s]."""
-    shape: tuple[int, int]
-    """Numbers of particles n and of dimensions d."""
-    dtype: np.dtype[Any]
-    """Type of positions, velocities and scalars."""
-    steps: int
-    scalars: tuple[str, ...]
-    vectors: tuple[str, ...]
-    """Further fields of three components, besides the velocity."""
-    others: Mapping[str, NDArray[Any]]
-    """Further arrays of every frame, with the types and shapes of the first."""
-    constants: Mapping[str, NDArray[Any]]
-    """Arrays of any shape that hold for the whole run."""
-    diagnostics: Mapping[str, np.dtype[Any]]
+    """(frames,) [s] of the frames that will come, as far as it is known"""
+    particles: int
+    dimension: int
+    """2 or 3; in 2-D the stored points have z = 0."""
+    precision: str = "float32"
+    """Type of the stored positions, velocities and scalars, "float32" or "float64"."""
+    steps: int = 0
+    """Most steps of which numbers are kept."""
+    scalars: Sequence[str] = ()
+    """Names of further scalar fields of every frame, such as "density" and "pressure", which ParaView shows."""
+    vectors: Sequence[str] = ()
+    """Names of further fields of vectors, besides the velocity."""
+    others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Further arrays of every frame by name, with the types and shapes of the first."""
+    constants: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Arrays of any shape that hold for the whole run, by name."""
+    diagnostics: Mapping[str, Any] = field(default_factory=dict)
     """Types of the numbers kept of every step, by name."""
-    origin: str
+    origin: str = ""
     """JSON text on the particles' origin; empty where nothing is known."""
     marks: tuple[float, ...] = ()
     """Time [s] of the first due frame, and frames per second; empty where steps choose the frames."""
+
+    def __post_init__(self) -> None:
+        own: dict[str, Any] = {"times": np.array(self.times, dtype=np.float64, ndmin=1)}
+        if len(own["times"]) < 1 or self.particles < 1 or self.dimension not in (2, 3) or self.steps < 0:
+            raise InputError(
+                f"A trajectory needs at least 1 frame, 1 particle and dimension 2 or 3, but was given "
+                f"{len(own['times'])} frames, {self.particles} particles, dimension {self.dimension} and {self.steps} "
+                "steps."
+            )
+        own |= {key: {n: np.asarray(a) for n, a in getattr(self, key).items()} for key in ("others", "constants")}
+        own["diagnostics"] = {name: np.dtype(kind) for name, kind in self.diagnostics.items()}
+        own["marks"] = tuple(map(float, self.marks))
+        for name, value in own.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Return the numbers of particles n and of dimensions d."""
+        return self.particles, self.dimension
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Return the type of positions, velocities and scalars."""
+        return np.dtype(self.precision)
 
     @property
     def rows(self) -> dict[str, tuple[int, ...]]:

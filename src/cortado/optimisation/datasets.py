@@ -213,7 +213,7 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
 def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where the bounds of a data set begin in the scene, how long they are, and the periods of its axes, 0 of
     those without one, each (d,) [m]. Walls are within; raises `InputError` without a container."""
-    ends, (_, periods) = scene.container.extent(), scene.container.periods(scene.dimension)
+    ends, (_, periods) = scene.container.extent(), scene.periods
     if ends is None:
         raise InputError("container.shape is 'none', but must be 'box' or 'cylinder', as a data set has bounds.")
     room = np.where(periods > 0.0, 0.0, MARGIN * scene.discretisation.spacing)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, in_space
 from cortado.errors import ComputationError, ExtraMissingError, InputError, shown
 from cortado.files.disk import as_path, sentences, unfinished, write_atomically
 from cortado.files.image_encoding import to_srgb
 from cortado.files.terminal import announce, track
-from cortado.pictures.exported import Exported, ExportedFrame, Mesh, Pose, in_space
+from cortado.pictures.exported import Exported, ExportedFrame, Mesh, Pose
 from cortado.runs.frames import FRACTION
 from cortado.runs.solid_motion import SolidMotion
 from cortado.runs.trajectory import Trajectory
@@ -34,39 +34,42 @@ def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
 
     upright = Pose(run.up, np.zeros(3)).matrix
     for number, frame in enumerate(run.frames(run.series)):
+        parts: dict[str, Any] = {} if frame.surface is None else {"surface": (frame.surface, upright)}
+        parts |= {one.part: (one.mesh, upright @ frame.poses[one.name].matrix) for one in run.solids}
+        parts["particles"] = frame, upright
         scene = trimesh.Scene()
-        if frame.surface is not None:
-            scene.add_geometry(_trimesh(frame.surface, _linear), "surface", "surface", transform=upright)
-        for solid in run.solids:
-            pose = upright @ frame.poses[solid.name].matrix
-            scene.add_geometry(_trimesh(solid.mesh, _linear), solid.part, solid.part, transform=pose)
-        scene.add_geometry(_trimesh(frame, _linear), "particles", "particles", transform=upright)
+        for name, (what, pose) in parts.items():
+            scene.add_geometry(_trimesh(what, _linear), name, name, transform=pose)
         write_atomically(folder / _numbered("frame", number, "glb"), scene.export(file_type="glb"))
         advance()
     return folder
 
 
-def _write_series(run: Exported, folder: Path, advance: Advance, ending: str) -> Path:
-    """Write the files of each frame by trimesh, with sRGB colours as programs expect, and return the folder."""
+def _write_series(
+    run: Exported, folder: Path, advance: Advance, ending: str, content: Callable[[Any], str | bytes]
+) -> list[str]:
+    """Write the files of each frame, each with its ``content``, and return entries of ParaView's collections."""
+    entries = []
     for number, frame in enumerate(run.frames(run.series)):
-        for name, what in _files(run, number, frame, ending).values():
+        for part, (of, (name, what)) in enumerate(_files(run, number, frame, ending).items()):
             if not (folder / name).exists():
-                write_atomically(folder / name, _trimesh(what, _srgb).export(file_type=ending))
+                write_atomically(folder / name, content(what))
+            where = f'timestep="{frame.time!r}" part="{part}" name="{of}" file="{name}"'
+            entries.append(f"    <DataSet {where}/>")
         advance()
+    return entries
+
+
+def _write_meshes(run: Exported, folder: Path, advance: Advance, ending: str) -> Path:
+    """Write a series by trimesh, with sRGB colours as programs expect, and return the folder."""
+    _write_series(run, folder, advance, ending, lambda what: _trimesh(what, _srgb).export(file_type=ending))
     return folder
 
 
 def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
-    """Write the files of each frame by VTK, with all fields of the particles; return ``run.pvd``, which has them all at
-    their times."""
-    entries = []
-    for number, frame in enumerate(run.frames(run.series)):
-        for part, (of, (name, what)) in enumerate(_files(run, number, frame, "vtp").items()):
-            if not (folder / name).exists():
-                write_atomically(folder / name, _vtp(what))
-            where = f'timestep="{frame.time!r}" part="{part}" name="{of}" file="{name}"'
-            entries.append(f"    <DataSet {where}/>")
-        advance()
+    """Write a series by VTK, with all fields of the particles; return ``run.pvd``, which has them all at their
+    times."""
+    entries = _write_series(run, folder, advance, "vtp", _vtp)
     lines = ['<VTKFile type="Collection" version="0.1">', "  <Collection>", *entries, "  </Collection>", "</VTKFile>"]
     write_atomically(folder / "run.pvd", "\n".join([*lines, ""]))
     return folder / "run.pvd"
@@ -295,8 +298,8 @@ def _vtk() -> Any:
 
 
 FORMATS: dict[str, Callable[[Exported, Path, Advance], Path]] = {
-    "ply": partial(_write_series, ending="ply"),
-    "obj": partial(_write_series, ending="obj"),
+    "ply": partial(_write_meshes, ending="ply"),
+    "obj": partial(_write_meshes, ending="obj"),
     "glb": write_glb,
     "usd": write_usd,
     "vtp": write_vtp,
@@ -381,18 +384,17 @@ def labelled(trajectory: Trajectory) -> Any:
 def _of_solids(solids: Mapping[str, SolidMotion], turned: tuple[str, ...]) -> Variables:
     """Return xarray variables of moving solids, one behind the other; given paths have no velocities."""
 
-    def stacked(each: list[Any], alike: list[Any]) -> Any:
-        rows = [np.full_like(as_, np.nan) if one is None else one for one, as_ in zip(each, alike, strict=True)]
-        return np.stack(rows, axis=1)
+    def over_time(
+        name: str, like: str, axes: tuple[str, ...], unit: str
+    ) -> tuple[tuple[str, ...], Any, dict[str, str]]:
+        pairs = [(getattr(one, name), getattr(one, like)) for one in solids.values()]
+        rows = [np.full_like(other, np.nan) if own is None else own for own, other in pairs]
+        return ("time", "solid", *axes), np.stack(rows, axis=1), {"units": unit}
 
-    every = list(solids.values())
-    places, turns = [one.positions for one in every], [one.rotations for one in every]
-    own, spins = [one.velocities for one in every], [one.angular_velocities for one in every]
-    at = ("time", "solid")
     return {
-        "solid_position": ((*at, "space"), stacked(places, places), {"units": "m"}),
-        "solid_scale": (("solid",), [one.scale for one in every], {"units": "1"}),
-        "solid_rotation": ((*at, *turned), stacked(turns, turns), {"units": "rad"}),
-        "solid_velocity": ((*at, "space"), stacked(own, places), {"units": "m/s"}),
-        "solid_angular_velocity": ((*at, *turned), stacked(spins, turns), {"units": "rad/s"}),
+        "solid_position": over_time("positions", "positions", ("space",), "m"),
+        "solid_scale": (("solid",), [one.scale for one in solids.values()], {"units": "1"}),
+        "solid_rotation": over_time("rotations", "rotations", turned, "rad"),
+        "solid_velocity": over_time("velocities", "positions", ("space",), "m/s"),
+        "solid_angular_velocity": over_time("angular_velocities", "rotations", turned, "rad/s"),
     }

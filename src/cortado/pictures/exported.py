@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import BandLauncher
 from cortado.device.threads import WARP, usable_cores
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, in_space
 from cortado.errors import ComputationError
 from cortado.pictures.film import coloured_by, is_out, shown_places, those
 from cortado.pictures.painter import Scale, colours_of
@@ -244,8 +244,8 @@ class Exported:
     def _frame(self, frame: Frame, recorded: int, solids: SolidMotions, number: int) -> ExportedFrame:
         """Make a frame of a state near a recorded one, with the solids where they are in a frame of their motion."""
         shown = those(is_out(self.scene, frame.others.get("emitted"), len(frame.positions)))
-        within = self.scene.container.domain(self.scene.dimension).wrapped(frame.positions[shown])
-        positions, velocities = in_space(within), in_space(frame.velocities[shown])
+        within = self.scene.domain.wrapped(frame.positions[shown])
+        positions, velocities = in_space(np.float64(within)), in_space(np.float64(frame.velocities[shown]))
         colours = colours_of(self.scene, frame.mass_fractions, len(frame.positions))
         if self._scale is not None and self._values is not None:
             colours = self._scale.colours(self._values[recorded])
@@ -253,7 +253,7 @@ class Exported:
         named = dict(zip(fraction_names(fractions.shape[1]), fractions.T, strict=True)) | dict(frame.quantities)
         colours, fields = colours[shown], {name: values[shown] for name, values in named.items()}
         placed = _first_of_each(posed(self.scene, solids, number))
-        poses = {name: Pose(turn_in_space(one.turn), in_space(one.position[None])[0]) for name, one in placed.items()}
+        poses = {name: Pose(turn_in_space(one.turn), in_space(one.position)) for name, one in placed.items()}
         surface = self._surface(positions, velocities, colours) if self.scene.dimension == 3 else None
         if surface is not None and self._stage.picture.surface != "spheres":
             volumes = enclosed(surface.points, surface.triangles), self.spacing**3 * len(positions)
@@ -280,11 +280,6 @@ class Exported:
 def _unlike(held: tuple[float, float, float]) -> float:
     """Return the relative difference between a surface's volume and the fluid's, given a frame's time and both."""
     return abs(held[1] / held[2] - 1.0)
-
-
-def in_space(vectors: Points) -> Points:
-    """Return vectors (n, d) as (n, 3) in float64, with a 0 behind those of the plane."""
-    return np.pad(np.asarray(vectors, dtype=np.float64), ((0, 0), (0, 3 - vectors.shape[1])))
 
 
 def _first_of_each(scene: Scene) -> dict[str, ShownSolid]:

@@ -202,6 +202,8 @@ class ShownRun:
     trajectory: Trajectory
     values: NDArray | None = None
     """(frames, n) values by which a scale colours particles; None for the colours of phases."""
+    unit: str | None = None
+    """Unit of values that not all scenes have."""
 
     @cached_property
     def stage(self) -> PlaneStage | Stage:
@@ -266,7 +268,7 @@ class ShownRun:
     def _moment(self, k: int) -> Moment:
         places = {table.name: table.middle() for table in self.scene.solid}
         places |= {name: motion.positions[k] for name, motion in self._motions.items()}
-        domain = self.scene.container.domain(self.scene.dimension)
+        domain = self.scene.domain
         places = {name: domain.wrapped(place) for name, place in places.items()}
         up = upright(np.asarray(self.scene.forces.gravity))[1]
         return Moment(k / max(len(self.trajectory) - 1, 1), float(self.times[k]), up, places)

@@ -4,8 +4,6 @@ report.html of a run folder, which holds its pictures and films inside and opens
 
 from __future__ import annotations
 
-import base64
-import html
 import json
 import shlex
 from base64 import b64encode
@@ -36,8 +34,11 @@ from cortado.simulation import Simulation
 
 Figures = list[tuple[str, str | Path]]
 """(caption, path) of each picture or video"""
-_KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml", ".gif": "image/gif"}
-_VIDEOS = {".mp4": "video/mp4", ".webm": "video/webm"}
+_KINDS = {
+    **{".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml", ".gif": "image/gif"},
+    **{".webp": "image/webp", ".mp4": "video/mp4", ".webm": "video/webm"},
+}
+WIDE = ' style="width: 100%"'
 MOST_WRITTEN_OUT = 12
 """Most numbers that are written out one by one."""
 
@@ -52,7 +53,7 @@ class Section:
     failures: Sequence[object] = ()
     """Paragraphs about what went wrong, which are marked."""
     figures: Sequence[tuple[str, str | Path]] = ()
-    """(caption, path) of pictures (png, jpg, svg, gif) or videos (mp4, webm), embedded in the page"""
+    """(caption, path) of pictures (png, jpg, svg, gif, webp) or videos (mp4, webm), embedded in the page"""
     view: str = ""
     """HTML of `particle_view`."""
     head: Sequence[str] = ()
@@ -118,7 +119,7 @@ def _number(value: Any) -> str:
 
 
 def _safe(text: object) -> str:
-    return html.escape(str(text))
+    return escape(str(text))
 
 
 def _section(section: Section) -> str:
@@ -140,19 +141,22 @@ def _table(section: Section) -> str:
 
 
 def _figure(caption: str, path: Path) -> str:
-    kind = (_KINDS | _VIDEOS).get(path.suffix.lower())
+    return f"<figure>{_shown(path, caption)}<figcaption>{_safe(caption)}</figcaption></figure>"
+
+
+def _shown(path: Path, words: str, look: str = "") -> str:
+    """Return HTML of a picture or a video that a file holds, as a part of the page, with ``words`` about it."""
+    kind = _KINDS.get(path.suffix.lower())
     if kind is None:
-        raise InputError(f"{path} cannot be shown; a report takes {', '.join(_KINDS | _VIDEOS)}.")
+        raise InputError(f"{path} cannot be shown; a report takes {', '.join(_KINDS)}.")
     try:
-        content = base64.b64encode(path.read_bytes()).decode()
+        content = b64encode(path.read_bytes()).decode()
     except OSError as problem:
         raise InputError(f"The picture {path} cannot be read: {problem}.") from problem
-    source = f'src="data:{kind};base64,{content}"'
+    source = f'src="data:{kind};base64,{content}"{look}'
     if kind.startswith("video"):
-        shown = f'<video controls loop muted playsinline aria-label="{_safe(caption)}" {source}></video>'
-    else:
-        shown = f'<img alt="{_safe(caption)}" {source}>'
-    return f"<figure>{shown}<figcaption>{_safe(caption)}</figcaption></figure>"
+        return f'<video controls loop muted playsinline aria-label="{_safe(words)}" {source}></video>'
+    return f'<img alt="{_safe(words)}" {source}>'
 
 
 def _again(folder: RunFolder) -> str:
@@ -218,11 +222,7 @@ def trajectory_page(run: Trajectory) -> str:
 
 def film_page(film: Film) -> str:
     """Return HTML of a film: its repr, and the video, or the animation, which is part of the page."""
-    content, words = b64encode(film.path.read_bytes()).decode(), as_words(film)
-    if film.path.suffix.lower() == ".webp":
-        return f'{words}<img src="data:image/webp;base64,{content}" style="width: 100%">'
-    source = f"data:video/mp4;base64,{content}"
-    return f'{words}<video controls loop muted playsinline src="{source}" style="width: 100%"></video>'
+    return as_words(film) + _shown(film.path, repr(film), WIDE)
 
 
 def result_page(
@@ -285,8 +285,7 @@ def picture(found: object, draw: Callable[[Path], Any]) -> str:
             draw(path)
         except ImportError:
             return ""
-        content = b64encode(path.read_bytes()).decode()
-    return f'<img src="data:image/png;base64,{content}" alt="{escape(repr(found))}" style="width: 100%">'
+        return _shown(path, repr(found), WIDE)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

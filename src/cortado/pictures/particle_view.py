@@ -8,12 +8,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cortado.discretise.shapes import Points, corners
+from cortado.discretise.shapes import Points, corners, in_space
 from cortado.files.image_encoding import to_srgb
 from cortado.pictures.painter import colours_of
 from cortado.pictures.shown_solids import solid_outline
@@ -146,8 +146,7 @@ def _extent(clouds: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]
 
 def _space(vectors: NDArray[Any]) -> NDArray[Any]:
     """Return vectors (..., d) as (..., 3), with few digits."""
-    missing = 3 - vectors.shape[-1]
-    padded = np.pad(vectors, [(0, 0)] * (vectors.ndim - 1) + [(0, missing)])
+    padded = in_space(vectors)
     return np.array([float(f"{number:.6g}") for number in padded.ravel()]).reshape(padded.shape)
 
 
@@ -166,25 +165,9 @@ ROUND = 48
 """Number of sides of the polygon that stands for a circle."""
 
 
-class MovingState(Protocol):
-    """A state of a run with velocities; n particles in d dimensions."""
-
-    @property
-    def positions(self) -> Points:
-        """Return the positions (n, d) [m]."""
-
-    @property
-    def velocities(self) -> Points:
-        """Return the velocities (n, d) [m/s]."""
-
-    @property
-    def mass_fractions(self) -> Points | None:
-        """Return the mass fractions (n, phases) [-]; None with one phase."""
-
-
-def scene_view(scene: Scene, runs: Mapping[str, Iterable[MovingState]], times: ArrayLike) -> str:
+def scene_view(scene: Scene, runs: Mapping[str, Iterable[Any]], times: ArrayLike) -> str:
     """Return HTML that shows runs of a scene side by side, each by its name with a state for each of the times
-    (frames,) [s]; see `particle_view`. Solids that move are not shown."""
+    (frames,) [s], such as a `Frame`; see `particle_view`. Solids that move are not shown."""
     turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
     states, times = {name: list(of_run) for name, of_run in runs.items()}, np.asarray(times)
     particles = len(next(iter(states.values()))[0].positions)
@@ -225,9 +208,9 @@ def _cup(container: CylinderContainer) -> Points:
     return np.concatenate([*rims, sides])
 
 
-def _cloud(scene: Scene, name: str, states: list[MovingState], turn: Points, stride: int) -> Cloud:
+def _cloud(scene: Scene, name: str, states: list[Any], turn: Points, stride: int) -> Cloud:
     """Make the cloud of a run of states, with one of every ``stride`` particles."""
-    domain = scene.container.domain(scene.dimension)
+    domain = scene.domain
     positions = domain.wrapped(np.stack([state.positions[::stride] for state in states])) @ turn.T
     speeds = np.stack([np.linalg.norm(state.velocities[::stride], axis=1) for state in states])
     particles = positions.shape[1]

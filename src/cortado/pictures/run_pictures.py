@@ -6,7 +6,8 @@ converged, what sensors have read, and whether gradients are right.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +47,7 @@ def run_pictures(
 ) -> Figures:
     """Draw the first and the last state of a run, and a film of it, into a folder; (caption, path) of each. ``values``
     as those of `run_page`."""
-    page, last = run_page(scene, trajectory, device, values), len(trajectory) - 1
+    page, last = run_page(ShownRun(scene, trajectory, values), device), len(trajectory) - 1
     stills: Figures = []
     for k, name, words in ((0, "first", "at the start"), (last, "last", "at the end")):
         path = folder / f"{name}.png"
@@ -61,15 +62,11 @@ def run_pictures(
     return [(f"The run, {made.pace.in_words}.", made.path), *stills]
 
 
-def run_page(
-    scene: Scene, trajectory: Trajectory, device: Any, values: NDArray | None = None, unit: str | None = None
-) -> Page:
-    """Return the frames of a run as pictures, by their number. ``values`` (frames, n) colour its particles; ``unit`` is
-    for a quantity that not all scenes have."""
-    run, picture = ShownRun(scene, trajectory, values), scene.picture or Picture()
-    if values is None:
+def run_page(run: ShownRun, device: Any) -> Page:
+    """Return the frames of a run as pictures, by their number."""
+    if run.values is None:
         return Page([run.panel(run.stage, device, None)], fingerprint=run.fingerprint)
-    scale = Scale.of(picture.colour, values, unit)
+    scale = Scale.of((run.scene.picture or Picture()).colour, run.values, run.unit)
     stage, composed = _with_scale(run.stage, scale)
     return Page([run.panel(stage, device, scale)], lambda images: composed(alone(images)), run.fingerprint)
 
@@ -93,41 +90,28 @@ Units = Mapping[str, str]
 """Units of fields that not all scenes have, by their names."""
 
 
-def page_of(
+def shown_run(
     trajectory: Trajectory,
     scene: Scene,
-    device: Any,
     settings: Mapping[str, Any],
     units: Units | None = None,
     simulation: Callable[[], Simulation] | None = None,
-) -> Page:
-    """Return the frames of a run as pictures, with keys of [picture] replaced; ``simulation`` computes unrecorded
-    colours."""
-    known = dict.fromkeys(trajectory.others, "") if units is None else units
-    pictured = shown_as(scene, settings, known)
-    colour = (pictured.picture or Picture()).colour
-    return run_page(pictured, trajectory, device, coloured_by(pictured, trajectory, simulation), known.get(colour))
-
-
-def film_of(
-    trajectory: Trajectory,
-    scene: Scene,
-    path: str | Path,
-    device: Any,
-    settings: Mapping[str, Any],
-    units: Units | None = None,
-    simulation: Callable[[], Simulation] | None = None,
-) -> Film:
-    """Write a film of a run, with the settings of `page_of`."""
+) -> ShownRun:
+    """Return a run as pictures with keys of [picture] replaced show it; ``simulation`` computes unrecorded colours."""
     if not len(trajectory):
         raise InputError("The trajectory has no frames, but must have one to be filmed.")
-    pictured = shown_as(scene, settings, trajectory.others if units is None else units)
-    missing = lacking(pictured)
-    if missing:
+    known = dict.fromkeys(trajectory.others, "") if units is None else units
+    pictured = shown_as(scene, settings, known)
+    unit = known.get((pictured.picture or Picture()).colour)
+    return ShownRun(pictured, trajectory, coloured_by(pictured, trajectory, simulation), unit)
+
+
+def film_of(run: ShownRun, path: str | Path, device: Any) -> Film:
+    """Write a film of a run."""
+    if missing := lacking(run.scene):
         raise InputError(missing)
-    page = page_of(trajectory, scene, device, settings, units, simulation)
-    pace = pace_of(trajectory.due, pictured.picture or Picture(), common_rate([trajectory.marks]))
-    return film(Path(as_path("path", path)), page, range(len(trajectory)), pace)
+    pace = pace_of(run.times, run.scene.picture or Picture(), common_rate([run.trajectory.marks]))
+    return film(Path(as_path("path", path)), run_page(run, device), range(len(run.trajectory)), pace)
 
 
 def simulation_picture(simulation: Simulation, frame: Frame, settings: Mapping[str, Any]) -> ShadedPicture:
@@ -137,7 +121,8 @@ def simulation_picture(simulation: Simulation, frame: Frame, settings: Mapping[s
     units = _units_of_fields(simulation)
     if (shown_as(simulation.scene, settings, units).picture or Picture()).colour == "age":
         raise InputError('One frame does not tell how old its fluid is: take trajectory.picture(k, colour="age").')
-    return ShadedPicture.of(page_of(_alone(frame), simulation.scene, simulation.device, settings, units).image(0))
+    run = shown_run(_alone(frame), simulation.scene, settings, units)
+    return ShadedPicture.of(run_page(run, simulation.device).image(0))
 
 
 def simulation_film(
@@ -147,7 +132,8 @@ def simulation_film(
     if not isinstance(trajectory, Trajectory):
         raise InputError(f"trajectory is {shown(trajectory)}, but must be one, as simulation.run returns it.")
     units = _units_of_fields(simulation)
-    return film_of(trajectory, simulation.scene, path, simulation.device, settings, units, lambda: simulation)
+    run = shown_run(trajectory, simulation.scene, settings, units, lambda: simulation)
+    return film_of(run, path, simulation.device)
 
 
 def trajectory_picture(
@@ -157,15 +143,15 @@ def trajectory_picture(
     count = len(trajectory)
     if k not in range(-count, count):
         raise InputError(f"k is {shown(k)}, but must be the number of one of {count} frames, such as 0 or -1.")
-    page = page_of(trajectory, _scene_of(trajectory, scene), device_of(device), settings)
-    return ShadedPicture.of(page.image(k % count))
+    run = shown_run(trajectory, _scene_of(trajectory, scene), settings)
+    return ShadedPicture.of(run_page(run, device_of(device)).image(k % count))
 
 
 def trajectory_film(
     trajectory: Trajectory, path: str | Path, scene: Scene | str | Path | None, device: str, settings: Mapping[str, Any]
 ) -> Film:
     """Write a film of a trajectory, see `Trajectory.film`."""
-    return film_of(trajectory, _scene_of(trajectory, scene), path, device_of(device), settings)
+    return film_of(shown_run(trajectory, _scene_of(trajectory, scene), settings), path, device_of(device))
 
 
 def device_of(name: str) -> Any:
@@ -268,35 +254,38 @@ def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float
 
 def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
     """Plot a curve for each number of each sensor, those of one unit in one panel."""
-    each = [(name, own, column, unit) for name, own in found.items() for column, unit in own.units.items()]
-    lines = [(f"{name} {column}", unit, own, column) for name, own, column, unit in each]
-    units = list(dict.fromkeys(unit for _, unit, _, _ in lines))
+    lines = dict[str, list[tuple[str, Readings, str]]]()
+    for name, own in found.items():
+        for column, unit in own.units.items():
+            lines.setdefault(unit, []).append((f"{name} {column}".replace("_", " "), own, column))
+    with _over_time(path, list(lines)) as panels:
+        for panel, shown in zip(panels, lines.values(), strict=True):
+            for k, (label, own, column) in enumerate(shown):
+                panel.plot(own.times, own[column], color=PALETTE[k % len(PALETTE)], linewidth=1.3, label=label)
+    return Path(path)
+
+
+@contextmanager
+def _over_time(path: str | Path, units: Sequence[str]) -> Iterator[Any]:
+    """Yield panels of a plot over time, one below the other, with these units; each gets a legend."""
     with drawing(path, height=1.5 + 2.5 * len(units)) as figure:
         panels = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
+        yield panels
         for panel, unit in zip(panels, units, strict=True):
-            shown = [line for line in lines if line[1] == unit]
-            for k, (label, _, own, column) in enumerate(shown):
-                label = label.replace("_", " ")
-                panel.plot(own.times, own[column], color=PALETTE[k % len(PALETTE)], linewidth=1.3, label=label)
             panel.set_ylabel(f"[{unit}]")
             panel.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
         panels[-1].set_xlabel("time [s]")
-    return Path(path)
 
 
 def beside_measured(found: Mapping[str, Readings], measured: Sequence[MeasuredColumn], path: str | Path) -> Path:
     """Plot a panel for each measured number: its points, the curve of the sensor, and the error in the title."""
-    with drawing(path, height=1.5 + 2.5 * len(measured)) as figure:
-        panels = figure.subplots(len(measured), 1, sharex=True, squeeze=False)[:, 0]
+    with _over_time(path, [one.unit for one in measured]) as panels:
         for panel, one in zip(panels, measured, strict=True):
             name, _, column = one.name.rpartition(".")
             panel.plot(found[name].times, found[name][column], color=PALETTE[0], linewidth=1.3, label="simulated")
             panel.plot(one.times, one.values, "o", color=PALETTE[6], markersize=3.5, label="measured")
             error = f"apart by {one.errors['root_mean_square']:.3g} {one.unit} (root mean square)"
             panel.set_title(f"{name} {column}: {error}".replace("_", " "))
-            panel.set_ylabel(f"[{one.unit}]")
-            panel.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
-        panels[-1].set_xlabel("time [s]")
     return Path(path)
 
 

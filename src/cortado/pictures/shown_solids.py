@@ -107,13 +107,13 @@ class ShownSolid:
 def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
     """Return the solids of a scene where its tables have them, or as images within a period that they went beyond;
     behind them the images a period away that reach into the container."""
-    found, domain = [], scene.container.domain(scene.dimension)
+    found, domain = [], scene.domain
     for table in scene.solid:
         shape, middle = table.shape_about()
         position, is_tank = middle if table.position is None else np.array(table.position), table.side == "inside"
         position = domain.wrapped(position)
         found.append(ShownSolid(table.name, shape, position, table.turn(scene.dimension), table.finish, is_tank))
-    ends, lengths = scene.container.extent(), scene.container.periods(scene.dimension)[1]
+    ends, lengths = scene.container.extent(), scene.periods[1]
     if ends is None or not lengths.any():
         return tuple(found)
     shifts = list(product(*[(0.0, -length, length) if length else (0.0,) for length in lengths]))[1:]

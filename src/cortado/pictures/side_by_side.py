@@ -31,7 +31,7 @@ from cortado.pictures.film import (
 from cortado.pictures.painter import Scale, labelled, side_by_side
 from cortado.pictures.run_pictures import device_of, shown_as
 from cortado.runs.frames import Film, common_rate, pace_of
-from cortado.runs.run_folder import computed
+from cortado.runs.run_folder import computed, differences
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene, as_scene
@@ -218,27 +218,8 @@ class ShownFrames:
         return [note for note, is_on in ((begins, self.during[0]), (ends, self.during[-1])) if not is_on]
 
 
-_MISSING = "missing"
 MOST_KEYS, LONGEST = 3, 64
 """Values and characters of a label; where it has more, it is another one."""
-
-
-def differences(one: Any, other: Any, name: str = "") -> dict[str, list[Any]]:
-    """Return both values of whatever differs in two objects, by dotted names."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        pairs = {key: (one.get(key, _MISSING), other.get(key, _MISSING)) for key in {**one, **other}}
-    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other) and _has_tables(one):
-        pairs = {str(k): pair for k, pair in enumerate(zip(one, other, strict=True))}
-    else:
-        return {} if one == other else {name: [one, other]}
-    before = f"{name}." if name else ""
-    return {
-        key: pair for part, values in pairs.items() for key, pair in differences(*values, f"{before}{part}").items()
-    }
-
-
-def _has_tables(values: list[Any]) -> bool:
-    return any(isinstance(value, Mapping) for value in values)
 
 
 def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
@@ -246,7 +227,7 @@ def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
     differ, such as ``viscosity = 0.1 Pa s``. ``otherwise``: what they are called where no values differ, or too
     many."""
     tables = [computed(json.loads(scene.to_json())) for scene in scenes]
-    keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table)))
+    keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table, "missing")))
     short = [key.rpartition(".")[2] for key in keys]
     names = short if len(set(short)) == len(keys) else keys
     by_value = [

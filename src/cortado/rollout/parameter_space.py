@@ -30,7 +30,7 @@ from cortado.scene.motions import Steady
 from cortado.scene.parameter_values import Arrays, Values, check_known, checked_value, entry, scene_values, stacked
 from cortado.scene.parameters import Role
 from cortado.scene.restart import Clock, RestartState
-from cortado.scene.scene_warnings import parameter_sentence
+from cortado.scene.scene_warnings import viscosity_sentence
 from cortado.scene.stability import divergence_advice
 
 SAME = 1e-9
@@ -139,7 +139,7 @@ class ParameterSpace:
             self._go_on(rollout, members, states, arrays)
             self._keep(rollout, values, varied, members, arrays)
             return
-        sought = parameter_sentence(simulation.scene) if "viscosity" in varied else None
+        sought = viscosity_sentence(simulation.scene, "the viscosity is a parameter") if "viscosity" in varied else None
         self._warn(sought)
         rollout.begin_evaluation()
         rollout.goes_on = bool(states)

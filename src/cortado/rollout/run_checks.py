@@ -18,7 +18,6 @@ from cortado.rollout.scene_parameters import DENSITY, Simulated
 from cortado.rollout.step_bounds import Travel, moved_by
 from cortado.scene.checks import NEAREST
 from cortado.scene.discrete_scene import WHOLE
-from cortado.scene.model import resting_room, room_of
 from cortado.scene.motions import displacement_name, position_name, scale_name, told
 from cortado.scene.parameter_values import Arrays, Known
 from cortado.scene.parameters import Changing, Range
@@ -48,7 +47,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
-        for particle in outside(room_of(scene), positions[:free], spacing)[:1]:
+        for particle in outside(scene.room, positions[:free], spacing)[:1]:
             place = place_in_words(positions[particle])
             raise InputError(
                 f"parameter initial_positions has particle {particle} at {place}, outside the container or in a solid."
@@ -68,7 +67,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
     if "nozzle_path" in values and scene.emitter is not None:
         path, opening = np.atleast_2d(values["nozzle_path"]), scene.emitter.opening(spacing) - scene.emitter.outlet
         places = (path[:, None] + opening).reshape(-1, scene.dimension)
-        for step in outside(room_of(scene), places, spacing)[:1] // len(opening):
+        for step in outside(scene.room, places, spacing)[:1] // len(opening):
             raise InputError(
                 f"parameter nozzle_path is at {place_in_words(path[step])} in step {step + 1}, but must be where all "
                 "of the opening is inside the container."
@@ -189,7 +188,7 @@ def _jumps(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changi
 def _stretches(scene: Scene, values: Arrays) -> Iterator[str]:
     """Yield sentences on solids whose scale is too far from 1 for their walls, lets them overlap fluid beside them, or
     leaves a gap in a period."""
-    spacing, periods = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
+    spacing, periods = scene.discretisation.spacing, scene.periods[1]
     for table in told(scene.solid):
         scale = float(values.get(scale_name(table.name), 1.0))
         if scale == 1.0:
@@ -225,7 +224,7 @@ def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
         spacing=cut.spacing,
         support=cut.support,
         kernel=cut.kernel,
-        periods=tuple(map(float, scene.container.periods(scene.dimension)[1])),
+        periods=tuple(map(float, scene.periods[1])),
         waiting=len(simulation.positions) - simulation.free_particles,
         rest_density=tuple(map(float, rest_density)),
         solver=simulation.carried_by,
@@ -296,13 +295,13 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
     _check_densities(fields[DENSITY], fields["mass_fractions"], np.array(origin.rest_density))
     held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
     free, spacing = positions[: simulation.free_particles], scene.discretisation.spacing
-    for particle in outside(resting_room(scene), free, spacing)[:1] if held else ():  # solids that move are elsewhere
+    for particle in outside(scene.resting_room, free, spacing)[:1] if held else ():  # solids that move are elsewhere
         place = place_in_words(positions[particle])
         raise InputError(
             f"state positions has particle {particle} at {place}, outside the container of this scene or in a solid."
         )
     if scene.forces.pressure:
-        check_apart("state positions", positions, origin.spacing, scene.container.periods(scene.dimension))
+        check_apart("state positions", positions, origin.spacing, scene.periods)
 
 
 def check_clock(clock: Clock) -> None:

@@ -118,7 +118,7 @@ def frame_writer(
         constants=constants,
         diagnostics={name: column.dtype for name, column in diagnostics.items()},
         origin="" if origin is None else origin.to_json(),
-        marks=None if marks is None else (marks.start, marks.rate),
+        marks=() if marks is None else (marks.start, marks.rate),
         expected=expected,
         kept=kept,
     )

@@ -3,6 +3,7 @@
 They are NumPy in float64, on the host. In a run `cortado.runs.step_sums` computes them on the device.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -10,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.shapes import grid
+from cortado.discretise.shapes import grid, in_space
 from cortado.runs.sensor import Cut, Reading, SensedScene, Sensor
 
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}
@@ -149,14 +150,36 @@ class ParticleSum(Protocol):
         """Compute the sum (6,) of a state; numbers that a sum does not have are 0."""
 
 
-class Summed(Sensor, Protocol):
+class Summed(Sensor):
     """A sensor whose reading is a function of one sum over particles, besides the poses of solids."""
 
+    def __repr__(self) -> str:
+        given = [value for name, value in vars(self).items() if not name.startswith("_")]
+        shown = (repr(value.tolist() if isinstance(value, np.ndarray) else value) for value in given)
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+    def value(self, at: Reading) -> NDArray[Any]:
+        return self.reading(at, self.summed(at).on_host(at))
+
+    @abstractmethod
     def summed(self, at: SensedScene) -> ParticleSum:
         """Return the sum that the sensor reads in a scene."""
 
+    @abstractmethod
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
         """Return the sensor's reading (k,) from the sum (6,). Of fields it looks at the poses of solids alone."""
+
+
+class LoadSensor(Summed):
+    """A sensor of a force and its torque: in the plane, those of a metre across it."""
+
+    def columns(self, dimension: int) -> dict[str, str]:
+        force, torque = ("N", "N m") if dimension == 3 else ("N/m", "N")
+        turning = ["torque_x", "torque_y", "torque_z"] if dimension == 3 else ["torque"]
+        return dict.fromkeys(["force_x", "force_y", "force_z"][:dimension], force) | dict.fromkeys(turning, torque)
+
+    def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
+        return in_the_scene(found, at.dimension)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,8 +214,7 @@ class RegionSum:
     quantity: str = "wall_force"
 
     def on_host(self, at: Reading) -> NDArray[Any]:
-        (arms, force), pad = self.chosen(at), (0, 3 - at.dimension)
-        arms, force = np.pad(arms, ((0, 0), pad)), np.pad(force, ((0, 0), pad))
+        arms, force = map(in_space, self.chosen(at))
         return np.concatenate([force.sum(axis=0), np.cross(arms, force).sum(axis=0)])
 
     def chosen(self, at: Reading) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -209,7 +231,7 @@ class LoadSum:
 
     def on_host(self, at: Reading) -> NDArray[Any]:
         load, d = at[self.quantity], at.dimension
-        return np.concatenate([np.pad(load[:d], (0, 3 - d)), load[d:] if d == 3 else np.pad(load[d:], (2, 0))])
+        return np.concatenate([in_space(load[:d]), load[d:] if d == 3 else np.pad(load[d:], (2, 0))])
 
 
 def in_the_scene(found: NDArray[Any], dimension: int) -> NDArray[Any]:

@@ -7,15 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.calls import fixed
+from cortado.discretise.shapes import in_space
 from cortado.errors import InputError, shown
 from cortado.runs.particle_sums import (
     ACROSS,
     Around,
+    LoadSensor,
     LoadSum,
     RegionSum,
     Seen,
+    Summed,
     WeightedSum,
-    in_the_scene,
     parts_of,
     reach_of,
 )
@@ -27,7 +29,6 @@ from cortado.runs.sensor import (
     corner,
     direction,
     in_dimension,
-    load_columns,
     point,
     positive,
 )
@@ -37,7 +38,7 @@ from cortado.scene.scene import Scene
 
 
 @fixed
-class PressureProbe:
+class PressureProbe(Summed):
     """A sensor of the mean pressure of the particles around a point, those nearby weighing most:
 
     p = sum_i p_i w_i / sum_i w_i,   w_i = w(r_i / radius).
@@ -51,23 +52,15 @@ class PressureProbe:
         self.position = point("position", position)
         self.radius = None if radius is None else positive("radius", radius)
 
-    def __repr__(self) -> str:
-        return f"PressureProbe({self.position.tolist()}, {self.radius})"
-
     def columns(self, dimension: int) -> dict[str, str]:
         return {"pressure": "Pa"}
 
-    def value(self, at: Reading) -> NDArray[Any]:
-        return self.reading(at, self.summed(at).on_host(at))
-
     def summed(self, at: SensedScene) -> WeightedSum:
-        """Return the sums of weights and of weighted pressures."""
         radius = at.lattice.support if self.radius is None else self.radius
         place = in_dimension("position", self.position, at.dimension)
         return WeightedSum(Around(place, radius, lambda way: way), "pressure")
 
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
-        """Return the mean pressure (1,) from the sums."""
         return np.array([found[1] / found[0] if found[0] else 0.0])
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -81,7 +74,7 @@ class PressureProbe:
 
 
 @fixed
-class FlowRate:
+class FlowRate(Summed):
     """A sensor of the volume of fluid that goes through a plane in a second, along its normal; the mean over a layer
     around it:
 
@@ -100,24 +93,15 @@ class FlowRate:
             )
         self.reach = None if reach is None else positive("reach", reach)
 
-    def __repr__(self) -> str:
-        return f"FlowRate({self.position.tolist()}, {self.normal.tolist()}, {self.reach})"
-
     def columns(self, dimension: int) -> dict[str, str]:
         return {"flow_rate": "m3/s" if dimension == 3 else "m2/s"}
 
-    def value(self, at: Reading) -> NDArray[Any]:
-        return self.reading(at, self.summed(at).on_host(at))
-
     def summed(self, at: SensedScene) -> WeightedSum:
-        """Return the sum of weighted velocities along the normal, of the distances (n, 1) of particles from the
-        plane."""
         reach, place = reach_of(self.reach, at), in_dimension("position", self.position, at.dimension)
         around = Around(place, reach, self._along, parts_of(reach, at, self._along, 1))
         return WeightedSum(around, along=self.normal)
 
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
-        """Return the flow (1,) from the sums."""
         return np.array([self._scale(at) * found[1]])
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -135,7 +119,7 @@ class FlowRate:
 
 
 @fixed
-class WallForce:
+class WallForce(LoadSensor):
     """A sensor of the force with which the fluid pushes the walls, and of its torque:
 
     F = sum_i f_i,   T = sum_i (x_i - about) x f_i,
@@ -158,19 +142,7 @@ class WallForce:
         if self.lower is not None and self.upper is not None and not (self.lower < self.upper).all():
             raise InputError(f"upper is {self.upper.tolist()}, but must be greater than lower, {self.lower.tolist()}.")
 
-    def __repr__(self) -> str:
-        shown = (None if values is None else values.tolist() for values in (self.lower, self.upper, self.about))
-        return f"WallForce({', '.join(map(str, shown))})"
-
-    def columns(self, dimension: int) -> dict[str, str]:
-        return load_columns(dimension)
-
-    def value(self, at: Reading) -> NDArray[Any]:
-        return self.reading(at, self.summed(at).on_host(at))
-
     def summed(self, at: SensedScene) -> RegionSum:
-        """Return the sums of forces and torques over the region."""
-
         def place(what: str, values: NDArray[Any] | None, end: float) -> NDArray[Any]:
             d = at.dimension
             return np.full(d, end) if values is None else in_dimension(what, values, d)
@@ -178,26 +150,18 @@ class WallForce:
         lower, upper = place("lower", self.lower, -np.inf), place("upper", self.upper, np.inf)
         return RegionSum(lower, upper, place("about", self.about, 0.0))
 
-    def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
-        """Return force and torque, (6,), in the plane (3,), from the sums."""
-        return in_the_scene(found, at.dimension)
-
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
         summed, d = self.summed(at), at.dimension
         (arms, force), torque_bar = summed.chosen(at), bar[d:] if d == 3 else np.array([0.0, 0.0, bar[d]])
         inside = at.lattice.domain.within(at["positions"], summed.lower, summed.upper)[1]
         return {
-            "positions": np.cross(_in_space(force), torque_bar)[:, :d],
-            "wall_force": np.where(inside[:, None], bar[:d] + np.cross(torque_bar, _in_space(arms))[:, :d], 0.0),
+            "positions": np.cross(in_space(force), torque_bar)[:, :d],
+            "wall_force": np.where(inside[:, None], bar[:d] + np.cross(torque_bar, in_space(arms))[:, :d], 0.0),
         }
 
 
-def _in_space(vectors: NDArray[Any]) -> NDArray[Any]:
-    return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
-
-
 @fixed
-class SolidLoad:
+class SolidLoad(LoadSensor):
     """A sensor of the force of the fluid on a solid, and of its torque about the solid's middle c,
 
     F = sum_i f_i,   T = sum_i (x_i - c) x f_i,
@@ -214,22 +178,8 @@ class SolidLoad:
             raise InputError(f"solid is {shown(solid)}, but must be the name of a solid.")
         self.solid = solid
 
-    def __repr__(self) -> str:
-        return f"SolidLoad({self.solid!r})"
-
-    def columns(self, dimension: int) -> dict[str, str]:
-        return load_columns(dimension)
-
-    def value(self, at: Reading) -> NDArray[Any]:
-        return self.reading(at, self.summed(at).on_host(at))
-
     def summed(self, at: SensedScene) -> LoadSum:
-        """Return the load."""
         return LoadSum(load_name(self.solid))
-
-    def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
-        """Return force and torque, (6,), in the plane (3,), from the load."""
-        return in_the_scene(found, at.dimension)
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
         return {load_name(self.solid): bar}

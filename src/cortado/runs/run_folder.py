@@ -26,10 +26,6 @@ from cortado.scene.parameter_values import NAMES
 from cortado.scene.scene import Scene
 from cortado.version import __version__
 
-_FORMAT = 2
-"""Format of run folders, in environment.json; earlier ones have none there."""
-FORMER_FRAMES = 120
-"""The default of film_frames in folders without a format."""
 LARGEST = 2**31
 """Most bytes of a file that is read again when a run goes on."""
 _PACKAGES = ("warp-lang", "numpy", "scipy", "pydantic", "h5py", "matplotlib")
@@ -131,7 +127,7 @@ class RunFolder:
         """
         folder = cls(Path(path).absolute())
         noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
-        noted |= {"format": _FORMAT, "meshes": mesh_marks(scene_json)}
+        noted["meshes"] = mesh_marks(scene_json)
         with sentences(folder.path):
             folder._make_room(kind, overwrite)
             folder.path.mkdir(parents=True, exist_ok=True)
@@ -171,7 +167,6 @@ class RunFolder:
         folder.require(scene_json, kind, settings)
         noted = read_json(folder.environment)
         noted.setdefault("resumed", []).append(session(command, device))
-        noted["format"] = _FORMAT
         with sentences(folder.path):
             folder.result.unlink(missing_ok=True)
             folder._remove_unfinished()
@@ -218,7 +213,6 @@ class RunFolder:
         text = bytes_of(self.scene).decode(errors="replace")
         with unwarned():
             try:
-                text = in_present_words(text, "format" in read_json(self.environment))
                 return Scene.from_json(text, overrides)
             except SceneError as error:
                 raise error.in_file(str(self.scene)) from None
@@ -315,21 +309,6 @@ class RunFolder:
         return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
 
 
-def in_present_words(scene_json: str, has_format: bool) -> str:
-    """Return the scene of an earlier folder in present words: `colour` of [picture] was called colour_by, and in
-    folders without a format the default of film_frames, 120, was written as if it were asked for."""
-    try:
-        scene = json.loads(scene_json)
-        picture = scene["picture"]
-        if "colour_by" in picture:
-            picture["colour"] = picture.pop("colour_by") or "phase"
-        if not has_format and picture["film_frames"] == FORMER_FRAMES:
-            del picture["film_frames"]
-    except (ValueError, RecursionError, LookupError, TypeError):
-        return scene_json  # an error is reported where it is read
-    return json.dumps(scene)
-
-
 def computed(scene: Any) -> Any:
     """Return a scene without tables that change only how it is shown, and what is read of it."""
     shown = ("picture", "sensor")
@@ -393,20 +372,29 @@ def as_json(value: Any) -> Any:
     return json.loads(json.dumps(value, default=plain))
 
 
-def require_same(former: Any, given: Any, folder: Path, field: str = "") -> None:
+def require_same(former: Any, given: Any, folder: Path) -> None:
     """Raise `InputError`, with the field, where given settings differ from those that the run in a folder was begun
     with."""
-    if isinstance(former, dict) and isinstance(given, dict):
-        for name in sorted({*former, *given}):
-            require_same(former.get(name), given.get(name), folder, f"{field}.{name}".lstrip("."))
-    elif _are_tables(former) and _are_tables(given) and len(former) == len(given):
-        for k, pair in enumerate(zip(former, given, strict=True)):
-            require_same(*pair, folder, f"{field}[{k}]")
-    elif former != given:
+    for name, (before, now) in sorted(differences(former, given).items()):
+        field = ".".join(part if not part.isdigit() else f"[{part}]" for part in name.split(".")).replace(".[", "[")
         raise InputError(
-            f"The run in {folder} was begun with {field} = {_written(former)} and is now given {field} = "
-            f"{_written(given)}; give the former, or choose another --out."
+            f"The run in {folder} was begun with {field} = {_written(before)} and is now given {field} = "
+            f"{_written(now)}; give the former, or choose another --out."
         )
+
+
+def differences(one: Any, other: Any, missing: Any = None, name: str = "") -> dict[str, list[Any]]:
+    """Return both values of whatever differs in two objects, by dotted names; of entries that one of them has not the
+    value ``missing``."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        pairs = {key: (one.get(key, missing), other.get(key, missing)) for key in {**one, **other}}
+    elif _are_tables(one) and _are_tables(other) and len(one) == len(other):
+        pairs = {str(k): pair for k, pair in enumerate(zip(one, other, strict=True))}
+    else:
+        return {} if one == other else {name: [one, other]}
+    before = f"{name}." if name else ""
+    each = [differences(*values, missing, f"{before}{part}") for part, values in pairs.items()]
+    return {key: pair for found in each for key, pair in found.items()}
 
 
 def _written(value: Any) -> str:
@@ -417,7 +405,7 @@ def _written(value: Any) -> str:
 
 
 def _are_tables(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(entry, dict) for entry in value)
+    return isinstance(value, list) and any(isinstance(entry, Mapping) for entry in value)
 
 
 def _version(package: str) -> str | None:

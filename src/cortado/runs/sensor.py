@@ -67,13 +67,6 @@ TIME = "time [s]"
 """The first column of a table of readings."""
 
 
-def load_columns(dimension: int) -> dict[str, str]:
-    """Return the names of a force and its torque, with their units: in the plane those of a metre across it."""
-    force, torque = ("N", "N m") if dimension == 3 else ("N/m", "N")
-    turning = ["torque_x", "torque_y", "torque_z"] if dimension == 3 else ["torque"]
-    return dict.fromkeys(["force_x", "force_y", "force_z"][:dimension], force) | dict.fromkeys(turning, torque)
-
-
 def point(what: str, values: Any) -> NDArray[Any]:
     """Check a place or a direction, (d,), finite; raise `InputError`."""
     array = corner(what, values)

@@ -32,7 +32,7 @@ def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_
 
     nowhere, ends = np.zeros(len(points), dtype=bool), scene.container.extent()
     solids = [table.solid() for table in scene.solid if not table.moves]
-    if ends is None or not solids or scene.emitter is not None or any(scene.container.periods(scene.dimension)[1]):
+    if ends is None or not solids or scene.emitter is not None or any(scene.periods[1]):
         return nowhere
     lower, upper = np.array(ends, dtype=np.float64)
     counts = np.maximum(np.ceil((upper - lower) / (0.5 * scene.discretisation.spacing)), 1.0)
@@ -145,7 +145,7 @@ def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
 def _too_wide(scene: Scene, key: str, wide: float | None) -> str | None:
     """Say that a reach is larger than a container without periods."""
     ends = scene.container.extent()
-    if wide is None or ends is None or any(scene.container.periods(scene.dimension)[1]):
+    if wide is None or ends is None or any(scene.periods[1]):
         return None
     size = float(np.linalg.norm(np.subtract(*ends)))
     if wide <= size:

@@ -120,9 +120,8 @@ def _motion(name: str, fields: Mapping[str, NDArray[Any]], dimension: int) -> So
         moving["angular_velocities"] = fields[angular_velocity_name(name)][:, 0]
         return SolidMotion(position, _turned(axes + np.eye(dimension, 3), begun, dimension), **moving)
     turns = fields[turn_name(name)][:, 0].astype(np.float64)
-    scale = [*fields.get(scale_name(name), np.zeros((0, 1)))[:, 0], 1.0][0]  # earlier versions kept none
     rotations = turns + begun if dimension == 2 else _product(turns, begun)
-    return SolidMotion(position, rotations, scale=float(scale))
+    return SolidMotion(position, rotations, scale=float([*fields[scale_name(name)][:, 0], 1.0][0]))
 
 
 def _turned(axes: NDArray[Any], begun: NDArray[Any], dimension: int) -> NDArray[Any]:

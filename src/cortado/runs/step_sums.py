@@ -2,9 +2,9 @@
 (`cortado.runs.particle_sums`) of all states of a chunk, launched behind it, in float64 and a fixed order."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from math import isqrt
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.discretise.room import Domain
+from cortado.discretise.shapes import in_space
 from cortado.errors import InputError
 from cortado.particles.state import Parameters, State, StateSeries
 from cortado.runs.particle_sums import LoadSum, ParticleSum, RegionSum, WeightedSum
@@ -52,17 +53,9 @@ class _Region:
     about: wp.vec3d
 
 
-@dataclass(frozen=True)
-class _Kernels:
-    """Kernels of partial sums over every so many particles of a scene in one state, and of the sum of these."""
-
-    weighted: Any
-    within: Any
-    join: Any
-
-
 @cache
-def _kernels(precision: Precision) -> _Kernels:
+def _kernels(precision: Precision) -> SimpleNamespace:
+    """Make kernels of partial sums over every so many particles of a scene in one state, and of the sum of these."""
     real, vector, six = precision.real, precision.vector, SIX
     module = kernel_module(f"particle_sums_{precision.name}")
 
@@ -163,7 +156,7 @@ def _kernels(precision: Precision) -> _Kernels:
             found += partial[wp.tid() * stride + t]
         total[wp.tid()] = found
 
-    return _Kernels(weighted, within, join)
+    return SimpleNamespace(weighted=weighted, within=within, join=join)
 
 
 class StepQuantities:
@@ -186,7 +179,7 @@ class StepQuantities:
                 self.kept[name] = wp.zeros(self._length * len(found), dtype=found.dtype, device=found.device)
             own = self.of_step(name, step)
             if found.dtype is SIX:
-                launch(_copy_kernel(), len(found), found.device, given=found, own=own)
+                wp.copy(own, found)
             else:
                 unsort(context, found, own)
 
@@ -245,7 +238,7 @@ def _around(summed: WeightedSum, domain: Domain, device: Any) -> Any:
     found.reach, found.share = around.reach, 1.0 / len(shifts)
     found.widest = float(np.linalg.norm(offsets, axis=1).max()) + around.reach
     found.along = wp.vec3d(*_wide(np.zeros(d) if summed.along is None else summed.along))
-    found.offsets = wp.array(np.pad(offsets, ((0, 0), (0, 3 - offsets.shape[1]))), dtype=wp.vec3d, device=device)
+    found.offsets = wp.array(in_space(offsets), dtype=wp.vec3d, device=device)
     return found
 
 
@@ -265,12 +258,3 @@ def _wide(values: NDArray[Any], rest: float = 0.0) -> NDArray[Any]:
 def _square(matrix: NDArray[Any]) -> NDArray[Any]:
     """Return a matrix with zeros up to (3, 3), row by row."""
     return np.pad(matrix, [(0, 3 - size) for size in matrix.shape]).ravel()
-
-
-@cache
-def _copy_kernel() -> Any:
-    @wp.kernel(module=kernel_module("step_sums_copy"), enable_backward=False)
-    def copy(given: wp.array(dtype=SIX), own: wp.array(dtype=SIX)):
-        own[wp.tid()] = given[wp.tid()]
-
-    return copy

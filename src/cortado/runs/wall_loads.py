@@ -176,7 +176,8 @@ class WallLoads:
         if len(arrays) == 1:
             return arrays[0]
         total = self._vectors[name]
-        total.zero_()
+        if arrays:  # else it is 0 from the start
+            total.zero_()
         for array in arrays:
             add(array, total)
         return total

@@ -24,7 +24,7 @@ from cortado.discretise.room import Domain
 from cortado.discretise.shapes import corners, grid
 from cortado.discretise.solid import Solid
 from cortado.particles.state import padded
-from cortado.runs.particle_sums import ACROSS, Around, Seen, WeightedSum, Weights, parts_of, reach_of
+from cortado.runs.particle_sums import ACROSS, Around, Seen, Summed, WeightedSum, Weights, parts_of, reach_of
 from cortado.runs.sensor import Cut, Reading, SensedScene, direction, in_dimension, point, positive
 from cortado.scene.motions import Pose, position_name, scale_name
 from cortado.scene.shape_tables import Container
@@ -246,7 +246,7 @@ FINER = 4.0
 
 
 @fixed
-class WaveGauge:
+class WaveGauge(Summed):
     """A sensor of the height of the fluid's surface at a place: its volume in a column around it fills the room of the
     column from the floor on. Without solids that is its volume over the column's cross-section,
 
@@ -267,14 +267,8 @@ class WaveGauge:
         self.radius = None if radius is None else positive("radius", radius)
         self.up = direction("up", np.eye(len(self.position))[1] if up is None else up)
 
-    def __repr__(self) -> str:
-        return f"WaveGauge({self.position.tolist()}, {self.floor}, {self.radius}, {self.up.tolist()})"
-
     def columns(self, dimension: int) -> dict[str, str]:
         return {"height": "m"}
-
-    def value(self, at: Reading) -> NDArray[Any]:
-        return self.reading(at, self.summed(at).on_host(at))
 
     def summed(self, at: SensedScene) -> WeightedSum:
         """Return the sum of weights of the horizontal distances of particles, as vectors (n, d). Where the column has
@@ -286,7 +280,6 @@ class WaveGauge:
         return WeightedSum(Around(self.position, axis.reach, self._across, parts))
 
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
-        """Return the height (1,) from the sum."""
         axis = self._axis(at)
         column, depth = column_of(axis, at), self._scale(axis, at) * float(found[0])
         return np.array([self.floor + (depth if column is None else column.level(depth)[0])])

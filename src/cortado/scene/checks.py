@@ -15,7 +15,7 @@ from cortado.discretise.solid import Solid
 from cortado.errors import InputError, Words, shown
 from cortado.scene.emitter import EmitterTable
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
-from cortado.scene.model import MixtureTable, SceneTables, SolidLoadTable, room_of
+from cortado.scene.model import MixtureTable, SceneTables, SolidLoadTable
 from cortado.scene.motions import free
 from cortado.scene.parameters import BY_NAME
 from cortado.scene.shape_tables import MeshShape, check_length
@@ -42,13 +42,12 @@ def check_free(scene: SceneTables) -> None:
         raise field_error(("solver", "kind"), scene.solver.kind, f'"projection", {why}')
     if not scene.forces.pressure:
         raise field_error(("forces", "pressure"), False, f"true, as the solid {bodies[0].name!r} is free")
-    spacing, lengths = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
-    region = scene.container.region(scene.dimension).opened(lengths)
+    spacing, lengths = scene.discretisation.spacing, scene.periods[1]
     for index, table in enumerate(scene.solid):
         if table.motion != "free":
             continue
         points = _points_within(table.solid(), FINE * spacing)
-        depths = [("the container", region.distance(points))]
+        depths = [("the container", scene.region.distance(points))]
         for other in scene.solid:
             if other is not table:
                 near = _nearest_images(points, np.mean(other.solid().extent(), axis=0), lengths)
@@ -190,7 +189,7 @@ def check_scene(scene: SceneTables) -> None:
         check_distinct(("fluid", index), fluid, spacing)
     if scene.emitter is not None:
         _check_outlet(scene, scene.emitter)
-    check_overlaps(_bodies(scene), scene.container.periods(scene.dimension)[1], spacing)
+    check_overlaps(_bodies(scene), scene.periods[1], spacing)
     _check_schedule(scene)
 
 
@@ -304,7 +303,7 @@ def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
 
 def _check_free(scene: SceneTables, path: FieldPath, points: Points) -> None:
     """Check that points (n, d) [m] are outside of all solids."""
-    tolerance, room = TOLERANCE * scene.discretisation.spacing, room_of(scene)
+    tolerance, room = TOLERANCE * scene.discretisation.spacing, scene.room
     within = room.from_solids(points) < -tolerance
     if within.any():
         found = Words(f"partly in a solid, for example at {point_in_words(points[within][0])}")
@@ -321,7 +320,7 @@ def _check_outlet(scene: SceneTables, emitter: EmitterTable) -> None:
 
     Along a periodic axis it may not: what is outside there comes in again on the other side.
     """
-    spacing, lengths = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
+    spacing, lengths = scene.discretisation.spacing, scene.periods[1]
     tolerance, outlet, opening = 1e-6 * spacing, np.array(emitter.outlet), emitter.opening(spacing)
     if not scene.container.contains(outlet[None], tolerance).all():
         raise field_error(("emitter", "outlet"), emitter.outlet, "inside the container")
@@ -362,8 +361,7 @@ def _check_schedule(scene: SceneTables) -> None:
         wanted = f"emitter.outlet, {shown(scene.emitter.outlet)}, where the opening is at the start"
         raise field_error(("schedule", "nozzle_path", "values", 0), path.values[0], wanted)
     opening = scene.emitter.opening(spacing) - np.array(scene.emitter.outlet)
-    region = scene.container.region(scene.dimension).opened(scene.container.periods(scene.dimension)[1])
     for index, place in enumerate(path.values):
-        if not region.contains(np.array(place) + opening, 1e-6 * spacing).all():
+        if not scene.region.contains(np.array(place) + opening, 1e-6 * spacing).all():
             wanted = "where all of the opening is inside the container"
             raise field_error(("schedule", "nozzle_path", "values", index), place, wanted)

@@ -27,9 +27,8 @@ from cortado.discretise.walls import (
     wall_weights,
 )
 from cortado.errors import InputError, MassWarning, warn
-from cortado.scene.fluid_particles import FluidMasses, FluidSample, Surroundings, fluid_particles, period
+from cortado.scene.fluid_particles import FluidMasses, FluidSample, Surroundings, fluid_particles
 from cortado.scene.fluids import PointsFluid
-from cortado.scene.model import resting_room
 from cortado.scene.motions import moving, wall_numbers
 from cortado.scene.scene import Scene
 from cortado.scene.scene_warnings import standing_sentences, thin_sentences
@@ -76,7 +75,7 @@ def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     still = [_kept(scene, container, layers, lattice)]
     if container.room.solids:
         still.append(_around(scene, container, still[0], layers, lattice))
-    periods, tables = scene.container.periods(scene.dimension)[1], moving(scene.solid)
+    periods, tables = scene.periods[1], moving(scene.solid)
     return Walls.joined([*still, *(_alone(table, k, periods, layers, lattice) for k, table in enumerate(tables))])
 
 
@@ -84,7 +83,7 @@ def _container(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Contai
     """Make the walls of the container as they are without solids, in layers of even particles."""
     points = _even_points(scene.container, scene.dimension, layers, lattice.spacing)
     solids = scene.container.solids(scene.dimension, lattice.support)
-    return ContainerWalls(points, solids, resting_room(scene), lattice.spacing, lattice.support)
+    return ContainerWalls(points, solids, scene.resting_room, lattice.spacing, lattice.support)
 
 
 def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: RestLattice) -> Walls:
@@ -115,7 +114,7 @@ def _even_points(container: Container, dimension: int, layers: WallLayers, spaci
 
 def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLayers, lattice: RestLattice) -> Walls:
     """Make the wall particles of all solids at rest and of the container near them, where fluid can touch them."""
-    room, (lower, _) = container.room, scene.container.periods(scene.dimension)
+    room, (lower, _) = container.room, scene.periods
     resting = [solid for solid in scene.solid if not solid.moves]
     images = [room.images(solid) for solid in room.solids]
     tables: list[Container | SolidTable] = [scene.container for _ in container.solids]
@@ -258,7 +257,7 @@ def discretise(scene: Scene) -> DiscreteScene:
     lattice = Lattice.of(kernel, spacing, support, dimension, scene.container.domain(dimension))
     fluid = fluid_particles(scene)
     walls = walls_of(scene, layers, at_rest)
-    fluid = _packed(fluid, walls, at_rest, *period(scene))
+    fluid = _packed(fluid, walls, at_rest, *scene.periods)
     masses = FluidMasses.of(scene, fluid)
     for sentence in (*thin_sentences(scene), *standing_sentences(scene)):
         warn(sentence)
@@ -269,10 +268,10 @@ def discretise(scene: Scene) -> DiscreteScene:
     fluid = replace(fluid, velocities=_velocities(scene, fluid))
     if any(isinstance(body, PointsFluid) for body in scene.fluid):
         of_lattice = kernel, support, lattice.volume, spacing
-        told = check_crowding("the points of the fluid", fluid.positions, *of_lattice, period(scene))
+        told = check_crowding("the points of the fluid", fluid.positions, *of_lattice, scene.periods)
         if told is not None:
             warn(told)
-    return DiscreteScene(kernel, lattice, fluid, masses, layers, walls, period(scene)[1])
+    return DiscreteScene(kernel, lattice, fluid, masses, layers, walls, scene.periods[1])
 
 
 def _velocities(scene: Scene, fluid: FluidSample) -> Points:

@@ -17,7 +17,6 @@ from cortado.discretise.shapes import EXCESS, Points, apart, grid, pairs_within
 from cortado.errors import InputError
 from cortado.scene.emitter import EmitterSample
 from cortado.scene.fluids import ALIGNED, Fluid, PointsFluid, RegionFluid
-from cortado.scene.model import room_of
 from cortado.scene.scene import Scene
 
 FINER = 4
@@ -195,7 +194,7 @@ def fluid_particles(scene: Scene) -> FluidSample:
     """Make the fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with points
     is gone since the scene was read, or if walls leave no room for any particle of a fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
-    room, reach = room_of(scene), scene.discretisation.support_radius
+    room, reach = scene.room, scene.discretisation.support_radius
     bodies = [CutBody(body, room, spacing) if is_packed(body, room, reach, spacing) else None for body in scene.fluid]
     positions = [
         fluid.particles_in(room, spacing) if body is None else body.particles()
@@ -239,7 +238,7 @@ def reserve_offset(scene: Scene) -> Points:
     boxes = [fluid.extent(spacing) for fluid in scene.fluid] + [solid.body().extent() for solid in scene.solid]
     ends = np.array([[scene.emitter.outlet] * 2, scene.container.extent() or [scene.emitter.outlet] * 2, *boxes])
     size = float(np.ptp(ends.reshape(-1, scene.dimension), axis=0).max())
-    aside = np.where(direction > 0.0, -1.0, 1.0) * (period(scene)[1] == 0.0)
+    aside = np.where(direction > 0.0, -1.0, 1.0) * (scene.periods[1] == 0.0)
     return 2.0 * (size + scene.discretisation.support_radius) * aside
 
 
@@ -252,11 +251,6 @@ def _why_none(body: CutBody | None, spacing: float) -> str:
         )
     cells = body.volume() / spacing**body.room.dimension
     return f", as the volume that walls leave it is {cells:.2g} of that of a particle: it must be larger"
-
-
-def period(scene: Scene) -> tuple[Points, Points]:
-    """Return begin and length of the period of a scene, each (d,) [m]; the length is 0 for axes without one."""
-    return scene.container.periods(scene.dimension)
 
 
 @dataclass(frozen=True)

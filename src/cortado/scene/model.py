@@ -10,7 +10,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
 
-from cortado.discretise.room import Room
+from cortado.discretise.room import Domain, Region, Room
+from cortado.discretise.shapes import Points
 from cortado.scene.appearance import LIQUIDS, Coloured, Picture, Render
 from cortado.scene.emitter import EmitterTable
 from cortado.scene.fluids import AnyFluid, turned
@@ -129,12 +130,6 @@ class HerschelBulkley(Yielding, Thinning):
 
 AnyRheology = Annotated[PowerLaw | Carreau | Bingham | HerschelBulkley, Field(discriminator="kind")]
 """A law of viscosity by its ``kind``."""
-
-
-def greatest_viscosity(phase: Any, viscosity: float) -> float:
-    """Return the greatest viscosity of a phase [Pa s], for the value of its key viscosity, or of a parameter in its
-    place [Pa s]."""
-    return viscosity if phase.rheology is None else float(phase.rheology.thickest(viscosity))
 
 
 class MixtureTable(Table):
@@ -379,6 +374,31 @@ class SceneTables(Table):
         """Return True where fluid has no slip along some walls."""
         return self.container.sticks or any(solid.sticks for solid in self.solid)
 
+    @property
+    def periods(self) -> tuple[Points, Points]:
+        """Return begin and length of the period, each (d,) [m]; the length is 0 for axes without one."""
+        return self.container.periods(self.dimension)
+
+    @property
+    def domain(self) -> Domain:
+        """Return the periods, with what follows from them."""
+        return self.container.domain(self.dimension)
+
+    @property
+    def region(self) -> Region:
+        """Return the region of the container, which nothing closes along a period."""
+        return self.container.region(self.dimension).opened(self.periods[1])
+
+    @property
+    def room(self) -> Room:
+        """Return the room of the fluid at the start, in the container and outside of solids."""
+        return Room(self.region, solids_of(self.solid), self.periods[1])
+
+    @property
+    def resting_room(self) -> Room:
+        """Return the room that solids at rest alone leave."""
+        return replace(self.room, solids=solids_of(tuple(solid for solid in self.solid if not solid.moves)))
+
     @model_validator(mode="before")
     @classmethod
     def _choose_for_solver(cls, data: Any) -> Any:
@@ -428,15 +448,3 @@ class SceneTables(Table):
         if "dimension" not in info.data:
             return tables
         return tuple(table.in_dimension(info.data["dimension"], (index,)) for index, table in enumerate(tables))
-
-
-def room_of(scene: SceneTables) -> Room:
-    """Return the room of a scene's fluid at the start: in its container, outside of solids; nothing closes a period."""
-    lengths = scene.container.periods(scene.dimension)[1]
-    region = scene.container.region(scene.dimension).opened(lengths)
-    return Room(region, solids_of(scene.solid), lengths)
-
-
-def resting_room(scene: SceneTables) -> Room:
-    """Return the `room_of` a scene with its solids at rest alone."""
-    return replace(room_of(scene), solids=solids_of(tuple(solid for solid in scene.solid if not solid.moves)))

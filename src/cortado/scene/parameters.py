@@ -1,5 +1,5 @@
 """The one list of parameters: what each is called, its unit, shape and range, what it is in a scene, and what a
-meaningful change of it is. Without Warp. ``python -m cortado.scene.parameters`` prints it as a table in Markdown.
+meaningful change of it is. Without Warp.
 
 Shapes on a device, checks of what users write, scales of the certificate and tables of the documents follow from it.
 """
@@ -343,32 +343,3 @@ def offered(scene: Any) -> tuple[str, ...]:
     """Return the names of parameters that a scene has, without mass fractions where there is one phase."""
     one_phase = {"mass_fractions"} if len(scene.phase) == 1 else set()
     return tuple(p.name for p in PARAMETERS if p.present(scene) and p.name not in one_phase)
-
-
-HEAD = "| parameter | shape | unit | | range |\n|---|---|---|---|---|\n"
-
-
-def markdown() -> str:
-    """Return a Markdown table with a row for each parameter; n particles, d dimensions, in a run of several steps."""
-    return HEAD + "".join(_row(parameter) for parameter in PARAMETERS)
-
-
-def _row(parameter: Parameter) -> str:
-    allowed = "" if parameter.range.value == "any" else parameter.range.value
-    return f"| `{parameter.name}` | {_shape(parameter)} | {parameter.unit} | {parameter.meaning} | {allowed} |\n"
-
-
-def _shape(parameter: Parameter) -> str:
-    if parameter.axis is Axis.SCALAR:
-        return "a number"
-    components = parameter.components
-    if components is None:
-        return "a number; (phases,) of several"
-    own = {(2, 3): "d", (1, 2): "d - 1", (7, 7): "phases", (3, 3): "3"}[components(2, 7), components(3, 7)]
-    if parameter.axis is Axis.STEP:
-        return f"({own},) or (steps, {own})"
-    return f"({'n' if parameter.axis is Axis.PARTICLE else 'phases'}, {own})"
-
-
-if __name__ == "__main__":
-    print(markdown(), end="")

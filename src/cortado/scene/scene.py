@@ -19,9 +19,9 @@ from cortado.errors import InputError, SceneError, shown, warn
 from cortado.scene.checks import check_bounded, check_scene
 from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.restart import RestartState
-from cortado.scene.scene_warnings import check_idle, creep_sentence, idle_sentences, wall_sentence
+from cortado.scene.scene_warnings import check_idle, creep_sentence, idle_sentences, viscosity_sentence
 from cortado.scene.shape_tables import BoxContainer, CylinderContainer
-from cortado.scene.stability import broken_limit, longest_step
+from cortado.scene.stability import broken_limits, longest_step
 from cortado.scene.tables import sentences
 from cortado.scene.toml import put_in, read_toml
 from cortado.words import counted
@@ -45,12 +45,12 @@ class Scene(SceneTables):
         time_step = self.solver.time_step
         if time_step == "auto":
             check_bounded(self)
-        elif broken := broken_limit(self, {}, time_step):
-            found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {broken[1]:.3g} s"
-            warn(f"{found}, which comes from {broken[0]}.")
-        for sentence in filter(
-            None, (*_in_other_units(self), wall_sentence(self), creep_sentence(self), *idle_sentences(self))
-        ):
+        elif broken := broken_limits(self, {}, time_step):
+            name, limit = broken[0]
+            found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {limit:.3g} s"
+            warn(f"{found}, which comes from {name}.")
+        held = viscosity_sentence(self, 'slip is "no" at walls') if self.sticks else None
+        for sentence in filter(None, (*_in_other_units(self), held, creep_sentence(self), *idle_sentences(self))):
             warn(sentence)
         return self
 
@@ -70,7 +70,7 @@ class Scene(SceneTables):
         particles than memory holds.
         """
         emitter, spacing = self.emitter, self.discretisation.spacing
-        lengths = self.container.periods(self.dimension)[1]
+        lengths = self.periods[1]
         if steps is not None:
             time = steps * longest_step(self)
         if emitter is None or time is None or np.any((lengths > 0.0) & (np.array(emitter.direction) != 0.0)):

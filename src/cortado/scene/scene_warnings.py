@@ -10,7 +10,7 @@ from cortado.discretise.room import Room
 from cortado.discretise.solid_walls import surface_feet
 from cortado.scene.appearance import Keyframes, Picture
 from cortado.scene.fluids import PointsFluid
-from cortado.scene.model import Carreau, DiscretisationTable, SceneTables, Thinning, Yielding, resting_room
+from cortado.scene.model import Carreau, SceneTables, Thinning, Yielding
 from cortado.scene.motions import Steady, courses, told
 from cortado.scene.shape_tables import BoxContainer
 from cortado.scene.solids import SolidTable
@@ -148,17 +148,8 @@ FAULT = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the di
 """The fault of the pairwise viscosity, as measured in waves of shear (`docs/discretisation.md`)."""
 
 
-def wall_sentence(scene: SceneTables) -> str | None:
-    """Return the sentence about a scene whose walls hold the fluid back; None if there is nothing."""
-    return _sentence(scene, 'slip is "no" at walls') if scene.sticks else None
-
-
-def parameter_sentence(scene: SceneTables) -> str | None:
-    """Return the sentence about a viscosity that is a parameter of a problem; None if there is nothing."""
-    return _sentence(scene, "the viscosity is a parameter")
-
-
-def _sentence(scene: SceneTables, where: str) -> str | None:
+def viscosity_sentence(scene: SceneTables, where: str) -> str | None:
+    """Return the sentence about a scene with the inaccurate form of viscosity, ``where`` it matters; None of others."""
     if scene.forces.viscosity != "pairwise":
         return None
     return f'{where} and forces.viscosity is "pairwise", {FAULT}: viscosity = "stress" has it within 1 %.'
@@ -217,16 +208,12 @@ SHARE = 0.01
 """Part of the surface that may be too thin without a word."""
 
 
-def holding_thickness(cut: DiscretisationTable) -> float:
-    """Return the least thickness of walls that hold fluid [m]."""
-    return (ONE_LAYER if cut.support <= 2.0 else TWO_LAYERS) * cut.spacing
-
-
 def thin_sentences(scene: SceneTables) -> Iterator[str]:
     """Yield a sentence on each solid that has fluid on both sides where it is too thin to hold any."""
-    least, spacing = holding_thickness(scene.discretisation), scene.discretisation.spacing
+    cut = scene.discretisation
+    spacing, least = cut.spacing, (ONE_LAYER if cut.support <= 2.0 else TWO_LAYERS) * cut.spacing
     for table in scene.solid if scene.forces.pressure else ():
-        solid, resting = table.solid(), resting_room(scene)
+        solid, resting = table.solid(), scene.resting_room
         room = Room(resting.region, (solid,), resting.periods) if table.moves else resting
         feet, away = surface_feet(solid, spacing)
         feet, away = (part[room.contains(feet + MARGIN * least * away, 0.0)] for part in (feet, away))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
@@ -35,12 +35,6 @@ def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:
         raise field_error(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
 
 
-def refuse_plane(dimension: int, path: FieldPath, others: str) -> None:
-    """Raise a `field_error` for a cylinder in 2-D."""
-    if dimension == 2:
-        raise field_error((*path, "shape"), "cylinder", f"{others} in 2-D")
-
-
 def _beside_scene(file: str, info: ValidationInfo) -> str:
     """Return the absolute name of a file that a scene names, which is beside the scene's own."""
     folder = Path((info.context or {}).get("folder", "."))
@@ -59,7 +53,7 @@ class BoxShape(Table):
 
     shape: Literal["box"] = "box"
     lower: Vector[Length]
-    """(d,) Corner with the least coordinates, before it is turned [m]."""
+    """(d,) Corner with the least coordinates, before any rotation [m]."""
     upper: Vector[Length]
     """(d,) Corner with the greatest coordinates [m]."""
 
@@ -100,10 +94,11 @@ class CylinderShape(Table):
     height: Annotated[float, quantity("m", gt=0.0)]
     """From the base, along the axis [m]."""
     axis: Literal["x", "y", "z"] = "y"
-    """The axis of space along which it stands, before it is turned."""
+    """The axis of space along which it stands, before any rotation."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        refuse_plane(dimension, path, self.instead)
+        if dimension == 2:
+            raise field_error((*path, "shape"), "cylinder", f"{self.instead} in 2-D")
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
@@ -206,19 +201,10 @@ def _crossing(corners: Points) -> tuple[int, int] | None:
 class Container(Table):
     """A container of the fluid, of any shape."""
 
-    @property
-    def sticks(self) -> bool:
-        """Return True where its walls have no slip."""
-        return getattr(self, "slip", "free") == "no"
-
-    @property
-    def finish(self) -> Finish | None:
-        """Return the finish of its walls; None if the scene says nothing of it."""
-        material, colour = getattr(self, "material", None), getattr(self, "colour", None)
-        if material is None:
-            return None if colour is None else Finish(colour)
-        own = FINISHES[material]
-        return own if colour is None else replace(own, colour=colour)
+    sticks: ClassVar[Any] = False
+    """True where its walls have no slip."""
+    finish: ClassVar[Any] = None
+    """`Finish` of its walls; None if the scene says nothing of it."""
 
     @abstractmethod
     def extent(self) -> tuple[Points, Points] | None:
@@ -292,16 +278,9 @@ class NoContainer(Container):
         return Places.upright(np.zeros((0, dimension)))
 
 
-class BoxContainer(Container):
-    """A container in the shape of a box, closed on all sides along which it is not periodic."""
+class Walled(Table):
+    """The walls of a container."""
 
-    shape: Literal["box"] = "box"
-    lower: Vector[Length]
-    """(d,) Corner with the least coordinates [m]."""
-    upper: Vector[Length]
-    """(d,) Corner with the greatest coordinates [m]."""
-    periodic: Vector[Flag] = (False, False, False)
-    """(d,) Whether what leaves on one side of an axis comes back on the other."""
     slip: Literal["free", "no"] = "free"
     """"no": the viscous force acts between fluid and wall; "free": it does not."""
     material: Annotated[str, OneOf(tuple(FINISHES))] | None = None
@@ -310,10 +289,23 @@ class BoxContainer(Container):
     """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light. Without a material the walls are
     painted in it, and not clear."""
 
-    @model_validator(mode="after")
-    def _check_order(self) -> Self:
-        check_order(self.lower, self.upper)
-        return self
+    @property
+    def sticks(self) -> bool:
+        return self.slip == "no"
+
+    @property
+    def finish(self) -> Finish | None:
+        if self.material is None:
+            return None if self.colour is None else Finish(self.colour)
+        own = FINISHES[self.material]
+        return own if self.colour is None else replace(own, colour=self.colour)
+
+
+class BoxContainer(Walled, BoxShape, Container):
+    """A container in the shape of a box, closed on all sides along which it is not periodic."""
+
+    periodic: Vector[Flag] = (False, False, False)
+    """(d,) Whether what leaves on one side of an axis comes back on the other."""
 
     def extent(self) -> tuple[Points, Points]:
         return np.array(self.lower), np.array(self.upper)
@@ -351,31 +343,12 @@ class BoxContainer(Container):
         return lower, np.where(self.periodic, upper - lower, 0.0)
 
 
-class CylinderContainer(Container):
+class CylinderContainer(Walled, CylinderShape, Container):
     """A container in the shape of a cup, in 3-D."""
 
-    shape: Literal["cylinder"] = "cylinder"
-    base: Vector[Length]
-    """(3,) Middle of the bottom [m]."""
-    radius: Annotated[float, quantity("m", gt=0.0)]
-    """From the axis to the side [m]."""
-    height: Annotated[float, quantity("m", gt=0.0)]
-    """From the base, along the axis [m]."""
-    axis: Literal["x", "y", "z"] = "y"
-    """The axis of space along which it stands."""
+    instead: ClassVar = '"box" or "none"'
     lid: Flag = True
     """Whether it is closed on top; without a lid, fluid may be above the rim."""
-    slip: Literal["free", "no"] = "free"
-    """"no": the viscous force acts between fluid and wall; "free": it does not."""
-    material: Annotated[str, OneOf(tuple(FINISHES))] | None = None
-    """What it looks like in pictures; clear glass if left out."""
-    colour: Colour | None = None
-    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light. Without a material the walls are
-    painted in it, and not clear."""
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        refuse_plane(dimension, path, '"box" or "none"')
-        return super().in_dimension(dimension, path)
 
     def extent(self) -> tuple[Points, Points]:
         axis = INDEX_OF_AXIS[self.axis]

@@ -8,7 +8,7 @@ import numpy as np
 from cortado.discretise.calibration import pairwise_rate, stress_rate
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import smoothing_kernel
-from cortado.scene.model import SceneTables, greatest_viscosity
+from cortado.scene.model import SceneTables
 from cortado.scene.motions import free, greatest_speed, moving, position_name, rotation_name, scale_name, told
 from cortado.scene.parameter_values import Arrays, Tilt
 from cortado.scene.parameters import PARAMETERS
@@ -29,7 +29,7 @@ def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arra
     gravity changes or goes around a period, the solid is free, solids go along paths, convey, or begin elsewhere. What
     values say of each step of a path is not looked at."""
     whole = greatest_fall(scene, gravity)
-    around = scene.container.periods(scene.dimension)[1] > 0.0
+    around = scene.periods[1] > 0.0
     stirred = greatest_speed(told(scene.solid), values) > 0.0 or any(one.surface_velocity for one in scene.solid)
     elsewhere = {name(one.name) for one in moving(scene.solid) for name in (position_name, rotation_name, scale_name)}
     if len(gravity) > 1 or (gravity[0] * around).any() or stirred or solid.motion == "free" or elsewhere & {*values}:
@@ -134,11 +134,6 @@ def longest_step(scene: SceneTables) -> float:
     return min(chosen_limits(scene).values()) if size == "auto" else size
 
 
-def broken_limit(scene: SceneTables, values: Arrays, time_step: float) -> tuple[str, float] | None:
-    """Return the smallest of the `stability_limits` that a time step is beyond, by name [s]; None if there is none."""
-    return next(iter(broken_limits(scene, values, time_step)), None)
-
-
 def broken_limits(scene: SceneTables, values: Arrays, time_step: float) -> list[tuple[str, float]]:
     """Return the `stability_limits` that a time step is beyond, smallest first: each with its name and the limit
     [s]."""
@@ -151,10 +146,10 @@ def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> s
     step [s] breaks, if any. A time step that is chosen breaks none."""
     if scene.solver.chooses:
         return "try a smaller solver.courant or solver.greatest_time_step, or more pressure iterations"
-    broken = broken_limit(scene, values, time_step)
-    if broken is None:
+    broken = broken_limits(scene, values, time_step)
+    if not broken:
         return f"try a smaller time step than {time_step:g} s, or more pressure iterations"
-    name, limit = broken
+    name, limit = broken[0]
     return f"{name} limits the time step to about {limit:.2g} s, but it is {time_step:g} s: try one within the limit"
 
 
@@ -263,7 +258,8 @@ def viscous_limit(scene: SceneTables, values: Arrays) -> float:
     used = [k for k, phase in enumerate(scene.phase) if phase.name in names]
     densities = np.atleast_1d(values.get("rest_density", [phase.rest_density for phase in scene.phase]))
     viscosities = np.atleast_1d(values.get("viscosity", [phase.viscosity for phase in scene.phase]))
-    thickest = [greatest_viscosity(scene.phase[k], float(viscosities[k])) for k in used]
+    laws = [(scene.phase[k].rheology, float(viscosities[k])) for k in used]
+    thickest = [eta if law is None else float(law.thickest(eta)) for law, eta in laws]
     density, viscosity = float(densities[used].min()), max(thickest)
     if viscosity <= 0.0:
         return inf

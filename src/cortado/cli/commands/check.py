@@ -7,6 +7,7 @@ from pathlib import Path
 from cortado.arrays import check_steps
 from cortado.certificate import Certificate, certify
 from cortado.errors import ComputationError, InputError, shown
+from cortado.files.disk import make_folder
 from cortado.files.terminal import tell
 from cortado.losses import CentreOfMass, FinalPositions, Image, Loss
 from cortado.problem import Problem
@@ -35,7 +36,7 @@ def check_scene(
     simulation = Simulation(scene, device, "float64")
     problem = Problem(simulation, steps, _loss(loss, simulation))
     if out is not None:
-        _make(out)
+        make_folder(out)
     certificate = certify(problem, parameters, perturbation, seed)
     found = json.dumps(certificate.as_dict(), indent=2)
     text = found if as_json else f"Loss: {loss}.\n{certificate}"
@@ -55,13 +56,6 @@ def _loss(name: str, simulation: Simulation) -> Loss:
         return CentreOfMass(simulation.positions.mean(axis=0))
     renderer = simulation.renderer()
     return Image(renderer, renderer.render(simulation.initial))
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as problem:
-        raise InputError(f"The folder {folder} cannot be made: {problem}.") from problem
 
 
 def _written(certificate: Certificate, found: str, out: Path, as_json: bool) -> str:

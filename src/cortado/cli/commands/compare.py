@@ -6,6 +6,7 @@ limit.
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,11 @@ from cortado.cli.commands.options import OwnQuantity, named_runs
 from cortado.errors import InputError, shown, warn
 from cortado.optimisation.sweep import Extrapolation
 from cortado.pictures.run_pictures import beside_measured
-from cortado.pictures.side_by_side import differences
-from cortado.runs.run_folder import RunFolder, read_json
+from cortado.runs.run_folder import RunFolder, differences, read_json
 from cortado.runs.sensor import MeasuredColumn, measured_beside, summary
 from cortado.runs.trajectory import Trajectory
 
-IGNORED = ("command", "started", "resumed", "settings", "kind", "format")
+IGNORED = ("command", "started", "resumed", "settings", "kind")
 """Keys of environment.json that differ between any two runs, or are compared apart."""
 SAME_TIME = 1e-9
 """Relative difference below which times are equal, as sums of steps of other lengths are."""
@@ -50,12 +50,13 @@ def _compared(one: RunFolder, other: RunFolder) -> dict[str, Any]:
     )
     environments = [{key: value for key, value in noted.items() if key not in IGNORED} for noted in (here, there)]
     settings = [{"kind": noted.get("kind"), **_table(noted.get("settings"))} for noted in (here, there)]
+    unlike = partial(differences, missing="missing")
     found: dict[str, Any] = {
         "runs": [str(one.path), str(other.path)],
-        "scene": differences(scenes[0], scenes[1]),
-        "settings": differences(settings[0], settings[1]),
-        "environment": differences(environments[0], environments[1]),
-        "result": differences(one.read_result() or {}, other.read_result() or {}),
+        "scene": unlike(*scenes),
+        "settings": unlike(*settings),
+        "environment": unlike(*environments),
+        "result": unlike(one.read_result() or {}, other.read_result() or {}),
         "metrics": _other_steps(settings, scenes) or _metrics(one, other),
         "last_state": _last_states(one, other),
     }

@@ -33,8 +33,7 @@ from cortado.optimisation.datasets import (
     bounds_of,
     one_run,
 )
-from cortado.pictures.side_by_side import differences
-from cortado.runs.run_folder import read_json
+from cortado.runs.run_folder import differences, read_json
 from cortado.scene.scene import Scene, load_scene
 from cortado.scene.tables import MISSING
 from cortado.scene.tables import sentences as in_sentences
@@ -239,7 +238,7 @@ def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
         left_behind.unlink(missing_ok=True)
     if note.exists():
         there = read_json(note)
-        if other := differences(there, json.loads(json.dumps(asked))):
+        if other := differences(there, json.loads(json.dumps(asked)), "missing"):
             own = {key.removeprefix("scene."): pair for key, pair in other.items()}
             unlike = "; ".join(f"{key} is {shown(now)}, but must be {shown(old)}" for key, (old, now) in own.items())
             raise InputError(f"{file}: {unlike}, as in the data set that {out} holds; choose another --out.")

@@ -15,7 +15,7 @@ import warp as wp
 from cortado.device.memory import frame_parts, gradient_parts, simulation_parts, step_parts
 from cortado.discretise.shapes import EXCESS
 from cortado.errors import ComputationError, DivergedError, InputError
-from cortado.files.disk import sentences
+from cortado.files.disk import make_folder
 from cortado.files.terminal import timed_note
 from cortado.optimisation.inverse.task import load_task, task_in_words
 from cortado.pictures.image_files import write_picture
@@ -144,8 +144,7 @@ def describe_scene(
     if "optimise" in read_toml(scene_file):
         found["search"] = task_in_words(load_task(scene_file, overrides))
     if picture is not None:
-        with sentences(picture.parent):
-            picture.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(picture.parent)
         found["picture"] = str(_drawn(simulation, picture).absolute())
     return json.dumps(found, indent=2) if as_json else _as_text(found, length)
 

@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 
 from cortado.errors import InputError, shown
-from cortado.files.disk import SCHEMA, examples_folder, is_taken, sentences, write_atomically
+from cortado.files.disk import SCHEMA, examples_folder, is_taken, make_folder, write_atomically
 from cortado.files.terminal import is_quiet
 
 DAM = "dam"
@@ -41,8 +41,7 @@ def new_scene(path: Path, template: str, dimension: int | None) -> str:
     if is_taken(file):
         raise InputError(f"{file} is already there; choose another NAME, or remove it.")
     schema = file.with_name(SCHEMA.name)
-    with sentences(file.parent):
-        file.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(file.parent)
     text, options = scene_text(file, f"{template}{IN_3D}" if dimension == 3 else template)
     write_atomically(file, text)
     if not is_taken(schema):
@@ -86,8 +85,7 @@ def _copied(sources: list[Path], folder: Path) -> str:
     for target in targets:
         if is_taken(target):
             raise InputError(f"{target} is already there; choose another folder with --to, or remove it.")
-    with sentences(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     for source, target in zip(sources, targets, strict=True):
         write_atomically(target, source.read_bytes())
     return "" if is_quiet() else "\n".join(f"{example}: {_command(example)}" for example in examples)

@@ -71,7 +71,7 @@ def draw_runs(
         raise InputError("--film is given, but picture.film_frames is 0, which is no film: leave out one of them.")
     if len(each) == 1:
         (one,) = each
-        page, times = run_page(one.scene, one.trajectory, device, one.values), one.times
+        page, times = run_page(one, device), one.times
         place, name = folders[0].figures, "film" if as_film else "picture"
     else:
         page, times = runs_page(each, labels(scenes, _names(folders)), device)

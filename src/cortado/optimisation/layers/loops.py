@@ -118,7 +118,7 @@ class OneLoop(LoopPass):
 
 
 class Smoothed:
-    """A loss of a closed loop smoothed by an estimator over an ensemble: see `cortado.jax.smoothed`."""
+    """A loss of a closed loop smoothed by an estimator over an ensemble: see `smoothed`."""
 
     def __init__(self, bridge: Bridge, estimator: GradientEstimator, loop: Loop):
         self._bridge, self._estimator, self._loop = bridge, estimator, loop
@@ -142,3 +142,23 @@ class Smoothed:
         if DISPLACED in own:
             raise InputError(f"weights has {DISPLACED}, but must have another name for it, as ensembles scatter these.")
         return estimate(self._loop, own, self._estimator)
+
+
+def smoothed(
+    bridge: Bridge,
+    simulation: Simulation,
+    loss: Callable[..., Any],
+    estimator: GradientEstimator,
+    state: Mapping[str, Any] | None = None,
+) -> Smoothed:
+    """Return the loss of a closed loop smoothed over an ensemble, as a function of ``weights``, arrays by name.
+
+    Its value is the mean of the loss, and its gradient the smoothed one; its method ``estimate(weights)`` returns both
+    in an `Estimate`, with the standard error. ``loss(weights, state, gradient)`` returns a number, and hands
+    ``gradient`` on to `step` or `rollout`. The ``estimator`` says how to smooth, over which spread of the weights, in
+    their units, and which scatter of first positions. `gradients.EnsembleMean` has the mean gradient of scattered
+    loops, whose sizes `gradients.Guided` corrects by differences of the loss. Loops run as batches, by `jax.vmap` in
+    programs that are compiled, or by `torch.vmap`. They begin at ``state``, the scene's first one if left out. Raises
+    `InputError` for what does not fit, and within a program that is compiled.
+    """
+    return Smoothed(bridge, estimator, Loop(bridge, simulation, loss, state))
