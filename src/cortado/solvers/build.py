@@ -337,7 +337,10 @@ def _parts(
 ) -> list[PartMaker]:
     """Make the parts of a solver that are no forces, in the order in which they end a step."""
     found: list[PartMaker | None] = [_phases(scene, discretisation, free_energy), _nozzle(scene, discrete)]
-    found += [_free_solids(scene, discrete, search, layout), _moving_solids(scene, search)]
+    found.append(_free_solids(scene, discrete, search, layout))
+    if tables := moving(scene.solid):  # this also writes the walls of free bodies
+        numbers = {table.name: number for number, table in enumerate(tables) if table.motion != "free"}
+        found.append(MovingSolids(numbers, scene.dimension, search))
     return [part for part in found if part is not None]
 
 
@@ -376,13 +379,6 @@ def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:
                 other = bodies.index(against) if against in bodies else -1
                 found.append(Touching(body, against, other, [_obstacle(one, one.own_solid(), spacing)], points))
     return found
-
-
-def _moving_solids(scene: Scene, search: NeighbourSearch) -> MovingSolids | None:
-    """Make the part that moves solids and writes the walls of all moving solids; None where no solid moves."""
-    tables = moving(scene.solid)
-    numbers = {table.name: number for number, table in enumerate(tables) if table.motion != "free"}
-    return MovingSolids(numbers, scene.dimension, search) if tables else None
 
 
 def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:

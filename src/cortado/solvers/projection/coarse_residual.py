@@ -121,7 +121,7 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     sums = projection_sums(discretisation)
-    spread, spread_tangent = image_sums(discretisation).spread, image_sums(discretisation).spread_tangent
+    spread, spread_tangent = image_sums(discretisation).spread.forward, image_sums(discretisation).spread.tangent
     gradient, gradient_tangent = sums.velocity_gradient.forward, sums.velocity_gradient.tangent
     packed, clamp = symmetric(precision), clamp_functions(precision)
     wanted, wanted_tangent, typed = clamp.wanted, clamp.wanted_tangent, types_by_name(precision)

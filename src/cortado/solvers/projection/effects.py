@@ -41,6 +41,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import image_sum, mirror_sum
@@ -194,32 +195,21 @@ LEAST = 1e-6
 class ImageSums:
     """Warp functions of the sums over images of the fluid in flat walls, and over the walls that mirror."""
 
-    weights: Any
-    """sum V W_i'"""
-    weights_tangent: Any
-    lift: Any
-    """sum (h_i y_i + h_j y_j) g_i', for arrays y and h."""
-    lift_tangent: Any
-    lift_back: Any
-    """For adjoints f of the lift: sum g_i' . (f_i - R f_j), and what x is given."""
+    weights: Kernels
+    """sum V W_i', without an adjoint"""
+    lift: Kernels
+    """sum (h_i y_i + h_j y_j) g_i', for arrays y and h. From adjoints f of it: sum g_i' . (f_i - R f_j), and what x is
+    given."""
     echo: Any
     """sum (c_i + c_j) g_i'"""
-    spread: Any
-    """sum (u_i - R u_j) . g_i'"""
-    spread_tangent: Any
-    sweep: Any
-    """sum g_i' . (what mirrors have swept), where solids move."""
-    sweep_tangent: Any
-    walls: Any
+    spread: Kernels
+    """sum (u_i - R u_j) . g_i', without an adjoint"""
+    sweep: Kernels
+    """sum g_i' . (what mirrors have swept), where solids move, without an adjoint"""
+    walls: Kernels
     """Sums over walls that mirror about a position: along their normals, nu, and the drift along their normals."""
-    walls_tangent: Any
-    walls_back: Any
-    """The adjoint of x from those of the sums over mirroring walls."""
-    behind: Any
-    """The wall coverage nu alone."""
-    behind_tangent: Any
-    behind_back: Any
-    """The gradient of nu."""
+    behind: Kernels
+    """The wall coverage nu alone; the adjoint is its gradient."""
     mirror_of: Any
     """The number of the walls that mirror about a position."""
 
@@ -317,9 +307,14 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
         return s.volume * gradient(x_ij, s)
 
     return ImageSums(
-        *(image_weights, image_weights_tangent, lift, lift_tangent, lift_back, echo, spread, spread_tangent),
-        *(sweep, sweep_tangent),
-        *(mirror_walls, mirror_walls_tangent, mirror_walls_back, behind, behind_tangent, behind_back, mirror_of),
+        Kernels(image_weights, image_weights_tangent, None),
+        Kernels(lift, lift_tangent, lift_back),
+        echo,
+        Kernels(spread, spread_tangent, None),
+        Kernels(sweep, sweep_tangent, None),
+        Kernels(mirror_walls, mirror_walls_tangent, mirror_walls_back),
+        Kernels(behind, behind_tangent, behind_back),
+        mirror_of,
     )
 
 

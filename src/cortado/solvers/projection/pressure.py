@@ -117,7 +117,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     packed, matrix = symmetric(precision), matrix_type(precision)
     six, pack = packed.kind, packed.pack
     mirrors = image_sums(discretisation)
-    spread, spread_tangent, lift, lift_back = mirrors.spread, mirrors.spread_tangent, mirrors.lift, mirrors.lift_back
+    spread, spread_tangent = mirrors.spread.forward, mirrors.spread.tangent
+    lift, lift_back = mirrors.lift.forward, mirrors.lift.adjoint
     gradient, gradient_tangent = sums.velocity_gradient.forward, sums.velocity_gradient.tangent
     topic = f"projection_{dimension}d"
     module, tangent_module, adjoint_module = discretisation.modules(topic)

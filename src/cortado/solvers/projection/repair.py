@@ -55,9 +55,9 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     sums, densities = projection_sums(discretisation), density_sums(discretisation)
     push, push_tangent, push_back = sums.push.forward, sums.push.tangent, sums.push.adjoint
     mirrors = image_sums(discretisation)
-    image_weights, image_weights_tangent = mirrors.weights, mirrors.weights_tangent
-    lift, lift_tangent, lift_back = mirrors.lift, mirrors.lift_tangent, mirrors.lift_back
-    behind, behind_tangent, behind_back = mirrors.behind, mirrors.behind_tangent, mirrors.behind_back
+    image_weights, image_weights_tangent = mirrors.weights.forward, mirrors.weights.tangent
+    lift, lift_tangent, lift_back = mirrors.lift.forward, mirrors.lift.tangent, mirrors.lift.adjoint
+    behind, behind_tangent, behind_back = mirrors.behind.forward, mirrors.behind.tangent, mirrors.behind.adjoint
     mirror_of = mirrors.mirror_of
     weights, weights_tangent, weights_adjoint = densities.forward, densities.tangent, densities.adjoint
     topic = f"projection_{dimension}d"

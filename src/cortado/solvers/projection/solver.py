@@ -67,7 +67,7 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     weights4, packed = weights_type(precision), symmetric(precision)
     six, pack = packed.kind, packed.pack
-    spread = image_sums(discretisation).spread
+    spread = image_sums(discretisation).spread.forward
     gradient, clamp = projection_sums(discretisation).velocity_gradient.forward, clamp_functions(precision)
     wanted, parts = clamp.wanted, clamp.parts
     module = discretisation.module(False, "fixed_point")

@@ -270,7 +270,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
 
     typed = types_by_name(precision)
 
-    @particle_kernel(module, "kick u", [over(sums.force.forward, "total"), over(mirrors.lift, "lifted")])
+    @particle_kernel(module, "kick u", [over(sums.force.forward, "total"), over(mirrors.lift.forward, "lifted")])
     @typed
     def velocity(total, lifted, m_i, y_i, T_i, g_i, gamma_i, v_star_i) -> tuple[vector, vector]:
         """Return the kick -D^T y / m by the pressure y, and the velocity u = v* + kick; T is y L."""
@@ -282,7 +282,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         """Return the pull T = y L of a pressure, and its tangent."""
         return y_i * pack(L_i), y_dot_i * pack(L_i) + y_i * pack(L_dot_i)
 
-    both = [over(sums.force.tangent, "total"), over(mirrors.lift_tangent, "lifted")]
+    both = [over(sums.force.tangent, "total"), over(mirrors.lift.tangent, "lifted")]
 
     @particle_kernel(tangent_module, "kick_dot u_dot", both)
     def velocity_tangent(
@@ -307,7 +307,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         kick_dot = -(change + m_dot_i * (u_i - v_star_i)) / m_i
         return kick_dot, v_star_dot_i + kick_dot
 
-    both = [over(sums.force.adjoint, "diagonal others x_part"), over(mirrors.lift_back, "widened x_lift")]
+    both = [over(sums.force.adjoint, "diagonal others x_part"), over(mirrors.lift.adjoint, "widened x_lift")]
 
     @particle_kernel(adjoint_module, "+y_bar +image_bar +L_bar +gamma_bar +x_bar", both)
     @typed

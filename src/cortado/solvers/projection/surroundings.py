@@ -47,11 +47,12 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
     moments, moments_tangent, moments_back = sums.moments.forward, sums.moments.tangent, sums.moments.adjoint
     walls = beside_sums(discretisation)
-    beside, beside_tangent, beside_back = walls.sums, walls.tangent, walls.back
+    beside, beside_tangent, beside_back = walls.forward, walls.tangent, walls.adjoint
     mirrors = image_sums(discretisation)
-    image_weights, image_weights_tangent, echo = mirrors.weights, mirrors.weights_tangent, mirrors.echo
-    mirror_walls, mirror_walls_tangent, mirror_walls_back = mirrors.walls, mirrors.walls_tangent, mirrors.walls_back
-    mirror_of, sweep, sweep_tangent = mirrors.mirror_of, mirrors.sweep, mirrors.sweep_tangent
+    image_weights, image_weights_tangent, echo = mirrors.weights.forward, mirrors.weights.tangent, mirrors.echo
+    by_mirrors, mirror_of = mirrors.walls, mirrors.mirror_of
+    mirror_walls, mirror_walls_tangent, mirror_walls_back = by_mirrors.forward, by_mirrors.tangent, by_mirrors.adjoint
+    sweep, sweep_tangent = mirrors.sweep.forward, mirrors.sweep.tangent
     topic = f"projection_{dimension}d"
     module, tangent_module, adjoint_module = discretisation.modules(topic)
     own, packed = moment_functions(precision, dimension), symmetric(precision)

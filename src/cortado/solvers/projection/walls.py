@@ -46,17 +46,6 @@ DIRECTION = 0.01
 
 
 @dataclass(frozen=True)
-class BesideSums:
-    """Warp functions of the sums over wall particles beside a fluid particle."""
-
-    sums: Any
-    """normal, whole, nu and the drifts."""
-    tangent: Any
-    back: Any
-    """The adjoint of x by those of the sums."""
-
-
-@dataclass(frozen=True)
 class EdgeFunctions:
     """Warp functions of one particle that tell how much it is beside the edge of a wall."""
 
@@ -98,8 +87,8 @@ def normal_part(discretisation: Discretisation) -> Any:
 
 
 @cache
-def beside_sums(discretisation: Discretisation) -> BesideSums:
-    """Make the projection's sums over wall particles, for a discretisation."""
+def beside_sums(discretisation: Discretisation) -> Kernels:
+    """Make the projection's sums over the wall particles beside a fluid particle: normal, whole, nu and the drifts."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
@@ -131,7 +120,7 @@ def beside_sums(discretisation: Discretisation) -> BesideSums:
         pushed = normal(normal_bar_i + normal_drift_bar_i * v_j, foot) + whole_bar_i + whole_drift_bar_i * v_j
         return s.volume * (hessian_product(x_ij, pushed, s) + nu_bar_i * gradient(x_ij, s))
 
-    return BesideSums(beside, beside_tangent, beside_back)
+    return Kernels(beside, beside_tangent, beside_back)
 
 
 def beside_solid_kernel(discretisation: Discretisation) -> Any:
