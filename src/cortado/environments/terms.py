@@ -326,11 +326,9 @@ class MinusReward:
         return self.value(end), self.reward.adjoint(self._at(end), -1.0)
 
     def values(self, end: SnapshotBatch) -> NDArray:
-        """Return the loss of each scene; see `losses.batch.BatchedLoss`."""
         return -self.reward.values(self._at(end))
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[NDArray, State]:
-        """Return the loss of each scene and the adjoint of the states; see `losses.batch.BatchedLoss`."""
         return self.values(end), self.reward.adjoint(self._at(end), -1.0)
 
     def _at(self, end: Any) -> StepEnd:

@@ -75,11 +75,9 @@ class FinalPositions:
         return self.value(end), self._adjoint(end)
 
     def values(self, end: SnapshotBatch) -> np.ndarray:
-        """Return the loss of each scene of a batch; see `losses.loss.BatchedLoss`."""
         return self._mean_squares(end)
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
-        """Return the losses and adjoints of a batch; see `losses.loss.BatchedLoss`."""
         return self.values(end), self._adjoint(end)
 
     @WARP

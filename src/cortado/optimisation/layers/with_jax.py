@@ -238,12 +238,10 @@ class JaxBridge(Bridge):
     stack = staticmethod(jnp.stack)
 
     def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
-        """Apply a layer to JAX arrays by name, and return its results by name."""
         found = evaluate_p.bind(*given.values(), layer=layer, names=tuple(given), sizes=(), keep=False)
         return dict(zip(layer.outputs(), found, strict=True))
 
     def array(self, what: str, value: Any, layer: Layer) -> Any:
-        """Return an array of the layer's precision as it is, or numbers as one; raise `InputError` for any other."""
         real = np.dtype(layer.real)
         if real == np.float64 and not jax.config.jax_enable_x64:
             raise InputError(
@@ -260,7 +258,6 @@ class JaxBridge(Bridge):
         return value.astype(real)
 
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
-        """Copy arrays of a layer to JAX arrays."""
         return {name: self.array(name, np.array(on_host(array)), layer) for name, array in found.items()}
 
     def repeated(

@@ -168,7 +168,6 @@ class TorchBridge(Bridge):
 
     @torch.compiler.disable
     def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
-        """Apply a layer to tensors by name, and return its results by name."""
         unpack = torch.autograd.forward_ad.unpack_dual
         tangents = any(unpack(tensor).tangent is not None for tensor in given.values())
         keep = tangents or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given.values()))
@@ -176,7 +175,6 @@ class TorchBridge(Bridge):
         return dict(zip(layer.outputs(), found, strict=True))
 
     def array(self, what: str, value: Any, layer: Layer) -> Any:
-        """Return a tensor of the layer's precision as it is, or numbers as one; raise `InputError` for any other."""
         real = _dtype(layer)
         if not isinstance(value, torch.Tensor):
             return torch.as_tensor(np.array(as_precise_numbers(what, value)), dtype=real, device=_device(layer))
@@ -191,7 +189,6 @@ class TorchBridge(Bridge):
         return value.to(real)
 
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
-        """Copy arrays of a layer to tensors."""
         shapes = {name: tuple(array.shape) for name, array in found.items()}
         return {name: own.clone() for name, own in zip(shapes, _tensors(layer, found, shapes), strict=True)}
 

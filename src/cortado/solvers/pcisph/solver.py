@@ -35,13 +35,10 @@ class PcisphAdjoint(ParticleAdjoint):
         self._p_bar, self._y_bar, self._r, self._t_bar = (solver.numbers() for _ in range(4))
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
-        """Replace the adjoint of the replayed step's result by that of its state; adjoints of the parameters are added
-        to ``bar``."""
         self._begin(counts, state_bar, parameters)
         self._go_back(counts, state_bar, parameters)
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
-        """Write the adjoint of a replayed step's state, for adjoints ``within`` the step (`PressureAdjoint`)."""
         state_bar.clear()
         self._begin(counts, state_bar, parameters)
         add(within.p, self._p_bar)
@@ -115,7 +112,6 @@ class PcisphTangent(ParticleTangent):
         self._zero_pressure, *self._p_dot, self._c_dot, self._y_dot, self._wall_y_dot, self._t_dot = scalars
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
-        """Replace the tangent of the replayed step's state by that of its result."""
         (iterations,) = counts
         solver, it, kernels, known = self._solver, self._solver.iterates, self._solver.kernels, self.dot.named
         context = solver.context(parameters)
@@ -149,7 +145,6 @@ class PcisphTangent(ParticleTangent):
         self.unsort(context, self._x_star_dot, self._v_star_dot, state_dot)
 
     def pressures(self, rounds: Sequence[int]) -> NDArray:
-        """Return the tangents (n,) of the pressures of the last step; see `PressureTangent`."""
         own = [p_dot.numpy().reshape(len(rounds), -1) for p_dot in self._p_dot]
         return np.concatenate([own[(k - 1) % 2][b] for b, k in enumerate(rounds)])
 

@@ -43,7 +43,6 @@ class ProjectionTangent(ParticleTangent):
         self._coarse = CoarseTangent(solver.coarse, *own)
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
-        """Replace the tangent of the replayed step's state by that of its result."""
         solver, kernels = self._solver, self._solver.kernels
         context = solver.context(parameters)
         self.sort(context, state_dot)
@@ -76,11 +75,9 @@ class ProjectionTangent(ParticleTangent):
         self.unsort(context, self._x_now_dot, self._v_end_dot, state_dot, **carried)
 
     def pressures(self, rounds: Sequence[int]) -> NDArray:
-        """Return the tangents (n,) of the pressures of the last step; see `PressureTangent`."""
         return self._over_time(self._solver.iterates[rounds[0]]["k"], self._k_dot.numpy())
 
     def stresses(self, rounds: Sequence[int]) -> NDArray:
-        """Return the tangents (n,) of the mean stresses of the last step; see `PressureTangent`."""
         solver, at = self._solver, {**self._pull, "k": self._solver.iterates[rounds[0]]["k"], "k_dot": self._k_dot}
         context, around = solver.context(solver.parameters), (solver.around, self._around)
         change = solver.mean_stress.tangent(context, self.dot, around, at)
@@ -161,12 +158,10 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._coarse = CoarseAdjoint(solver.coarse, *own, self._faces)
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
-        """Replace the adjoint of the replayed step's result by that of its state."""
         self._begin(state_bar, parameters)
         self._go_back(counts, state_bar, parameters)
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
-        """Write the adjoint of a replayed step's state, for adjoints ``within`` it (`PressureAdjoint`)."""
         solver = self._solver
         state_bar.clear()
         self._begin(state_bar, parameters)

@@ -48,38 +48,36 @@ class MeanStress:
     def __init__(self, discretisation: Discretisation, layout: Layout, dimension: int, faces: int):
         self._faces = FaceShares(discretisation, layout, faces)
         self._kernels = mean_stress_kernels(discretisation, dimension)
-        self._reach = WallSums(WallTerm(discretisation, TOPIC, _reach_work, "reach_bar"), layout)
-        self._mirrors = WallSums(WallTerm(discretisation, TOPIC, _mirror_work, "reach_bar"), layout)
+        works = {"reach": _reach_work, "mirrors": _mirror_work}
+        self._walls = {
+            name: WallSums(WallTerm(discretisation, TOPIC, work, "reach_bar"), layout) for name, work in works.items()
+        }
         self._arrays = layout.arrays(q=layout.precision.real, reach_bar=layout.precision.vector)
+
+    def _totals(self, context: StepContext, *around: Named) -> Named:
+        return {name: sums.total(context, ALL_WALLS, *around) for name, sums in self._walls.items()}
 
     def impulses(self, context: StepContext, around: Named, at: Named) -> wp.array:
         """Return the mean normal stress times the time step, dt p (n,) [Pa s]."""
-        found, reach = self._arrays["q"], self._reach.total(context, ALL_WALLS, around)
-        mirrors = self._mirrors.total(context, ALL_WALLS, around)
-        context.launch(self._kernels.forward, around, at, reach=reach, mirrors=mirrors, q=found)
+        found = self._arrays["q"]
+        context.launch(self._kernels.forward, around, at, self._totals(context, around), q=found)
         return found
 
     def tangent(self, context: StepContext, dot: Tangents, around: tuple[Named, ...], at: Named) -> NDArray:
         """Return the tangent (n,) of the stress impulses dt p; ``around`` and ``at`` come with their tangents."""
-        reach = self._reach.total(context, ALL_WALLS, *around)
-        reach_dot = self._reach.tangent(context, dot, ALL_WALLS, *around)
-        mirrors = self._mirrors.total(context, ALL_WALLS, *around)
-        mirrors_dot = self._mirrors.tangent(context, dot, ALL_WALLS, *around)
-        found, walls = self._arrays["q"], {"reach": reach, "mirrors": mirrors}
-        walls |= {"reach_dot": reach_dot, "mirrors_dot": mirrors_dot}
-        context.launch(self._kernels.tangent, *dot.named, *around, at, walls, q_dot=found)
+        found, walls = self._arrays["q"], self._totals(context, *around)
+        dots = {f"{name}_dot": one.tangent(context, dot, ALL_WALLS, *around) for name, one in self._walls.items()}
+        context.launch(self._kernels.tangent, *dot.named, *around, at, walls, dots, q_dot=found)
         return np.array(found.numpy())
 
     def adjoint(self, context: StepContext, bar: Adjoints, around: tuple[Named, ...], at: Named) -> None:
         """Add to the adjoints of k, of particles and of ``around`` from that of the stress, ``q_bar`` in ``at``."""
-        own, pairs = self._kernels.adjoint
-        reach, reach_bar = self._reach.total(context, ALL_WALLS, *around), self._arrays["reach_bar"]
-        mirrors = self._mirrors.total(context, ALL_WALLS, *around)
-        context.launch(own, *bar.named, at, reach=reach, mirrors=mirrors, reach_bar=reach_bar)
+        (own, pairs), reach_bar = self._kernels.adjoint, self._arrays["reach_bar"]
+        context.launch(own, *bar.named, at, self._totals(context, *around), reach_bar=reach_bar)
         context.launch(pairs, *bar.named, *around, at)
-        self._reach.adjoint(context, bar, ALL_WALLS, reach_bar, reach_bar, *around)
         self._faces.add(context, bar, *around, k=at["k"], q=at["q_bar"])
-        self._mirrors.adjoint(context, bar, ALL_WALLS, reach_bar, reach_bar, *around)
+        for sums in self._walls.values():
+            sums.adjoint(context, bar, ALL_WALLS, reach_bar, reach_bar, *around)
 
 
 def spread_term(d: Discretisation) -> Any:

@@ -135,7 +135,6 @@ class FixedPointAdjoint(ProjectionAdjoint):
         self._solution = ConjugateGradients(layout, precision.real, tolerance, most)
 
     def arrive(self, state: State) -> None:
-        """Keep k of the state that the next step to go back through led to; see `ResumingAdjoint`."""
         wp.copy(self._after[IMPULSE], state[IMPULSE])
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
