@@ -1,6 +1,6 @@
-"""Many scenes in one launch: each has the bits of its single run, whatever the others do."""
+"""Many scenes in one launch: each has the bits of its single run, whatever the others do; with more that a scene may
+have in tests/test_features.py."""
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,9 +10,6 @@ import cortado
 import scenes
 from cortado import CortadoWarning, InputError, Problem, Simulation, gradients
 from cortado.losses import CentreOfMass, FinalPositions, Frames
-from test_free_bodies import touching
-from test_moving_solids import ROTOR
-from test_moving_solids import plane as beside
 
 STEPS = 8
 FREE = {"kind": "pcisph", "time_step": 0.0021, "minimum_iterations": 3, "maximum_iterations": 12}
@@ -24,14 +21,6 @@ ESTIMATORS = [gradients.Exact(), gradients.AdjointViscosity(20.0, order=2), grad
 
 def random_gravity(size: float, batch: int, rows: int, dimension: int = 3) -> np.ndarray:
     return size * RANDOM.standard_normal((batch, rows, dimension)) - 9.0 * np.eye(dimension)[1]
-
-
-PULL = {"gravity": [0.0, -9.81], "surface_tension": 0.5}
-CURVED = {"forces": PULL, "solver": {"kind": "projection", "time_step": 0.0021}}
-
-
-def tension(**changes: Any) -> Any:
-    return scenes.plane(**{"forces": {**PULL, "viscosity": "pairwise"}, **changes})
 
 
 def layers() -> Any:
@@ -56,10 +45,6 @@ CASES: dict[str, tuple[Any, dict[str, Any], dict[str, Any]]] = {
         {"nozzle_path": np.array([0.09, 0.17, 0.12]) + RANDOM.uniform(-0.02, 0.02, (3, STEPS, 3))},
         {"gravity": np.tile([0.0, -9.0, 0.0], (STEPS, 1))},
     ),
-    "tension": (tension, {"surface_tension": RANDOM.uniform(0.1, 1.0, 3)}, {"gravity": [0.0, -9.0]}),
-    "tension by curvature": (partial(tension, **CURVED), {"surface_tension": RANDOM.uniform(0.1, 1.0, 3)}, {}),
-    "bodies": (touching, {"raft.density": np.array([300.0, 700.0])}, {}),
-    "rotor": (lambda: beside(ROTOR), {"gravity": random_gravity(2.0, 2, 1, 2)}, {}),
     "tilt": (scenes.scene, {"tilt": RANDOM.uniform(-20.0, 20.0, (3, STEPS, 2))}, {}),
 }
 
