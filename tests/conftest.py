@@ -108,6 +108,16 @@ def cortado_command(capfd, monkeypatch):
     return run
 
 
+@pytest.fixture(scope="module")
+def jax():
+    """In float64, as long as tests of a file run."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    yield jax
+    jax.config.update("jax_enable_x64", False)
+
+
 @pytest.fixture
 def unrendered(request, monkeypatch):
     """Figures are made, but saved as a white square: to render them takes longer than all else that such tests are

@@ -20,13 +20,10 @@ PATH = "paddle.displacement"
 
 
 @pytest.fixture(scope="module")
-def at():
+def at(jax):
     """What the uses below go wrong with: 48 particles beside a paddle, in float64."""
-    import jax
-
     import cortado.jax
 
-    jax.config.update("jax_enable_x64", True)
     made = SimpleNamespace(jax=jax, np=jax.numpy, layer=cortado.jax)
     tables = {"solid": [{**PADDLE, "velocity": [0.0, 0.0]}], "solver": {"kind": "projection", "time_step": 0.002}}
     made.scene = pool([0.4, 0.3], [0.8, 0.8], viscosity=1.0, **tables)
@@ -57,8 +54,7 @@ def at():
     made.seen = partial(measured.Experiment, made.simulation)
     made.make_one = partial(gymnasium.make, "cortado/Carry-v0")
     made.make = partial(cortado.environments.make_vec, "Carry")
-    yield made
-    jax.config.update("jax_enable_x64", False)
+    return made
 
 
 REFUSED = [

@@ -25,16 +25,6 @@ from layered import (
 from scenes import plane, two_layers
 
 
-@pytest.fixture(scope="module", autouse=True)
-def jax():
-    """In float64, as long as tests of this file run."""
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    yield jax
-    jax.config.update("jax_enable_x64", False)
-
-
 @pytest.fixture(scope="module")
 def layer(jax):
     import cortado.jax

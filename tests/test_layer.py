@@ -13,17 +13,14 @@ from layered import POINT, STIFF, matched, same_bits, scheduled, shear, sheared
 from scenes import jet, two_layers
 
 
-def of_jax():
-    import jax
-
+def of_jax(jax):
     import cortado.jax
 
-    jax.config.update("jax_enable_x64", True)
     given = {name: getattr(jax, name) for name in ("grad", "jvp", "vjp", "vmap", "jacrev", "jacfwd", "value_and_grad")}
     return SimpleNamespace(layer=cortado.jax, array=jax.numpy.asarray, compiled=jax.jit, **given)
 
 
-def of_torch():
+def of_torch(_):
     torch = pytest.importorskip("torch", reason="PyTorch is not installed: its CPU wheel is optional")
     import cortado.torch
 
@@ -48,10 +45,8 @@ def of_torch():
 
 
 @pytest.fixture(scope="module", params=[of_jax, of_torch], ids=["jax", "torch"])
-def lib(request):
-    yield request.param()
-    if request.param is of_jax:
-        __import__("jax").config.update("jax_enable_x64", False)
+def lib(request, jax):
+    return request.param(jax)
 
 
 @pytest.fixture(scope="module")

@@ -15,14 +15,7 @@ STEPS = 6
 PLACE = [0.3, 0.2]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def jax():
-    """In float64, as long as tests of this file run."""
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    yield jax
-    jax.config.update("jax_enable_x64", False)
+pytestmark = pytest.mark.usefixtures("jax")
 
 
 @pytest.fixture(scope="module")
