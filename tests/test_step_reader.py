@@ -123,7 +123,8 @@ def judged(simulation, sensor, steps=STEPS):
     return cortado.Problem(simulation, steps, cortado.losses.Frames(each))
 
 
-OF_LOSSES = {"projection": PressureProbe([0.2, 0.1]), "rotor": SolidLoad("rotor"), "period": WallForce()}
+PROBE = PressureProbe([0.2, 0.1])
+OF_LOSSES = {"projection": PROBE, "plane": PROBE, "rotor": SolidLoad("rotor"), "period": WallForce()}
 
 
 @pytest.mark.parametrize("batch", [None, 2])

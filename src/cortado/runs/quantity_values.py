@@ -5,7 +5,7 @@ What a state decides of each particle is computed here from formulas, and record
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Protocol, cast
 
 import numpy as np
@@ -13,6 +13,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.arrays import require_names
+from cortado.device.launching import CapturedGraph
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Fields, Parameters, State
@@ -39,7 +40,7 @@ from cortado.scene.solids import SolidTable
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import Counts, PressureAdjoint, PressureTangent, Solver, WithinBar
-from cortado.sph.parts import Adjoints, StepContext
+from cortado.sph.parts import Adjoints, StepContext, sort
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +139,8 @@ class QuantityEvaluator:
         self._formulas = formulas(solver, scene.dimension, circulation_factor)
         self._counts: Counts = ()
         """Of the step that was solved last."""
+        self._graphs: dict[tuple[int, Counts], CapturedGraph] = {}
+        """The way back from pressures, by the solver's generation and the counts of the step."""
         self._rounds: list[int] = []
         """(members,) the same of each scene."""
 
@@ -178,6 +181,8 @@ class QuantityEvaluator:
         """Turn adjoints of quantities, by name, into those of the state, by fields, and of the parameters of the step,
         as `Moment` has them but with an axis for the scenes."""
         wanted, solver = self._checked(bars), self.solver
+        if wanted == [STRESS]:
+            return self._from_stress(bars[STRESS], moment)
         at, sums = self._begin(wanted, moment, replay=True)
         solved = any(map(_needs_the_step, wanted))
         adjoint = self._pressure_adjoint if solved else self._field_adjoint
@@ -198,9 +203,42 @@ class QuantityEvaluator:
             self._pressure_adjoint.from_within(self._counts, within, state_bar, self._rollout.parameters)
         else:
             self._from_fields(fields, state_bar)
-        parameters = adjoint.collect()
+        return self._found(adjoint, state_bar)
+
+    def _from_stress(self, stress_bar: NDArray, moment: Moment) -> tuple[Arrays, Arrays]:
+        """Return what `adjoint` does for pressures that a gauge would read, by a captured graph."""
+        solver, (given, _, state_bar), adjoint = self.solver, self._of_stress, self._pressure_adjoint
+        self._set(moment)
+        self._solve((), False)
+        given.assign(stress_bar.reshape(-1))
+        adjoint.begin()
+        solver.step_number.fill_(0)
+        key = solver.generation, self._counts
+        if key not in self._graphs:
+            self._graphs = {k: graph for k, graph in self._graphs.items() if k[0] == solver.generation}
+            self._graphs[key] = CapturedGraph(partial(self._go_back, self._counts), solver.launch)
+        self._graphs[key]()
+        return self._found(adjoint, state_bar)
+
+    def _go_back(self, counts: Counts) -> None:
+        """Replay the step, and go back through it from the adjoint of pressures."""
+        solver, parameters, (given, own, state_bar) = self.solver, self._rollout.parameters, self._of_stress
+        solver.reserve(counts)
+        solver.replay(self._rollout.initial, parameters, counts)
+        sort(solver.context(parameters), given, own.stress)
+        self._pressure_adjoint.from_within(counts, own, state_bar, parameters)
+
+    @cached_property
+    def _of_stress(self) -> tuple[wp.array, WithinBar, State]:
+        """Make the adjoint of pressures in the scene's order, that within the step, and that of the state."""
+        solver, numbers = self.solver, self.solver.numbers
+        fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
+        return numbers(), WithinBar(fields, numbers(), numbers(), solver.vectors()), solver.new_state()
+
+    def _found(self, adjoint: ParticleAdjoint | StepWithin, state_bar: State) -> tuple[Arrays, Arrays]:
+        """Return adjoints of the state and of the parameters in float64, by name."""
+        parameters, state = adjoint.collect(), state_bar.numpy(self.dimension)
         found = {name: parameters[name].numpy().astype(np.float64) for name in parameters.names}
-        state = state_bar.numpy(self.dimension)
         return {name: array.astype(np.float64) for name, array in state.items()}, found
 
     def _checked(self, names: Iterable[str]) -> list[str]:
@@ -219,16 +257,19 @@ class QuantityEvaluator:
     def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[Particles, Sums]:
         """Find the particles' neighbours and, where a pressure is wanted, take the step; ``replay`` it for
         derivatives."""
-        rollout = self._rollout
-        rollout.begin_evaluation()
-        rollout.initial.assign(moment.state)
-        rollout.parameters.set(moment.parameters)
-        rollout.substeps = moment.substeps
+        self._set(moment)
         if any(map(_needs_the_step, names)):
             context, pressures = self._solve(names, replay)
         else:
             context, pressures = self._look_around(moment.substeps), None
         return Particles.of(self.solver.fields, pressures), Sums(self.solver, context)
+
+    def _set(self, moment: Moment) -> None:
+        rollout = self._rollout
+        rollout.begin_evaluation()
+        rollout.initial.assign(moment.state)
+        rollout.parameters.set(moment.parameters)
+        rollout.substeps = moment.substeps
 
     def _look_around(self, substeps: int) -> StepContext:
         solver, rollout = self.solver, self._rollout
@@ -311,13 +352,11 @@ class QuantityEvaluator:
 
     def of_scene(self, name: str, values: NDArray) -> NDArray:
         """Return as `values` does a quantity that a step has left in the scene's order, or six numbers of a load."""
-        wide = values.astype(np.float64)
-        if is_load(name):
-            found = self._shown(name, in_the_scene(wide, self.dimension))
-        else:
-            found = self._by_scene(wide if wide.ndim == 1 else wide[:, : self.dimension])
+        found = values.astype(np.float64)
         found.flags.writeable = False
-        return found
+        if is_load(name):
+            return self._shown(name, in_the_scene(found, self.dimension))
+        return self._by_scene(found if found.ndim == 1 else found[:, : self.dimension])
 
     def _by_scene(self, found: NDArray) -> NDArray:
         batch = self.solver.layout.batch

@@ -288,6 +288,11 @@ class Carried:
             unsort(step, a, state[name])
 
 
+def sort(step: StepContext, a_scene: wp.array, a: wp.array) -> None:
+    """Write the entries (n,) of an array in the scene's order to sorted particles."""
+    step.launch(_kernels(a).sort, a_scene=a_scene, a=a)
+
+
 def unsort(step: StepContext, a: wp.array, a_scene: wp.array) -> None:
     """Write the entries (n,) of sorted particles to an array in the scene's order."""
     step.launch(_kernels(a).unsort, a=a, a_scene=a_scene)

@@ -151,7 +151,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         pull = solver.layout.arrays(T=six, S=six)
         self._pull, self._push = pull["T"], pull["S"]
         self._m_unused, self._k_before_bar, self._n_now_bar = (solver.numbers() for _ in range(3))
-        self._k_bar, self._y_bar, self._c_bar, self._d_bar = (solver.numbers() for _ in range(4))
+        self._k_bar, self._y_bar, self._c_bar, self._d_bar, self._q_bar = (solver.numbers() for _ in range(5))
         free = [part for part in self._parts if isinstance(part, FreeSolidsAdjoint)]
         self._bodies = None if solver.bodies is None else BodiesAdjoint(solver.bodies, free[0].bodies)
         own = solver.layout, self._bodies, self.bar
@@ -169,7 +169,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         pressed, k = pressed_kernels(solver.layout.precision).adjoint, self._last(counts)["k"]
         context.launch(pressed, *known, impulse=k, p_bar=within.p, impulse_bar=self._k_bar)
         if within.stress is not None:
-            at = {"k": k, "T": solver.pull, "k_bar": self._k_bar, "q_bar": solver.numbers()}
+            self._q_bar.zero_()
+            at = {"k": k, "T": solver.pull, "k_bar": self._k_bar, "q_bar": self._q_bar}
             q = solver.mean_stress.impulses(context, solver.around, at)
             context.launch(pressed, *known, impulse=q, p_bar=within.stress, impulse_bar=at["q_bar"])
             solver.mean_stress.adjoint(context, self.bar, (solver.around, self._around), at)
