@@ -163,6 +163,24 @@ def hung_block():
     return (x[0] - x[-1])[:, 1].mean() / (0.5 * 9.81 * 0.2 * 0.202)
 
 
+def shut_box(across, time_step, iterations=2, steps=20, device="cpu"):
+    """A box full of water, with a jitter, in which gravity is switched on along a side. After 1, 10 and 20 steps: the
+    mean velocity along it, and the mean speed, over g t."""
+    simulation = simulated(
+        1.0 / across,
+        fluid=[box([0.0, 0.0], [1.0, 1.0])],
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
+        forces={"gravity": [9.81, 0.0]},
+        discretisation={**C2, "jitter": 0.05},
+        solver={**PROJECTION, "time_step": time_step, "iterations": iterations},
+        device=device,
+    )
+    v = simulation.run(steps, record_every=1).velocities
+    after = np.array([n for n in (1, 10, 20) if n <= steps])
+    means = np.stack([v[after, :, 0].mean(axis=1), np.linalg.norm(v[after], axis=2).mean(axis=1)], axis=1)
+    return means / (9.81 * time_step * after[:, None])
+
+
 def dam_break(solver=PROJECTION, time_step=0.002, time=1.2, across=20, dimension=2):
     """Greatest energy over the first; means over particles and time: the compression, that of the density averaged over
     neighbours twice, that as the last repair or iteration finds it, and the part of particles that are nearer than half

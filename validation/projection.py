@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from cortado.errors import CortadoWarning
 from falling_jets import falling_jet
 from oscillating_drops import C2, C4, CUBIC
-from projected_flows import dam_break, elliptical_drop, hung_block, kolmogorov, rotating_patch, taylor_green
+from projected_flows import dam_break, elliptical_drop, hung_block, kolmogorov, rotating_patch, shut_box, taylor_green
 from sloping_films import sloping_film
 from standing_waves import standing_wave
 from still_fluids import still_water, two_layers
@@ -59,6 +59,16 @@ CASES: dict[str, Case] = {
         for re in (0.1, 1.0, 10.0, 100.0)
     },
     "block under a lid: fall": lambda _: hung_block(),
+    **{
+        f"shut box, {n} across, {iterations} iterations, steps of {1000 * step:g} ms: mean velocity, speed over g t": (
+            lambda device, own=(n, step, iterations, steps): shut_box(*own, device=device)
+        )
+        for n, step, iterations, steps in (
+            *((n, step, 2, 20) for n in (20, 40, 80, 160) for step in (0.001, 0.0005)),
+            (40, 0.002, 1000, 1),
+            (80, 0.002, 1000, 1),
+        )
+    },
     "dam break, steps of 0.5, 1, 2, 3 ms: energy, compressions, nearer than s / 2": lambda _: [
         dam_break(time_step=step) for step in (0.0005, 0.001, 0.002, 0.003)
     ],

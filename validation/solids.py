@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from loads import LOADS
 
 from cortado import Scene, Simulation
 from cortado.errors import CortadoWarning
-from floating_bodies import added_mass, floating_box
+from floating_bodies import added_mass, disc_in_a_round_tank, floating_box
 from held_water import MESHES, cup_turned, meshes, stirred
 from piston_waves import piston
 
@@ -80,6 +81,12 @@ def _at(point: np.ndarray, x: np.ndarray, values: np.ndarray, width: float) -> f
     return float(np.linalg.lstsq(terms * root[:, None], values[near] * root, rcond=None)[0][0])
 
 
+def disc(density: float, across: int, iterations: int) -> np.ndarray:
+    """How much faster a disc in the middle of a full round tank gets in each of six steps, over theory."""
+    with TemporaryDirectory() as folder:
+        return disc_in_a_round_tank(density, f"{folder}/rings.npy", 0.3 / across, 6, iterations=iterations)
+
+
 def cases(device: str) -> dict[str, Callable[[], object]]:
     """By name; the cavity and the piston run on the device."""
     found: dict[str, Callable[[], object]] = {}
@@ -100,6 +107,13 @@ def cases(device: str) -> dict[str, Callable[[], object]]:
         "added-mass, a sphere 8 across, 20 deep, 4 iterations, 10 steps": lambda: added_mass(8, 20, 100, 4, steps=10),
         "added-mass, a sphere 8 across, 20 deep, 16 iterations": lambda: added_mass(8, 20, 100, 16),
         "added-mass, a sphere 8 across, 20 deep, 32 iterations": lambda: added_mass(8, 20, 200, 32),
+        **{
+            f"disc, {density:g} kg/m3, {across} across, {iterations} iterations": partial(
+                disc, density, across, iterations
+            )
+            for density in (50.0, 500.0)
+            for across, iterations in ((10, 2), (20, 2), (20, 100), (30, 2), (30, 100))
+        },
         **LOADS,
     }
 
