@@ -82,10 +82,10 @@ class Face:
     def reflection(self):
         return np.eye(2) - 2 * np.outer(self.normal, self.normal), 2 * self.normal @ self.place * self.normal
 
-    def heights(self, x, reach):
+    def heights(self, x):
         """How far positions are in front of it, infinite where they are not."""
         height, along = (x - self.place) @ self.normal, (x - self.place) @ [self.normal[1], -self.normal[0]]
-        return np.where((height >= 0) & (np.abs(along) < self.half + reach), height, np.inf)
+        return np.where((height >= 0) & (np.abs(along) < self.half), height, np.inf)
 
     def swept(self, x):
         """How far the step takes images of positions."""
@@ -176,7 +176,7 @@ class Projection:
                 yield np.diag(flip), apart, W * both, g * both[..., None], 0.0 * x
         for face in self.faces:
             R, offset = face.reflection
-            front = np.isfinite(face.heights(before, (1 + SKIN) * self.support))
+            front = np.isfinite(face.heights(before))
             both = front[:, None] & front[None, :]
             apart, W, g = self.pairs(x, x @ R + offset)
             yield R, apart, W * both, g * both[..., None], face.swept(x)
@@ -184,7 +184,7 @@ class Projection:
     def mirroring(self, x):
         """(n, b) which wall particles mirror about which position: those of the container, and of the nearest face."""
         reach, found = (1 + SKIN) * self.support, np.tile(self.container, (len(x), 1))
-        heights = np.array([face.heights(x, reach) for face in self.faces] or [np.full(len(x), np.inf)])
+        heights = np.array([face.heights(x) for face in self.faces] or [np.full(len(x), np.inf)])
         for f, face in enumerate(self.faces):
             found |= ((heights.argmin(0) == f) & (heights[f] < reach))[:, None] & face.walls
         return found

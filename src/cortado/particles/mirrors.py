@@ -6,7 +6,7 @@ ones. Beyond these numbers, from `FACES` on, are the flat faces of solids that m
 R diagonal at the container. Seen from particle i, the image of j is where the image of i sees j, so that every image
 that i can see is one of its neighbours, or its own. In lists of neighbours the image of j by a reflection has the
 number ``reflections j + reflection``. A wall mirrors what is in front of it, for what is in front of it, and not a
-column that waits behind it to come out of an opening; a face mirrors no further than `reach` beyond its edges.
+column that waits behind it to come out of an opening; a face mirrors nothing that is beyond its ends.
 
 A solid takes the points x of a face to x' from c_0 + Q (x - c) = x - D(x), with its middle c, at c_0 before the step,
 and Q = R_0 R^T. An image moves by R u + (D(R x + o) - R D(x)) / dt where its particle moves by u: the second part,
@@ -187,7 +187,7 @@ def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNames
     @wp.func
     def before_face(x: vector, f: int, furthest: real, member: int, s: neighbourhood) -> bool:
         at, sizes = place_at(x, f, member, s), s.scales[member, s.face_solids[f]] * s.face_sizes[f]
-        beside = wp.abs(at[1]) < sizes[1] + s.reach and wp.abs(at[2]) < sizes[2] + s.reach
+        beside = wp.abs(at[1]) < sizes[1] and wp.abs(at[2]) < sizes[2]
         return at[0] >= real(0.0) and at[0] < furthest and beside
 
     @wp.func

@@ -233,7 +233,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     shared = Discretisation(discrete.kernel, precision, lanes, any(discrete.periods), moves)
     mirrors = mirrors_of(scene)
     most = MOST_FACES if layout.all_particles <= most_imaged(moving=True) else 0
-    faces = flat_faces(scene, discrete.fluid.positions, discrete.lattice.support, most)
+    faces = flat_faces(scene, discrete.lattice.support, most)
     search = _search(scene, discrete, shared, layout, bool(np.isfinite(mirrors).any()), faces)
 
     def system(discretisation: Discretisation) -> ParticleSystem:
