@@ -35,8 +35,8 @@ from cortado.runs.frames import Film
 from cortado.runs.quantity_values import Moment, QuantityEvaluator
 from cortado.runs.recording import recorded
 from cortado.runs.sensor import Sensor
+from cortado.runs.step_reader import Table
 from cortado.runs.trajectory import Frame, Trajectory
-from cortado.runs.waiting import Table
 from cortado.scene.discrete_scene import check_distance, discretise
 from cortado.scene.parameter_values import OVER_TIME, scene_values
 from cortado.scene.quantity_names import check_readable

@@ -17,8 +17,7 @@ from cortado.runs.probes import SENSORS, sensors_of
 from cortado.runs.quantity_values import Moment, QuantityEvaluator, Recorder
 from cortado.runs.sensor import Readings, Sensor, SensorLog, value_of
 from cortado.runs.sensor_places import warn_of_places
-from cortado.runs.step_reader import StepReader
-from cortado.runs.waiting import Waiting
+from cortado.runs.step_reader import StepReader, Waiting
 from cortado.scene.parameter_values import Arrays
 
 

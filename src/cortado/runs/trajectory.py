@@ -50,9 +50,7 @@ class Frame:
         Raises:
             InputError: it was not recorded, or there is no such quantity.
         """
-        fractions = {} if self.mass_fractions is None else {"mass_fractions": self.mass_fractions}
-        fields = {"positions": self.positions, "velocities": self.velocities, **fractions, **self.others}
-        return chosen(self.quantities, name, fields)
+        return chosen(self.quantities, name, fields_of(self))
 
     def moved(self, duration: float) -> Frame:
         """Return about the state a short time [s] later, or earlier: every particle goes on along its velocity."""
@@ -62,6 +60,12 @@ class Frame:
 
     def __repr__(self) -> str:
         return f"Frame({counted(len(self.positions), 'particle')}, t = {self.time:.4g} s)"
+
+
+def fields_of(of: Frame | Trajectory) -> dict[str, NDArray[Any]]:
+    """Return every field that steps change, of a frame or over frames, by its name."""
+    fractions = {} if of.mass_fractions is None else {"mass_fractions": of.mass_fractions}
+    return {"positions": of.positions, "velocities": of.velocities, **fractions, **of.others}
 
 
 def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
@@ -184,7 +188,7 @@ class Trajectory:
         Raises:
             InputError: it was not recorded, or there is no such quantity.
         """
-        return chosen(self.quantities, name, self._fields)
+        return chosen(self.quantities, name, fields_of(self))
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
@@ -215,12 +219,6 @@ class Trajectory:
     def particles(self) -> int:
         """Return the number of particles."""
         return self.positions.shape[1]
-
-    @property
-    def _fields(self) -> dict[str, NDArray[Any]]:
-        """Return every field that steps change, (frames, ...), by its name."""
-        fractions = {} if self.mass_fractions is None else {"mass_fractions": self.mass_fractions}
-        return {"positions": self.positions, "velocities": self.velocities, **fractions, **self.others}
 
     @property
     def iterations(self) -> NDArray[Any]:
@@ -259,7 +257,7 @@ class Trajectory:
         """
         if not len(self):
             raise InputError("The trajectory has no frame, but must have one to go on from.")
-        last = {**{name: array[-1] for name, array in self._fields.items()}, **self.constants}
+        last = {**{name: array[-1] for name, array in fields_of(self).items()}, **self.constants}
         own = {name: array.copy() for name, array in last.items()}
         taken = self.diagnostics.get("time_steps", np.zeros(0))[: int(self.steps[-1]) - (self.begun or 0)]
         size = float(taken[-1]) if len(taken) else 0.0
@@ -275,7 +273,7 @@ class Trajectory:
         if Path(as_path("path", path)).suffix.lower() not in SUFFIXES:
             wanted = f"must be a VTKHDF file, whose name ends in {' or '.join(SUFFIXES)}"
             raise InputError(f"path is {str(path)!r}, but {wanted}.")
-        frames = self._fields
+        frames = fields_of(self)
         first = {name: array[0] if len(array) else array for name, array in frames.items()}
         steps = len(self.converged)
         own = {name: array[:1] for name, array in self.quantities.items()}
@@ -288,7 +286,7 @@ class Trajectory:
         """Write all frames to a file that has room for them."""
         for k, step in enumerate(self.steps):
             recorded = {name: array[k] for name, array in self.quantities.items()}
-            frame = {name: array[k] for name, array in self._fields.items()}
+            frame = {name: array[k] for name, array in fields_of(self).items()}
             append_frame(writer, frame, int(step), recorded, float(self.times[k]))
 
     def export(self, folder: str | PathLike[str], to: str, scene: Scene | str | PathLike[str] | None = None) -> Path:
