@@ -210,11 +210,12 @@ def filtered(simulation, coefficient, point=None):
     arrays = bar.numpy(simulation.dimension)
     given = {name: random.standard_normal(array.shape) + 1.0 for name, array in arrays.items()}
     bar.set(given)
+    before = bar.numpy(simulation.dimension)
     viscosity = EddyViscosity(solver, coefficient)
     viscosity(bar, rollout.parameters)
     strengths = np.empty(simulation.particles)
     strengths[solver.search.order.numpy()[: simulation.particles]] = viscosity.strengths.numpy()
-    return given, bar.numpy(simulation.dimension), strengths
+    return before, bar.numpy(simulation.dimension), strengths
 
 
 def separations(x, kind):

@@ -198,7 +198,8 @@ def kernels_of(discretisation):
         *(curved.colour, curved.normal, curved.bend),
         *(kernels for mixture in mixtures for kernels in (mixture.potential, mixture.flux)),
     ]
-    kernels = [kernel for family in families for kernel in (family.forward, family.tangent, family.adjoint)]
+    adjoints = [family.adjoint[-1] if isinstance(family.adjoint, tuple) else family.adjoint for family in families]
+    kernels = [*adjoints, *(kernel for family in families for kernel in (family.forward, family.tangent))]
     alone = [fill_kernel(discretisation), filters.crowd, filters.strength, filters.viscosity]
     alone += [viscous.force.forward, viscous.force.tangent, *viscous.force.adjoint]
     return [*alone, *kernels, curved.mean.forward, curved.mean.tangent, curved.mean.adjoint[1]]
