@@ -114,25 +114,26 @@ class Numbers:
     """The numbers of some parameters, one parameter behind the other in a table (members, numbers)."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
-        self._kernels, self._members = packing_kernels(layout.precision, taped), layout.members
+        self._kernels = packing_kernels(layout.precision, taped) if parameters else None
+        self._members = layout.members
         sizes = [prod(one.shape) if one.axis is Axis.ARRAY else WIDTH[one.rank] for one in parameters]
         self._places = [(one.name, sum(sizes[:k]), sizes[k]) for k, one in enumerate(parameters)]
         self.size = sum(sizes)
 
     def pack(self, step: StepContext, values: Parameters, table: wp.array) -> None:
         """Write the parameters' values in a step to a table."""
-        self._launch(self._kernels.pack, step, values, table)
+        self._launch("pack", step, values, table)
 
     def add(self, step: StepContext, table: wp.array, bar: Parameters) -> None:
         """Add the adjoint of a table to those of the parameters."""
-        self._launch(self._kernels.add, step, bar, table)
+        self._launch("add", step, bar, table)
 
-    def _launch(self, kernel: Any, step: StepContext, values: Parameters, table: wp.array) -> None:
+    def _launch(self, kernel: str, step: StepContext, values: Parameters, table: wp.array) -> None:
         for name, first, size in self._places:
             count = values[name].size * getattr(values[name].dtype, "_length_", 1)
             numbers = components(values[name], (self._members, count // self._members))
             given = {"first": first, "size": size, "values": numbers, "table": table}
-            step.launch(kernel, threads=self._members * size, **given)
+            step.launch(getattr(self._kernels, kernel), threads=self._members * size, **given)
 
 
 class Tables:
