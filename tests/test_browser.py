@@ -15,9 +15,8 @@ import pytest
 from chromium import chromium, listened
 from PIL import Image
 
-from bad_tasks import GOOD_TASK, TINY_SCENE
+from bad_tasks import TINY_SCENE
 from cortado.cli import main
-from cortado.cli.view_window import PULL
 from cortado.cli.views import opened
 
 PORT = 18410
@@ -175,15 +174,9 @@ def test_a_scene_runs_in_the_viewer(page, look, text):
     until(page, shown, lambda: differ(scene_of(page), first))
     page.get_by_text("Run", exact=True).click()
     until(page, shown, lambda: not shown.running.value)
-    for colour, unit in (("density", "kg/m³"), ("pressure", "Pa"), (PULL, "m/m")):
+    for colour, unit in (("density", "kg/m³"), ("pressure", "Pa")):
         choose(page, colour)
         until(page, shown, page.get_by_text(f"{colour} [{unit}]").is_visible)
-    page.wait_for_timeout(300)
-    without = scene_of(page)
-    page.get_by_text("Arrows: where the loss pulls").click()
-    until(page, shown, page.get_by_text("The longest arrows").is_visible)
-    page.wait_for_timeout(500)
-    assert differ(scene_of(page), without) and coloured(scene_of(page)) > 0.005
 
 
 def test_a_run_is_scrubbed_in_the_viewer(page, look):
@@ -200,17 +193,6 @@ def test_a_run_is_scrubbed_in_the_viewer(page, look):
         page.wait_for_timeout(500)
         seen.append(scene_of(page))
     assert differ(*seen)
-
-
-def test_a_gradient_step_is_made_in_the_viewer(page, look):
-    shown = look(GOOD_TASK)
-    first = shown.loss
-    until(page, shown, page.get_by_text("The first guess").is_visible)
-    page.get_by_role("button", name="One gradient step").click()
-    until(page, shown, page.get_by_text("Step 1: the loss went").is_visible)
-    assert shown.loss < first and page.get_by_role("cell", name="gravity y").is_visible()
-    choose(page, PULL)
-    until(page, shown, page.get_by_text(f"{PULL} [m²/m]").is_visible)
 
 
 def test_a_viewer_is_loaded_again_and_looked_at_twice(browser, page, look):

@@ -10,11 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import cortado
-from bad_tasks import GOOD_TASK, TINY_SCENE
+from bad_tasks import TINY_SCENE
 from cortado import Scene, Trajectory
 from cortado.cli import main, view_window
-from cortado.cli.view_window import AHEAD, LONGEST_ARROW, PULL, upwards
-from cortado.cli.views import LiveView, RecordedView, TaskView, opened
+from cortado.cli.views import LiveView, RecordedView, opened
 from cortado.files.image_encoding import to_srgb
 from cortado.pictures.particle_view import outline
 from cortado.pictures.shown_solids import solid_outline
@@ -102,7 +101,7 @@ def coloured(shown, name: str) -> np.ndarray:
     return np.array(shown.window._cloud.colors)
 
 
-@pytest.mark.parametrize(("name", "unit"), [("speed", "m/s"), ("density", "kg/m³"), ("pressure", "Pa"), (PULL, "m/m")])
+@pytest.mark.parametrize(("name", "unit"), [("speed", "m/s"), ("density", "kg/m³"), ("pressure", "Pa")])
 def test_particles_are_coloured_by_what_is_asked(live, name, unit):
     for _ in range(12):  # until it has fallen onto the floor
         live.tick()
@@ -129,36 +128,6 @@ def test_pressures_carry_the_fluid(scene):
     assert np.abs(falling).max() < 0.2 * found.max()
 
 
-def test_the_pull_is_minus_the_gradient(scene):
-    """That of the same problem from the first state, in the public face."""
-    simulation = cortado.Simulation(scene, precision="float64")
-    first = simulation.run(1)[:1]
-    pull = view_window.pull_on_height(lambda: simulation, first.last_state, {})()
-    steps = round(AHEAD / simulation.scene.solver.time_step)
-    loss = cortado.losses.CentreOfMassAlong(upwards(simulation.scene))
-    problem = cortado.Problem(simulation, steps, loss)
-    _, gradient = problem.value_and_gradient({"initial_positions": first.positions[0]})
-    assert np.linalg.norm(pull) > 0.01
-    np.testing.assert_allclose(pull, -gradient["initial_positions"], atol=1e-12)
-
-
-def test_arrows_point_where_the_loss_pulls(live):
-    live.tick()
-    live.window.arrows.value = True
-    live.window.refresh()
-    ends = np.array(live.window._arrows.points)
-    pull = live.window._shown.pull()
-    along = ends[:, 1, :2] - ends[:, 0, :2]
-    np.testing.assert_allclose(ends[:, 0], points(live), atol=1e-6)
-    cosines = (along * pull).sum(axis=1) / np.linalg.norm(along, axis=1) / np.linalg.norm(pull, axis=1)
-    np.testing.assert_allclose(cosines, 1.0, atol=1e-4)
-    assert np.linalg.norm(along, axis=1).max() == pytest.approx(LONGEST_ARROW * 0.05, rel=1e-4)
-    assert "m/m" in live.window.arrows_legend.content
-    live.window.arrows.value = False
-    live.window.refresh()
-    assert not live.window._arrows.visible and live.window.arrows_legend.content == ""
-
-
 def test_what_a_solver_does_not_know_is_said_in_a_sentence(scene, live, monkeypatch):
     scene.write_text(TINY_SCENE + "[forces]\npressure = false\n")
     with window(scene, PORT + 3) as shown:
@@ -171,53 +140,6 @@ def test_what_a_solver_does_not_know_is_said_in_a_sentence(scene, live, monkeypa
     assert "no densities" in live.window.legend.content
 
 
-@pytest.fixture
-def task(scene):
-    scene.write_text(GOOD_TASK)
-    with window(scene, PORT + 4) as shown:
-        yield shown
-
-
-def test_a_task_goes_on_one_step_of_its_search_at_a_time(task):
-    assert isinstance(task, TaskView)
-    losses, made = [task.loss], task.made
-    first = points(task)
-    for _ in range(3):
-        task._wished = True
-        task.tick()
-        losses.append(task.loss)
-    result = cortado.optimise(made.search, made.start, made.task.optimise.algorithm(), 3, bounds=made.bounds)
-    assert losses == [record.loss for record in result.history] and losses[-1] < losses[0]
-    assert "Step 3" in task.told.content and f"{losses[3]:.4g} m²" in task.told.content
-    assert f"{result.last_parameters['gravity'][0]:.4g}" in task.told.content and "m/s²" in task.told.content
-    task.played.show(5)
-    run = made.problem.run(result.last_parameters)
-    np.testing.assert_allclose(points(task)[:, :2], run.positions[5], atol=1e-6)
-    assert first.shape == points(task).shape
-
-
-def test_a_task_shows_the_adjoints_of_its_loss(task):
-    """After the last step the derivative of the mean squared distance itself."""
-    last, target = task.made.problem.steps, task.made.targets[5]
-    task.played.show(last)
-    expected = -2.0 / len(target) * (task.played.trajectory.positions[last] - target)
-    np.testing.assert_allclose(task.window._shown.pull(), expected, rtol=1e-4, atol=1e-9)
-    coloured(task, PULL)
-    assert "[m²/m]" in task.window.legend.content
-    coloured(task, "pressure")
-    assert "[Pa]" in task.window.legend.content
-
-
-def test_a_step_that_fails_says_why(task, monkeypatch):
-    def fails(*_args, **_options):
-        raise cortado.ComputationError("The run diverged.")
-
-    monkeypatch.setattr("cortado.cli.views.optimise", fails)
-    task._wished, loss = True, task.loss
-    task.tick()
-    assert "The run diverged." in task.told.content and task.loss == loss and not task.button.disabled
-
-
 def test_a_run_is_played_and_gone_through(scene):
     main(["run", "scene.toml", "--steps", "4", "--out", "a", "--no-pictures"])
     with window(Path("a"), PORT + 1, None) as shown:
@@ -226,7 +148,6 @@ def test_a_run_is_played_and_gone_through(scene):
         np.testing.assert_allclose(points(shown)[:, :2], trajectory.positions[3], atol=1e-6)
         shown.show(4)
         assert shown.window._shown.quantities["density"]().mean() == pytest.approx(1000.0, rel=0.3)
-        assert shown.window._shown.pull().shape == (64, 2)
         shown._former -= 1.0
         shown.tick()
         assert shown.slider.value > 0

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 import cortado
-from bad_tasks import GOOD_TASK, TINY_SCENE
-from cortado.cli.views import opened
+from bad_tasks import TINY_SCENE
+from cortado.cli.views import RecordedView, opened
 from signals import listen
 
 viser = pytest.importorskip("viser")
@@ -281,20 +281,19 @@ def test_a_slider_goes_to_both_its_ends(live):
 
 
 def test_what_is_disabled_is_not_moved(file):
-    file.write_text(GOOD_TASK)
-    shown = opened(file, [], "cpu", "float32", PORT)
+    simulation = cortado.Simulation(file)
+    shown = RecordedView(simulation.scene, simulation.run(3), lambda: simulation, PORT)
     with closing(shown.window):
-        shown.played.playing.value = False
-        shown.button.disabled = True
+        shown.playing.value = False
+        shown.playing.disabled = True
         with heard(shown) as page:
-            say(page, *(update(shown.played.slider, value=value) for value in (1.5, 99, -1, True)))
-            say(page, update(shown.button, value=True), update(shown.played.slider, value=2))
-            until(lambda: shown.played.slider.value == 2)
-            shown.tick()
-            assert shown.taken == 0
-            shown.button.disabled = False
-            say(page, update(shown.button, value=False), update(shown.button, value=True))
-            until(lambda: shown._wished)
+            say(page, *(update(shown.slider, value=value) for value in (1.5, 99, -1, True)))
+            say(page, update(shown.playing, value=True), update(shown.slider, value=2))
+            until(lambda: shown.slider.value == 2)
+            assert not shown.playing.value
+            shown.playing.disabled = False
+            say(page, update(shown.playing, value=True))
+            until(lambda: shown.playing.value)
 
 
 def test_nothing_is_shared(live, monkeypatch):

@@ -192,19 +192,18 @@ def export(
 
 
 def view(
-    path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml|TASK.toml")],
+    path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml")],
     overrides: Overrides = (),
     device: Device = "cpu",
     precision: str | None = None,
     port: int = 8080,
 ) -> Work:
-    """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders, or the search of a task, with
-    a button for its next step; Ctrl-C ends it.
+    """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders; Ctrl-C ends it.
 
     Args:
-        path: The folder of a run, a scene file, or a task file.
+        path: The folder of a run, or a scene file.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        precision: "float32" or "float64", of a scene or a task that runs; "float32" if left out.
+        precision: "float32" or "float64", of a scene that runs; "float32" if left out.
         port: Of the page on this machine; the next one that is free if it is taken.
     """
     from cortado.cli.views import view as show

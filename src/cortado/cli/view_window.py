@@ -1,11 +1,11 @@
-"""A window in the browser: particles, the container, what particles are coloured by, and where a loss pulls them.
+"""A window in the browser: particles, the container, and what particles are coloured by.
 
 What particles may be coloured by is computed when it is asked for.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from html import escape
 from typing import Any
 
@@ -14,42 +14,25 @@ import numpy as np
 from cortado.discretise.shapes import Points, in_space
 from cortado.errors import CortadoError, InputError
 from cortado.files.image_encoding import to_srgb
-from cortado.gradients import Exact
-from cortado.losses import CentreOfMassAlong, Loss, Snapshot
-from cortado.losses.loss import ADJOINT_FIELDS, by_field
+from cortado.losses.loss import ADJOINT_FIELDS
 from cortado.pictures.particle_view import container_outline, outline
 from cortado.pictures.shown_solids import ShownSolid, own_faces, own_lines, shown_solids, turn_in_space
 from cortado.pictures.stage import upright
 from cortado.rollout.rollout import Rollout
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene
-from cortado.scene.stability import longest_step
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 
-PULL = "pull of the loss"
 UNITS = {"speed": "m/s", "density": "kg/m³", "pressure": "Pa", "vorticity": "1/s", "wall_force": "N"}
 """Units of the quantities that every state has."""
-HEIGHT_UNITS = {**UNITS, PULL: "m/m"}
-"""Units of these quantities, and of the pull where the loss is the height of the centre of mass."""
-AHEAD = 1.0 / 50.0
-"""Time [s] from a state to the one whose height is the loss."""
 RADIUS = 0.4
 """Radius of a particle that is drawn, in spacings."""
 DISTANCE = 1.7
 """Distance of the camera at the start, in radii of the contents."""
 PALETTE = "cividis"
-BRIGHTEST, BRIGHTEST_PULL = 99.5, 90.0
-"""Percentiles at the upper end of the colours, so that a few particles do not darken all the others; the pulls of a
-splash differ by orders of magnitude."""
-MOST_ARROWS = 1500
-"""Most arrows; of more particles, every k-th has one."""
-LONGEST_ARROW = 2.5
-"""Length of arrows of pulls that are as large as the colours go or larger, in spacings."""
-BESIDE_ARROWS = 0.4
-"""Factor of the size of particles, where they would hide arrows."""
-ARROWS = (170, 30, 15)
-"""sRGB colour of arrows."""
+BRIGHTEST = 99.5
+"""Percentile at the upper end of the colours, so that a few particles do not darken all the others."""
 LINES = (130, 125, 118)
 """sRGB colour of the container and of solids."""
 THIN: Any = {"thickness": 1.5, "thickness_units": "screen"}
@@ -68,16 +51,13 @@ class Shown:
     """(n, 3) their own, linear."""
     quantities: Mapping[str, Quantity]
     """(n,) by name."""
-    pull: Quantity
-    """(n, d) where the loss pulls them: minus its derivative with respect to their positions."""
 
 
 class Window:
     """A window in the browser, a page of viser's; y is up, whatever the axes of the scene."""
 
     def __init__(self, scene: Scene, port: int, units: Mapping[str, str]):
-        """Open a window with ``units`` of the quantities that colours may show, by name, `PULL` among them, and
-        "phase"."""
+        """Open a window with ``units`` of the quantities that colours may show, by name, besides "phase"."""
         try:
             import viser  # noqa: F401  for the sentence
 
@@ -90,7 +70,6 @@ class Window:
         self._turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
         self._units = units
         self._cloud: Any = None
-        self._arrows: Any = None
         self._shown: Shown | None = None
         self._stale = False
         """Whether the user wants to see something else of what is shown; `refresh` draws it."""
@@ -98,10 +77,7 @@ class Window:
         gui, first = self.server.gui, "phase" if len(scene.phase) > 1 else next(iter(units))  # one colour has no depth
         self.colour = gui.add_dropdown("Colour", ["phase", *units], initial_value=first)
         self.legend = gui.add_html("")
-        self.arrows = gui.add_checkbox("Arrows: where the loss pulls", False)
-        self.arrows_legend = gui.add_html("")
-        for choice in (self.colour, self.arrows):
-            choice.on_update(lambda _: setattr(self, "_stale", True))  # in a thread of viser's, which computes nothing
+        self.colour.on_update(lambda _: setattr(self, "_stale", True))  # in a thread of viser's, which computes nothing
         self._draw_container()
         self._solids = [self._draw_solid(f"/solid_{number}", one) for number, one in enumerate(shown_solids(scene))]
 
@@ -126,14 +102,8 @@ class Window:
             for frame, solid in zip(self._solids, shown_solids(scene), strict=False):
                 frame.position, frame.wxyz = self._space(solid.position), _quaternion(self._turn @ solid.turn)
 
-    def add_still(self, name: str, positions: Points) -> Any:
-        """Add grey points at positions (n, d) [m] that stay where they are, hidden at first."""
-        size = 0.6 * RADIUS * self.scene.discretisation.spacing
-        style = {"point_size": size, "point_shape": "circle", "precision": "float32", "visible": False}
-        return self.server.scene.add_point_cloud(name, self._space(positions), (150, 146, 140), **style)
-
     def refresh(self) -> None:
-        """Draw again where the user has chosen other colours or arrows."""
+        """Draw again where the user has chosen other colours."""
         if self._stale and self._shown is not None:
             self._draw()
 
@@ -141,32 +111,13 @@ class Window:
         assert self._shown is not None
         self._stale = False
         points, colours = self._space(self._shown.positions), self._colours(self._shown)
-        arrows = self._arrows_of(self._shown) if self.arrows.value else None
-        with self.server.atomic():
-            self._draw_particles(points, colours)
-            self._draw_arrows(arrows)
-
-    def _draw_particles(self, points: np.ndarray, colours: np.ndarray) -> None:
-        size = 2.0 * RADIUS * self.scene.discretisation.spacing * (BESIDE_ARROWS if self.arrows.value else 1.0)
         if self._cloud is None:
+            size = 2.0 * RADIUS * self.scene.discretisation.spacing
             style = {"point_size": size, "point_shape": "circle", "precision": "float32"}
             self._cloud = self.server.scene.add_point_cloud("/particles", points, colours, **style)
             return
-        self._cloud.points, self._cloud.colors, self._cloud.point_size = points, colours, size
-
-    def _draw_arrows(self, ends: np.ndarray | None) -> None:
-        """Draw arrows from their ends (k, 2, 3); none without."""
-        if ends is None:
-            self.arrows_legend.content = "" if not self.arrows.value else self.arrows_legend.content
-            if self._arrows is not None:
-                self._arrows.visible = False
-            return
-        if self._arrows is None or len(self._arrows.points) != len(ends):
-            spacing = self.scene.discretisation.spacing
-            style = {"shaft_radius": 0.06 * spacing, "head_radius": 0.18 * spacing, "head_length": 0.4 * spacing}
-            self._arrows = self.server.scene.add_arrows("/pull", ends, ARROWS, **style)
-            return
-        self._arrows.points, self._arrows.visible = ends, True
+        with self.server.atomic():
+            self._cloud.points, self._cloud.colors = points, colours
 
     def _colours(self, shown: Shown) -> np.ndarray:
         """Return sRGB colours (n, 3); the legend says their range, or why there are none."""
@@ -177,31 +128,14 @@ class Window:
             self.legend.content = ""
             return own
         try:
-            values = np.linalg.norm(shown.pull(), axis=1) if name == PULL else np.asarray(shown.quantities[name]())
+            values = np.asarray(shown.quantities[name]())
         except CortadoError as error:
             self.legend.content = in_words(str(error))
             return own
-        least, greatest = float(values.min()), _upper_end(values, BRIGHTEST_PULL if name == PULL else BRIGHTEST)
+        least, greatest = float(values.min()), float(np.percentile(values, BRIGHTEST, method="higher"))
         self.legend.content = _scale(name, self._units[name], least, greatest, clips=values.max() > greatest)
         share = np.clip((values - least) / (greatest - least or 1.0), 0.0, 1.0)
         return (255.0 * colormaps[PALETTE](share)[:, :3]).astype(np.uint8)
-
-    def _arrows_of(self, shown: Shown) -> np.ndarray | None:
-        """Return ends (k, 2, 3) of arrows from particles; None, with the reason in the legend, where there is no
-        pull."""
-        try:
-            pull = shown.pull()
-        except CortadoError as error:
-            self.arrows_legend.content = in_words(str(error))
-            return None
-        lengths = np.linalg.norm(pull, axis=1)
-        longest = _upper_end(lengths, BRIGHTEST_PULL)
-        self.arrows_legend.content = in_words(f"The longest arrows: {longest:.4g} {self._units[PULL]} or more.")
-        reach = LONGEST_ARROW * self.scene.discretisation.spacing
-        scaled = pull * (np.minimum(lengths / (longest or 1.0), 1.0) * reach / np.where(lengths, lengths, 1.0))[:, None]
-        chosen = slice(None, None, -(-len(pull) // MOST_ARROWS))
-        starts = shown.positions[chosen]
-        return self._space(np.stack([starts, starts + scaled[chosen]], axis=1))
 
     def _space(self, points: Points) -> np.ndarray:
         """Return points (..., d) as (..., 3) float32, with y up."""
@@ -242,11 +176,6 @@ def _quaternion(turn: Points) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     return np.roll(Rotation.from_matrix(turn_in_space(turn)).as_quat(), 1)
-
-
-def _upper_end(values: np.ndarray, percentile: float) -> float:
-    """Return a percentile of values (n,) that is one of them."""
-    return float(np.percentile(values, percentile, method="higher"))
 
 
 def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> str:
@@ -300,37 +229,3 @@ def densities(rollout: Rollout) -> np.ndarray:
     if not isinstance(solver, ParticleSolver):
         raise InputError("The solver of this scene has no densities of particles to show.")
     return solver.densities(rollout.initial, rollout.parameters)
-
-
-def pull_on_height(
-    simulation: Callable[[], Simulation], state: RestartState, controls: Mapping[str, Any]
-) -> Callable[[], np.ndarray]:
-    """Return a function that computes, once, the pull (n, d) [m/m] of a loss that is the height of the centre of mass
-    `AHEAD` of a state."""
-
-    @cache
-    def pull() -> np.ndarray:
-        made = simulation()
-        steps = max(round(AHEAD / longest_step(made.scene)), 1)
-        loss = CentreOfMassAlong(upwards(made.scene), state["reference_density"])
-        return pull_of(made, made.rollout(steps, controls, state), loss)
-
-    return pull
-
-
-def pull_of(simulation: Simulation, rollout: Rollout, loss: Loss) -> np.ndarray:
-    """Return minus the exact derivative (n, d) of a loss of a rollout's last state with respect to its first
-    positions."""
-    colours = np.array([phase.colour for phase in simulation.scene.phase])
-    end = Snapshot(rollout.forward().copy(), simulation.dimension, colours)
-    bar = simulation.solver.new_state()
-    bar.set(by_field(loss.value_and_adjoint(end)[1], simulation.dimension))
-    first = rollout.backward(Exact().derivative(rollout), {rollout.steps: bar})
-    return -first.numpy(simulation.dimension, only=["positions"])["positions"].astype(np.float64)
-
-
-def upwards(scene: Scene) -> np.ndarray:
-    """Return the unit vector (d,) against the scene's gravity; along y where there is none."""
-    gravity = np.asarray(scene.forces.gravity, dtype=np.float64)
-    size = float(np.linalg.norm(gravity))
-    return -gravity / size if size else np.eye(len(gravity))[1]
