@@ -13,7 +13,7 @@ import cortado
 import cortado.environments
 from cortado import InputError, Simulation
 from cortado.environments import FluidEnv, make_vec, scenes, side_by_side
-from cortado.environments.catalogue import TASKS, Carry, Splash
+from cortado.environments.catalogue import TASKS, Carry
 
 
 class Timed(Carry):
@@ -29,18 +29,7 @@ class Timed(Carry):
         return cortado.Scene(**tables)
 
 
-class Chosen(Splash):
-    """A box that is shaken, whose scene chooses its time steps."""
-
-    name = "Chosen"
-
-    @property
-    def scene(self):
-        tables = super().scene.model_dump(exclude_unset=True)
-        return cortado.Scene(**{**tables, "solver": {"time_step": "auto"}})
-
-
-MADE = {"Timed": Timed, "Chosen": Chosen}
+MADE = {"Timed": Timed}
 pytestmark = pytest.mark.filterwarnings("ignore:.*time_step is:cortado.CortadoWarning")
 
 
@@ -66,10 +55,10 @@ def gone_on(envs, actions):
     return [[np.asarray(part).tobytes() for part in envs.step(action)[:4]] for action in actions]
 
 
-@pytest.mark.parametrize("name", ["Carry", "Latte", "Raft", "Timed", "Chosen"])
+@pytest.mark.parametrize("name", ["Carry", "Latte", "Raft", "Timed"])
 def test_batches_that_are_saved_copied_and_pickled_go_on_with_the_same_bits(batches, name):
-    """Beyond the end of an episode, so that their generators draw the next one: with a nozzle, a body that floats, a
-    block on a path of its own, and time steps that are chosen."""
+    """Beyond the end of an episode, so that their generators draw the next one: with a nozzle, a body that floats, and
+    a block on a path of its own."""
     envs = batches(name)
     actions = actions_of(envs, 8)
     envs.reset(seed=3)
@@ -88,22 +77,12 @@ def test_batches_that_are_saved_copied_and_pickled_go_on_with_the_same_bits(batc
 
 
 def test_what_the_scene_itself_changes_goes_on_from_step_to_step(batches):
-    """A block is where its path has it, and steps that are chosen are those of one run."""
+    """A block is where its path has it."""
     envs = batches("Timed")
     envs.reset(seed=3)
     gone_on(envs, actions_of(envs, 3))
     place, task = envs.scenes.state["block.position"].numpy()[:, 0, 0], envs.scenes.task
     assert np.allclose(place, -0.45 + 0.05 * 3 * task.substeps * task.time_step, atol=1e-6)
-    envs = batches("Chosen")
-    envs.reset(seed=3)
-    actions = actions_of(envs, 3)
-    gone_on(envs, actions)
-    task, fluid = envs.scenes.task, envs.scenes.state
-    for b, start in enumerate(envs.scenes.starts):
-        rows = task.actuators[0].over(3, task.substeps, task.time_step).parameter(actions[:, b])
-        run = Simulation(task.scene).run(3 * task.substeps, {"initial_positions": start.positions, "gravity": rows})
-        assert np.array_equal(run.positions[-1], fluid["positions"].numpy()[b, :, :2])
-        assert run.last_state.clock == fluid.scenes[b].clock and run.last_state.clock.time_step > 0.0
 
 
 def test_a_single_one_goes_on_through_the_wrappers_of_gymnasium():
@@ -189,7 +168,7 @@ def test_scenes_that_diverged_stay_so(batches):
     assert other.scenes._lost == {1} and gone_on(other, actions[1:]) == gone_on(envs, actions[1:])
 
 
-@pytest.mark.parametrize("name", ["Raft", "Chosen"])
+@pytest.mark.parametrize("name", ["Raft", "Timed"])
 def test_batches_that_are_cut_for_the_cores_have_the_bits_of_single_ones(name, monkeypatch):
     """Also where a scene diverged, and in the episode after it."""
     monkeypatch.setattr(scenes, "parts_of", lambda simulation: 1)

@@ -12,7 +12,7 @@ import cortado
 import cortado.environments
 from cortado import InputError, Simulation
 from cortado.discretise.room import Domain
-from cortado.environments.catalogue import TASKS
+from cortado.environments.catalogue import TASKS, Carry
 from cortado.environments.task import Position, Velocity
 from cortado.environments.terms import Distance, Miss, Missed, OneBox, Share, Spread, StepEnd
 
@@ -84,7 +84,7 @@ def test_observations_are_what_the_layout_says(environments):
 
 
 def test_sensors_are_observed_as_a_simulation_reads_them():
-    """Also that of the pressure, which follows from where solids are in the next step."""
+    """Also that of the pressure, which follows from where solids go in the next step."""
     sensors = {"probe": cortado.sensors.PressureProbe([0.5, 0.1]), "gauge": cortado.sensors.WaveGauge([0.7, 0.0])}
     envs = cortado.environments.make_vec("Raft", 2, precision="float64", sensors=sensors)
     first, _ = envs.reset(seed=1)
@@ -281,6 +281,25 @@ def test_in_a_batch_the_others_go_on():
 def test_bad_settings_are_refused_in_a_sentence(settings, sentence):
     with pytest.raises(InputError, match=sentence):
         cortado.environments.make_vec("Carry", **{"num_envs": 1, **settings})
+
+
+class OfOtherSteps(Carry):
+    """A task of a user whose scene has not the task's own time step."""
+
+    def __init__(self, length):
+        super().__init__()
+        self.__dict__["length"] = length
+
+    def scene_of(self, **tables):
+        return super().scene_of(**tables, solver={"time_step": self.length})
+
+
+@pytest.mark.parametrize(("length", "said"), [("auto", "'auto'"), (0.001, "0.001")])
+def test_steps_of_another_length_than_those_of_actuators_are_refused(length, said):
+    """A cup that was sent on with 0.6 m/s went with 0.3 m/s where steps were chosen."""
+    sentence = f"Carry has solver.time_step = {said}, but must have the task's own, 0.0025 s"
+    with pytest.raises(InputError, match=sentence):
+        cortado.environments.FluidEnv(OfOtherSteps(length))
 
 
 def test_steps_before_the_first_episode_and_other_bad_calls(environments):

@@ -17,7 +17,7 @@ from cortado.device.launching import launch
 from cortado.device.threads import WARP
 from cortado.environments.kernels import environment_kernels
 from cortado.environments.side_by_side import SideBySide, parts_of
-from cortado.environments.task import Task, split
+from cortado.environments.task import Task, checked_scene, split
 from cortado.errors import CortadoWarning, InputError, MassWarning, shown
 from cortado.losses.loss import SnapshotBatch
 from cortado.particles.state import State
@@ -147,7 +147,7 @@ class Scenes:
         self.task = task
         with warnings.catch_warnings():  # rewards are shares of the fluid that there is
             warnings.simplefilter("ignore", MassWarning)
-            make = partial(Simulation, task.scene, device, precision, lanes=LANES)
+            make = partial(Simulation, checked_scene(task), device, precision, lanes=LANES)
             self.simulation = make(batch=scenes)
             parts = 1 if self._sensors else parts_of(self.simulation)  # sensors read the step of a whole
             self._steps = SideBySide(self.simulation, lambda count: make(batch=count), parts, task.substeps)
@@ -344,9 +344,11 @@ class Scenes:
             for b in self._lost:
                 state.member(b).assign(self._first.arrays.member(b))
         simulation, rollout = self.simulation, self._steps.steppers[0].rollout
-        row = rollout.steps - 1
-        parameters = {**row_of(rollout, rollout.parameters.written, row), **self._driven}
-        moment = Moment(state, parameters, rollout.substeps, row, simulation.evaluator)
+        parameters = row_of(rollout, rollout.parameters.written, rollout.steps)
+        for name, at_rest in self._driven.items():  # where an episode begins; after a step what is driven goes on
+            begins = np.reshape(self.step_number == 0, (-1, *(1,) * (at_rest.ndim - 1)))
+            parameters[name] = np.where(begins, at_rest, parameters[name])
+        moment = Moment(state, parameters, rollout.substeps, rollout.steps, simulation.evaluator)
         colours = np.zeros((len(self), len(simulation.scene.phase), 3))
         end = SnapshotBatch(state, simulation.dimension, colours, moment)
         return {name: np.array([value_of(sensor, one) for one in end]) for name, sensor in self._sensors.items()}

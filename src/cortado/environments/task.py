@@ -176,6 +176,19 @@ class Task(ABC):
         return Scene(dimension=self.dimension, **{**common, **tables})
 
 
+def checked_scene(task: Task) -> Scene:
+    """Return the scene of a task. Raises `InputError` unless its time step is that of the task: actuators move what
+    they drive by it, at another speed in steps of another length."""
+    scene = task.scene
+    found, wanted = scene.solver.time_step, task.time_step
+    if found == "auto" or not np.isclose(found, wanted, rtol=1e-6, atol=0.0):
+        raise InputError(
+            f"the scene of the task {task.name} has solver.time_step = {shown(found)}, but must have the task's own, "
+            f"{wanted:g} s, by which actions move what they drive."
+        )
+    return scene
+
+
 def checked_actions(what: str, given: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Return actions clipped to -1 and 1; raises `InputError` for another shape and for values that are not finite."""
     array = as_numbers(what, given)
