@@ -8,7 +8,7 @@ from cortado.gradients import Exact, Tape
 from cortado.losses import FinalPositions, Image
 from cortado.pictures.plots import PALETTE
 from cortado.problem import Problem
-from cortado.render.scene_renderer import scene_renderer
+from cortado.render.renderer import scene_renderer
 from cortado.scene.tables import Several, Vector, count, quantity
 from cortado.simulation import Simulation
 from experiments.canvas import blank

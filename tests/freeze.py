@@ -44,7 +44,7 @@ from cortado.certificate.horizon import directions, everything, scales
 from cortado.cli import main
 from cortado.cli.commands.new import new_scene, templates
 from cortado.cli.subcommands import CORTADO
-from cortado.optimisation.inverse.tables import file_schema
+from cortado.optimisation.inverse.task_tables import file_schema
 from cortado.scene.parameters import Role
 from scenes import jet, plane, plane_of_three, scene, two_layers
 from test_examples import FILES

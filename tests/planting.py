@@ -256,8 +256,8 @@ def case(scene, loss: str, precision: str = "float64"):
     import numpy as np
 
     from cortado import Problem, Simulation, losses
-    from cortado.losses.image_losses import Pyramid, SquaredDifference
-    from cortado.render.scene_renderer import scene_renderer
+    from cortado.image_losses import Pyramid, SquaredDifference
+    from cortado.render.renderer import scene_renderer
 
     simulation, random = Simulation(scene, precision=precision), np.random.default_rng(1)
     spacing = scene.discretisation.spacing

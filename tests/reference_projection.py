@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 import reference
-from cortado.discretise.calibration import SKIN
+from cortado.discretise.smoothing import SKIN
 
 
 def between(H, first, second):

@@ -17,7 +17,7 @@ from cortado.certificate.consistency import LossHistory, balanced, in_float64
 from cortado.certificate.horizon import Alignment, Horizon, Judged, growth
 from cortado.pictures.run_pictures import gradient_check
 from cortado.problem import ProblemForwardPass
-from cortado.render.scene_renderer import scene_renderer
+from cortado.render.renderer import scene_renderer
 from cortado.sph.free_energy import FREE_ENERGIES
 from scenes import box, jet, plane, plane_of_three, pour, scene, splash, two_layers
 

@@ -26,7 +26,7 @@ from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE
 from cortado import Problem, Scene, Trajectory
 from cortado.files.disk import locked
 from cortado.optimisation.inverse.solved_task import TaskFigures
-from cortado.optimisation.inverse.task import load_task
+from cortado.optimisation.inverse.task_files import load_task
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.pictures.image_files import heart, rosetta, write_picture
 from cortado.runs.run_folder import FIGURES

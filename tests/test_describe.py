@@ -13,9 +13,8 @@ from cortado.cli import main
 from cortado.cli.commands.describe import RunLength, seconds_of_picture
 from cortado.cli.commands.run import RunRequest, run_scene
 from cortado.cli.commands.run_report import Energy, RunSummary
-from cortado.discretise.calibration import SLACK
-from cortado.discretise.smoothing import KERNELS
-from cortado.optimisation.inverse.task import load_task, task_in_words
+from cortado.discretise.smoothing import KERNELS, SLACK
+from cortado.optimisation.inverse.task_files import load_task, task_in_words
 from cortado.pictures.image_files import read_picture
 from cortado.pictures.plane import PlanePainter
 from cortado.runs.recording import EverySteps, FramesPerSecond

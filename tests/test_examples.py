@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import warp as wp
 
-import cortado.cli.commands.check
 import cortado.cli.commands.describe
 import cortado.cli.commands.new
 import cortado.cli.commands.optimise
@@ -24,7 +23,7 @@ from compiling_notice import without_compiling
 from cortado import CortadoWarning, load_scene
 from cortado.cli import main
 from cortado.cli.commands.new import new_scene, templates
-from cortado.optimisation.inverse.task import load_task
+from cortado.optimisation.inverse.task_files import load_task
 from cortado.pictures.image_files import read_picture
 from cortado.rollout.run_checks import unstable_sentence
 from cortado.scene.parameter_values import Tilt
@@ -165,7 +164,7 @@ def test_a_command_is_one(command, monkeypatch):
         (cortado.cli.commands.describe, "describe_scene"),
         (cortado.cli.commands.run, "run_scene"),
         (cortado.cli.commands.optimise, "optimise_task"),
-        (cortado.cli.commands.check, "check_scene"),
+        (cortado.cli.commands.describe, "check_scene"),
         (cortado.cli.commands.sweep, "run_sweep"),
     ):
         monkeypatch.setattr(module, function, lambda *arguments: "done")

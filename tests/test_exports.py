@@ -17,9 +17,8 @@ from cortado.pictures.export_formats import FORMATS
 from cortado.pictures.exported import Exported, WholeFrames
 from cortado.pictures.film import ShownRun
 from cortado.pictures.painter import Scale
-from cortado.runs.frames import Marks
+from cortado.runs.frames import Marks, SolidMotion, SolidMotions
 from cortado.runs.run_folder import RunFolder
-from cortado.runs.solid_motion import SolidMotion, SolidMotions
 from cortado.scene.scene import scene_from_dict
 from full_disk import largest_file
 from scenes import box, pool

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import cortado.render.scene_renderer
+import cortado.render.renderer
 from bad_tasks import GOOD_TASK, PLANE_PICTURE, TINY_LATTE
 from cortado import SceneError, optimise
 from cortado.cli import main
-from cortado.losses.image_losses import psnr
-from cortado.optimisation.inverse.task import load_task, setup
+from cortado.image_losses import psnr
+from cortado.optimisation.inverse.task_files import load_task, setup
 from cortado.optimisation.optimisers import Adam
 
 STAGED = "optimise.extinction_schedule=[0.25, 1.0]"
@@ -36,7 +36,7 @@ def images(made, values):
 @pytest.mark.parametrize("fineness", [0.5, 0.25])
 def test_a_layer_is_as_opaque_as_its_spacing_is_thick(file, monkeypatch, fineness):
     """How fine the nodes are does not change how opaque the plane is; factors of the extinction do."""
-    monkeypatch.setitem(cortado.render.scene_renderer.FINENESS, 2, fineness)
+    monkeypatch.setitem(cortado.render.renderer.FINENESS, 2, fineness)
     task = load_task(file, [STAGED, "render.extinction=20.0", "problem.distance=squared_difference"])
     made = setup(task, "cpu", "float64")
     x = made.problem.simulation.positions

@@ -20,7 +20,7 @@ from cortado.cli.commands.new import scene_text, templates
 from cortado.cli.process import usage_sentence
 from cortado.cli.subcommands import COMMANDS, app, gradients
 from cortado.files.disk import SCHEMA, examples_folder
-from cortado.optimisation.inverse.tables import file_schema, file_schema_text
+from cortado.optimisation.inverse.task_tables import file_schema, file_schema_text
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted(examples_folder().glob("*.toml"))

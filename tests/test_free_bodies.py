@@ -9,7 +9,7 @@ from cortado.discretise.solid import Mass
 from cortado.errors import MissingDerivativeError
 from cortado.gradients import ImplicitPressure, Tape
 from cortado.losses import CentreOfMass, SolidPose
-from cortado.runs.solid_motion import posed
+from cortado.runs.frames import posed
 from cortado.scene.solids import AnySolid
 from cortado.solvers.contacts import STIFFNESS
 from finite_differences import central_difference

@@ -8,10 +8,9 @@ import pytest
 from cortado import InputError, Problem, Scene, Simulation, losses
 from cortado.device.precision import FLOAT64
 from cortado.discretise.smoothing import CUBIC_SPLINE
-from cortado.losses.image_losses import Pyramid, SquaredDifference, psnr, reduce, reduce_transposed
-from cortado.render.renderer import Renderer
-from cortado.render.scene_renderer import scene_renderer
-from cortado.render.views import TopView
+from cortado.image_losses import Pyramid, SquaredDifference, psnr, reduce, reduce_transposed
+from cortado.render.cameras import TopView
+from cortado.render.renderer import Renderer, scene_renderer
 from finite_differences import both_modes, decades, directional, distance, fourth_order_difference
 from scenes import plane_of_three, two_layers
 

@@ -20,15 +20,15 @@ from cortado.particles.neighbours import fill_kernel
 from cortado.particles.pair_sums import fluid_sum
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
 from cortado.solvers.pcisph.steps import density_ratio_kernels, wall_kernels
-from cortado.sph.curvature_kernels import curvature_kernels
+from cortado.sph.curvature import curvature_kernels
 from cortado.sph.density import density_kernels
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.integration import integration_kernels
+from cortado.sph.stress_forces import newtonian_law
 from cortado.sph.stress_kernels import stress_kernels
 from cortado.sph.surface_tension import normal_kernels, surface_tension_kernels
 from cortado.sph.viscosity import viscosity_kernels
-from cortado.sph.viscosity_law import newtonian_law
 from scenes import plane, scene, two_layers
 
 CPU = wp.get_device("cpu")

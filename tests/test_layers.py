@@ -218,7 +218,7 @@ def test_import_is_light():
     assert not found, f"import cortado alone imports {', '.join(found)}"
 
 
-WITHOUT_WARP = ["errors", "scene.parameter_values", "discretise.calibration", "scene.scene", "scene.discrete_scene"]
+WITHOUT_WARP = ["errors", "scene.parameter_values", "discretise.smoothing", "scene.scene", "scene.discrete_scene"]
 WITHOUT_WARP += ["reference"]
 """What an engine without Warp stands on."""
 

@@ -11,8 +11,7 @@ from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.stage import TINT, media_of
 from cortado.pictures.tracing.liquid_surface import liquid_surface
 from cortado.pictures.tracing.near_particles import Particles
-from cortado.pictures.tracing.space import State, environment_of
-from cortado.pictures.tracing.wetting import particles_of
+from cortado.pictures.tracing.space import State, environment_of, particles_of
 from cortado.scene.appearance import FINISHES, LIQUIDS
 from scenes import box
 

@@ -10,7 +10,7 @@ import pytest
 from bad_scenes import plane
 from cortado import InputError, Problem, SceneError, Simulation, losses
 from cortado.device import memory
-from cortado.render.scene_renderer import scene_renderer
+from cortado.render.renderer import scene_renderer
 from cortado.scene.scene import scene_from_dict
 
 MEASURE = """

@@ -10,11 +10,10 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cortado.device.grid import Grid
+from cortado.device.cells import Grid
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
-from cortado.discretise.calibration import SKIN
-from cortado.discretise.smoothing import CUBIC_SPLINE
-from cortado.particles import candidates
+from cortado.discretise.smoothing import CUBIC_SPLINE, SKIN
+from cortado.particles import neighbours as candidates
 from cortado.particles.moving_walls import WallArrays
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch

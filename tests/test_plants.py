@@ -25,19 +25,18 @@ UNNAMED = {
     },
     "sph.viscous_stress": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
     "solvers.projection.effects": {f"image_sums.{name}_back" for name in ("lift", "mirror_walls", "behind")},
-    "solvers.projection.coarse_residual": {"coarse_sums.push_back"},
+    "solvers.projection.coarse_levels": {"coarse_sums.push_back"},
     "solvers.projection.sums": {
         *("projection_sums.moments_back", "projection_sums.force_back"),
         *("projection_sums.divergence_back", "projection_sums.velocity_gradient_back", "projection_sums.push_back"),
     },
-    "solvers.projection.walls": {"beside_sums.beside_back", "_work.beside_work"},
+    "solvers.projection.wall_sums": {"beside_sums.beside_back", "_work.beside_work"},
     "solvers.projection.repair": {"_work.repair_work"},
     "solvers.projection.body_kernels": {"body_kernels.push_back"},
     "solvers.pcisph.pressure": {"_work.pressure_work"},
     "particles.wall_terms": {"solid_kernel.share"},
-    "sph.density": {"_density_work.density_work"},
     "sph.viscosity": {"viscosity_term.made.viscosity_work"},
-    "sph.walls": {"_work.wall_slope_work"},
+    "sph.density": {"_density_work.density_work", "_work.wall_slope_work"},
     "sph.own_arrays": {"packing_kernels.add"},
     "sph.stress_kernels": {*("moments_work.moments_work", "moment_sums.moments_back", "moment_sums.wall_moments_back")},
     "sph.stress_forces": {
@@ -49,7 +48,7 @@ UNNAMED = {
 SHARED = {
     "particles.neighbourhood": {"pair_functions.factor_gradient", "pair_functions.hessian_product"},
     "discretise.smoothing_functions": {"_cubic_spline.hessian_factor", "smoothing_functions.slope_change"},
-    "losses.image_losses": {"adjoint", "reduce_transposed"},
+    "image_losses": {"adjoint", "reduce_transposed"},
     "losses.distances": {"matching_kernels.difference"},
     "render.absorption": {"brightness_functions.brightness_derivative", "absorption_kernels.gather"},
     "render.rays": {"interpolation_functions.trilinear_weight"},
@@ -67,8 +66,7 @@ ELSEWHERE = {
     "device.modules": "it compiles adjoints and has none",
     "particles.made_derivatives": "it makes them of terms, in texts: tests/test_terms.py",
     "sph.integration.begin_adjoint_kernel.begin_adjoint": "for solvers from outside: tests/test_solver.py",
-    "solvers.projection.image_loads": "of loads, which no loss of these scenes sees: tests/test_faces.py",
-    "solvers.projection.mean_stress": "of a quantity, which no loss of these scenes sees: tests/test_energy_budget.py",
+    "solvers.projection.mean_stress": "of quantities that no loss of these scenes sees: tests/test_energy_budget.py",
 }
 """Modules with functions of adjoints that no plant is in, and single such functions, and why."""
 FEWEST = {"functions": 48, "plants": 226}

@@ -7,7 +7,7 @@ import cortado
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
 from cortado.errors import InputError
-from cortado.scene.quantity_names import NAMES, QUANTITIES
+from cortado.scene.parameters import NAMES, QUANTITIES
 from finite_differences import both_modes, distance
 from scenes import jet, plane, scene, two_layers
 

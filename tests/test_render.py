@@ -10,9 +10,8 @@ import warp as wp
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.discretise.smoothing import CUBIC_SPLINE, KERNELS, WENDLAND_C2, SmoothingKernel
 from cortado.errors import InputError
-from cortado.render.cameras import Camera, Orthographic, Perspective
+from cortado.render.cameras import Camera, Orthographic, Perspective, TopView, View, Volume
 from cortado.render.renderer import RenderAdjoint, Renderer
-from cortado.render.views import TopView, View, Volume
 from finite_differences import decades, plateau
 
 SPACING, SUPPORT, N, PHASES = 0.1, 0.2, 200, 3

@@ -13,7 +13,7 @@ import cortado
 from cortado import InputError, SceneError, Simulation
 from cortado.errors import OutOfRangeError
 from cortado.forces import OverTime, Rheology
-from cortado.sph.viscosity_law import LAWS, bingham, carreau, herschel_bulkley, power_law
+from cortado.sph.stress_forces import LAWS, bingham, carreau, herschel_bulkley, power_law
 from scenes import HONEY, aimed, bodies, box, plane
 
 ROOT = Path(__file__).parents[1]

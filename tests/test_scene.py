@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from bad_scenes import BAD_SCENES, EMITTER, GOOD_SCENE, MIXTURE, RENDER, assert_one_sentence, one_sentence, plane
 from cortado import Problem, Simulation
-from cortado.discretise.calibration import pairwise_rate, stress_rate
-from cortado.discretise.smoothing import CUBIC_SPLINE
+from cortado.discretise.smoothing import CUBIC_SPLINE, pairwise_rate, stress_rate
 from cortado.errors import CortadoWarning, DivergedError, InputError, MassWarning, SceneError
 from cortado.losses import CentreOfMass
 from cortado.scene.fluids import BoxFluid

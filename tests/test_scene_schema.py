@@ -18,10 +18,10 @@ from bad_scenes import GOOD_SCENE, MIXTURE, RENDER
 from bad_scenes import plane as plane_tables
 from cortado import InputError, Problem, SceneError, Simulation
 from cortado.device.precision import FLOAT64
-from cortado.optimisation.inverse.tables import TaskTables
+from cortado.optimisation.inverse.task_tables import TaskTables
 from cortado.particles.state import to_device
-from cortado.render.scene_renderer import scene_renderer
-from cortado.render.views import TopView
+from cortado.render.cameras import TopView
+from cortado.render.renderer import scene_renderer
 from cortado.scene.appearance import Render
 from cortado.scene.fluid_particles import fluid_particles
 from cortado.scene.model import MixtureTable

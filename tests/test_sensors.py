@@ -14,8 +14,8 @@ from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series
 from cortado.losses.distances import SensorMatch
 from cortado.runs.quantity_values import QuantityEvaluator
+from cortado.runs.recording import StepReader, Table
 from cortado.runs.sensor import Readings, SensorLog, as_csv, from_csv, value_of
-from cortado.runs.step_reader import StepReader, Table
 from cortado.scene.shape_tables import NoContainer
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
 from cortado.watching import Watch
@@ -558,7 +558,7 @@ def test_frames_and_readings_do_not_depend_on_how_long_states_wait(monkeypatch):
     simulation, sensors = cortado.Simulation(plane()), {"gauge": WaveGauge([0.2, 0.0])}
     wanted = simulation.run(21, record_every=2, sensors=sensors, record=["density"])
     singles = [simulation.run(n) for n in (2, 20)]
-    monkeypatch.setattr("cortado.runs.step_reader.MOST", 1)
+    monkeypatch.setattr("cortado.runs.recording.MOST", 1)
     found = simulation.run(21, record_every=2, sensors=sensors, record=["density"])
     assert wanted.steps.tolist() == [*range(0, 21, 2), 21]
     for n, single in zip((1, 10), singles, strict=True):

@@ -23,9 +23,8 @@ from cortado.pictures.painter import colours_of, labelled, painter, side_by_side
 from cortado.pictures.stage import Stage, screen_axes, upright
 from cortado.pictures.tracing.liquid_surface import spheres
 from cortado.pictures.tracing.solid_surfaces import NODES, FloorShadow
-from cortado.pictures.tracing.space import State, environment_of, scenery
+from cortado.pictures.tracing.space import State, environment_of, particles_of, scenery, wetting
 from cortado.pictures.tracing.trace import find_contrast
-from cortado.pictures.tracing.wetting import particles_of, wetting
 from cortado.runs.frames import Pace, pace_of
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.appearance import Picture

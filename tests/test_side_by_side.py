@@ -13,7 +13,7 @@ from cortado.pictures import Orbit
 from cortado.pictures.film import ALONE, Page, ShownRun, coloured_by, framed_together, in_a_row
 from cortado.pictures.painter import labelled
 from cortado.pictures.run_pictures import shown_as
-from cortado.pictures.side_by_side import ShownFrames, common_times, labels, runs_page
+from cortado.pictures.several_runs import ShownFrames, common_times, labels, runs_page
 from cortado.pictures.stage import Stage
 from cortado.scene.appearance import Picture
 from cortado.scene.toml import unit_of

@@ -9,16 +9,17 @@ import pytest
 import warp as wp
 
 from cortado.device.precision import FLOAT32, FLOAT64
-from cortado.discretise.calibration import (
+from cortado.discretise.smoothing import (
+    KERNELS,
     RATE_LIMIT,
     SLACK,
     greatest_rate,
     lattice_offsets,
     pressure_stiffness,
     rest_volume,
+    smoothing_kernel,
     wall_response,
 )
-from cortado.discretise.smoothing import KERNELS, smoothing_kernel
 from cortado.discretise.smoothing_functions import smoothing_functions
 from cortado.errors import InputError
 from finite_differences import decades, plateau

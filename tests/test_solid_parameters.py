@@ -13,7 +13,7 @@ from cortado.gradients import Tape
 from cortado.losses import CentreOfMass
 from cortado.losses.distances import SensorMatch
 from cortado.pictures.exported import Exported
-from cortado.runs.solid_motion import posed
+from cortado.runs.frames import posed
 from cortado.sensors import PressureProbe, WallForce
 from finite_differences import both_modes, decades, distance
 from scenes import box

@@ -13,7 +13,7 @@ from cortado.pictures.plots import particles
 from cortado.pictures.shown_solids import FAR, SolidMesh, shown_solids, solid_outline
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.tracing.solid_surfaces import NODES, REACH, FloorShadow, SolidSurfaces
-from cortado.pictures.tracing.wetting import mirrored
+from cortado.pictures.tracing.space import mirrored
 from scenes import bodies, box
 
 BLUE, ORANGE = (0.05, 0.1, 0.8), (0.7, 0.3, 0.05)
@@ -143,7 +143,7 @@ def test_light_goes_no_further_than_to_a_solid(monkeypatch, tank):
     if tank:
         before = lattice([0.0] * 3, [0.6, 0.3, 0.1])
     for depth in (1.0, 0.1):
-        monkeypatch.setattr("cortado.pictures.tracing.wetting.DEPTHS", (depth,))
+        monkeypatch.setattr("cortado.pictures.tracing.space.DEPTHS", (depth,))
         solid, held = (CAVITY, {"container": {"shape": "none"}}) if tank else (PILLAR, {})
         light.append(seen(scene_of(3, solid, picture=FRONT, **held), before, (0.4, 0.15, 0.1 if tank else 0.25)))
     # the layer in the tank, two particles thick, is thinner with images far behind it

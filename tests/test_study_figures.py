@@ -14,7 +14,7 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_LATTE
 from cortado.cli import main
 from cortado.gradients import AdjointViscosity, Exact
-from cortado.optimisation.inverse.task import load_task, setup
+from cortado.optimisation.inverse.task_files import load_task, setup
 from cortado.optimisation.optimise import optimise
 from cortado.optimisation.optimisers import Adam
 from cortado.reference import Simulation, Terms

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 import cortado
 from cortado import CortadoWarning, Problem, Scene, Simulation, losses
 from cortado.optimisation.optimisers import Adam
-from cortado.render.scene_renderer import scene_renderer
+from cortado.render.renderer import scene_renderer
 from scenes import bodies, box
 
 SIGMA, DENSITY, RADIUS = 0.07, 1000.0, 0.05

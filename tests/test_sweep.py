@@ -21,7 +21,7 @@ from cortado import executors as of_dask
 from cortado.cli import main
 from cortado.cli.arguments import ALL_FRAMES
 from cortado.executors import Distributed, InProcess
-from cortado.files.interruption import Interrupted
+from cortado.files.terminal import Interrupted
 from cortado.optimisation.sweep import combinations, write_table
 from cortado.runs.sensor import Readings, from_csv, summary
 from dask_processes import PATIENCE, scheduler

@@ -11,7 +11,7 @@ from bad_tasks import BAD_TASKS, GOOD_TASK
 from cortado import SceneError, gradients, optimise
 from cortado.cli.commands.optimise import found_in_words, judge
 from cortado.optimisation.inverse.solved_task import knot_values
-from cortado.optimisation.inverse.task import load_task, setup
+from cortado.optimisation.inverse.task_files import load_task, setup
 from cortado.optimisation.optimise import Record, Result
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent
 

@@ -14,8 +14,7 @@ from scipy.interpolate import CubicSpline
 
 import potential_flow
 from cortado import Simulation
-from cortado.discretise.calibration import rest_volume
-from cortado.discretise.smoothing import smoothing_kernel
+from cortado.discretise.smoothing import rest_volume, smoothing_kernel
 from scenes import bodies, box, pool
 
 DATA = Path(__file__).parent / "data"

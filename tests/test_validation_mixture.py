@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from cortado import Scene, Simulation, Trajectory
-from cortado.discretise.calibration import shear_factor
+from cortado.discretise.smoothing import shear_factor
 from cortado.scene.parameter_values import reference_density
 
 

@@ -12,8 +12,7 @@ import pytest
 from scipy.optimize import brentq
 
 from cortado import Simulation
-from cortado.discretise.calibration import lattice_offsets
-from cortado.discretise.smoothing import smoothing_kernel
+from cortado.discretise.smoothing import lattice_offsets, smoothing_kernel
 from scenes import bodies, box
 
 GRAVITY = 1.0

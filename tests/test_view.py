@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import cortado
 from bad_tasks import TINY_SCENE
 from cortado import Scene, Trajectory
-from cortado.cli import main, view_window
+from cortado.cli import main, views
 from cortado.cli.views import LiveView, RecordedView, opened
 from cortado.files.image_encoding import to_srgb
 from cortado.pictures.particle_view import outline
@@ -117,7 +117,7 @@ def test_pressures_carry_the_fluid(scene):
     at_rest = simulation.run(600, record_every=600).last_state
 
     def pressures(state, controls):
-        return view_window.quantities_of(state["velocities"], lambda: simulation, state, controls)["pressure"]()
+        return views.quantities_of(state["velocities"], lambda: simulation, state, controls)["pressure"]()
 
     found = pressures(at_rest, {})
     depth = 0.4 - at_rest["positions"][:, 1]
@@ -134,7 +134,7 @@ def test_what_a_solver_does_not_know_is_said_in_a_sentence(scene, live, monkeypa
         own = coloured(shown, "phase")
         np.testing.assert_array_equal(coloured(shown, "pressure"), own)
         assert "without a pressure" in shown.window.legend.content
-    monkeypatch.setattr(view_window, "ParticleSolver", int)  # a solver of another kind
+    monkeypatch.setattr(views, "ParticleSolver", int)  # a solver of another kind
     own = coloured(live, "phase")
     np.testing.assert_array_equal(coloured(live, "density"), own)
     assert "no densities" in live.window.legend.content

@@ -3,7 +3,7 @@
 import numpy as np
 
 import reference
-from cortado.discretise.calibration import stress_control
+from cortado.discretise.smoothing import stress_control
 from cortado.sph.curvature import CurvatureConstants
 from cortado.sph.emitter import Nozzle
 from cortado.sph.surface_tension import CurvatureTension, SurfaceTension, tension_constants

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from cortado import Simulation
-from cortado.discretise.calibration import stress_control
+from cortado.discretise.smoothing import stress_control
 from scenes import box
 from viscous_flows import DENSITY, NU, VISCOSITY, acceleration, simulation
 

@@ -25,9 +25,9 @@ import numpy as np
 
 from cortado import Problem, Scene, Simulation, gradients, losses
 from cortado.files.terminal import track
-from cortado.losses.image_losses import Pyramid
+from cortado.image_losses import Pyramid
 from cortado.pictures.plots import INK, PALETTE, drawing
-from cortado.render.scene_renderer import scene_renderer
+from cortado.render.renderer import scene_renderer
 
 SPACING, GRAVITY = 0.025, (0.0, -9.81)
 MOST_BLOCKS = 8

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.discretise.calibration import lattice_offsets
-from cortado.discretise.smoothing import smoothing_kernel
+from cortado.discretise.smoothing import lattice_offsets, smoothing_kernel
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 

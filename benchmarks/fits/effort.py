@@ -11,8 +11,8 @@ from scipy.optimize import minimize
 import cortado
 from cortado import measured
 from cortado.errors import DivergedError
+from cortado.optimisation.fitting.gauss_newton import next_point, search
 from cortado.optimisation.fitting.least_squares import Coordinates, LeastSquares, Weighting
-from cortado.optimisation.fitting.search import next_point, search
 
 from .cases import STEPS, TIME_STEP, video
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from cortado import Simulation
+from cortado.image_losses import Pyramid
 from cortado.losses import CentreOfMass, FinalPositions, Image, Loss, Snapshot
-from cortado.losses.image_losses import Pyramid
 from cortado.scene.shape_tables import BoxContainer
 
 PIXELS = 32

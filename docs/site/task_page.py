@@ -1,14 +1,14 @@
 """The page that lists the tables of a task: ``python docs/site/task_page.py`` writes docs/task_file.md.
 
-Its tables come from the models in `cortado.optimisation.inverse.tables`, so that they say what is checked. Each table
-has an example, which below the scene of `scene_page` is a valid task; `tests/test_docs.py` loads them.
+Its tables come from the models in `cortado.optimisation.inverse.task_tables`, so that they say what is checked. Each
+table has an example, which below the scene of `scene_page` is a valid task; `tests/test_docs.py` loads them.
 """
 
 from pathlib import Path
 
 from rows import rows, toml
 
-from cortado.optimisation.inverse.tables import FitTables, TaskTables
+from cortado.optimisation.inverse.task_tables import FitTables, TaskTables
 
 PAGE = Path(__file__).parents[1] / "task_file.md"
 

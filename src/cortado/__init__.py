@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from cortado.optimisation.optimise import evaluate as evaluate
     from cortado.optimisation.optimise import optimise as optimise
     from cortado.optimisation.optimise import optimize as optimize
-    from cortado.pictures.side_by_side import film_side_by_side as film_side_by_side
+    from cortado.pictures.several_runs import film_side_by_side as film_side_by_side
     from cortado.problem import Problem as Problem
     from cortado.runs.trajectory import Trajectory as Trajectory
     from cortado.scene.scene import Scene as Scene
@@ -66,7 +66,7 @@ _HOMES = {
     "Trajectory": "runs.trajectory",
     "certify": "certificate",
     "evaluate": "optimisation.optimise",
-    "film_side_by_side": "pictures.side_by_side",
+    "film_side_by_side": "pictures.several_runs",
     "fit": "optimisation.fitting.fit",
     "load_scene": "scene.scene",
     "optimise": "optimisation.optimise",

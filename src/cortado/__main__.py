@@ -1,7 +1,7 @@
 """The process of the command ``cortado``, also ``python -m cortado``: ready for signals before anything large is
 imported."""
 
-from cortado.files import interruption
+from cortado.files import terminal as interruption
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ from cortado.device.threads import CORES, usable_cores
 from cortado.device.warp_start import VISIBLE, visible_gpus
 from cortado.device.worker_calls import Answer, Lacking, Payload, call, in_words, pickled
 from cortado.errors import ComputationError, InputError, shown, warn
-from cortado.files.interruption import Hold
+from cortado.files.terminal import Hold
 from cortado.words import counted
 
 if TYPE_CHECKING:

@@ -1,5 +1,174 @@
-"""Distances of pictures, for `losses.Image`: `cortado.losses.image_losses` by the name that users have for it."""
+"""How far an image is from its target: numbers of two images (rows, columns, 3), each with its own adjoint."""
 
-from cortado.losses.image_losses import *  # noqa: F403
-from cortado.losses.image_losses import __all__ as __all__
-from cortado.losses.image_losses import __dir__ as __dir__
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cortado.arrays import as_numbers, require_whole
+from cortado.calls import face
+from cortado.errors import InputError
+
+__all__ = ["ImageLoss", "Pyramid", "SquaredDifference", "psnr"]
+
+Image = NDArray[np.float64]
+"""A linear picture: array (rows, columns, 3) of red, green and blue."""
+SMALLEST = 2
+"""Greatest side of the coarsest level of a pyramid, in pixels."""
+
+
+class ImageLoss(Protocol):
+    """Protocol of a differentiable number of an image and its target."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Text that tells losses apart, for checkpoints."""
+
+    def value(self, image: ArrayLike, target: ArrayLike) -> float:
+        """Return the loss of an image (rows, columns, 3)."""
+
+    def adjoint(self, image: ArrayLike, target: ArrayLike) -> Image:
+        """Return the derivative (rows, columns, 3) of the loss with respect to the image."""
+
+
+@dataclass(frozen=True)
+class SquaredDifference:
+    """An image loss: the mean over pixels and channels of the squared difference.
+
+    Shapes that do not overlap do not feel each other; `Pyramid` is for these.
+    """
+
+    @property
+    def fingerprint(self) -> str:
+        return "squared difference"
+
+    def value(self, image: ArrayLike, target: ArrayLike) -> float:
+        return float(np.mean(_difference(image, target) ** 2))
+
+    def adjoint(self, image: ArrayLike, target: ArrayLike) -> Image:
+        difference = _difference(image, target)
+        return 2.0 / difference.size * difference
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """An image loss: the weighted mean squared difference, summed over the levels of a Gaussian pyramid (Burt and
+    Adelson 1983).
+
+    The first level is the image itself, every other one the level before, blurred by a binomial and reduced by 2
+    (`reduction`). Coarse levels see where a shape is before it overlaps with its target, fine levels its outline.
+    """
+
+    levels: int | None = None
+    """Number of levels; None: that of the weights or, without weights, until no side is longer than 2 pixels."""
+    weights: tuple[float, ...] | None = None
+    """Weights (levels,) from fine to coarse; None: 1, 2, 4 ..., as a shape is fainter the more it is blurred."""
+
+    def __post_init__(self) -> None:
+        if self.levels is not None:
+            require_whole("levels", self.levels, 1)
+        if self.weights is None:
+            return
+        numbers = np.atleast_1d(as_numbers("weights", self.weights))
+        if numbers.ndim != 1:
+            raise InputError(f"weights has shape {numbers.shape}, but must be one number for each level.")
+        weights = tuple(numbers.tolist())
+        object.__setattr__(self, "weights", weights)
+        if not (np.isfinite(weights).all() and min(weights, default=-1.0) >= 0.0 and max(weights) > 0.0):
+            raise InputError(f"weights is {weights}, but must be finite, not negative and not all zero.")
+        if self.levels not in (None, len(weights)):
+            raise InputError(f"There are {len(weights)} weights for {self.levels} levels; give one for each level.")
+
+    @property
+    def fingerprint(self) -> str:
+        return f"pyramid, levels {self.levels}, weights {self.weights}"
+
+    def value(self, image: ArrayLike, target: ArrayLike) -> float:
+        levels = self._levels(_difference(image, target))
+        weights = self._weights(levels)
+        return sum(weight * float(np.mean(level**2)) for weight, level in zip(weights, levels, strict=True))
+
+    def adjoint(self, image: ArrayLike, target: ArrayLike) -> Image:
+        levels = self._levels(_difference(image, target))
+        weights = self._weights(levels)
+        bar = np.zeros_like(levels[-1])
+        for k in reversed(range(len(levels))):
+            if k < len(levels) - 1:
+                bar = reduce_transposed(bar, levels[k].shape[:2])
+            bar += 2.0 * weights[k] / levels[k].size * levels[k]
+        return bar
+
+    def _levels(self, difference: Image) -> list[Image]:
+        """Return the pyramid of the difference, which equals the difference of the pyramids."""
+        wanted = self.levels or (len(self.weights) if self.weights else None)
+        levels = [difference]
+        while len(levels) < wanted if wanted else max(levels[-1].shape[:2]) > SMALLEST:
+            levels.append(reduce(levels[-1]))
+        return levels
+
+    def _weights(self, levels: list[Image]) -> tuple[float, ...]:
+        return self.weights or tuple(2.0**k for k in range(len(levels)))
+
+
+def psnr(image: ArrayLike, target: ArrayLike) -> float:
+    """Return the peak signal-to-noise ratio [dB] for a peak of 1; infinite for two equal images."""
+    error = SquaredDifference().value(image, target)
+    return float(-10.0 * np.log10(error)) if error > 0.0 else float("inf")
+
+
+def reduce(image: Image) -> Image:
+    """Return the next level (ceil(rows / 2), ceil(columns / 2), 3) of a Gaussian pyramid."""
+    rows, columns = image.shape[:2]
+    return _along_columns(_along_rows(image, reduction(rows)), reduction(columns))
+
+
+def reduce_transposed(bar: Image, shape: tuple[int, ...]) -> Image:
+    """Return the adjoint of an image (rows, columns) from that of its next level: `reduce` transposed."""
+    rows, columns = shape
+    return _along_rows(_along_columns(bar, reduction(columns).T), reduction(rows).T)
+
+
+@lru_cache(maxsize=64)
+def reduction(size: int) -> Any:
+    """Return a sparse matrix (ceil(size / 2), size) that blurs a line of pixels and keeps every other one.
+
+    Where the size is odd, Burt and Adelson's 1 4 6 4 1 about every other pixel, the first and the last among them.
+    Where it is even, that would treat the two ends differently and make a level prefer shapes at one of them; there,
+    1 3 3 1 makes one pixel of two. At an edge the weights of the pixels that are there are divided by their sum, so
+    that a constant stays constant.
+    """
+    from scipy.sparse import csr_array
+
+    first, binomial = (-2, (1.0, 4.0, 6.0, 4.0, 1.0)) if size % 2 else (-1, (1.0, 3.0, 3.0, 1.0))
+    rows, offsets = np.mgrid[: (size + 1) // 2, first:3]
+    columns = 2 * rows + offsets
+    there = (columns >= 0) & (columns < size)
+    weights = np.where(there, binomial, 0.0)
+    weights /= weights.sum(axis=1, keepdims=True)
+    return csr_array((weights[there], (rows[there], columns[there])), shape=(len(rows), size))
+
+
+def _along_rows(image: Image, matrix: Any) -> Image:
+    rows, columns, channels = image.shape
+    return (matrix @ image.reshape(rows, columns * channels)).reshape(-1, columns, channels)
+
+
+def _along_columns(image: Image, matrix: Any) -> Image:
+    return _along_rows(image.swapaxes(0, 1), matrix).swapaxes(0, 1)
+
+
+def _difference(image: ArrayLike, target: ArrayLike) -> Image:
+    """Return image - target as a float64 array (rows, columns, 3)."""
+    image, target = as_numbers("The image", image), as_numbers("The target", target)
+    if image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise InputError(f"The image has shape {image.shape}, but must be (rows, columns, 3).")
+    if image.shape != target.shape:
+        raise InputError(f"The image has shape {image.shape}, but its target {target.shape}: they must be the same.")
+    return image - target
+
+
+__dir__ = face(globals())

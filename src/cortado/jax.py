@@ -7,20 +7,20 @@ compiled program, where values are known only as it runs, JAX raises an error of
 """
 
 from cortado.calls import face
-from cortado.optimisation.layers import calls, loops
-from cortado.optimisation.layers.calls import bound
+from cortado.optimisation.layers import user_functions
+from cortado.optimisation.layers.user_functions import bound
 from cortado.optimisation.layers.with_jax import JaxBridge
 
 __all__ = ["measure", "picture", "restart_state", "rollout", "smoothed", "state", "step", "value"]
 
 _BRIDGE = JaxBridge()
-measure = bound(calls.measure, _BRIDGE, __name__)
-picture = bound(calls.picture, _BRIDGE, __name__)
-restart_state = bound(calls.restart_state, _BRIDGE, __name__)
-rollout = bound(calls.rollout, _BRIDGE, __name__)
-smoothed = bound(loops.smoothed, _BRIDGE, __name__)
-state = bound(calls.state, _BRIDGE, __name__)
-step = bound(calls.step, _BRIDGE, __name__)
-value = bound(calls.value, _BRIDGE, __name__)
+measure = bound(user_functions.measure, _BRIDGE, __name__)
+picture = bound(user_functions.picture, _BRIDGE, __name__)
+restart_state = bound(user_functions.restart_state, _BRIDGE, __name__)
+rollout = bound(user_functions.rollout, _BRIDGE, __name__)
+smoothed = bound(user_functions.smoothed, _BRIDGE, __name__)
+state = bound(user_functions.state, _BRIDGE, __name__)
+step = bound(user_functions.step, _BRIDGE, __name__)
+value = bound(user_functions.value, _BRIDGE, __name__)
 
 __dir__ = face(globals())

@@ -29,9 +29,9 @@ from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.rollout import OBSERVED, BackwardStep, Observer, Residual, Rollout
 from cortado.rollout.run_checks import one_for_each
 from cortado.rollout.stepper import BackwardSteps
+from cortado.runs.probes import warn_of_places
 from cortado.runs.quantity_values import Moment, add_to_row, row_of
-from cortado.runs.sensor_places import warn_of_places
-from cortado.runs.step_reader import QuantityReader
+from cortado.runs.recording import QuantityReader
 from cortado.runs.trajectory import noted
 from cortado.scene.parameter_values import NAMES, UNITS, Arrays, Values, require_points
 from cortado.scene.restart import RestartState

@@ -17,13 +17,12 @@ from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import precision_named
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.device.warp_start import device_named, start_warp
-from cortado.discretise.calibration import circulation_factor
+from cortado.discretise.smoothing import circulation_factor
 from cortado.errors import InputError, shown, unwarned, warn
 from cortado.files.image_encoding import ShadedPicture
 from cortado.lazy import on_top
 from cortado.particles.state import State
-from cortado.render.renderer import Renderer
-from cortado.render.scene_renderer import scene_renderer
+from cortado.render.renderer import Renderer, scene_renderer
 from cortado.rollout.outcome import trouble
 from cortado.rollout.parameter_space import ParameterSpace, end_after, steps_of_run
 from cortado.rollout.rollout import Rollout
@@ -33,13 +32,12 @@ from cortado.rollout.step_bounds import expected_frames
 from cortado.rollout.stepper import Stepping
 from cortado.runs.frames import Film
 from cortado.runs.quantity_values import Moment, QuantityEvaluator
-from cortado.runs.recording import recorded
+from cortado.runs.recording import Table, recorded
 from cortado.runs.sensor import Sensor
-from cortado.runs.step_reader import Table
 from cortado.runs.trajectory import Frame, Trajectory
 from cortado.scene.discrete_scene import check_distance, discretise
 from cortado.scene.parameter_values import OVER_TIME, scene_values
-from cortado.scene.quantity_names import check_readable
+from cortado.scene.parameters import check_readable
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import OWN

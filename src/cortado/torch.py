@@ -11,8 +11,8 @@ from typing import Any
 from cortado.calls import face
 from cortado.errors import InputError
 from cortado.gradients import AdjointEstimator
-from cortado.optimisation.layers import calls, loops
-from cortado.optimisation.layers.calls import bound
+from cortado.optimisation.layers import user_functions
+from cortado.optimisation.layers.user_functions import bound
 from cortado.optimisation.layers.with_torch import TorchBridge, torch
 from cortado.scene.parameter_values import Values
 from cortado.simulation import Simulation
@@ -22,14 +22,14 @@ __all__ = ["Steps", "measure", "picture", "restart_state", "rollout", "smoothed"
 Tensors = Mapping[str, Any]
 """Tensors by name."""
 _BRIDGE = TorchBridge()
-measure = bound(calls.measure, _BRIDGE, __name__)
-picture = bound(calls.picture, _BRIDGE, __name__)
-restart_state = bound(calls.restart_state, _BRIDGE, __name__)
-rollout = bound(calls.rollout, _BRIDGE, __name__)
-smoothed = bound(loops.smoothed, _BRIDGE, __name__)
-state = bound(calls.state, _BRIDGE, __name__)
-step = bound(calls.step, _BRIDGE, __name__)
-value = bound(calls.value, _BRIDGE, __name__)
+measure = bound(user_functions.measure, _BRIDGE, __name__)
+picture = bound(user_functions.picture, _BRIDGE, __name__)
+restart_state = bound(user_functions.restart_state, _BRIDGE, __name__)
+rollout = bound(user_functions.rollout, _BRIDGE, __name__)
+smoothed = bound(user_functions.smoothed, _BRIDGE, __name__)
+state = bound(user_functions.state, _BRIDGE, __name__)
+step = bound(user_functions.step, _BRIDGE, __name__)
+value = bound(user_functions.value, _BRIDGE, __name__)
 
 
 class Steps(torch.nn.Module):
@@ -45,7 +45,7 @@ class Steps(torch.nn.Module):
         """Make the module; ``trained``: parameters by name with their first values, such as ``{"viscosity": 0.1}``;
         ``gradient`` as of `step`."""
         super().__init__()
-        layer = calls.steps_layer(simulation, steps, gradient)
+        layer = user_functions.steps_layer(simulation, steps, gradient)
         self.simulation, self.steps, self.gradient = simulation, steps, gradient
         made = {name: _BRIDGE.array(f"parameter {name}", value, layer) for name, value in (trained or {}).items()}
         self.trained = torch.nn.ParameterDict({_key(name): torch.nn.Parameter(own) for name, own in made.items()})

@@ -13,11 +13,10 @@ from cortado.losses.loss import Snapshot, SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.rollout import Observer, Rollout
 from cortado.rollout.stepper import Steppable
-from cortado.runs.probes import SENSORS, sensors_of
+from cortado.runs.probes import SENSORS, sensors_of, warn_of_places
 from cortado.runs.quantity_values import Moment, QuantityEvaluator, Recorder
+from cortado.runs.recording import StepReader, Waiting
 from cortado.runs.sensor import Readings, Sensor, SensorLog, value_of
-from cortado.runs.sensor_places import warn_of_places
-from cortado.runs.step_reader import StepReader, Waiting
 from cortado.scene.parameter_values import Arrays
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.discretise.calibration import SKIN, stress_control
+from cortado.discretise.smoothing import SKIN, stress_control
 from cortado.errors import InputError, shown
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
 from cortado.scene.parameters import BY_NAME

@@ -19,8 +19,7 @@ from signal import SIGINT
 from cortado.cli.arguments import Program, Work
 from cortado.cli.subcommands import CORTADO
 from cortado.errors import LONGEST, ComputationError, CortadoError, CortadoWarning, InputError, MassWarning
-from cortado.files.interruption import Interrupted
-from cortado.files.terminal import say, tell, to_stdout
+from cortado.files.terminal import Interrupted, say, tell, to_stdout
 from cortado.version import __version__
 
 BROKEN_PIPE = 141

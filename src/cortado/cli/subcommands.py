@@ -66,7 +66,7 @@ def check(
     """
     require_at_least(0, seed, "--seed")
     words = text_overrides(scene, overrides)
-    from cortado.cli.commands.check import check_scene
+    from cortado.cli.commands.describe import check_scene
 
     return partial(check_scene, scene, steps, parameters, loss, perturbation, out, words, device, json, seed)
 
@@ -249,7 +249,7 @@ command(app)(dataset)
 @command(app, answers=True)
 def schema() -> Work:
     """Print the JSON schema of scenes and tasks, with which editors complete and check them."""
-    from cortado.optimisation.inverse.tables import file_schema_text
+    from cortado.optimisation.inverse.task_tables import file_schema_text
 
     return lambda: file_schema_text().rstrip("\n")
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.calibration import SLACK, lattice_offsets, rest_volume
 from cortado.discretise.shapes import Numbers, Points, Which, launch_on_cpu, pairs_within, shared
+from cortado.discretise.smoothing import SLACK, lattice_offsets, rest_volume
 from cortado.discretise.walls import RestLattice
 from cortado.files.terminal import timed_note
 
@@ -111,7 +111,7 @@ class PointsAround:
     @cached_property
     def _by_cell(self) -> tuple[Any, Any]:
         """Return the points in the order of cells as wide as the reach, and the grid of these."""
-        from cortado.device.grid import Grid
+        from cortado.device.cells import Grid
 
         ends = self.points.min(axis=0), self.points.max(axis=0)
         cells = Grid.around(*ends, self.lengths, self.reach, MOST_CELLS)

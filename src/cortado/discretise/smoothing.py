@@ -7,10 +7,15 @@ With q = r / h, s = x / h and the normalisation sigma [1 / m^d]:
 where f(q) = w'(q) / q is finite at q = 0 for every kernel here, so that no direction is needed at r = 0.
 Cubic spline: Monaghan (1992). Wendland C2 and C4: Dehnen and Aly (2012). The same in Warp, with Hessians:
 `cortado.discretise.smoothing_functions`.
+
+Constants of a filled neighbourhood on the lattice of the rest spacing are functions of a smoothing kernel, the spacing
+[m] of the lattice, the support radius [m] and the dimension, 2 or 3.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from math import pi
 from typing import Any
 
@@ -76,3 +81,151 @@ def smoothing_kernel(name: str) -> SmoothingKernel:
     if name not in KERNELS:
         raise InputError(f"kernel is {name!r}, but must be one of {', '.join(KERNELS)}.")
     return KERNELS[name]
+
+
+SKIN = 0.03
+"""Reach of neighbour lists beyond the support radius, relative to it: density is also taken at predicted positions."""
+SLACK = 1e-4
+"""How far the lattice stays below the rest density, relative.
+
+At the rest density exactly, every particle of a block that starts as a lattice sits on the kink of the pressure clamp:
+round-off would choose the pressure's derivative, and no finite difference could confirm it.
+"""
+RATE_LIMIT = 1.5
+"""Bound on `greatest_rate`, as the iteration converges below 2; the margin is for particles off the lattice."""
+
+
+def lattice_offsets(spacing: float, support: float, dimension: int) -> np.ndarray:
+    """Return separations (m, d) [m] between a lattice point and all points within the support, itself included."""
+    reach = range(-int(support / spacing) - 1, int(support / spacing) + 2)
+    offsets = spacing * np.array(list(itertools.product(reach, repeat=dimension)), dtype=np.float64)
+    return offsets[np.linalg.norm(offsets, axis=1) < support]
+
+
+def _waves(spacing: float, dimension: int, count: int = 25) -> np.ndarray:
+    """Return wave vectors (count^d, d) [rad/m] of one octant, up to the shortest waves on the lattice."""
+    return np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, count), repeat=dimension)))
+
+
+def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """Return V_0 = (1 - SLACK) / sum_j W_ij [m^d]: with a mass rho_0 V_0 the lattice has the rest density less
+    slack."""
+    distances = np.linalg.norm(lattice_offsets(spacing, support, dimension), axis=1)
+    return float((1.0 - SLACK) / kernel.weight(distances, dimension, support).sum())
+
+
+def _filled(
+    kernel: SmoothingKernel, spacing: float, support: float, dimension: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the `lattice_offsets` (m, d) [m], the gradients of W there (m, d) [1 / m^(d + 1)], and the volume V [m^d]
+    with which the lattice has the rest density exactly."""
+    offsets = lattice_offsets(spacing, support, dimension)
+    volume = rest_volume(kernel, spacing, support, dimension) / (1.0 - SLACK)
+    return offsets, kernel.gradient(offsets, support), volume
+
+
+def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """Return PCISPH's stiffness k = delta dt^2 [m2] (Solenthaler and Pajarola 2009):
+
+    delta = 1 / (beta (S . S + sum_j G_ij . G_ij)), beta = 2 m^2 dt^2 / rho_0^2, S = sum_j G_ij,
+
+    lowered where the pressure iteration would diverge with it: where its `greatest_rate` is above `RATE_LIMIT`.
+    """
+    gradients = kernel.gradient(lattice_offsets(spacing, support, dimension), support)
+    total = gradients.sum(axis=0)
+    volume = rest_volume(kernel, spacing, support, dimension)
+    prototype = 1.0 / (2.0 * volume**2 * (total @ total + (gradients**2).sum()))
+    return float(prototype * min(1.0, RATE_LIMIT / greatest_rate(kernel, spacing, support, dimension)))
+
+
+@cache
+def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """Return the factor by which one pressure iteration with the delta of a filled neighbourhood overcorrects the worst
+    pressure wave on the lattice [-].
+
+    A pressure wave exp(i k . x) moves the particles so that their density answers with delta times |S(k)|^2 / (2 sum_j
+    G_j . G_j), where S(k) = sum_j G_j sin(k . x_j): the iteration converges where that is below 2. It is 1.4 for the
+    cubic spline with a support of 2 spacings in 3-D, and 3.7 with 3 spacings.
+    """
+    offsets = lattice_offsets(spacing, support, dimension)
+    gradients = kernel.gradient(offsets, support)
+    answers = np.sin(_waves(spacing, dimension) @ offsets.T) @ gradients
+    return float((answers**2).sum(axis=1).max() / (2.0 * (gradients**2).sum()))
+
+
+def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: float) -> np.ndarray:
+    """Return F = x . G / (|x|^2 + 0.01 h^2) (m,) [1 / m^(d + 2)], the factor of second derivatives by differences, at
+    separations (m, d) [m]."""
+    squares = (separations**2).sum(axis=1)
+    return (separations * kernel.gradient(separations, support)).sum(axis=1) / (squares + 0.01 * support**2)
+
+
+def wall_response(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """Return sum_j G_j . G_j [1 / m^(2 d + 2)], the scale of the relaxation beside walls (`solvers.pcisph.steps`)."""
+    return float((kernel.gradient(lattice_offsets(spacing, support, dimension), support) ** 2).sum())
+
+
+@cache
+def lattice_laplacian_correction(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """Return the factor [-] that makes the Laplacian 2 V sum_j (u_i - u_j) F_ij exact for a parabola on the lattice.
+
+    Without it second derivatives are 1 to 8 % small at any resolution, mostly by the 0.01 h^2 of F.
+    """
+    offsets, _, volume = _filled(kernel, spacing, support, dimension)
+    return float(-1.0 / (volume * (shear_factor(kernel, offsets, support) * offsets[:, 0] ** 2).sum()))
+
+
+@cache
+def circulation_factor(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """Return mu = -(V / d) sum_j x_j . G_j of the lattice [-]: the sum of V v_ij x G_ij is mu times the curl of v."""
+    offsets, gradients, volume = _filled(kernel, spacing, support, dimension)
+    return float(-volume * (offsets * gradients).sum() / dimension)
+
+
+@cache
+def laplacian_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """Return the size of the greatest eigenvalue [1 / m2] of the corrected Laplacian on the lattice."""
+    offsets, _, volume = _filled(kernel, spacing, support, dimension)
+    correction = lattice_laplacian_correction(kernel, spacing, support, dimension)
+    weights = -2.0 * volume * correction * shear_factor(kernel, offsets, support)
+    return float(((1.0 - np.cos(_waves(spacing, dimension) @ offsets.T)) @ weights).max())
+
+
+@cache
+def pairwise_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """Return the greatest eigenvalue [1 / m2] on the lattice of the pairwise viscous force on velocities,
+
+    2 (d + 2) V sum_j F_ij x_ij x_ij^T / |x_ij|^2 (v_i - v_j).
+
+    In a wave of compression it is about three times that of the Laplacian.
+    """
+    offsets, _, volume = _filled(kernel, spacing, support, dimension)
+    squares = (offsets**2).sum(axis=1)
+    weights = -2.0 * (dimension + 2) * volume * shear_factor(kernel, offsets, support)
+    products = (offsets[:, :, None] * offsets[:, None, :]).reshape(len(offsets), -1)
+    matrices = (weights / np.where(squares > 0.0, squares, np.inf))[:, None] * products
+    answers = (1.0 - np.cos(_waves(spacing, dimension, 13) @ offsets.T)) @ matrices
+    return float(np.linalg.eigvalsh(answers.reshape(-1, dimension, dimension)).max())
+
+
+@cache
+def stress_control(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """Return the damping C = 4 / (3 m_2) of `cortado.sph.stress_kernels` [-], with the second moment m_2 = V sum_j
+    (-a_j) x_j^2 along an axis of the lattice, grad W = a x."""
+    return 4.0 / (3.0 * circulation_factor(kernel, spacing, support, dimension))
+
+
+@cache
+def stress_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """Return the greatest eigenvalue [1 / m2] on the lattice of viscosity as a stress (`cortado.sph.stress_kernels`),
+    in a wave of compression: of 2 |g|^2 + C (sum_j 2 s_j (1 - cos k . x_j) - m_2 |g|^2) with g = sum_j s_j x_j sin(k .
+    x_j) / m_2."""
+    offsets, gradients, volume = _filled(kernel, spacing, support, dimension)
+    others = np.any(offsets != 0.0, axis=1)
+    offsets, gradients = offsets[others], gradients[others]
+    slopes = (offsets * gradients).sum(axis=1) / (offsets**2).sum(axis=1)
+    second = circulation_factor(kernel, spacing, support, dimension)
+    phases = _waves(spacing, dimension) @ offsets.T
+    squares = ((np.sin(phases) @ (-volume * slopes[:, None] * offsets) / second) ** 2).sum(axis=1)
+    remainders = (1.0 - np.cos(phases)) @ (-2.0 * volume * slopes) - second * squares
+    return float((2.0 * squares + stress_control(kernel, spacing, support, dimension) * remainders).max())

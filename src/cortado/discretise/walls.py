@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cortado.discretise.calibration import lattice_offsets
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points, Rows, apart, disc, grid, pairs_within
-from cortado.discretise.smoothing import SmoothingKernel
+from cortado.discretise.smoothing import SmoothingKernel, lattice_offsets
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

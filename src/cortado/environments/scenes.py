@@ -22,9 +22,9 @@ from cortado.errors import CortadoWarning, InputError, MassWarning, shown
 from cortado.losses.loss import SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState
+from cortado.runs.probes import warn_of_places
 from cortado.runs.quantity_values import Moment, row_of
 from cortado.runs.sensor import Sensor, checked_sensor, value_of
-from cortado.runs.sensor_places import warn_of_places
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, velocity_name
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene

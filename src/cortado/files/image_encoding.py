@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from cortado.arrays import as_numbers
 from cortado.errors import InputError
 from cortado.files.disk import sentences, unfinished, write_atomically
-from cortado.files.interruption import held
+from cortado.files.terminal import held
 
 ROWS = 32
 """Number of rows of a picture converted at a time, few enough for the processor's cache."""

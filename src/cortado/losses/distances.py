@@ -18,7 +18,7 @@ from cortado.device.reduction import TreeReduction, sum_of
 from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
 from cortado.files.image_encoding import LIGHT, check_light
-from cortado.losses.image_losses import ImageLoss, SquaredDifference
+from cortado.image_losses import ImageLoss, SquaredDifference
 from cortado.losses.loss import Adjoint, Frames, Snapshot, SnapshotAdjoint, SnapshotBatch
 from cortado.particles.state import State, to_device
 from cortado.runs.sensor import Sensor, checked_sensor, value_of

@@ -16,7 +16,7 @@ from cortado.errors import InputError, shown
 from cortado.particles.state import State
 from cortado.runs.quantity_values import Moment
 from cortado.scene.discrete_scene import Lattice
-from cortado.scene.quantity_names import check_readable
+from cortado.scene.parameters import check_readable
 from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
 from cortado.words import counted

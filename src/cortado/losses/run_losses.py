@@ -27,7 +27,7 @@ from cortado.losses.loss import (
 )
 from cortado.particles.state import State
 from cortado.runs.sensor import SensedScene
-from cortado.scene.quantity_names import check_readable
+from cortado.scene.parameters import check_readable
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
 LAUNCHED = "positions", "velocities", "an array for the loss"

@@ -14,7 +14,7 @@ from cortado.errors import InputError
 from cortado.losses import FinalPositions
 from cortado.particles.state import State
 from cortado.problem import Problem
-from cortado.runs.solid_motion import SolidMotion
+from cortado.runs.frames import SolidMotion
 from cortado.scene.motions import wall_numbers
 from cortado.scene.parameters import BY_NAME
 from cortado.scene.scene import Scene

@@ -187,7 +187,7 @@ def neighbourhood_type(precision: Precision) -> Any:
         response_scale: real
         """(sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], for the relaxation beside walls."""
         laplacian_correction: real
-        """Factor of second derivatives [-], see `cortado.discretise.calibration`."""
+        """Factor of second derivatives [-], see `cortado.discretise.smoothing`."""
         volume: real
         """Volume V of a particle on the rest lattice [m^d]: with it that lattice has the rest density."""
         period: vector

@@ -15,10 +15,9 @@ from cortado.files.disk import as_path, sentences, unfinished, write_atomically
 from cortado.files.image_encoding import to_srgb
 from cortado.files.terminal import announce, track
 from cortado.pictures.exported import Exported, ExportedFrame, Mesh, Pose
-from cortado.runs.frames import FRACTION
-from cortado.runs.solid_motion import SolidMotion
+from cortado.runs.frames import FRACTION, SolidMotion
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.quantity_names import QUANTITIES
+from cortado.scene.parameters import QUANTITIES
 from cortado.scene.scene import Scene, as_scene
 from cortado.simulation import Simulation
 from cortado.version import __version__

@@ -24,10 +24,8 @@ from cortado.pictures.painter import Scale, colours_of
 from cortado.pictures.shown_solids import ShownSolid, SolidMesh, shown_solids, turn_in_space
 from cortado.pictures.stage import Stage, upright
 from cortado.pictures.tracing.liquid_surface import Surface, liquid_surface, nearest_colours, sized_level, spheres
-from cortado.pictures.tracing.space import environment_of
-from cortado.pictures.tracing.wetting import particles_of, wetting
-from cortado.runs.frames import SAME, Marks, fraction_names
-from cortado.runs.solid_motion import SolidMotions, posed, sized
+from cortado.pictures.tracing.space import environment_of, particles_of, wetting
+from cortado.runs.frames import SAME, Marks, SolidMotions, fraction_names, posed, sized
 from cortado.runs.trajectory import Frame, Trajectory
 from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene

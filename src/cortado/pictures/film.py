@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.device.threads import WARP
-from cortado.discretise.calibration import circulation_factor, rest_volume
 from cortado.discretise.shapes import Points, pairs_among
-from cortado.discretise.smoothing import smoothing_kernel
+from cortado.discretise.smoothing import circulation_factor, rest_volume, smoothing_kernel
 from cortado.errors import InputError
 from cortado.files.image_encoding import moving_picture
 from cortado.files.terminal import track
@@ -31,11 +30,10 @@ from cortado.pictures.plane import PlanePainter, PlaneStage
 from cortado.pictures.stage import Stage, upright
 from cortado.pictures.tracing.space import SpacePainter, State
 from cortado.pictures.tracing.steady import WINDOW
-from cortado.runs.frames import Film, Pace
-from cortado.runs.solid_motion import SolidMotions, posed, sized, solid_motions
+from cortado.runs.frames import Film, Pace, SolidMotions, posed, sized, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.appearance import Moment, Picture, View
-from cortado.scene.quantity_names import sizes
+from cortado.scene.parameters import sizes
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 from cortado.version import __version__

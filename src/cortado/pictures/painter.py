@@ -20,7 +20,7 @@ from cortado.pictures.stage import Stage
 from cortado.pictures.tracing.near_particles import mixed
 from cortado.pictures.tracing.space import SpacePainter
 from cortado.scene.appearance import Picture
-from cortado.scene.quantity_names import QUANTITIES
+from cortado.scene.parameters import QUANTITIES
 from cortado.scene.scene import Scene
 
 FINER = 3

@@ -12,8 +12,7 @@ from cortado.device.threads import usable_cores
 from cortado.discretise.shapes import Points, wrapped
 from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids
 from cortado.pictures.stage import fluid_extent, thinned
-from cortado.pictures.tracing.space import State
-from cortado.pictures.tracing.wetting import mirrored
+from cortado.pictures.tracing.space import State, mirrored
 from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import BoxContainer

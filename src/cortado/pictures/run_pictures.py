@@ -35,8 +35,7 @@ from cortado.runs.frames import Film, common_rate, pace_of
 from cortado.runs.sensor import MeasuredColumn, Readings
 from cortado.runs.trajectory import Frame, Trajectory
 from cortado.scene.appearance import CameraPath, Picture
-from cortado.scene.parameters import Axis
-from cortado.scene.quantity_names import NAMES
+from cortado.scene.parameters import NAMES, Axis
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.tables import field_name
 from cortado.simulation import Simulation

@@ -10,21 +10,19 @@ from cortado.lazy import getter
 if TYPE_CHECKING:
     from cortado.render import cameras as cameras
     from cortado.render import renderer as renderer
-    from cortado.render import scene_renderer as scene_renderer
-    from cortado.render import views as views
     from cortado.render.cameras import Orthographic as Orthographic
     from cortado.render.cameras import Perspective as Perspective
+    from cortado.render.cameras import TopView as TopView
+    from cortado.render.cameras import Volume as Volume
     from cortado.render.renderer import Renderer as Renderer
-    from cortado.render.views import TopView as TopView
-    from cortado.render.views import Volume as Volume
 
-_MODULES = ("cameras", "renderer", "scene_renderer", "views")
+_MODULES = ("cameras", "renderer")
 _HOMES = {
     "Orthographic": "cameras",
     "Perspective": "cameras",
     "Renderer": "renderer",
-    "TopView": "views",
-    "Volume": "views",
+    "TopView": "cameras",
+    "Volume": "cameras",
 }
 __all__ = sorted([*_MODULES, *_HOMES])
 

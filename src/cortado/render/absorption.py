@@ -25,10 +25,9 @@ from cortado.device.memory import field_parts, picture_parts, require, sample_pa
 from cortado.device.modules import Kernels, kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_of
-from cortado.render.cameras import Camera
+from cortado.render.cameras import Camera, View, ViewTangent
 from cortado.render.colour_field import node_functions, nodes_type, rgba_type
 from cortado.render.rays import camera_tangent_type, camera_type, interpolation_functions, ray_functions
-from cortado.render.views import View, ViewTangent
 
 SAMPLES_PER_CELL = 2
 """Number of samples of a ray per node distance."""

@@ -1,7 +1,13 @@
-"""Cameras: where they stand, where they look, and what they see of the depth."""
+"""Cameras: where they stand, where they look, and what they see of the depth; and views: a camera, how opaque the fluid
+is, what stands behind it, and how such a view changes.
 
-from collections.abc import Sequence
+A view may not be known exactly: `Calibration` has the numbers of its camera as parameters.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -135,3 +141,192 @@ def check_resolution(resolution: tuple[int, int]) -> None:
         raise InputError(
             f"resolution is {shown(resolution)}, but must be two positive whole numbers, columns and rows."
         )
+
+
+WHITE = (1.0, 1.0, 1.0)
+ZERO = (0.0, 0.0, 0.0)
+NUDGE = 1e-6
+"""Step of a rotation vector [rad], for the direction in which a turned camera turns further."""
+
+
+class View(Protocol):
+    """Protocol of a view as the renderer needs it: camera, extinction and background."""
+
+    @property
+    def camera(self) -> Camera: ...
+
+    @property
+    def extinction(self) -> float:
+        """Extinction of filled fluid [1 / m]."""
+        ...
+
+    @property
+    def background(self) -> Vector:
+        """Background in linear RGB, (3,)."""
+        ...
+
+
+@public
+@dataclass(frozen=True)
+class Volume:
+    """A view of translucent fluid, from any camera."""
+
+    camera: Camera
+    extinction: float
+    """Extinction of filled fluid [1 / m]: after 1 / extinction, 1 / e of the light is left."""
+    background: Vector = WHITE
+    """Background in linear RGB, (3,)."""
+
+    def __post_init__(self) -> None:
+        positive("extinction", self.extinction)
+        object.__setattr__(self, "background", vector("background", self.background))
+
+
+@public
+@dataclass(frozen=True)
+class TopView:
+    """A view of the free surface's colour from above, as who pours latte art sees it.
+
+    The picture shows the whole container, seen along the axis downwards; it is not mirrored. Columns run along the
+    first of the other two axes, left to right. Then, with y upwards, rows run along z: row 0 has the lowest z, and the
+    viewer stands at the side of the greatest z. With z upwards rows run against y, as in a plot; with x upwards
+    (columns along y) against z.
+    """
+
+    lower: Vector
+    """Corner of the container [m], (2,) or (3,); in 2-D, where one looks at the plane, ``up_axis`` is 2."""
+    upper: Vector
+    spacing: float
+    """Spacing of the particles [m]."""
+    resolution: tuple[int, int] = (256, 256)
+    """Numbers of columns and rows."""
+    up_axis: int = 1
+    opacity: float = 4.0
+    """Extinction times spacing [-]: how well the first layer of particles hides the second."""
+    background: Vector = WHITE
+    """Background in linear RGB, (3,)."""
+
+    def __post_init__(self) -> None:
+        length = 2 if np.shape(self.lower) == (2,) else 3
+        for name in ("lower", "upper"):
+            corner = vector(name, getattr(self, name), length)
+            object.__setattr__(self, name, (*corner, 0.0)[:3])
+        object.__setattr__(self, "background", vector("background", self.background))
+        check_resolution(self.resolution)
+        keep_own(self, "resolution")
+        positive("spacing", self.spacing)
+        positive("opacity", self.opacity)
+        if not is_whole(self.up_axis) or self.up_axis not in (0, 1, 2):
+            raise InputError(f"up_axis is {shown(self.up_axis)}, but must be 0, 1 or 2.")
+        extent = np.delete(np.subtract(self.upper, self.lower), self.up_axis)
+        if not (extent > 0).all():
+            raise InputError(f"upper is {shown(self.upper)}, but must be above lower, {shown(self.lower)}.")
+
+    @cached_property
+    def camera(self) -> Camera:
+        """Camera above the whole field, looking down."""
+        lower, upper = np.array(self.lower), np.array(self.upper)
+        back = np.eye(3)[self.up_axis]
+        right = np.eye(3)[1 if self.up_axis == 0 else 0]
+        up = np.cross(back, right)
+        extent = upper - lower
+        columns, rows = self.resolution
+        width = max(extent @ right, abs(extent @ up) * columns / rows)
+        top = np.where(back, upper, 0.5 * (lower + upper))
+        margin = 8 * self.spacing
+        return Orthographic(
+            tuple(top + margin * back),
+            tuple(top),
+            tuple(up),
+            width,
+            resolution=self.resolution,
+            far=2 * margin + extent @ back,
+        )
+
+    @property
+    def extinction(self) -> float:
+        return self.opacity / self.spacing
+
+
+@dataclass(frozen=True)
+class ViewTangent:
+    """A change of a view, as the direction of a derivative."""
+
+    translation: Vector = ZERO
+    """Translation of the camera (3,) [m]."""
+    rotation: Vector = ZERO
+    """Rotation vector (3,) of the camera about its position [rad]."""
+    half_width: tuple[float, float] = (0.0, 0.0)
+    """Change of `Camera.half_width`: at the camera [m], and of its growth with depth [-]."""
+    extinction: float = 0.0
+    """Change of the extinction of filled fluid [1 / m]."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The search for unknown numbers of a view, from an aimed one. Names are "translation" (3,) [m] and "rotation" (3,)
+    [rad] of the camera, its "field_of_view" [degrees] or, with parallel rays, "width" [m], and the "extinction" of the
+    fluid [1/m]."""
+
+    aimed: View
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in self.names:
+            if name not in self._values:
+                wanted = ", ".join(self._values)
+                raise InputError(f"calibrate has {shown(name)}, but must be made of {wanted}.")
+
+    @property
+    def start(self) -> dict[str, np.ndarray]:
+        """Values of the searched numbers in the aimed view."""
+        return {name: self._values[name] for name in self.names}
+
+    @property
+    def unseen(self) -> dict[str, np.ndarray]:
+        """Masks by name, true for numbers that no picture shows: the shift of a camera with parallel rays along an
+        axis-aligned sight."""
+        camera = self.aimed.camera
+        if "translation" not in self.names or not isinstance(camera, Orthographic):
+            return {}
+        sight = np.subtract(camera.look_at, camera.position)
+        return {"translation": np.isclose(np.abs(sight), np.linalg.norm(sight))}
+
+    def view(self, values: Mapping[str, np.ndarray]) -> View:
+        """Return the view with these values; raises `InputError` for impossible ones."""
+        if not self.names:
+            return self.aimed
+        all_values = {**self._values, **values}
+        camera = self.aimed.camera.moved(all_values["translation"], all_values["rotation"])
+        if isinstance(camera, Perspective):
+            camera = replace(camera, field_of_view=float(all_values["field_of_view"]))
+        elif isinstance(camera, Orthographic):
+            camera = replace(camera, width=float(all_values["width"]))
+        return Volume(camera, float(all_values["extinction"]), self.aimed.background)
+
+    def tangent(self, values: Mapping[str, np.ndarray], directions: Mapping[str, np.ndarray]) -> ViewTangent:
+        """Return the change of the view with these values along directions of some of them."""
+        from scipy.spatial.transform import Rotation
+
+        rotation: Vector = ZERO
+        if "rotation" in directions:
+            at = np.asarray(values["rotation"])
+            further = Rotation.from_rotvec(at + NUDGE * directions["rotation"])
+            rotation = tuple((further * Rotation.from_rotvec(at).inv()).as_rotvec() / NUDGE)
+        half_width = (0.5 * float(directions.get("width", 0.0)), 0.0)
+        if "field_of_view" in directions:
+            half_angle = np.radians(0.5 * float(values["field_of_view"]))
+            half_width = (0.0, float(np.radians(0.5 * directions["field_of_view"]) / np.cos(half_angle) ** 2))
+        translation = tuple(directions.get("translation", ZERO))
+        return ViewTangent(translation, rotation, half_width, float(directions.get("extinction", 0.0)))
+
+    @property
+    def _values(self) -> dict[str, np.ndarray]:
+        """All numbers of the aimed view, by name."""
+        camera = self.aimed.camera
+        found = {"translation": np.zeros(3), "rotation": np.zeros(3), "extinction": np.array(self.aimed.extinction)}
+        if isinstance(camera, Perspective):
+            found["field_of_view"] = np.array(camera.field_of_view)
+        elif isinstance(camera, Orthographic):
+            found["width"] = np.array(camera.width)
+        return found

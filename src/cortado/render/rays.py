@@ -50,7 +50,7 @@ def camera_type(precision: Precision) -> Any:
 
 @cache
 def camera_tangent_type(precision: Precision) -> Any:
-    """Return the Warp struct of a view's change; see `cortado.render.views.ViewTangent`."""
+    """Return the Warp struct of a view's change; see `cortado.render.cameras.ViewTangent`."""
     real, vector = precision.real, precision.vector
 
     class CameraTangent:

@@ -1,14 +1,18 @@
-"""States that a run keeps on its way forward, so that another way may lead back, and one that it goes on from."""
+"""States that a run keeps on its way forward, so that another way may lead back, and one that it goes on from.
+
+Protocols say what is computed of states while they are on the device: beside each step, and behind each chunk.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from math import isqrt
+from typing import Protocol
 
 import numpy as np
 
 from cortado.errors import InputError
-from cortado.particles.state import State, StateSeries
+from cortado.particles.state import Parameters, State, StateSeries
 from cortado.rollout.step_sizes import StepSizes
 
 MEMORY_BUDGET = 8 * 2**30
@@ -100,3 +104,22 @@ class Progress:
             return dict(found)
         n = self.step
         return {name: np.concatenate([self.diagnostics[name][:n], column[n:]]) for name, column in found.items()}
+
+
+class Beside(Protocol):
+    """Launches beside the steps of a chunk, which are captured with them."""
+
+    def launch(self, step: int, parameters: Parameters) -> None:
+        """Launch what reads the solver's arrays after a step of a chunk, counted from 0."""
+
+
+class ChunkReader(Protocol):
+    """A reader of the states of a run on the device, chunk by chunk."""
+
+    @property
+    def beside(self) -> Beside | None:
+        """Return what is to be launched beside each step; None for nothing."""
+
+    def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
+        """Read the states at which steps ``step`` to ``end`` began, the ``first`` and those ``later``; the next chunk
+        overwrites them."""

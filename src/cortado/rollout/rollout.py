@@ -22,8 +22,7 @@ from cortado.device.reduction import add
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Parameters, State, StateSeries
-from cortado.rollout.checkpoints import MEMORY_BUDGET, Checkpoints, Progress, checkpoint_interval
-from cortado.rollout.chunk_reader import Beside, ChunkReader
+from cortado.rollout.checkpoints import MEMORY_BUDGET, Beside, Checkpoints, ChunkReader, Progress, checkpoint_interval
 from cortado.rollout.divergence import diverged
 from cortado.rollout.step_sizes import StepSizes
 from cortado.scene.restart import Clock, Origin

@@ -1,14 +1,15 @@
-"""Sensors of pressure at a point, of a flow through a plane, of loads on walls and solids; those that a scene names."""
+"""Sensors of pressure at a point, of a flow through a plane, of loads on walls and solids; those that a scene names;
+and warnings of sensors that stand where no fluid can be."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cortado.calls import fixed
-from cortado.discretise.shapes import in_space
-from cortado.errors import InputError, shown
+from cortado.discretise.shapes import Points, corners, grid, in_space
+from cortado.errors import InputError, shown, warn
 from cortado.runs.particle_sums import (
     ACROSS,
     Around,
@@ -21,20 +22,11 @@ from cortado.runs.particle_sums import (
     parts_of,
     reach_of,
 )
-from cortado.runs.sensor import (
-    Cut,
-    Reading,
-    SensedScene,
-    Sensor,
-    corner,
-    direction,
-    in_dimension,
-    point,
-    positive,
-)
+from cortado.runs.sensor import Cut, Reading, SensedScene, Sensor, corner, direction, in_dimension, point, positive
 from cortado.runs.wave_gauge import WaveGauge
-from cortado.scene.quantity_names import load_name
+from cortado.scene.parameters import load_name
 from cortado.scene.scene import Scene
+from cortado.words import point_in_words
 
 
 @fixed
@@ -203,3 +195,200 @@ def sensors_of(scene: Scene) -> dict[str, Sensor]:
         table.name: SENSORS[table.kind](**table.model_dump(exclude={"name", "kind"}), **upwards.get(table.kind, {}))
         for table in scene.sensor
     }
+
+
+MOST_CELLS = 200_000
+"""Most cells of half a spacing that are looked at; a larger container is not judged."""
+DEEP = 0.01
+"""In spacings: a place that is less deep in a wall or a solid is on its surface."""
+
+
+def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_]:
+    """Test (n,) which points (n, d) [m] no way leads to from particles (m, d) [m] through cells half a spacing wide, in
+    a container without periods and emitters. Solids at rest are in the way, moving ones are not."""
+    from scipy.ndimage import label
+
+    nowhere, ends = np.zeros(len(points), dtype=bool), scene.container.extent()
+    solids = [table.solid() for table in scene.solid if not table.moves]
+    if ends is None or not solids or scene.emitter is not None or any(scene.periods[1]):
+        return nowhere
+    lower, upper = np.array(ends, dtype=np.float64)
+    counts = np.maximum(np.ceil((upper - lower) / (0.5 * scene.discretisation.spacing)), 1.0)
+    if np.prod(counts) > MOST_CELLS:
+        return nowhere
+    shape, cells = tuple(counts.astype(int)), (upper - lower) / counts
+    middles = lower + (np.indices(shape).reshape(len(shape), -1).T + 0.5) * cells
+    taken = np.any([one.distance_up_to(middles, float(cells.max())) <= 0.0 for one in solids], axis=0)
+    names, _ = label(~taken.reshape(shape), np.ones((3,) * len(shape)))
+
+    def named(places: Points) -> NDArray[np.int_]:
+        return np.asarray(names[tuple(np.clip((places - lower) // cells, 0, counts - 1).astype(int).T)])
+
+    found = named(points)
+    return (found > 0) & ~np.isin(found, named(fluid))
+
+
+MOST = 16
+"""Most points along an axis by which planes and columns are looked at."""
+
+
+class Prepared(Cut, Protocol):
+    """A simulation as checks of sensors see it."""
+
+    @property
+    def scene(self) -> Scene:
+        """Return the scene that is simulated."""
+
+    @property
+    def positions(self) -> Points:
+        """Return first positions (n, d) [m]."""
+
+    @property
+    def walls(self) -> Points:
+        """Return wall particles (b, d) [m]."""
+
+
+def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
+    """Warn of sensors, by their names, from which the scene, as it begins, keeps all fluid away."""
+    for name, sensor in sensors.items():
+        found = _doubt(simulation, sensor)
+        if found is not None:
+            warn(f"the sensor {name!r} {found}.")
+
+
+def _doubt(simulation: Prepared, sensor: Any) -> str | None:
+    """Say why a sensor may never see fluid; None where it may, and for sensors that are not Cortado's own."""
+    scene, spacing = simulation.scene, simulation.scene.discretisation.spacing
+    if isinstance(sensor, WallForce):
+        return _without_walls(simulation, sensor)
+    if not isinstance(sensor, PressureProbe | WaveGauge | FlowRate):
+        return None
+    place = sensor.position
+    if len(place) != scene.dimension:
+        return None  # refused where it is read
+    there = _what_is_at(simulation, _looked_at(scene.container.extent() or _of_things(simulation), sensor))
+    key = "reach" if isinstance(sensor, FlowRate) else "radius"
+    if all(there):
+        what = {PressureProbe: "is at", WaveGauge: "has its column at", FlowRate: "has its plane through"}[type(sensor)]
+        reads = f"its floor, {sensor.floor:g} m" if isinstance(sensor, WaveGauge) else "0"
+        names = " and ".join(dict.fromkeys(filter(None, there)))
+        reads += f", or what is within its {key}"
+        return f"{what} {point_in_words(place)} m, {names}: it reads {reads}{_in_metres(scene, place)}"
+    wide = getattr(sensor, key)
+    if wide is not None and wide < 0.5 * spacing:
+        return f"has a {key} of {wide:g} m, less than half a spacing of {spacing:g} m: it sees next to no particles"
+    if scene.container.extent() is None:
+        return _far_away(simulation, sensor, reach_of(wide, simulation))
+    return _of_column(simulation, sensor) if isinstance(sensor, WaveGauge) else _too_wide(scene, key, wide)
+
+
+def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
+    """Say that a sensor without a container is further from fluid and solids than its reach and their own size."""
+    ends = _of_things(simulation)
+    points = _looked_at(ends, sensor)
+    gap = float(np.linalg.norm(points - np.clip(points, *ends), axis=1).min())
+    if isinstance(sensor, FlowRate):
+        off = (corners(*ends) - sensor.position) @ sensor.normal
+        gap = max(float(off.min()), float(-off.max()), 0.0)
+    size = float(np.linalg.norm(ends[1] - ends[0]))
+    if gap <= reach + size:
+        return None
+    begins = f"the fluid and the solids, which begin from {point_in_words(ends[0])} to {point_in_words(ends[1])} m"
+    return f"is {gap:.4g} m from {begins}: it reads nothing unless fluid comes so far (positions are in metres)"
+
+
+def _of_things(simulation: Prepared) -> tuple[Points, Points]:
+    """Return the box around fluid and walls as they begin, lower and upper (d,) [m]."""
+    points = np.concatenate([simulation.positions, simulation.walls])
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
+    """Say that a gauge's column does not begin at the bottom of the container, or reaches far beyond it."""
+    scene, ends = simulation.scene, simulation.scene.container.extent()
+    assert ends is not None
+    heights = corners(*ends) @ gauge.up
+    bottom, top = float(heights.min()), float(heights.max())
+    if gauge.floor > top:
+        return f"has its floor at {gauge.floor:g} m, above the container, which ends at {top:g} m"
+    foot = gauge.position + (gauge.floor - gauge.position @ gauge.up) * gauge.up
+    near = 0.5 * scene.discretisation.spacing
+    stands = any(table.solid().distance_up_to(foot[None], near)[0] < near for table in scene.solid)
+    if abs(gauge.floor - bottom) > near and not stands:
+        reads = f"{abs(gauge.floor - bottom):g} m {'more' if gauge.floor > bottom else 'less'} than the level"
+        return f"has its floor at {gauge.floor:g} m, but the container begins at {bottom:g} m: it reads {reads} there"
+    return _too_wide(scene, "radius", gauge.radius)
+
+
+def _too_wide(scene: Scene, key: str, wide: float | None) -> str | None:
+    """Say that a reach is larger than a container without periods."""
+    ends = scene.container.extent()
+    if wide is None or ends is None or any(scene.periods[1]):
+        return None
+    size = float(np.linalg.norm(np.subtract(*ends)))
+    if wide <= size:
+        return None
+    return f"has a {key} of {wide:g} m, more than the container, which is {size:g} m across: it reads no place in it"
+
+
+def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
+    """Return points (n, d) of a sensor within a box (2, d), of which fluid has to reach one [m]."""
+    place = sensor.position
+    if isinstance(sensor, PressureProbe):
+        return np.array([place])
+    around = corners(*ends)
+    if isinstance(sensor, WaveGauge):
+        heights = (around - place) @ sensor.up
+        return np.asarray(place + np.linspace(heights.min(), heights.max(), 4 * MOST)[1:-1, None] * sensor.up)
+    off = (around - place) @ sensor.normal
+    if off.min() > 0.0 or off.max() < 0.0:
+        return np.array([place])
+    points = grid([np.linspace(a, b, MOST)[1:-1] for a, b in zip(*ends, strict=True)])
+    return np.asarray(points - ((points - place) @ sensor.normal)[:, None] * sensor.normal)
+
+
+def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
+    """Say what keeps fluid away from each of the points (n, d) [m]; None where nothing does."""
+    scene = simulation.scene
+    d, deep = scene.dimension, DEEP * scene.discretisation.spacing
+    region, ends = scene.container.region(d).opened(scene.container.periods(d)[1]), scene.container.extent()
+    found: list[str | None] = [None] * len(points)
+    if ends is not None:
+        where = f"outside of the container, which is from {point_in_words(ends[0])} to {point_in_words(ends[1])} m"
+        found = [None if inside else where for inside in region.contains(points, deep)]
+    domain = scene.container.domain(d)
+    for table in scene.solid:
+        solid, middle = table.solid(), table.middle()
+        near = middle + domain.shortest(points - middle)
+        called = f"in the solid {table.name!r}{', where it begins' if table.moves else ''}"
+        for k in np.flatnonzero(solid.distance(near) < -deep):
+            found[k] = found[k] or called
+    free = np.array([k for k, what in enumerate(found) if what is None], dtype=int)
+    for k in free[is_shut_off(scene, simulation.positions, points[free])]:
+        found[k] = "shut off from all fluid by solids"
+    return found
+
+
+def _in_metres(scene: Scene, place: Points) -> str:
+    """Return a hint where a place is far outside, as it would be in millimetres."""
+    ends = scene.container.extent()
+    if ends is None or np.abs(place).max() <= 10.0 * np.abs(ends).max():
+        return ""
+    return " (positions are in metres)"
+
+
+def _without_walls(simulation: Prepared, sensor: WallForce) -> str | None:
+    """Say that no particle is in a region which could push walls."""
+    walls, d = simulation.walls, simulation.scene.dimension
+    lower = np.full(d, -np.inf) if sensor.lower is None else sensor.lower
+    upper = np.full(d, np.inf) if sensor.upper is None else sensor.upper
+    if len(lower) != d or len(upper) != d:
+        return None  # refused where it is read
+    if not len(walls):
+        return "reads forces on walls, but the scene has none: it reads 0"
+    reach = simulation.lattice.support + 0.5 * simulation.scene.discretisation.spacing
+    if simulation.lattice.domain.within(walls, lower - reach, upper + reach)[1].any():
+        return None
+    ends = " to ".join(point_in_words(end) for end in (walls.min(axis=0), walls.max(axis=0)))
+    region = f"from {point_in_words(lower)} to {point_in_words(upper)} m"
+    return f"looks at a region {region} without walls: all are within {ends} m, and it reads 0"

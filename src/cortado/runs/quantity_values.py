@@ -33,7 +33,7 @@ from cortado.runs.quantity_formulas import (
 )
 from cortado.runs.wall_loads import SolidLoadQuantity, WallForceQuantity, WallLoads
 from cortado.scene.parameter_values import Arrays
-from cortado.scene.quantity_names import LOAD, QUANTITIES, check_quantity, is_load, load_name
+from cortado.scene.parameters import LOAD, QUANTITIES, check_quantity, is_load, load_name
 from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
@@ -126,7 +126,7 @@ class QuantityEvaluator:
     use meanwhile. Its arguments and results are in the scene's order, of a batch with a first axis for the scenes."""
 
     def __init__(self, solver: Solver, scene: Scene, circulation_factor: float):
-        """Take a solver; ``circulation_factor`` is that of `cortado.discretise.calibration`. Raises `InputError` for a
+        """Take a solver; ``circulation_factor`` is that of `cortado.discretise.smoothing`. Raises `InputError` for a
         solver without particles."""
         if not isinstance(solver, ParticleSolver):
             raise InputError("The solver of this scene does not say what lies around its particles: no quantities.")

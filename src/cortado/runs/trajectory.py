@@ -18,10 +18,18 @@ from cortado.files import vtkhdf
 from cortado.files.disk import as_path
 from cortado.files.image_encoding import ShadedPicture
 from cortado.lazy import on_top
-from cortado.runs.frames import FRACTION, Film, Marks, append_frame, fraction_names, frame_writer
+from cortado.runs.frames import (
+    FRACTION,
+    Film,
+    Marks,
+    SolidMotions,
+    append_frame,
+    fraction_names,
+    frame_writer,
+    motions_in,
+)
 from cortado.runs.sensor import Readings
-from cortado.runs.solid_motion import SolidMotions, motions_in
-from cortado.scene.quantity_names import QUANTITIES, check_quantity
+from cortado.scene.parameters import QUANTITIES, check_quantity
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.scene import Scene
 from cortado.words import counted

@@ -6,7 +6,7 @@ Particle i pushes walls, those of one solid or all, with
 
 where A_i is the sum over wall particles along which its pressure acts (``wall_push`` of
 `cortado.solvers.particles.ParticleSolver`), a_i the acceleration that they give it by a force such as viscosity, and
-B_i the part of images (`cortado.solvers.projection.image_loads`), if walls mirror. The walls so get what momentum the
+B_i the part of images (`cortado.solvers.projection.mean_stress`), if walls mirror. The walls so get what momentum the
 fluid loses to them: the mass of a particle is m_i s^d, with the spacing s.
 """
 
@@ -29,8 +29,8 @@ from cortado.runs.particle_sums import in_the_scene
 from cortado.runs.quantity_formulas import Particles, Sums, vectors
 from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.particles import ParticleSolver
+from cortado.sph.density import WallAction
 from cortado.sph.parts import StepContext, Tangents
-from cortado.sph.walls import WallAction
 
 
 @cache

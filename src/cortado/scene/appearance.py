@@ -14,7 +14,7 @@ from pydantic import Field, SerializationInfo, ValidationInfo, field_serializer,
 from cortado.calls import public
 from cortado.discretise.shapes import Points
 from cortado.errors import Words
-from cortado.scene.quantity_names import NAMES
+from cortado.scene.parameters import NAMES
 from cortado.scene.tables import (
     MISSING,
     Colour,

@@ -13,7 +13,7 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.solid import Solid
 from cortado.errors import InputError, Words, shown
-from cortado.scene.emitter import EmitterTable
+from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
 from cortado.scene.model import MixtureTable, SceneTables, SolidLoadTable
 from cortado.scene.motions import free

@@ -10,11 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.calibration import lattice_laplacian_correction, pressure_stiffness, rest_volume, wall_response
 from cortado.discretise.packing import Packing
 from cortado.discretise.room import Domain, Region, Room
 from cortado.discretise.shapes import Points, Rows, check_crowding
-from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
+from cortado.discretise.smoothing import (
+    SmoothingKernel,
+    lattice_laplacian_correction,
+    pressure_stiffness,
+    rest_volume,
+    smoothing_kernel,
+    wall_response,
+)
 from cortado.discretise.solid import Placed
 from cortado.discretise.solid_walls import ContainerWalls, ExposedSurface, WallPoints, solid_places
 from cortado.discretise.walls import (
@@ -201,7 +207,7 @@ class Lattice:
     response: float
     """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.steps`."""
     laplacian_correction: float
-    """[-], see `cortado.discretise.calibration.lattice_laplacian_correction`."""
+    """[-], see `cortado.discretise.smoothing.lattice_laplacian_correction`."""
     domain: Domain
     """The axes along which it repeats, with their periods."""
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cortado.discretise.room import Region, Room
 from cortado.discretise.shapes import EXCESS, Points, apart, grid, pairs_within
 from cortado.errors import InputError
-from cortado.scene.emitter import EmitterSample
+from cortado.scene.emitter_table import EmitterSample
 from cortado.scene.fluids import ALIGNED, Fluid, PointsFluid, RegionFluid
 from cortado.scene.scene import Scene
 

@@ -13,7 +13,7 @@ from pydantic import Field, ValidationInfo, create_model, field_validator, model
 from cortado.discretise.room import Domain, Region, Room
 from cortado.discretise.shapes import Points
 from cortado.scene.appearance import LIQUIDS, Coloured, Picture, Render
-from cortado.scene.emitter import EmitterTable
+from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.fluids import AnyFluid, turned
 from cortado.scene.motions import Schedule
 from cortado.scene.packages import AnyForces

@@ -141,7 +141,7 @@ def main(path: str) -> int:
 
 
 SUFFIXES = (".npy", *READERS)
-MOST_BYTES = 2**30
+MOST_POINT_BYTES = 2**30
 """Most bytes of a file of points."""
 SECONDS, BYTES_PER_SECOND = 15.0, 5e6
 """How long a file may take to be read at most: this long, and its size over this pace."""
@@ -152,7 +152,7 @@ def read_points(path: str, dimension: int) -> Points:
     if Path(path).suffix not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}.")
     try:
-        stat = regular_file(path, MOST_BYTES)
+        stat = regular_file(path, MOST_POINT_BYTES)
     except OSError as problem:
         raise InputError(f"{path!r} cannot be opened ({reason(problem)}).") from None
     return _read(path, dimension, stat.st_mtime_ns, stat.st_size)

@@ -5,9 +5,8 @@ from math import inf, sqrt
 
 import numpy as np
 
-from cortado.discretise.calibration import pairwise_rate, stress_rate
 from cortado.discretise.shapes import Points
-from cortado.discretise.smoothing import smoothing_kernel
+from cortado.discretise.smoothing import pairwise_rate, smoothing_kernel, stress_rate
 from cortado.scene.model import SceneTables
 from cortado.scene.motions import free, greatest_speed, moving, position_name, rotation_name, scale_name, told
 from cortado.scene.parameter_values import Arrays, Tilt

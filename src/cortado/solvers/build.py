@@ -12,10 +12,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from cortado.code_words import code_words
-from cortado.device.grid import Grid
+from cortado.device.cells import Grid
 from cortado.device.lanes import lanes_for
 from cortado.device.precision import Precision
-from cortado.discretise.calibration import SKIN
+from cortado.discretise.smoothing import SKIN
 from cortado.discretise.solid import Hollow, Mass, Solid
 from cortado.errors import InputError, shown
 from cortado.particles.mirrors import MOST_FACES, most_imaged
@@ -24,7 +24,6 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout, padded
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
-from cortado.scene.flat_faces import ON, FlatFaces, flat_faces
 from cortado.scene.fluid_particles import reserve_offset
 from cortado.scene.motions import motion_parameters, moving, solid_frames, wall_numbers
 from cortado.scene.parameter_values import REGISTRY, Known, checked_value
@@ -34,7 +33,7 @@ from cortado.scene.shape_tables import NoContainer
 from cortado.scene.solids import SolidTable
 from cortado.scene.solvers import OWN, PackageSolver, SolverTable
 from cortado.solvers.contacts import Contacts, Touching
-from cortado.solvers.obstacles import FINE, NamedSolid, Obstacle, Walled
+from cortado.solvers.obstacles import FINE, ON, FlatFaces, NamedSolid, Obstacle, Walled, flat_faces
 from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.solver import Solver
 from cortado.sph.diffusion import Diffusion
@@ -45,7 +44,7 @@ from cortado.sph.mixture import Phases
 from cortado.sph.moving_solids import MovingSolids
 from cortado.sph.own_force import Rheology
 from cortado.sph.parts import Force, Part, PartMaker, Setting
-from cortado.sph.viscosity_law import LAWS
+from cortado.sph.stress_forces import LAWS
 
 
 class ForceMaker(Protocol):

@@ -16,23 +16,21 @@ from cortado.calls import Staying
 from cortado.device.launching import KernelLauncher
 from cortado.device.memory import gradient_parts
 from cortado.device.threads import Turn
-from cortado.discretise.calibration import SKIN
 from cortado.discretise.shapes import Points
+from cortado.discretise.smoothing import SKIN
 from cortado.errors import MissingDerivativeError
 from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import POSITIONS, VELOCITIES, Fields, Layout, Parameters, State, StateField, check_fields
 from cortado.scene.discrete_scene import Lattice
-from cortado.scene.flat_faces import FlatFaces
 from cortado.solvers.containment import Containment
 from cortado.solvers.loop import IterationLog, Loop, convergence_kernels
-from cortado.solvers.obstacles import NamedSolid, Walled
+from cortado.solvers.obstacles import FlatFaces, NamedSolid, Walled
 from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint, StepTangent
-from cortado.sph.density import Density
+from cortado.sph.density import Density, WallAction, WallSums, wall_slope_term
 from cortado.sph.integration import integration_kernels
 from cortado.sph.parts import Carried, Force, Part, PartMaker, StepContext
-from cortado.sph.walls import WallAction, WallSums, wall_slope_term
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,7 @@ class ParticleSolver(Staying):
         return WallSums(wall_slope_term(self.discretisation), self.layout)
 
     def image_loads(self) -> Any:
-        """Return what walls that mirror get beside `wall_push`: `cortado.solvers.projection.image_loads.ImageLoads`;
+        """Return what walls that mirror get beside `wall_push`: `cortado.solvers.projection.mean_stress.ImageLoads`;
         None where none does."""
         return None
 

@@ -22,8 +22,7 @@ import warp as wp
 
 from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
-from cortado.discretise.calibration import laplacian_rate
-from cortado.discretise.smoothing import smoothing_kernel
+from cortado.discretise.smoothing import laplacian_rate, smoothing_kernel
 from cortado.errors import OutOfRangeError
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of

@@ -43,8 +43,8 @@ from cortado.sph.function_text import keep_source, plain_function, source_of
 from cortado.sph.moment_functions import matrix_type
 from cortado.sph.own_arrays import READ_AS, Tables
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
+from cortado.sph.stress_forces import Law, check_law
 from cortado.sph.stress_kernels import VelocityGradients, gradient_functions
-from cortado.sph.viscosity_law import Law, check_law
 from cortado.sph.viscous_stress import ViscousStress, stress_of
 
 

@@ -174,9 +174,9 @@ class Force(Protocol):
         """Add to the adjoints ``bar`` of the force's inputs, given that of the acceleration, (n,) vectors. A force
         whose own acceleration depends on ``before`` returns the adjoint of that; it says ``is_last = True``, and comes
         after all others. One that solves a system of equations has what does so as ``solve``: see
-        `cortado.solvers.loop`. One with which walls act on fluid has what they do, a `cortado.sph.walls.WallAction`, as
-        ``wall_action``, or loads on solids lack it. Where that does not act at the particle, ``wall_couple`` is another
-        one, of the sum of y x a, with which a acts at x_i - y."""
+        `cortado.solvers.loop`. One with which walls act on fluid has what they do, a `cortado.sph.density.WallAction`,
+        as ``wall_action``, or loads on solids lack it. Where that does not act at the particle, ``wall_couple`` is
+        another one, of the sum of y x a, with which a acts at x_i - y."""
 
 
 class PartTangent:

@@ -54,8 +54,7 @@ from cortado.particles.wall_terms import solid_kernel
 from cortado.sph.formula import theta_of
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.stress_forces import contact_functions, stress_sums, stress_work, work_types
-from cortado.sph.viscosity_law import Law, newtonian_law
+from cortado.sph.stress_forces import Law, contact_functions, newtonian_law, stress_sums, stress_work, work_types
 
 LEAST_VISCOSITY = 1e-12
 """The number added to viscosities [Pa s]: the mean of their reciprocals is finite where there is none."""

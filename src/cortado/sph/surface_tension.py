@@ -1,4 +1,4 @@
-"""Surface tension: by curvature (`cortado.sph.curvature_kernels`), and with PCISPH as a force of pairs, a stress (the
+"""Surface tension: by curvature (`cortado.sph.curvature`), and with PCISPH as a force of pairs, a stress (the
 continuum surface stress of Lafaurie et al. 1994, between particles):
 
     n_i = (1 / N) sum_j (1 - s)^2 x_ij,   s = |x|^2 / h^2
@@ -29,7 +29,7 @@ import warp as wp
 
 from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
-from cortado.discretise.calibration import lattice_offsets
+from cortado.discretise.smoothing import lattice_offsets
 from cortado.errors import warn
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation
@@ -37,8 +37,7 @@ from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.particles.particle_kernels import sum_kernel, sum_kernels
 from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
-from cortado.sph.curvature import CurvatureConstants
-from cortado.sph.curvature_kernels import curvature_kernels, entries
+from cortado.sph.curvature import CurvatureConstants, curvature_kernels, entries
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 
 PART = 2.0 / 3.0

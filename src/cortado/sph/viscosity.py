@@ -23,9 +23,9 @@ from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, rubbing_sum, tangent_of
 from cortado.particles.particle_kernels import sum_kernels
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm
+from cortado.sph.density import WallSums
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.viscous_stress import ViscousStress, stress_of
-from cortado.sph.walls import WallSums
 
 
 @cache

@@ -8,7 +8,7 @@ velocities at the start, what acts at the end of a step is a' of
 
     a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y),
 
-which `cortado.sph.conjugate_gradients` solves to round-off. B is symmetric and positive with respect to the product
+which `cortado.sph.moment_functions` solves to round-off. B is symmetric and positive with respect to the product
 sum_i m_i a_i . b_i. mu is that of the velocities v at the start, the stress that of u = v + dt a' at the end. So the
 derivatives are those of the solution, whatever way led to it: the tangent is one more solve with B, and so is the
 adjoint, as B is symmetric in the product weighted with masses.
@@ -27,7 +27,7 @@ from cortado.device.launching import Named
 from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import Precision
 from cortado.device.reduction import add
-from cortado.discretise.calibration import stress_control
+from cortado.discretise.smoothing import stress_control
 from cortado.errors import MissingDerivativeError
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import over, particle_kernel
@@ -36,14 +36,12 @@ from cortado.particles.wall_terms import WallTerm, WorkMaker
 from cortado.scene.parameters import Parameter
 from cortado.scene.scene import Scene
 from cortado.scene.stability import is_implicit
-from cortado.sph.conjugate_gradients import ConjugateGradients, round_off
+from cortado.sph.density import WallSums
 from cortado.sph.formula import Packed, compiled
-from cortado.sph.moment_functions import matrix_type
+from cortado.sph.moment_functions import ConjugateGradients, matrix_type, round_off
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.stress_forces import stress_couple_work, stress_sums, stress_work
+from cortado.sph.stress_forces import Law, newtonian_law, stress_couple_work, stress_sums, stress_work
 from cortado.sph.stress_kernels import moment_sums, stress_kernels, stress_solid_kernels, traction_function
-from cortado.sph.viscosity_law import Law, newtonian_law
-from cortado.sph.walls import WallSums
 
 CLOSEST = 0.25
 """In spacings: walls without slip pull no harder on particles that are closer, see `cortado.sph.stress_forces`."""
@@ -168,7 +166,7 @@ class ViscousStress:
 
 
 class StressWalls:
-    """The sums by which walls act on particles through viscous stress: a `cortado.sph.walls.WallAction`."""
+    """The sums by which walls act on particles through viscous stress: a `cortado.sph.density.WallAction`."""
 
     def __init__(self, setting: Setting, stress: ViscousStress, work: WorkMaker, bar: str):
         """Take ``work`` and ``bar`` of its `WallTerm`: `stress_work` for accelerations, `stress_couple_work` for their

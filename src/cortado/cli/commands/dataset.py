@@ -21,18 +21,9 @@ from cortado.errors import (
     warn,
 )
 from cortado.files.disk import LOCK, UNFINISHED, locked, sentences, write_atomically
-from cortado.files.interruption import keeping
-from cortado.files.terminal import track, untracked
+from cortado.files.terminal import keeping, track, untracked
 from cortado.optimisation.dataset_files import PARTS, DatasetFolder, metadata
-from cortado.optimisation.datasets import (
-    KINDS,
-    MORE_FLUID,
-    DatasetTable,
-    DatasetTables,
-    Sample,
-    bounds_of,
-    one_run,
-)
+from cortado.optimisation.datasets import KINDS, MORE_FLUID, DatasetTable, DatasetTables, Sample, bounds_of, one_run
 from cortado.runs.run_folder import differences, read_json
 from cortado.scene.scene import Scene, load_scene
 from cortado.scene.tables import MISSING

@@ -1,9 +1,11 @@
-"""``cortado describe``: a scene before it is run: particles, limits of the time step, memory, time, and the film."""
+"""``cortado describe``: a scene before it is run: particles, limits of the time step, memory, time, and the film; and
+``cortado gradients check``, the certificate of a scene."""
 
 import json
 import math
 import time
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -12,14 +14,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.arrays import check_steps
+from cortado.certificate import Certificate, certify
 from cortado.device.memory import frame_parts, gradient_parts, simulation_parts, step_parts
 from cortado.discretise.shapes import EXCESS
-from cortado.errors import ComputationError, DivergedError, InputError
+from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.files.disk import make_folder
-from cortado.files.terminal import timed_note
-from cortado.optimisation.inverse.task import load_task, task_in_words
+from cortado.files.terminal import tell, timed_note
+from cortado.losses import CentreOfMass, FinalPositions, Image, Loss
+from cortado.optimisation.inverse.task_files import load_task, task_in_words
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.painter import colours_of, painter, plan
+from cortado.problem import Problem
 from cortado.rollout.checkpoints import MEMORY_BUDGET
 from cortado.rollout.parameter_space import steps_of_run
 from cortado.rollout.rollout import Rollout
@@ -40,8 +46,6 @@ MANY = 1_000_000
 """Number of particles that is announced before they are made, as that takes some seconds or minutes."""
 FIRST_STEPS, MOST_STEPS, ENOUGH = 4, 100, 0.5
 """Steps that are timed: a few, or more if they are fast, until they take so many seconds together."""
-
-
 SAME = 1e-6
 """Relative difference of a time step that was rounded to float32."""
 MOST_FRAMES = 1_000_000
@@ -391,3 +395,56 @@ def _bytes(size: float | None) -> str:
     if size is None:
         return "unknown"
     return f"about {size / 1e9:.2g} GB" if size >= 1e9 else f"about {max(size / 1e6, 0.1):.2g} MB"
+
+
+LOSSES = ("positions", "centre-of-mass", "image")
+
+
+def check_scene(
+    scene_file: Path,
+    steps: int,
+    parameters: Sequence[str],
+    loss: str,
+    perturbation: float,
+    out: Path | None,
+    overrides: list[str],
+    device: str,
+    as_json: bool,
+    seed: int,
+) -> str:
+    """Compute the certificate of a scene's gradients as text; raise `ComputationError` when an adjoint is wrong."""
+    if loss not in LOSSES:
+        raise InputError(f"--loss is {shown(loss)}, but must be one of {', '.join(LOSSES)}.")
+    scene = load_scene(scene_file, overrides).lasting(steps=check_steps(steps))
+    simulation = Simulation(scene, device, "float64")
+    problem = Problem(simulation, steps, _loss(loss, simulation))
+    if out is not None:
+        make_folder(out)
+    certificate = certify(problem, parameters, perturbation, seed)
+    found = json.dumps(certificate.as_dict(), indent=2)
+    text = found if as_json else f"Loss: {loss}.\n{certificate}"
+    if out is not None:
+        text += _written(certificate, found, out, as_json)
+    if not certificate.right:
+        tell(text)
+        raise ComputationError(f"The adjoint is wrong for: {', '.join(certificate.wrong)}.")
+    return text
+
+
+def _loss(name: str, simulation: Simulation) -> Loss:
+    """Make the loss of a name: how far the fluid has come from where it starts."""
+    if name == "positions":
+        return FinalPositions(simulation.positions)
+    if name == "centre-of-mass":
+        return CentreOfMass(simulation.positions.mean(axis=0))
+    renderer = simulation.renderer()
+    return Image(renderer, renderer.render(simulation.initial))
+
+
+def _written(certificate: Certificate, found: str, out: Path, as_json: bool) -> str:
+    from cortado.files.disk import write_atomically
+    from cortado.pictures.run_pictures import gradient_check
+
+    gradient_check(certificate, out / "certificate.png")
+    write_atomically(out / "certificate.json", found.encode())
+    return "" if as_json else f"\nThe results are in {out.resolve()}"

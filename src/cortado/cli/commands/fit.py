@@ -11,7 +11,7 @@ from cortado.files.disk import locked
 from cortado.files.terminal import announce, track
 from cortado.optimisation.fitting.figures import profile_figure, residual_figure, video_figures
 from cortado.optimisation.fitting.fit import NOISE_ALONE, Fit, Profile, fit, unit_of
-from cortado.optimisation.inverse.fit_task import FitTask, load_fit
+from cortado.optimisation.inverse.solved_task import FitTask, load_fit
 from cortado.pictures.pages import Section, write_report
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.scene import scene_in_words

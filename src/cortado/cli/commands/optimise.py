@@ -23,9 +23,8 @@ from cortado.cli.commands.options import HERE, Where
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
 from cortado.files.disk import locked
-from cortado.files.interruption import keeping
-from cortado.files.terminal import announce, say, track
-from cortado.losses.image_losses import psnr
+from cortado.files.terminal import announce, keeping, say, track
+from cortado.image_losses import psnr
 from cortado.optimisation.inverse.solved_task import (
     TaskFigures,
     begin_shaded,
@@ -33,7 +32,7 @@ from cortado.optimisation.inverse.solved_task import (
     shaded_figures,
     task_figures,
 )
-from cortado.optimisation.inverse.task import Setup, Task, load_task, setup
+from cortado.optimisation.inverse.task_files import Setup, Task, load_task, setup
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.pictures.film import lacking
 from cortado.pictures.pages import Section, write_report

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cortado.optimisation.inverse.solved_task import KnotValues, TaskFigures, component_names
-from cortado.optimisation.inverse.task import Setup, Task, task_in_words
+from cortado.optimisation.inverse.task_files import Setup, Task, task_in_words
 from cortado.optimisation.optimise import Result
 from cortado.pictures.pages import MOST_NUMBERS, Section, written
 from cortado.pictures.particle_view import scene_view

@@ -11,7 +11,7 @@ import numpy as np
 from cortado.errors import CortadoError, InputError, shown
 from cortado.executors import Distributed, Executor, InProcess, local_workers, require_processes
 from cortado.files.disk import LOCK
-from cortado.files.interruption import keeping
+from cortado.files.terminal import keeping
 from cortado.optimisation.sweep import folders_in
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory

@@ -9,12 +9,12 @@ from typing import Any
 
 from cortado.cli.commands.options import named_runs
 from cortado.errors import InputError
-from cortado.files.interruption import keeping
+from cortado.files.terminal import keeping
 from cortado.pictures.export_formats import export
 from cortado.pictures.film import ShownRun, coloured_by, film
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.run_pictures import device_of, run_page
-from cortado.pictures.side_by_side import labels, runs_page, shown_alike
+from cortado.pictures.several_runs import labels, runs_page, shown_alike
 from cortado.runs.frames import common_rate, pace_of
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory

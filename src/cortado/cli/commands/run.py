@@ -17,8 +17,7 @@ from cortado.device.memory import frame_parts, require
 from cortado.device.modules import compile_ahead
 from cortado.errors import DivergedError, InputError, warn
 from cortado.files.disk import locked
-from cortado.files.interruption import keeping
-from cortado.files.terminal import announce, track
+from cortado.files.terminal import announce, keeping, track
 from cortado.files.vtkhdf import TrajectoryWriter
 from cortado.particles.state import State
 from cortado.pictures.pages import Section

@@ -24,10 +24,9 @@ from cortado.pictures.run_pictures import density_errors, readings, run_pictures
 from cortado.pictures.shown_solids import solid_outline
 from cortado.rollout.outcome import divergence_sentence, dry_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
-from cortado.runs.frames import Pace, common_rate
+from cortado.runs.frames import Pace, common_rate, posed, solid_motions
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensor import Readings, summary
-from cortado.runs.solid_motion import posed, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import Scene, scene_in_words
 from cortado.simulation import Simulation

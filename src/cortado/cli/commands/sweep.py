@@ -12,9 +12,8 @@ from cortado.cli.commands.options import HERE, Where, require_shared
 from cortado.cli.commands.run import RunRequest, run_scene, run_settings
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, unwarned, warn
 from cortado.files.disk import locked
-from cortado.files.interruption import Interrupted, keeping
-from cortado.files.terminal import track, untracked
-from cortado.optimisation.inverse.task import load_task
+from cortado.files.terminal import Interrupted, keeping, track, untracked
+from cortado.optimisation.inverse.task_files import load_task
 from cortado.optimisation.sweep import NAME, Combination, combinations, failed, write_table
 from cortado.runs.recording import FrameChoice
 from cortado.runs.run_folder import RunFolder

@@ -14,7 +14,7 @@ from cortado.losses import FinalPositions, Snapshot
 from cortado.optimisation.fitting.observations import CLOCK, Again, Direction, Frames, Observation
 from cortado.particles.state import State
 from cortado.problem import Problem
-from cortado.runs.sensor_places import warn_of_places
+from cortado.runs.probes import warn_of_places
 from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.restart import RestartState
 from cortado.scene.stability import is_implicit

@@ -15,8 +15,8 @@ from cortado.lazy import on_top
 from cortado.optimisation.fitting.certainty import Certainty, FittedPart, counted_covariance, noise_of, spread
 from cortado.optimisation.fitting.doubts import dear_causes, doubts_of
 from cortado.optimisation.fitting.experiment import Experiment
+from cortado.optimisation.fitting.gauss_newton import TINY, least, misfit, other_starts, over_the_bars, search
 from cortado.optimisation.fitting.least_squares import Coordinates, LeastSquares, Linearised, Weighting
-from cortado.optimisation.fitting.search import TINY, least, misfit, other_starts, over_the_bars, search
 from cortado.scene.parameter_values import UNITS
 from cortado.scene.parameters import Range
 from cortado.words import counted

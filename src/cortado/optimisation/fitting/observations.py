@@ -15,7 +15,7 @@ from cortado.discretise.shapes import wrapped
 from cortado.errors import InputError, shown
 from cortado.losses import Snapshot
 from cortado.render import Renderer
-from cortado.render.views import Calibration
+from cortado.render.cameras import Calibration
 from cortado.runs.particle_sums import Weights
 from cortado.runs.sensor import Sensor, checked_sensor, value_of
 from cortado.scene.parameter_values import Arrays

@@ -35,11 +35,11 @@ from cortado.rollout.device_states import DeviceState, DeviceStates
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.rollout import Residual, Rollout
 from cortado.rollout.stepper import Stepper, StepResidual
+from cortado.runs.probes import warn_of_places
 from cortado.runs.quantity_values import Moment, row_of
 from cortado.runs.sensor import Sensor, checked_sensor, value_of
-from cortado.runs.sensor_places import warn_of_places
 from cortado.scene.parameter_values import Arrays
-from cortado.scene.quantity_names import QUANTITIES, check_quantity
+from cortado.scene.parameters import QUANTITIES, check_quantity
 from cortado.simulation import Simulation
 
 LOSS, READING, PICTURE = "loss", "reading", "picture"

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from cortado.arrays import as_precise_numbers
 from cortado.device.threads import WARP
 from cortado.errors import CortadoError, InputError, LibraryMissingError, Words
-from cortado.optimisation.layers.calls import Bridge
 from cortado.optimisation.layers.layer import Array, Layer, Named, on_host, rows, stacked
+from cortado.optimisation.layers.user_functions import Bridge
 
 try:
     import jax

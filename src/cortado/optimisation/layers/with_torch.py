@@ -11,8 +11,8 @@ import warp as wp
 
 from cortado.arrays import as_precise_numbers
 from cortado.errors import InputError, LibraryMissingError, Words
-from cortado.optimisation.layers.calls import Bridge
 from cortado.optimisation.layers.layer import Array, Layer, Named
+from cortado.optimisation.layers.user_functions import Bridge
 
 try:
     import torch

@@ -5,8 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.pictures.tracing.near_particles import Vec3s2d
-from cortado.pictures.tracing.surroundings import (
+from cortado.pictures.tracing.backdrop import (
     CLEAR,
     FAR,
     GLASS_EDGE,
@@ -30,6 +29,7 @@ from cortado.pictures.tracing.surroundings import (
     within_tube,
     within_walls,
 )
+from cortado.pictures.tracing.near_particles import Vec3s2d
 
 LAYERS = 8
 """Most surfaces of transparent solids that a ray passes."""

@@ -16,8 +16,8 @@ from cortado.device.modules import kernel_module
 from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import ShownSolid, SolidMesh
 from cortado.pictures.stage import Stage
+from cortado.pictures.tracing.backdrop import LitSurface, Solids
 from cortado.pictures.tracing.near_particles import Floats, Look, Particles, Vec3s, Vec3s2d, Vec4s2d
-from cortado.pictures.tracing.surroundings import LitSurface, Solids
 
 NODES = 320
 """Number of nodes along either side of the floor that may lie in shadow."""

@@ -15,9 +15,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import kernel_module
-from cortado.pictures.tracing.near_particles import Ints, Vec2s, Vec3s, Vec3s2d
-from cortado.pictures.tracing.ray_hits import glass_functions, meet_solid, reach_solid, shaded_solid, surface_functions
-from cortado.pictures.tracing.surroundings import (
+from cortado.pictures.tracing.backdrop import (
     FAR,
     OPAQUE,
     Environment,
@@ -29,6 +27,8 @@ from cortado.pictures.tracing.surroundings import (
     shading_module,
     sky,
 )
+from cortado.pictures.tracing.near_particles import Ints, Vec2s, Vec3s, Vec3s2d
+from cortado.pictures.tracing.ray_hits import glass_functions, meet_solid, reach_solid, shaded_solid, surface_functions
 
 BOUNCED = wp.constant(wp.float32(0.45))
 """The part of the light around that falls on solids, and back from them."""

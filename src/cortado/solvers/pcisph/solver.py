@@ -20,9 +20,8 @@ from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangen
 from cortado.solvers.pcisph.pressure import pressure_solid_kernel
 from cortado.solvers.pcisph.steps import PcisphSteps
 from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepTangent, WithinBar
-from cortado.sph.density import density_solid_kernel
+from cortado.sph.density import density_solid_kernel, wall_slope_term
 from cortado.sph.parts import StepContext
-from cortado.sph.walls import wall_slope_term
 
 
 class PcisphAdjoint(ParticleAdjoint):

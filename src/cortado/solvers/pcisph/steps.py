@@ -43,8 +43,8 @@ from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
 from cortado.solvers.solver import Counts
+from cortado.sph.density import wall_slope_sums
 from cortado.sph.parts import StepContext
-from cortado.sph.walls import wall_slope_sums
 
 SOFTNESS = 0.2
 """The softness a of the density-ratio relaxation [-]."""

@@ -2,7 +2,7 @@
 fluid.
 
 Walls of a body push particle i by gamma_i = sum w_b (N_b g_ib + e_i (g_ib - N_b g_ib)), N_b = n_b n_b^T, over its own
-wall particles, with e_i of all walls (`cortado.solvers.projection.walls`). With r_i = x_i - c', the pressure
+wall particles, with e_i of all walls (`cortado.solvers.projection.wall_sums`). With r_i = x_i - c', the pressure
 impulses y, the body's density rho and its volume K in those of a particle,
 
     V = V_0 + dt g + sum y_i gamma_i / (rho K),   L = L_0 + sum y_i r_i x gamma_i,   W = R' I^-1 R'^T L / rho
@@ -28,7 +28,7 @@ from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
 from cortado.solvers.projection.names import types_by_name
-from cortado.solvers.projection.walls import normal_part
+from cortado.solvers.projection.wall_sums import normal_part
 from cortado.sph.free_solids import free_module, rate_function
 
 

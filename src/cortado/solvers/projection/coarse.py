@@ -12,23 +12,25 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.cells import CellSort
-from cortado.device.grid import Grid
+from cortado.device.cells import CellSort, Grid
 from cortado.device.launching import Named
 from cortado.device.precision import FLOAT32
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
-from cortado.solvers.projection.coarse_bodies import CoarseBodies, CoarseBodiesAdjoint, CoarseBodiesTangent
-from cortado.solvers.projection.coarse_levels import Levels
+from cortado.solvers.projection.coarse_levels import Levels, coarse_push_kernels, residual_kernels
 from cortado.solvers.projection.coarse_nodes import node_kernels
-from cortado.solvers.projection.coarse_pressure import coarse_pressure_kernels, length_kernels
-from cortado.solvers.projection.coarse_residual import coarse_push_kernels, residual_kernels
+from cortado.solvers.projection.coarse_pressure import (
+    CoarseBodies,
+    CoarseBodiesAdjoint,
+    CoarseBodiesTangent,
+    coarse_pressure_kernels,
+    length_kernels,
+)
 from cortado.solvers.projection.faces import FaceShares
 from cortado.solvers.projection.lattice import SPACING
 from cortado.solvers.projection.sums import velocity_kernels
-from cortado.sph.conjugate_gradients import round_off
-from cortado.sph.moment_functions import matrix_type, symmetric
+from cortado.sph.moment_functions import matrix_type, round_off, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 LEAST = 1e-5

@@ -2,9 +2,9 @@
 fluid in flat walls that mirror it (`cortado.particles.neighbourhood`), in place of wall particles.
 
 M, Q and g are the moments of `cortado.solvers.projection.sums`, gamma and nu those of
-`cortado.solvers.projection.walls`, and H is the fullness of `cortado.sph.moment_functions`. S(a, b) is a smoothstep of
-H from a to b. B = 1 / (1 + ((nu + 9 q nu_m) / 0.05)^4) is 0 beside walls, with nu_m of those that mirror and q, which
-is 0 beside others. The projection takes:
+`cortado.solvers.projection.wall_sums`, and H is the fullness of `cortado.sph.moment_functions`. S(a, b) is a smoothstep
+of H from a to b. B = 1 / (1 + ((nu + 9 q nu_m) / 0.05)^4) is 0 beside walls, with nu_m of those that mirror and q,
+which is 0 beside others. The projection takes:
 
     sigma = S(0.1, 0.5) B    how much tension is let through, 1 where a scene is shut (see `pressure`),
     f = S(0.1, 0.5) of H + nu   how full it is: how much of the last step's pressure is taken on,
@@ -46,7 +46,7 @@ from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import image_sum, mirror_sum
 from cortado.solvers.projection.names import types_by_name, weights_type
-from cortado.solvers.projection.walls import DIRECTION, normal_part
+from cortado.solvers.projection.wall_sums import DIRECTION, normal_part
 from cortado.sph.moment_functions import matrix_type, moment_functions
 
 TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95)

@@ -41,8 +41,7 @@ from cortado.solvers.projection.pressure import clamp_functions
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
 from cortado.solvers.projection.sums import projection_sums, velocity_gradient_kernels
 from cortado.solvers.solver import Counts, ResumingAdjoint, Solver, StepAdjoint, StepTangent
-from cortado.sph.conjugate_gradients import ConjugateGradients, round_off
-from cortado.sph.moment_functions import matrix_type, symmetric
+from cortado.sph.moment_functions import ConjugateGradients, matrix_type, round_off, symmetric
 from cortado.sph.parts import Carried, StepContext
 
 

@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.grid import Grid
+from cortado.device.cells import Grid
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation
@@ -49,15 +49,14 @@ from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.coarse import Coarse
 from cortado.solvers.projection.effects import effect_functions
-from cortado.solvers.projection.image_loads import ImageLoads
 from cortado.solvers.projection.lattice import ProjectionConstants
-from cortado.solvers.projection.mean_stress import MeanStress, pressed_kernels
+from cortado.solvers.projection.mean_stress import ImageLoads, MeanStress, pressed_kernels
 from cortado.solvers.projection.names import types_by_name
 from cortado.solvers.projection.pressure import PressureKernels, beginning_kernels, pressure_kernels
 from cortado.solvers.projection.repair import RepairKernels, repair_kernels
 from cortado.solvers.projection.sums import VelocityKernels, velocity_kernels
 from cortado.solvers.projection.surroundings import Surroundings
-from cortado.solvers.projection.walls import ProjectionPush
+from cortado.solvers.projection.wall_sums import ProjectionPush
 from cortado.solvers.solver import Counts
 from cortado.sph.free_solids import FreeSolidsPart
 from cortado.sph.integration import integration_module

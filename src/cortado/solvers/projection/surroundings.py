@@ -17,7 +17,7 @@ from cortado.solvers.projection.faces import FaceShares
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.names import weights_type
 from cortado.solvers.projection.sums import APART, projection_sums
-from cortado.solvers.projection.walls import beside_solid_kernel, beside_sums, edge_functions
+from cortado.solvers.projection.wall_sums import beside_solid_kernel, beside_sums, edge_functions
 from cortado.sph.density import Density, DensityAdjoint, DensityTangent
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents

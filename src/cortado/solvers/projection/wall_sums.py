@@ -34,9 +34,9 @@ from cortado.particles.state import Layout
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm, solid_kernel
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.names import types_by_name
+from cortado.sph.density import WallSums, wall_slope_term
 from cortado.sph.moment_functions import moment_functions
 from cortado.sph.parts import Adjoints, StepContext, Tangents
-from cortado.sph.walls import WallSums, wall_slope_term
 
 EDGED = (0.1, 0.4)
 """The part of a wall's push, squared, off normals, up to which e is 0, and from which it is 1. It is below 0.02 along
@@ -188,7 +188,7 @@ def push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
 
 
 class ProjectionPush:
-    """The sums along which pressures of the projection push walls: a `cortado.sph.walls.WallAction`."""
+    """The sums along which pressures of the projection push walls: a `cortado.sph.density.WallAction`."""
 
     def __init__(
         self,

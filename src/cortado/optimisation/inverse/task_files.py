@@ -10,12 +10,11 @@ import numpy as np
 
 from cortado.errors import DivergedError, InputError, SceneError, Words
 from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
-from cortado.optimisation.inverse.tables import DISTANCES, RANDOM, OptimiseTable, ProblemTable, TaskTables
+from cortado.optimisation.inverse.task_tables import DISTANCES, RANDOM, OptimiseTable, ProblemTable, TaskTables
 from cortado.optimisation.transforms import Bijector, Logarithm, Softmax, TimeInterpolation, Transformed
 from cortado.pictures.image_files import heart, read_picture, rosetta
 from cortado.problem import Problem
-from cortado.render.renderer import Renderer
-from cortado.render.scene_renderer import scene_renderer
+from cortado.render.renderer import Renderer, scene_renderer
 from cortado.scene.fluid_particles import fluid_particles
 from cortado.scene.parameter_values import SUM_TOLERANCE, Arrays, Known, is_too_small
 from cortado.scene.parameters import Axis, Parameter, Range, Role, offered

@@ -30,7 +30,7 @@ from cortado.gradients import (
     GradientEstimator,
     ImplicitPressure,
 )
-from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
+from cortado.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.datasets import DatasetTables
 from cortado.optimisation.optimise import MOST_ITERATIONS
 from cortado.optimisation.optimisers import BY_NAME, Optimiser
