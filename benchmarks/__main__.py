@@ -123,6 +123,25 @@ def watching(depth: int = 20, steps: int = 200, repeats: int = 3, device: str = 
 
 
 @command(app, answers=True)
+def loops(side: int = 15, steps: int = 20, repeats: int = 5, device: str = "cpu", json: Flag = False) -> Work:
+    """Time loops of JAX in which a policy acts in every step, beside one call of as many steps.
+
+    Args:
+        side: Spacings in the side of a square of fluid in the plane, with its square of particles.
+        steps: Steps of a loop.
+        repeats: The least of so many repeats counts.
+        device: "cpu", or "cuda:0" for the first GPU.
+        json: Print JSON for machines instead of a table.
+    """
+    require_at_least(4, side, "--side")
+    require_at_least(1, steps, "--steps")
+    require_at_least(1, repeats, "--repeats")
+    from benchmarks.bench.loops import bench_loops
+
+    return partial(bench_loops, side, steps, repeats, device, json)
+
+
+@command(app, answers=True)
 def batches(
     scenes: tuple[int, ...] = (1, 256), steps: int = 100, repeats: int = 3, device: str = "cpu", json: Flag = False
 ) -> Work:

@@ -66,6 +66,30 @@ def test_a_loop_is_smoothed_as_the_problem_that_it_is(simulation, library, estim
         assert abs(found.mean_loss - found.loss) > 1e-9 * found.loss
 
 
+@pytest.mark.parametrize("library", ["jax", "torch"])
+def test_in_float32_it_is_the_problem_to_round_off(jax, library):
+    """Weights, and the gradient, are those of the library in its own precision, in a loop that is compiled."""
+    with jax.enable_x64(False):
+        single = Simulation(sheared(), precision="float32")
+        layer, gravity, estimator = layer_of(library), np.array([0.4, -9.0]), gradients.EnsembleMean(0.5)
+        smoothed = layer.smoothed(single, partial(loop, layer, single), estimator)
+        found = smoothed.estimate({"g": gravity})
+        wanted = Problem(single, STEPS, losses.CentreOfMass(PLACE)).estimate({"gravity": gravity}, estimator)
+        np.testing.assert_allclose(found.loss, wanted.loss, rtol=1e-4)
+        np.testing.assert_allclose(found.gradient["g"], wanted.gradient["gravity"], rtol=1e-3)
+        np.testing.assert_allclose(found.standard_error["g"], wanted.standard_error["gravity"], rtol=1e-2)
+        if library == "jax":
+            own = jax.grad(smoothed)({"g": jax.numpy.array(gravity)})["g"]
+        else:
+            import torch
+
+            given = torch.tensor(gravity, dtype=torch.float32, requires_grad=True)
+            smoothed({"g": given}).backward()
+            own = given.grad
+        assert np.asarray(own).dtype == np.float32
+        np.testing.assert_allclose(np.asarray(own), found.gradient["g"], rtol=1e-6)
+
+
 def test_its_value_is_the_mean_and_its_derivative_the_smoothed_gradient(jax, simulation):
     import torch
 
@@ -208,3 +232,20 @@ def test_a_scan_in_jax_says_so(jax):
         jax.jit(jax.grad(partial(end, estimator=None)))(gravity).block_until_ready()
     with pytest.warns(CortadoWarning, match="The adjoint of the state has grown by e"):
         jax.jit(jax.grad(partial(end, estimator=Growing(np.exp(1.0)))))(gravity).block_until_ready()
+
+
+# ---- a gravity in every step -------------------------------------------------------------------------------------
+def test_a_gravity_is_judged_by_the_limits_of_the_time_step_where_it_is_stronger_than_those_before():
+    """A weaker one is not, as a policy gives another in every step; that of the scene itself is."""
+    simulation = Simulation(sheared(), precision="float64")
+    state = simulation.state()
+
+    def said(gravity, steps=1, **others):
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            simulation.step(state, {**({} if gravity is None else {"gravity": gravity}), **others}, steps=steps)
+        return any("limit of stability" in str(one.message) for one in found)
+
+    assert not said([0.4, -9.0]) and not said([2.0, -1.0]) and said([0.0, -1e4]) and not said([0.0, -1e4])
+    longer = {"steps": 2, "time_step": 0.012}
+    assert not said([0.0, -1e-3], **longer) and said(None, **longer)

@@ -58,6 +58,8 @@ def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
 def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> str | None:
     """Return a warning on the step in which the projection left most divergence; None where few steps left much."""
     found = diagnostics.get("divergence", np.zeros(0))
+    if not (found > TORN).any():
+        return None
     torn = np.nan_to_num(found, nan=0.0, posinf=0.0)  # what is not finite is of a scene that is lost
     if scene.solver.kind != "projection" or np.count_nonzero(torn > TORN) <= RARE * torn.size:
         return None

@@ -61,6 +61,8 @@ class ParameterSpace:
         """Arrays that no step changes of the device state at which it began."""
         self._judged: Arrays | None = None
         """The last values that make sense: a step after another often has the same ones."""
+        self._strongest: tuple[Arrays, float] | None = None
+        """Values that were judged by limits of stability, but for gravity, and the strongest gravity [m/s2] so far."""
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Return values as float64 arrays; raises `InputError`. Where ``what`` is "direction", negative ones pass."""
@@ -371,9 +373,22 @@ class ParameterSpace:
             place = "" if self._batch is None else f"In scene {number} of the batch, "
             raise OutOfRangeError(f"{place}{error}") from error
         upright = self._one.upright(values)
-        unstable = unstable_sentence(upright, simulation.scene, self._told) if values else None
+        unstable = unstable_sentence(upright, simulation.scene, self._told) if self._is_stronger(upright) else None
         for sentence in filter(None, (crowded, unstable)):
             warn(sentence)
+
+    def _is_stronger(self, values: Arrays) -> bool:
+        """Test if limits of stability may be broken by values as they were not by those that were judged last: not by a
+        gravity that is no stronger, as a policy gives in every step."""
+        others = {name: np.zeros(0) if name == "gravity" else value.copy() for name, value in values.items()}
+        strength = float(np.linalg.norm(np.atleast_2d(values["gravity"]), axis=1).max()) if "gravity" in values else 0.0
+        last, self._strongest = self._strongest, (others, strength)
+        if last is None or last[0].keys() != others.keys():
+            return bool(values)
+        if not all(np.array_equal(value, others[name]) for name, value in last[0].items()):
+            return True
+        self._strongest = others, max(strength, last[1])
+        return strength > last[1]
 
     def _together(self, fields: list[Arrays]) -> Arrays:
         """Stack the fields of the states of all scenes along a first axis, from one table or one for each scene."""

@@ -26,7 +26,7 @@ from cortado.rollout.checkpoints import MEMORY_BUDGET, Beside, Checkpoints, Chun
 from cortado.rollout.divergence import diverged
 from cortado.rollout.step_sizes import StepSizes
 from cortado.scene.restart import Clock, Origin
-from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepTangent
+from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepLog, StepTangent
 
 Observer = Callable[[int, State], None]
 """A function that a run calls with the number of a state and the state, which later steps overwrite."""
@@ -142,6 +142,8 @@ class Rollout(Staying):
         self._evaluations = count(1)
         self.pending: WeakSet[Residual] = WeakSet()
         """Who will come back to the present evaluation."""
+        self.aside: list[tuple[State, StepLog]] = []
+        """First states and logs that were put aside and are written back, for the next that are put aside."""
         self._kept = self._run = -1
         """The evaluations that states were kept of, and that the last run was of."""
 
@@ -309,9 +311,12 @@ class Rollout(Staying):
             compile_ahead_adjoint(derivative, self._device)
         derivative.begin()
         self._forget_stale_graphs()
-        self._bar.clear()
+        if self.steps in bars:
+            self._bar.assign(bars[self.steps])
+        else:
+            self._bar.clear()
         for n in reversed(range(self.steps + 1)):
-            if n in bars:
+            if n in bars and n < self.steps:
                 for bar, total in zip(bars[n].arrays(), self._bar.arrays(), strict=True):
                     add(bar, total)
             if observe is not None:
@@ -385,18 +390,8 @@ class Rollout(Staying):
         self.step_sizes.seek(step)
 
 
-OF_AN_EVALUATION = (
-    "clocks",
-    "origins",
-    "substeps",
-    "advice",
-    "lost",
-    "goes_on",
-    "evaluation",
-    "_checkpoints",
-    "_kept",
-    "_run",
-)
+_OF_RUNS = "lost", "_checkpoints", "_kept", "_run"
+OF_AN_EVALUATION = *_OF_RUNS, "clocks", "origins", "substeps", "advice", "goes_on", "evaluation"
 """Attributes of a rollout that each evaluation replaces by new objects, rather than overwrites."""
 
 
@@ -421,9 +416,12 @@ class Residual:
 
     def put_aside(self) -> None:
         """Copy the first state, parameters and log that another evaluation is about to overwrite."""
-        rollout, log = self.rollout, self.rollout.solver.new_log(self.rollout.room)
+        rollout = self.rollout
+        made = rollout.aside.pop() if rollout.aside else (rollout.initial.like(), rollout.solver.new_log(rollout.room))
+        first, log = made
+        first.assign(rollout.initial)
         log.assign(rollout.log)
-        first, time_steps, sizes = rollout.initial.copy(), rollout.time_steps.copy(), rollout.step_sizes.recorded()
+        time_steps, sizes = rollout.time_steps.copy(), rollout.step_sizes.recorded()
         written = rollout.parameters.written.items()
         rows = {name: wp.clone(row) if isinstance(row, wp.array) else row.copy() for name, row in written}
         replaced = {name: getattr(rollout, name) for name in OF_AN_EVALUATION}
@@ -433,6 +431,7 @@ class Residual:
             rollout.parameters.set(rows)
             rollout.time_steps[:] = time_steps
             rollout.log.assign(log)
+            rollout.aside.append(made)
             rollout.step_sizes.assign(sizes)
             for name, value in replaced.items():
                 setattr(rollout, name, value)

@@ -130,7 +130,7 @@ class AdjointGrowth:
 
     def __init__(self) -> None:
         self._reached, self._ended, self._within, self._steps = math.nan, 0.0, 0.0, 0
-        self._begun: Any = np.zeros(2)
+        self._begun = 0.0, 0.0
         self._warned = False
 
     def follow(self, rollout: Rollout, last: State, first: State) -> None:
@@ -138,14 +138,13 @@ class AdjointGrowth:
         which the growth exceeds `MOST_GROWTH`."""
         start, end = (clocks_after(rollout, steps)[0].time for steps in (0, rollout.steps))
         into, out = _norms(last), _norms(first)
-        if not (abs(end - self._reached) < 0.5 * (end - start) / rollout.steps and self._begun.any()):
+        if not (abs(end - self._reached) < 0.5 * (end - start) / rollout.steps and any(self._begun)):
             self._begun, self._ended, self._within, self._steps = into, end, 0.0, 0
         self._reached, self._steps = start, self._steps + rollout.steps
-        per = np.array([1.0, 1.0 / (self._ended - start)])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            begun, into, out = (np.log(np.linalg.norm(per * one)) for one in (self._begun, into, out))
-        self._within += out - into
-        growth = min(out - begun, self._within)
+        each = [math.hypot(x, v / (self._ended - start)) for x, v in (self._begun, into, out)]
+        at_first, before, after = (math.log(one) if one > 0.0 else -math.inf for one in each)
+        self._within += after - before
+        growth = min(after - at_first, self._within)
         if growth > MOST_GROWTH and not self._warned:
             self._warned = True
             found = f"by e^{growth:.1f}" if math.isfinite(growth) else "beyond 1e19, whose square overflows,"
@@ -156,10 +155,15 @@ class AdjointGrowth:
             )
 
 
-def _norms(bar: State) -> Any:
-    """Return the norms (2,) of the adjoints of positions and velocities over all particles; infinite where squares
+def _norms(bar: State) -> tuple[float, float]:
+    """Return the norms of the adjoints of positions and velocities over all particles; infinite where squares
     overflow."""
-    return np.sqrt([wp.utils.array_inner(one, one) for one in (bar.positions, bar.velocities)])
+    return _norm(bar.positions), _norm(bar.velocities)
+
+
+def _norm(bar: wp.array) -> float:
+    numbers = bar.numpy().reshape(-1) if bar.device.is_cpu else None
+    return math.sqrt(wp.utils.array_inner(bar, bar) if numbers is None else numbers @ numbers)
 
 
 class Stepper:

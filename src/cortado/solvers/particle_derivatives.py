@@ -1,9 +1,11 @@
 """Tangent and adjoint of what solvers of particles have in common; a solver adds those of its own loops."""
 
+from functools import partial
 from weakref import finalize
 
 import warp as wp
 
+from cortado.device.launching import CapturedGraph
 from cortado.device.reduction import add
 from cortado.particles.state import Fields, Parameters, State
 from cortado.particles.wall_terms import SolidShares
@@ -92,6 +94,7 @@ class ParticleAdjoint:
         """Of what the step carries on, once `unsort` has been called."""
         self.density, self._acceleration_bar = solver.density.new_adjoint(), solver.vectors()
         self._parts = [part.new_adjoint() for part in reversed(solver.parts)]
+        self._collect = CapturedGraph(partial(self.bar.shares.collect, self.bar.parameters), solver.launch)
         finalize(self, solver.launch.forget)
 
     def begin(self) -> None:
@@ -103,7 +106,7 @@ class ParticleAdjoint:
 
     def collect(self) -> Parameters:
         """Return the adjoints of the parameters, summed over all steps since `begin`."""
-        self.bar.shares.collect(self.bar.parameters)
+        self._collect()
         return self.bar.parameters
 
     def unsort(self, context: StepContext, state_bar: State) -> State:

@@ -233,6 +233,9 @@ class NamedStates:
         self._space = ParameterSpace(simulation, 0)
         self._known: OrderedDict[bytes, tuple[Origin, ...]] = OrderedDict()
         """States that were judged, or that steps led to, by checksum: whose particles they are of."""
+        constant = (field.name for field in simulation.initial.fields if field.is_constant)
+        self._constants: dict[str, tuple[np.ndarray, wp.array] | None] = dict.fromkeys(constant)
+        """Fields that no step changes, with the numbers that were given last."""
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -280,6 +283,10 @@ class NamedStates:
 
     def written(self, given: Named) -> State:
         """Copy fields, or derivatives with respect to fields, to a state of Cortado's, 0 where they are left out."""
+        if self._simulation.device.is_cpu:
+            like = self._simulation.initial
+            own = {name: self._on_host(name, like[name], given.get(name)) for name in like.names}
+            return State(like.fields, own, like.batch)
         state = self._simulation.solver.new_state()
         for name, array in given.items():
             own = self._narrow(name, state.numbers(name))
@@ -289,22 +296,38 @@ class NamedStates:
                 own.assign(on_host(array).reshape(own.shape))
         return state
 
+    def _on_host(self, name: str, like: wp.array, given: Array | None) -> wp.array:
+        """Return a field of the kind of another one, with given numbers or 0, in memory of NumPy; for the last numbers
+        of a field that no step changes the last array."""
+        last = self._constants.get(name) if given is not None else None
+        if last is not None and np.array_equal(on_host(given), last[0]):
+            return last[1]
+        numbers = np.zeros_like(like.numpy())
+        if given is not None:
+            narrow = self._narrow(name, numbers)
+            narrow[:] = on_host(given).reshape(narrow.shape)
+        found = wp.array(numbers, dtype=like.dtype, device="cpu", copy=False)
+        if name in self._constants and given is not None:
+            self._constants[name] = numbers.reshape(np.shape(given)), found
+        return found
+
     def read(self, state: State) -> dict[str, Array]:
-        """Return named arrays of the fields of a state of Cortado's."""
+        """Return named arrays of the fields of a state of Cortado's; on a CPU they may share its memory."""
         return self.narrowed({name: state.numbers(name) for name in self.fields})
 
     def narrowed(self, found: Named) -> dict[str, Array]:
         """Return fields whose three-component vectors are cut to the scene's components."""
-        narrow = {name: self._narrow(name, found[name]) for name in self._entries}
-        wide = {name for name, entry in self._entries.items() if entry is Entry.DOUBLE}
-        return {name: on_host(array) if name in wide else array.contiguous() for name, array in narrow.items()}
+        is_cpu = self._simulation.device.is_cpu
+        read = {n: on_host(found[n]) if is_cpu or e is Entry.DOUBLE else found[n] for n, e in self._entries.items()}
+        narrow = {name: self._narrow(name, array) for name, array in read.items()}
+        return {name: a if isinstance(a, np.ndarray) else a.contiguous() for name, a in narrow.items()}
 
     @cached_property
     def _entries(self) -> dict[str, Entry]:
         """Return what the entries of each field are."""
         return {field.name: field.entry for field in self._simulation.initial.fields}
 
-    def _narrow(self, name: str, whole: wp.array) -> wp.array:
+    def _narrow(self, name: str, whole: Array) -> Array:
         """Return a view of a field's numbers, of vectors with the scene's components."""
         if self._entries[name] is not Entry.VECTOR or self._simulation.dimension == 3:
             return whole

@@ -353,6 +353,8 @@ def _callable(given: tuple[tuple[int, str], ...], made: tuple[tuple[int, str], .
             for result, own in zip(results, found, strict=True):
                 if isinstance(own, wp.array) and own.dtype == result.dtype and own.device == result.device:
                     wp.copy(result, own.reshape(result.shape))
+                elif result.device.is_cpu:
+                    np.copyto(result.numpy(), on_host(own).reshape(result.shape))
                 else:
                     result.assign(on_host(own).reshape(result.shape))
 
