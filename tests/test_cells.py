@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado.device.cells import CellSort, Grid, cell_kernels
+from cortado.device.cells import CellSort, cell_kernels
+from cortado.device.grid import Grid
 from cortado.device.launching import launch
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.discretise.shapes import pairs_within

@@ -5,7 +5,8 @@ import pytest
 import warp as wp
 
 from cortado import Problem, Simulation, gradients, losses
-from cortado.device.cells import CellSort, Grid
+from cortado.device.cells import CellSort
+from cortado.device.grid import Grid
 from cortado.device.lanes import COUNTS
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.device.reduction import sum_and_maximum, sum_of

@@ -10,7 +10,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cortado.device.cells import Grid
+from cortado.device.grid import Grid
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.discretise.smoothing import CUBIC_SPLINE, SKIN
 from cortado.particles import neighbours as candidates

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from benchmarks.by_hand import ROOT, noting_factories, pairs, without_walls
-from cortado.device.cells import Grid
+from cortado.device.grid import Grid
 from cortado.device.launching import bundles_of, launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import FLOAT32, FLOAT64

@@ -111,7 +111,7 @@ class PointsAround:
     @cached_property
     def _by_cell(self) -> tuple[Any, Any]:
         """Return the points in the order of cells as wide as the reach, and the grid of these."""
-        from cortado.device.cells import Grid
+        from cortado.device.grid import Grid
 
         ends = self.points.min(axis=0), self.points.max(axis=0)
         cells = Grid.around(*ends, self.lengths, self.reach, MOST_CELLS)

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.cells import CellSort, Grid, cell_grid_type
+from cortado.device.cells import CellSort, cell_grid_type
+from cortado.device.grid import Grid
 from cortado.device.launching import bundle, launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision, TypesByName

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.cells import CellSort, Grid, cell_functions, cell_grid_type
+from cortado.device.cells import CellSort, cell_functions, cell_grid_type
+from cortado.device.grid import Grid
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, HostCopy, KernelLauncher
 from cortado.device.precision import TypesByName

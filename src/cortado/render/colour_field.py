@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.cells import CellSort, Grid, cell_functions, cell_grid_type
+from cortado.device.cells import CellSort, cell_functions, cell_grid_type
+from cortado.device.grid import Grid
 from cortado.device.launching import launch
 from cortado.device.memory import field_parts, require
 from cortado.device.modules import Kernels, kernel_module

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from cortado.code_words import code_words
-from cortado.device.cells import Grid
+from cortado.device.grid import Grid
 from cortado.device.lanes import lanes_for
 from cortado.device.precision import Precision
 from cortado.discretise.smoothing import SKIN

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.cells import CellSort, Grid
+from cortado.device.cells import CellSort
+from cortado.device.grid import Grid
 from cortado.device.launching import BandLauncher
 from cortado.device.modules import kernel_module
 from cortado.device.precision import FLOAT32

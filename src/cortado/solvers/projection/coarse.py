@@ -12,7 +12,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.cells import CellSort, Grid
+from cortado.device.cells import CellSort
+from cortado.device.grid import Grid
 from cortado.device.launching import Named
 from cortado.device.precision import FLOAT32
 from cortado.particles.neighbourhood import Discretisation

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.device.cells import Grid
+from cortado.device.grid import Grid
 from cortado.discretise.smoothing import SmoothingKernel, lattice_offsets, rest_volume
 from cortado.scene.discrete_scene import DiscreteScene
 from cortado.scene.scene import Scene

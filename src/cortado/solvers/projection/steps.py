@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.cells import Grid
+from cortado.device.grid import Grid
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation
