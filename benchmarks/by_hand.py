@@ -10,8 +10,9 @@ import ast
 import importlib
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -29,23 +30,29 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import BY_HAND, ByHand
 
 ROOT = Path(cortado.__file__).parent
+NOTE = re.compile(r"\b(tangent_of|adjoint_of)\(")
 ASKED: dict[str, list[Any]] = {"phases": [3], "sticks": [False]}
 """What the factories of sums ask for beside a discretisation."""
 KINDS: dict[str, Callable[..., Any]] = {"tangent": made_tangent, "adjoint": made_adjoint}
 
 
-def noting_factories() -> Iterator[tuple[Callable[..., Any], int]]:
+@cache
+def noting_factories() -> list[tuple[Callable[..., Any], int]]:
     """All functions of the package that note derivatives by hand, and how many each notes."""
+    found = []
     for path in sorted(ROOT.rglob("*.py")):
-        for node in ast.parse(path.read_text()).body:
+        text = path.read_text()
+        for node in ast.parse(text).body if NOTE.search(text) else ():
             notes = [one for one in ast.walk(node) if isinstance(one, ast.Call) and _is_note(one.func)]
             if isinstance(node, ast.FunctionDef) and notes:
                 parts = path.relative_to(ROOT).with_suffix("").parts
-                yield getattr(importlib.import_module(".".join(("cortado", *parts))), node.name), len(notes)
+                factory = getattr(importlib.import_module(".".join(("cortado", *parts))), node.name)
+                found.append((factory, len(notes)))
+    return found
 
 
 def _is_note(function: ast.expr) -> bool:
-    return isinstance(function, ast.Name) and function.id in ("tangent_of", "adjoint_of")
+    return isinstance(function, ast.Name) and NOTE.match(f"{function.id}(") is not None
 
 
 def by_hand(d: Discretisation) -> dict[str, ByHand]:

@@ -356,8 +356,8 @@ def assert_same(one, other):
 
 
 def test_a_data_set_that_grows_is_the_one_made_at_once_and_keeps_its_runs(file, cortado_command, monkeypatch):
-    """Made with 5 runs and then 11, or with 11; of these runs one fails."""
-    asked, whole = [], one_run
+    """Made with 5 runs and then 11, or with 11; of these runs one fails. All have one box of fluid, which is quick."""
+    asked, whole, again = [], one_run, ("dataset", file, *varied("phase.water.viscosity", 0.1, 10.0, ()))
 
     def made(simulation, sample):
         asked.append(sample.number)
@@ -366,10 +366,10 @@ def test_a_data_set_that_grows_is_the_one_made_at_once_and_keeps_its_runs(file, 
         return whole(simulation, sample)
 
     monkeypatch.setattr(command, "one_run", made)
-    assert cortado_command("dataset", file, "--runs", 5, "--out", "grown")[0] == 0
+    assert cortado_command(*again, "--runs", 5, "--out", "grown")[0] == 0
     before = content_of("grown")
     asked.clear()
-    code, out, err = cortado_command("dataset", file, "--runs", 11, "--out", "grown")
+    code, out, err = cortado_command(*again, "--runs", 11, "--out", "grown")
     assert code == 0 and asked == list(range(5, 11)), err
     assert "its first 5 runs are as they were" in out and "failed" not in err
     after = content_of("grown")
@@ -377,7 +377,7 @@ def test_a_data_set_that_grows_is_the_one_made_at_once_and_keeps_its_runs(file, 
         {name: one for name, one in before.items() if name != "metadata"},
         {name: after[name] for name in before if name != "metadata"},
     )
-    assert cortado_command("dataset", file, "--runs", 11, "--out", "once")[0] == 0
+    assert cortado_command(*again, "--runs", 11, "--out", "once")[0] == 0
     assert_same(content_of("once"), after)
     assert after["metadata"]["runs"] == 11 and list(after["metadata"]["failed"]) == ["3"]
     counts = [after["metadata"][f"num_trajs_{purpose}"] for purpose in ("train", "valid", "test")]

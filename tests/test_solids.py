@@ -347,12 +347,13 @@ LININGS = {
 @pytest.mark.parametrize("name", LININGS)
 @pytest.mark.filterwarnings("error:the solid:cortado.CortadoWarning")
 def test_a_lining_thinner_than_a_spacing_has_the_wall_particles_of_what_is_behind_it(name):
-    """At the same depths as one solid in the place of both, and about as heavy."""
+    """At the same depths as one solid in the place of both, and about as heavy. No fluid is near: none is packed."""
     solids, upper = LININGS[name]
     whole = wall(1.5) if name == "of another" else wall(4.0)
 
     def layers(tables):
-        walls = discretise(scene(tables, container=box([0.0, 0.0], [upper, 1.0]))).walls
+        apart = [box([0.1, 0.4], [0.2, 0.5], phase="water")]
+        walls = discretise(scene(tables, container=box([0.0, 0.0], [upper, 1.0]), fluid=apart)).walls
         x, y = walls.positions.T
         beside = np.abs(y - 0.5) < 0.25
         return np.histogram(x[beside], [0.4, 0.43, 0.445, 0.5], weights=walls.weights[beside])[0]
