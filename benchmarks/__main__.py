@@ -142,6 +142,36 @@ def loops(side: int = 15, steps: int = 20, repeats: int = 5, device: str = "cpu"
 
 
 @command(app, answers=True)
+def probed(
+    depth: int = 11,
+    steps: int = 32,
+    every: tuple[int, ...] = (1, 2, 4, 8, 16),
+    repeats: int = 3,
+    device: str = "cpu",
+    precision: str = "float32",
+    json: Flag = False,
+) -> Work:
+    """Time losses of a pressure probe in some states of a run, beside a loss of its end.
+
+    Args:
+        depth: Spacings in the depth of a tank in the plane, with 3.4 times its square of particles.
+        steps: Steps of the run.
+        every: A loss in every so many states; one measurement for each.
+        repeats: The least of so many repeats counts.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64".
+        json: Print JSON for machines instead of a table.
+    """
+    require_at_least(4, depth, "--depth")
+    require_at_least(1, min(every), "--every")
+    require_at_least(1 + max(every), steps, "--steps")
+    require_at_least(1, repeats, "--repeats")
+    from benchmarks.bench.probed import bench_probed
+
+    return partial(bench_probed, depth, steps, every, repeats, device, precision, json)
+
+
+@command(app, answers=True)
 def batches(
     scenes: tuple[int, ...] = (1, 256), steps: int = 100, repeats: int = 3, device: str = "cpu", json: Flag = False
 ) -> Work:

@@ -63,6 +63,8 @@ class Moment:
     """Quantities that were asked for, also of other moments of a run that share this set: those that need a step are
     computed by one."""
     _values: Arrays = field(default_factory=dict)
+    _counts: list[Counts] = field(default_factory=list)
+    """The rounds of the loops of the step, once the run that has taken it has told them."""
 
     @classmethod
     def of(
@@ -91,9 +93,15 @@ class Moment:
                 self._values[own] = found
         return self._values[name]
 
-    def know(self, values: Arrays) -> None:
-        """Take quantities, by name, that the run itself has computed."""
+    @property
+    def counts(self) -> Counts | None:
+        """Return the rounds of the loops of the step; None where they are not known without taking it."""
+        return self._counts[0] if self._counts else None
+
+    def know(self, values: Arrays, counts: Counts | None) -> None:
+        """Take quantities, by name, that the run itself has computed, and the rounds of the loops of its step."""
         self._values.update(values)
+        self._counts[:] = [] if counts is None else [counts]
 
     def adjoint(self, bars: Mapping[str, NDArray]) -> tuple[Arrays, Arrays]:
         """Turn adjoints of quantities into those of the state's fields and of the step's parameters."""
@@ -209,14 +217,18 @@ class QuantityEvaluator:
         """Return what `adjoint` does for pressures that a gauge would read, by a captured graph."""
         solver, (given, _, state_bar), adjoint = self.solver, self._of_stress, self._pressure_adjoint
         self._set(moment)
-        self._solve((), False)
+        counts = moment.counts
+        if counts is None:
+            self._solve((), False)
+            counts = self._counts
+        solver.set_substeps(moment.substeps)
         given.assign(stress_bar.reshape(-1))
         adjoint.begin()
         solver.step_number.fill_(0)
-        key = solver.generation, self._counts
+        key = solver.generation, counts
         if key not in self._graphs:
             self._graphs = {k: graph for k, graph in self._graphs.items() if k[0] == solver.generation}
-            self._graphs[key] = CapturedGraph(partial(self._go_back, self._counts), solver.launch)
+            self._graphs[key] = CapturedGraph(partial(self._go_back, counts), solver.launch)
         self._graphs[key]()
         return self._found(adjoint, state_bar)
 
