@@ -43,8 +43,8 @@ from cortado.words import counted
 __all__ = ["NAMES", "UNITS", "Problem"]
 
 SPARSE = 8
-"""From one state in so many on, quantities are read in every step. With a probe in every 8th state a loss costs 3 to 6 %
-less so, and its gradient 1 to 9 %, of 408 and 7,824 particles in float32; in every 16th the same to 2 % (`python -m
+"""From one state in so many on, quantities are read in every step. With a probe in every 8th state a loss costs 3 to
+6 % less so, and its gradient 1 to 9 %, of 408 and 7,824 particles in float32; in every 16th the same to 2 % (`python -m
 benchmarks probed`)."""
 KEPT = 2
 """Number of batches of a problem, of different sizes, that are kept for the next evaluation."""
@@ -409,7 +409,8 @@ class Problem:
         reader = self._reader(wanted)
         self._rollout.forward(observe, keep, reader=reader)
         for step, found in () if reader is None else reader.found.items():
-            moment_of(ends[step]).know(found, self._rollout.log.seek(step) if single else None)
+            moment_of(ends[step]).know(found)
+            moment_of(ends[step]).counts.extend([self._rollout.log.seek(step)] if single else [])
         return ends
 
     def _reader(self, wanted: set[int]) -> QuantityReader | None:

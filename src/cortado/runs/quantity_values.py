@@ -62,9 +62,9 @@ class Moment:
     wanted: set[str] = field(default_factory=set)
     """Quantities that were asked for, also of other moments of a run that share this set: those that need a step are
     computed by one."""
+    counts: list[Counts] = field(default_factory=list)
+    """Rounds of the loops of the step, one entry once the run that took it has told them."""
     _values: Arrays = field(default_factory=dict)
-    _counts: list[Counts] = field(default_factory=list)
-    """The rounds of the loops of the step, once the run that has taken it has told them."""
 
     @classmethod
     def of(
@@ -93,15 +93,9 @@ class Moment:
                 self._values[own] = found
         return self._values[name]
 
-    @property
-    def counts(self) -> Counts | None:
-        """Return the rounds of the loops of the step; None where they are not known without taking it."""
-        return self._counts[0] if self._counts else None
-
-    def know(self, values: Arrays, counts: Counts | None) -> None:
-        """Take quantities, by name, that the run itself has computed, and the rounds of the loops of its step."""
+    def know(self, values: Arrays) -> None:
+        """Take quantities, by name, that the run itself has computed."""
         self._values.update(values)
-        self._counts[:] = [] if counts is None else [counts]
 
     def adjoint(self, bars: Mapping[str, NDArray]) -> tuple[Arrays, Arrays]:
         """Turn adjoints of quantities into those of the state's fields and of the step's parameters."""
@@ -217,19 +211,15 @@ class QuantityEvaluator:
         """Return what `adjoint` does for pressures that a gauge would read, by a captured graph."""
         solver, (given, _, state_bar), adjoint = self.solver, self._of_stress, self._pressure_adjoint
         self._set(moment)
-        counts = moment.counts
-        if counts is None:
+        if not moment.counts:
             self._solve((), False)
-            counts = self._counts
-        solver.set_substeps(moment.substeps)
+        counts, *_ = moment.counts or [self._counts]
         given.assign(stress_bar.reshape(-1))
         adjoint.begin()
         solver.step_number.fill_(0)
-        key = solver.generation, counts
-        if key not in self._graphs:
-            self._graphs = {k: graph for k, graph in self._graphs.items() if k[0] == solver.generation}
-            self._graphs[key] = CapturedGraph(partial(self._go_back, counts), solver.launch)
-        self._graphs[key]()
+        self._graphs = {k: graph for k, graph in self._graphs.items() if k[0] == solver.generation}
+        graph = CapturedGraph(partial(self._go_back, counts), solver.launch)
+        self._graphs.setdefault((solver.generation, counts), graph)()
         return self._found(adjoint, state_bar)
 
     def _go_back(self, counts: Counts) -> None:
@@ -270,10 +260,8 @@ class QuantityEvaluator:
         """Find the particles' neighbours and, where a pressure is wanted, take the step; ``replay`` it for
         derivatives."""
         self._set(moment)
-        if any(map(_needs_the_step, names)):
-            context, pressures = self._solve(names, replay)
-        else:
-            context, pressures = self._look_around(moment.substeps), None
+        solved = any(map(_needs_the_step, names))
+        context, pressures = self._solve(names, replay) if solved else (self._look_around(), None)
         return Particles.of(self.solver.fields, pressures), Sums(self.solver, context)
 
     def _set(self, moment: Moment) -> None:
@@ -282,10 +270,10 @@ class QuantityEvaluator:
         rollout.initial.assign(moment.state)
         rollout.parameters.set(moment.parameters)
         rollout.substeps = moment.substeps
+        self.solver.set_substeps(moment.substeps)
 
-    def _look_around(self, substeps: int) -> StepContext:
+    def _look_around(self) -> StepContext:
         solver, rollout = self.solver, self._rollout
-        solver.set_substeps(substeps)
         solver.reset()
         context = solver.sort(rollout.initial, rollout.parameters)
         while solver.make_room():
