@@ -15,6 +15,7 @@ from matplotlib.image import imsave
 from compiling_notice import without_compiling
 from cortado.cli import main
 from cortado.cli.subcommands import CORTADO
+from cortado.device.threads import CORES, usable_cores
 from short import is_slow, seconds_of, short
 from skips import complaints, reason_of
 
@@ -27,6 +28,11 @@ wp.config.cpu_compiler_flags = "-march=native"
 """LLVM's own limits of inlining: kernels compile in two thirds of the time, and long gradients take a fifth more."""
 gc.set_threshold(100_000, 20, 20)
 """Launches make so many small objects that looking for those in circles takes a tenth of the tests' time otherwise."""
+
+
+os.environ.setdefault(CORES, str(max(usable_cores() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")), 1)))
+"""Each worker of pytest has its share of the cores: threads beyond it only wait for each other. What several cores do is
+tested where a test asks for them."""
 
 
 def pytest_report_header():

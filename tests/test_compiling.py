@@ -32,8 +32,6 @@ FIRST = {
 sum over neighbours: what joins this list should be needed by every scene."""
 BACK = {
     "add_float32",
-    "add_float32_1",
-    "add_float32_3",
     "integration_derivative_float32",
     "matching_float32",
     "mixture_derivative_1_float32",
@@ -45,6 +43,7 @@ BACK = {
     "sum_float64",
 }
 """What the first gradient adds: no tangents, nothing that a tape needs."""
+ONE_PHASE = ["solver.kind=pcisph", "forces.viscosity=pairwise", "discretisation.kernel=cubic_spline"]
 RUN = """
 import os
 import cortado
@@ -53,14 +52,14 @@ from warp._src.context import user_modules
 def loaded():
     return sorted(name.removeprefix("cortado_") for name, module in user_modules.items() if module.execs)
 
-simulation = cortado.Simulation("docs/figures/dam_break_plane.toml")
+simulation = cortado.Simulation(cortado.load_scene("docs/figures/dam_break_plane.toml", CHANGES))
 WORK
 """
 
 
-def process(cache, work):
+def process(cache, work, changes=ONE_PHASE):
     environment = {**os.environ, "WARP_CACHE_PATH": str(cache)}
-    program = UNOPTIMISED + RUN.replace("WORK", work)
+    program = UNOPTIMISED + RUN.replace("WORK", work).replace("CHANGES", repr(changes))
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen([sys.executable, "-c", program], env=environment, text=True, **pipes)
 
@@ -103,15 +102,16 @@ print(float(simulation.run(2)[-1].positions.sum()).hex(), flush=True)
 if child == 0:
     raise SystemExit
 assert os.waitpid(child, 0)[1] == 0
-falling = cortado.load_scene("docs/figures/dam_break_plane.toml", ["forces.pressure=false", "forces.viscosity=none"])
-cortado.Simulation(falling, precision="float64").run(1)
+cortado.Simulation(simulation.scene, precision="float64").run(1)
 """
+FALLING = ["forces.pressure=false", "forces.viscosity=none"]
+"""Without sums over neighbours, which take long to compile."""
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 def test_a_fork_before_anything_is_compiled(tmp_path):
     """The child deletes folders of Warp's that it shares with its parent, which compiles more after that."""
-    out, err = result(process(tmp_path, FORK))
+    out, err = result(process(tmp_path, FORK, FALLING))
     child, parent = out.split()
     assert child == parent and "Traceback" not in err
 

@@ -16,7 +16,7 @@ from signals import NEEDED, listen
 
 STOPPED = "print('here', flush=True); time.sleep(60)"
 SLOW_IMPORT = f"import time; {STOPPED}"
-START = "import time; from cortado.files import interruption; interruption.leave_at_once(); "
+START = "import time; from cortado.files.terminal import keeping, leave_at_once; leave_at_once(); "
 KEEPING = f"""{START}
 class Late:
     def __del__(self):
@@ -24,7 +24,7 @@ class Late:
         time.sleep(0.5)
 
 try:
-    with interruption.keeping(lambda: "two frames are in runs"):
+    with keeping(lambda: "two frames are in runs"):
         WORK
 except KeyboardInterrupt as stop:
     print(stop)
