@@ -31,7 +31,7 @@ gc.set_threshold(100_000, 20, 20)
 
 
 os.environ.setdefault(CORES, str(max(usable_cores() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")), 1)))
-"""Each worker of pytest has its share of the cores: threads beyond it only wait for each other. What several cores do is
+"""Each worker of pytest has its share of the cores: threads beyond it wait for each other. What several cores do is
 tested where a test asks for them."""
 
 

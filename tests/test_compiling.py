@@ -15,6 +15,7 @@ import cortado
 from compiling_notice import COMPILING, UNOPTIMISED
 from cortado.device import modules
 from cortado.device.modules import DEEP, SHALLOW, UNUSED, is_derivative, kernel_module, kernels_of
+from cortado.device.threads import CORES
 from scenes import plane, pour
 
 FIRST = {
@@ -58,7 +59,7 @@ WORK
 
 
 def process(cache, work, changes=ONE_PHASE):
-    environment = {**os.environ, "WARP_CACHE_PATH": str(cache)}
+    environment = {**os.environ, "WARP_CACHE_PATH": str(cache), CORES: ""}
     program = UNOPTIMISED + RUN.replace("WORK", work).replace("CHANGES", repr(changes))
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen([sys.executable, "-c", program], env=environment, text=True, **pipes)
