@@ -97,12 +97,13 @@ SEEN = {
 
 @pytest.mark.parametrize("name", SEEN)
 def test_loads_have_derivatives(name):
-    """Reverse and forward mode to round-off, and differences, for gravity, viscosity, and what solids do."""
+    """Reverse and forward mode to round-off, and differences, for gravity, viscosity, density, and what solids do."""
     scene = SEEN[name]()
     problem = Problem(Simulation(scene, precision="float64"), STEPS, Loads(scene))
     point, along = ({}, {}) if name == "raft" else point_of(scene)
-    point |= {"gravity": np.array(scene.forces.gravity) + 0.5, "viscosity": np.array(scene.phase[0].viscosity)}
-    along |= {"gravity": np.ones(scene.dimension), "viscosity": 0.3 * point["viscosity"]}
+    point |= {name: np.array(getattr(scene.phase[0], name)) for name in ("viscosity", "rest_density")}
+    along |= {name: 0.3 * point[name] for name in ("viscosity", "rest_density")}
+    point["gravity"], along["gravity"] = np.array(scene.forces.gravity) + 0.5, np.ones(scene.dimension)
     if name == "raft":
         point |= {"raft.density": np.array(500.0), "raft.velocity": np.array([0.1, -0.2])}
         along |= {"raft.density": np.array(50.0), "raft.velocity": np.array([0.2, 0.3])}

@@ -1,34 +1,75 @@
-"""Quantities of the sorted particles of a step, with their tangents and adjoints.
+"""Quantities of the sorted particles of a step, on the device, with their tangents and adjoints.
 
-Sums over neighbours are kernels; what is done with the sum of each particle alone is NumPy in float64. n is the number
-density, m a particle's mass over its volume V on the rest lattice. Forces on walls are in `cortado.runs.wall_loads`.
-
-Vorticity is by summation over the fluid around a particle (Monaghan 1992):
+n is the number density, m a particle's mass over its volume V on the rest lattice. Vorticity is by summation over the
+fluid around a particle (Monaghan 1992):
 
     c_i = V sum_j (v_i - v_j) x G_ij,   omega_i = c_i / (mu n_i).
 
 mu = -(V / d) sum_j x_j . G_j is that of the rest lattice, on which a fluid that turns as a whole has twice its rate of
 turning. Walls have no part in it.
+
+Particle i pushes walls, those of one solid or all, with
+
+    f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i + B_i),
+
+where A_i is the sum over wall particles along which its pressure acts (``wall_push`` of
+`cortado.solvers.particles.ParticleSolver`), a_i the acceleration that they give it by a force such as viscosity, and
+B_i the part of images (`cortado.solvers.projection.mean_stress`), if walls mirror. The walls so get what momentum the
+fluid loses to them: the mass of a particle is m_i s^d, with the spacing s.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, Protocol, Self
+from functools import cache, cached_property
+from typing import Any, Protocol
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from cortado.device.launching import Named
-from cortado.device.modules import Kernels
+from cortado.device.modules import Kernels, kernel_module
+from cortado.device.precision import Precision
+from cortado.device.reduction import TreeReduction, add
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum
-from cortado.particles.particle_kernels import sum_kernels
-from cortado.particles.state import Fields
+from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels, sum_kernels
+from cortado.particles.wall_terms import ALL_WALLS
+from cortado.scene.parameters import load_name
+from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.particles import ParticleSolver
+from cortado.sph.density import WallAction
 from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+SIX = wp.types.vector(6, wp.float64)
+"""The type of a force and a torque on the device."""
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Adjoints within a step, to which those of quantities are added; see `cortado.solvers.solver.WithinBar`."""
+
+    of: Adjoints
+    """Adjoints of sorted particles at the start of the step, and of parameters and solids."""
+    p: wp.array
+    """(n,) of the pressures with which particles push walls."""
+    stress: wp.array
+    """(n,) of the pressures that a gauge would read."""
+    v_star: wp.array
+    """(n,) of the predicted velocities."""
+
+
+class QuantityFormula(Protocol):
+    """A formula of a quantity of the sorted particles of a step, with its derivatives: numbers or vectors (n,), or six
+    numbers for each scene. ``p`` (n,) are the pressures by which particles push walls, where the step was taken."""
+
+    def value(self, step: StepContext, p: Any) -> wp.array:
+        """Return the quantity; the next call overwrites it."""
+
+    def tangent(self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any) -> wp.array:
+        """Return the tangent of the quantity, given those of p and of the pressures that a gauge would read."""
+
+    def adjoint(self, step: StepContext, p: Any, own: wp.array, bar: Bars) -> None:
+        """Add to the adjoints ``bar`` by the quantity's own one."""
 
 
 def turns(discretisation: Discretisation) -> Callable[..., Any]:
@@ -54,137 +95,153 @@ def circulation_kernels(discretisation: Discretisation) -> Kernels:
     return sum_kernels("circulation", modules, sums, "circulation", times="s.volume")
 
 
-def vectors(array: wp.array) -> NDArray:
-    """Read an array of vectors from the device, (n, 3) in float64."""
-    return np.asarray(array.numpy(), dtype=np.float64)
+@cache
+def number_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
+    """Make the kernels of densities, of speeds, whose derivative at rest, where they have a kink, is taken as 0, and of
+    the vorticity, given the circulation c; ``factor`` is mu."""
+    real, vector = precision.real, precision.vector
+    modules = [kernel_module(f"quantities_{kind}_{precision.name}") for kind in ("forward", "tangent", "derivative")]
+
+    def density(m_i: real, n_i: real) -> real:
+        return m_i * n_i
+
+    def speed(v_i: vector) -> real:
+        return wp.length(v_i)
+
+    def vorticity(factor: real, circulation_i: vector, n_i: real) -> vector:
+        return circulation_i / (factor * n_i)
+
+    def made(function: Any, **names: Any) -> Kernels:
+        return pointwise_kernels(precision, modules, lambda _: function, ["q"], **names)
+
+    return made(density), made(speed), made(vorticity, numbers=["factor"], written=["circulation"])
 
 
-@dataclass(frozen=True)
-class Pressures:
-    """The pressures of the sorted particles of a step: copies."""
+@cache
+def wall_force_kernels(discretisation: Discretisation) -> Kernels:
+    """Make the kernels of the forces f of particles on walls, given the sums A, a and B as ``push``, ``rub`` and
+    ``by_images``."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
 
-    push: wp.array
-    """(n,) pressures with which they push walls [Pa], on the device."""
-    stress: NDArray | None
-    """(n,) pressures that a gauge would read [Pa], float64; None where nobody asks for them."""
+    def wall_force(
+        scale: real,
+        power: real,
+        cell: real,
+        p_i: real,
+        n_i: real,
+        m_i: real,
+        push_i: vector,
+        rub_i: vector,
+        by_images_i: vector,
+    ) -> vector:
+        return (scale * p_i / wp.pow(n_i, power)) * push_i - (cell * m_i) * rub_i + cell * by_images_i
 
-
-@dataclass(frozen=True)
-class Particles:
-    """Numbers of sorted particles in float64, off the device: of a step, their tangents, or adjoints."""
-
-    fields: Mapping[str, NDArray]
-    """By the names of `Fields`: ``x`` and ``v`` (n, 3), ``n`` and ``m`` (n,)."""
-    pressures: Pressures | None
-    """Their pressures; None where none were computed."""
-    on_device: "OnDevice | None" = None
-    """For adjoints, the arrays to which kernels add."""
-
-    @classmethod
-    def of(cls, fields: Fields, pressures: Pressures | None) -> Self:
-        """Read the fields of particles from the device."""
-        return cls({name: fields[name].numpy().astype(np.float64) for name in "xvnm"}, pressures)
-
-    @classmethod
-    def zeros(cls, push: wp.array, on_device: "OnDevice | None" = None) -> Self:
-        """Make fields and stresses of zeros, beside pressures ``push`` that are zeros."""
-        particles, shapes = len(push), {"x": (3,), "v": (3,), "n": (), "m": ()}
-        fields = {name: np.zeros((particles, *shape)) for name, shape in shapes.items()}
-        return cls(fields, Pressures(push, np.zeros(particles)), on_device)
-
-    def __getitem__(self, name: str) -> NDArray:
-        return self.fields[name]
-
-    @property
-    def push(self) -> wp.array:
-        """Return the pressures (n,) with which they push walls [Pa], on the device."""
-        assert self.pressures is not None
-        return self.pressures.push
-
-    @property
-    def stress(self) -> NDArray:
-        """Return the pressures (n,) that a gauge would read [Pa]."""
-        assert self.pressures is not None and self.pressures.stress is not None
-        return self.pressures.stress
-
-    @property
-    def within(self) -> "OnDevice":
-        """Return the arrays to which kernels add adjoints."""
-        assert self.on_device is not None
-        return self.on_device
+    numbers, written, modules = (
+        ["scale", "power", "cell"],
+        ["push", "rub", "by_images"],
+        discretisation.modules("wall_force"),
+    )
+    make = pointwise_kernels
+    return make(discretisation.precision, modules, lambda _: wall_force, ["f"], numbers=numbers, written=written)
 
 
-@dataclass(frozen=True)
-class OnDevice:
-    """Adjoints within a step on the device, for kernels."""
+@cache
+def load_kernels(precision: Precision) -> Kernels:
+    """Make the kernels of each particle's share in the force and the torque on a solid with a ``middle``, along a
+    periodic axis by the shorter arm; ``twist`` are its `WallLoads.twists`."""
+    real, vector = precision.real, precision.vector
+    module, derivative = (kernel_module(f"{name}_{precision.name}") for name in ("load", "load_derivative"))
+    numbers = ["cell", "period"]
 
-    bar: Adjoints
-    """Adjoints of sorted particles at the start of the step, and of parameters and solids."""
-    v_star: wp.array
-    """(n,) adjoint of the predicted velocities, see `cortado.solvers.solver.WithinBar`."""
+    @wp.func
+    def double(a: vector) -> wp.vec3d:
+        return wp.vec3d(wp.float64(a[0]), wp.float64(a[1]), wp.float64(a[2]))
+
+    @wp.func
+    def single(a: wp.vec3d) -> vector:
+        return vector(real(a[0]), real(a[1]), real(a[2]))
+
+    @wp.func
+    def arm_of(x: vector, middle: vector, period: vector) -> wp.vec3d:
+        arm = double(x) - double(middle)
+        for k in range(3):
+            if period[k] > real(0.0):
+                length = wp.float64(period[k])
+                arm[k] = arm[k] - length * wp.rint(arm[k] / length)
+        return arm
+
+    @wp.func
+    def six(force: wp.vec3d, torque: wp.vec3d) -> SIX:
+        return SIX(force[0], force[1], force[2], torque[0], torque[1], torque[2])
+
+    @particle_kernel(module, "load", numbers=numbers)
+    def load(cell: real, period: vector, middle: vector, x_i: vector, m_i: real, f_i: vector, twist_i: vector) -> SIX:
+        force, mass = double(f_i), wp.float64(cell) * wp.float64(m_i)
+        return six(force, mass * double(twist_i) + wp.cross(arm_of(x_i, middle, period), force))
+
+    @particle_kernel(derivative, "load_dot", numbers=numbers)
+    def load_tangent(
+        cell: real,
+        period: vector,
+        middle: vector,
+        middle_dot: vector,
+        x_i: vector,
+        x_dot_i: vector,
+        m_i: real,
+        m_dot_i: real,
+        f_i: vector,
+        f_dot_i: vector,
+        twist_i: vector,
+        twist_dot_i: vector,
+    ) -> SIX:
+        force, arm = double(f_dot_i), arm_of(x_i, middle, period)
+        twisted = wp.float64(m_dot_i) * double(twist_i) + wp.float64(m_i) * double(twist_dot_i)
+        turned = wp.cross(double(x_dot_i) - double(middle_dot), double(f_i)) + wp.cross(arm, force)
+        return six(force, wp.float64(cell) * twisted + turned)
+
+    @particle_kernel(derivative, "+x_bar +m_bar f_bar twist_bar middle_bar", numbers=numbers)
+    def load_adjoint(
+        cell: real, period: vector, middle: vector, x_i: vector, m_i: real, f_i: vector, twist_i: vector, load_bar: SIX
+    ) -> tuple[vector, real, vector, vector, vector]:
+        force, torque = wp.vec3d(load_bar[0], load_bar[1], load_bar[2]), wp.vec3d(load_bar[3], load_bar[4], load_bar[5])
+        x_bar = single(wp.cross(double(f_i), torque))  # type: ignore[arg-type]
+        f_bar = single(force + wp.cross(torque, arm_of(x_i, middle, period)))  # type: ignore[arg-type]
+        cell_torque = wp.float64(cell) * torque
+        m_bar, twist_bar = real(wp.dot(cell_torque, double(twist_i))), single(wp.float64(m_i) * cell_torque)
+        return x_bar, m_bar, f_bar, twist_bar, -x_bar
+
+    return Kernels(load, load_tangent, load_adjoint)
 
 
-class Sums:
-    """The sums over neighbours of a step, on the device."""
+class OfParticles:
+    """A quantity that is a function of each particle's own numbers, and of a sum over its neighbours, if there is
+    one."""
 
-    def __init__(self, solver: ParticleSolver, context: StepContext):
-        self._solver, self.context = solver, context
-        self.circulation = circulation_kernels(solver.discretisation)
+    def __init__(self, solver: ParticleSolver, kernels: Kernels, kind: Any, total: Kernels | None = None, **given: Any):
+        """Take kernels that write ``q``, of a ``kind``, and those of the sum ``circulation``; ``given`` are numbers."""
+        self._kernels, self._total, self._given = kernels, total, given
+        self._q = solver.layout.arrays(q=kind, q_dot=kind)
+        names = () if total is None else ("circulation", "circulation_dot", "circulation_bar")
+        self._sums = {name: solver.vectors() for name in names}
 
-    def __call__(self, kernel: Any, *named: Named, **given: NDArray) -> NDArray:
-        """Return the vectors (n, 3) that a kernel writes to its last argument, given the step's fields and further
-        vectors."""
-        arrays = {name: self.on_device(value) for name, value in given.items()}
-        found = self._solver.vectors()
-        self.context.launch(kernel, *named, **arrays, **{kernel.adj.args[-1].label: found})
-        return vectors(found)
+    def value(self, step: StepContext, p: Any) -> wp.array:
+        if self._total is not None:
+            step.launch(self._total.forward, self._sums)
+        step.launch(self._kernels.forward, self._sums, self._given, self._q)
+        return self._q["q"]
 
-    def add(self, kernel: Any, bar: Particles, **given: NDArray) -> None:
-        """Let a kernel add to the adjoints ``x_bar`` and ``v_bar``."""
-        arrays = {name: self.on_device(value) for name, value in given.items()}
-        own = {"x": self._solver.vectors(), "v": self._solver.vectors()}
-        self.context.launch(kernel, **arrays, **{f"{name}_bar": array for name, array in own.items()})
-        for name, array in own.items():
-            bar[name][:] += array.numpy()
+    def tangent(self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any) -> wp.array:
+        self.value(step, p)
+        if self._total is not None:
+            step.launch(self._total.tangent, *along.named, self._sums)
+        step.launch(self._kernels.tangent, *along.named, self._sums, self._given, self._q)
+        return self._q["q_dot"]
 
-    def on_device(self, values: NDArray) -> wp.array:
-        """Copy vectors (n, 3) to the device."""
-        return wp.array(values, dtype=self._solver.discretisation.precision.vector, device=self._solver.device)
-
-
-class QuantityFormula(Protocol):
-    """A formula of a quantity of the sorted particles of a step, with its derivatives."""
-
-    def value(self, at: Particles, sums: Sums) -> NDArray:
-        """Return the quantity (n,) or (n, k); for the load on a solid (scenes, k)."""
-
-    def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents) -> NDArray:
-        """Return the tangent of the quantity along ``dot``; ``along`` has it on the device."""
-
-    def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
-        """Add to the adjoints of the particles by the quantity's own adjoint, in the shape of its value."""
-
-
-class OnDeviceFormula(Protocol):
-    """A formula of a quantity that needs the step after a state, as captured steps compute it."""
-
-    def on_device(self, step: StepContext, p: wp.array) -> wp.array:
-        """Return the quantity of the step that was just taken, with the pressures ``p`` (n,) by which particles push
-        walls: an entry for each sorted particle, or six numbers for each scene. The next call overwrites it."""
-
-
-class Density:
-    """The quantity of densities, rho_i = m_i n_i."""
-
-    def value(self, at: Particles, sums: Sums) -> NDArray:
-        return at["m"] * at["n"]
-
-    def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents) -> NDArray:
-        return dot["m"] * at["n"] + at["m"] * dot["n"]
-
-    def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
-        bar["m"][:] += own * at["n"]
-        bar["n"][:] += own * at["m"]
+    def adjoint(self, step: StepContext, p: Any, own: wp.array, bar: Bars) -> None:
+        self.value(step, p)
+        step.launch(self._kernels.adjoint, *bar.of.named, self._sums, self._given, q_bar=own)
+        if self._total is not None:
+            step.launch(self._total.adjoint, *bar.of.named, self._sums)
 
 
 @dataclass(frozen=True)
@@ -193,62 +250,168 @@ class Pressure:
 
     solver: ParticleSolver
 
-    def on_device(self, step: StepContext, p: wp.array) -> wp.array:
-        """Return the pressures (n,) of sorted particles."""
+    def value(self, step: StepContext, p: Any) -> wp.array:
         return self.solver.stresses()
 
-    def value(self, at: Particles, sums: Sums) -> NDArray:
-        return at.stress
+    def tangent(self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any) -> wp.array:
+        return stress_dot
 
-    def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents) -> NDArray:
-        return dot.stress
-
-    def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
-        bar.stress[:] += own
+    def adjoint(self, step: StepContext, p: Any, own: wp.array, bar: Bars) -> None:
+        add(own, bar.stress)
 
 
-class SpeedQuantity:
-    """The quantity of speeds |v_i|; of a particle at rest, where it has a kink, the derivative is taken as 0."""
+class WallLoads:
+    """The forces of a solver's particles on walls [N], vectors (n,) on the device, which the next call overwrites.
+    ``solid`` is the number of a solid's wall particles, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
-    def value(self, at: Particles, sums: Sums) -> NDArray:
-        return np.linalg.norm(at["v"], axis=1)
+    def __init__(self, solver: ParticleSolver):
+        self._solver, self._kernels, self.cell = solver, wall_force_kernels(solver.discretisation), solver.lattice.cell
+        power, scale = float(solver.density_power), self.cell * solver.lattice.volume
+        self._numbers = {"power": power, "scale": scale, "cell": self.cell}
+        self._push, self._images = solver.wall_push(), solver.image_loads()
+        self._rubs, self._twists = self._actions("wall_action"), self._actions("wall_couple")
+        names = ("rub", "f", "twist", "by_images", "rub_dot", "f_dot", "twist_dot", "by_images_dot")
+        self._vectors = {name: solver.vectors() for name in names}
+        self._bars = {name: solver.vectors() for name in ("push_bar", "rub_bar", "by_images_bar")}
 
-    def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents) -> NDArray:
-        return (self._direction(at) * dot["v"]).sum(axis=1)
+    def _actions(self, name: str) -> list[WallAction]:
+        return [action for force in self._solver.forces if (action := getattr(force, name, None)) is not None]
 
-    def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
-        bar["v"][:] += self._direction(at) * own[:, None]
+    def forces(self, step: StepContext, p: wp.array, solid: int) -> wp.array:
+        """Return the forces f of particles on the walls of a solid."""
+        found, known = self._vectors["f"], self._sums(step, p, solid)
+        step.launch(self._kernels.forward, known, self._numbers, f=found)
+        return found
 
-    def _direction(self, at: Particles) -> NDArray:
-        speed = np.linalg.norm(at["v"], axis=1, keepdims=True)
-        return np.divide(at["v"], speed, out=np.zeros_like(at["v"]), where=speed > 0.0)
+    def tangent(self, step: StepContext, p: wp.array, p_dot: wp.array, along: Tangents, solid: int) -> wp.array:
+        """Return the tangent of the forces f of particles on the walls of a solid."""
+        rub_dot = self._total("rub_dot", [action.tangent(step, along, solid) for action in self._rubs])
+        dots = {"push_dot": self._push.tangent(step, along, solid), "rub_dot": rub_dot, "p_dot": p_dot}
+        dots["by_images_dot"] = self._vectors["by_images_dot"]
+        if self._images is not None:
+            dots["by_images_dot"] = self._images.tangent(step, along, solid, p, p_dot)
+        found, known = self._vectors["f_dot"], self._sums(step, p, solid)
+        step.launch(self._kernels.tangent, known, dots, *along.named, self._numbers, f_dot=found)
+        return found
+
+    def adjoint(self, step: StepContext, p: wp.array, f_bar: wp.array, bar: Bars, solid: int) -> None:
+        """Add to the adjoints of the particles by that of the forces f."""
+        known, bars = self._sums(step, p, solid), {**self._bars, "p_bar": bar.p}
+        step.launch(self._kernels.adjoint, known, bars, *bar.of.named, self._numbers, f_bar=f_bar)
+        self._push.adjoint(step, bar.of, solid, self._bars["push_bar"], bar.v_star)
+        if self._images is not None:
+            self._images.adjoint(step, bar.of, solid, p, self._bars["by_images_bar"], bar.p)
+        for action in self._rubs:
+            action.adjoint(step, bar.of, solid, self._bars["rub_bar"], bar.v_star)
+
+    def twists(self, step: StepContext, solid: int) -> wp.array:
+        """Return the sums of y x a over forces that act at x_i - y, by the walls of a solid; times m_i s^d they twist
+        it [N m]."""
+        return self._total("twist", [action.total(step, solid) for action in self._twists])
+
+    def twists_tangent(self, step: StepContext, along: Tangents, solid: int) -> wp.array:
+        """Return the tangent of `twists`."""
+        return self._total("twist_dot", [action.tangent(step, along, solid) for action in self._twists])
+
+    def twists_adjoint(self, step: StepContext, total_bar: wp.array, bar: Bars, solid: int) -> None:
+        """Add to the adjoints of the particles by that of `twists`."""
+        for action in self._twists:
+            action.adjoint(step, bar.of, solid, total_bar, bar.v_star)
+
+    def _sums(self, step: StepContext, p: wp.array, solid: int) -> dict[str, wp.array]:
+        rub = self._total("rub", [action.total(step, solid) for action in self._rubs])
+        found = {"push": self._push.total(step, solid), "rub": rub, "by_images": self._vectors["by_images"], "p": p}
+        if self._images is not None:
+            found["by_images"] = self._images.total(step, solid, p)
+        return found
+
+    def _total(self, name: str, arrays: list[wp.array]) -> wp.array:
+        """Add up arrays; the sum of one is itself."""
+        if len(arrays) == 1:
+            return arrays[0]
+        total = self._vectors[name]
+        if arrays:  # else it is 0 from the start
+            total.zero_()
+        for array in arrays:
+            add(array, total)
+        return total
 
 
 @dataclass(frozen=True)
-class Vorticity:
-    """The quantity of vorticities c_i / (mu n_i): see `cortado.runs.quantity_formulas`. In the plane it is the
-    component that stands on it."""
+class WallForces:
+    """The quantity of forces with which particles push all walls."""
 
-    factor: float
-    """mu [-]"""
-    dimension: int
+    loads: WallLoads
 
-    def value(self, at: Particles, sums: Sums) -> NDArray:
-        return self._shown(sums(sums.circulation.forward) / self._divisor(at))
+    def value(self, step: StepContext, p: Any) -> wp.array:
+        return self.loads.forces(step, p, ALL_WALLS)
 
-    def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents) -> NDArray:
-        change = sums(sums.circulation.tangent, *along.named)
-        whole = sums(sums.circulation.forward) / self._divisor(at)
-        return self._shown(change / self._divisor(at) - whole * (dot["n"] / at["n"])[:, None])
+    def tangent(self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any) -> wp.array:
+        return self.loads.tangent(step, p, p_dot, along, ALL_WALLS)
 
-    def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
-        turned = own if self.dimension == 3 else np.stack([np.zeros_like(own), np.zeros_like(own), own], axis=1)
-        sums.add(sums.circulation.adjoint, bar, circulation_bar=turned / self._divisor(at))
-        whole = sums(sums.circulation.forward) / self._divisor(at)
-        bar["n"][:] -= (turned * whole).sum(axis=1) / at["n"]
+    def adjoint(self, step: StepContext, p: Any, own: wp.array, bar: Bars) -> None:
+        self.loads.adjoint(step, p, own, bar, ALL_WALLS)
 
-    def _divisor(self, at: Particles) -> NDArray:
-        return self.factor * at["n"][:, None]
 
-    def _shown(self, turning: NDArray) -> NDArray:
-        return turning if self.dimension == 3 else turning[:, 2]
+class SolidLoads:
+    """The quantity of force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i, with r_i from its middle at
+    the end of the step, where its walls are, to particle i. For viscosity as a stress r_i leads to the surface beneath
+    the particle."""
+
+    def __init__(self, loads: WallLoads, solver: ParticleSolver, solid: NamedSolid):
+        vector, layout, number = solver.layout.precision.vector, solver.layout, solid.number
+        self._loads, self._layout, self._solid = loads, layout, number
+        self._kernels, self._moving = load_kernels(layout.precision), solver.search.moving if number >= 0 else None
+        self._given = {"cell": loads.cell, "period": vector(*solver.system.periods)}
+        rest = wp.full(layout.members, vector(*solid.middle), dtype=vector, device=layout.device)
+        self._rest = {"middle": rest, "middle_dot": wp.zeros_like(rest)}
+        self._bars = {name: solver.vectors() for name in ("f_bar", "twist_bar", "middle_bar")}
+
+    @cached_property
+    def _each(self) -> dict[str, wp.array]:
+        """Make the arrays of particles' shares, as most runs do without."""
+        return self._layout.arrays(load=SIX, load_dot=SIX)
+
+    @cached_property
+    def _sums(self) -> tuple[TreeReduction, TreeReduction]:
+        return self._layout.sum_of(SIX), self._layout.sum_of(self._layout.precision.vector)
+
+    def _known(self, step: StepContext, p: Any) -> tuple[Named, ...]:
+        middles = self._rest
+        if self._moving is not None:
+            named = {"middle": "after", "middle_dot": "after_dot"}
+            middles = {name: self._moving.named[of][:, self._solid] for name, of in named.items()}
+        own = {"f": self._loads.forces(step, p, self._solid), "twist": self._loads.twists(step, self._solid)}
+        return middles, own, self._given, self._each
+
+    def value(self, step: StepContext, p: Any) -> wp.array:
+        step.launch(self._kernels.forward, *self._known(step, p))
+        return self._sums[0](self._each["load"])
+
+    def tangent(self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any) -> wp.array:
+        dots = {"f_dot": self._loads.tangent(step, p, p_dot, along, self._solid)}
+        dots["twist_dot"] = self._loads.twists_tangent(step, along, self._solid)
+        step.launch(self._kernels.tangent, *along.named, dots, *self._known(step, p))
+        return self._sums[0](self._each["load_dot"])
+
+    def adjoint(self, step: StepContext, p: Any, own: wp.array, bar: Bars) -> None:
+        step.launch(self._kernels.adjoint, *bar.of.named, self._bars, *self._known(step, p), load_bar=own)
+        self._loads.adjoint(step, p, self._bars["f_bar"], bar, self._solid)
+        self._loads.twists_adjoint(step, self._bars["twist_bar"], bar, self._solid)
+        if self._moving is not None:
+            total = self._sums[1](self._bars["middle_bar"])
+            bar.of.solids.add_whole(self._solid, total, wp.zeros_like(total))
+
+
+def formulas(solver: ParticleSolver, circulation_factor: float) -> dict[str, QuantityFormula]:
+    """Make the formulas of a solver's particles, and of the loads on its solids, by their names."""
+    loads, precision = WallLoads(solver), solver.layout.precision
+    (density, speed, vorticity), circulation = number_kernels(precision), circulation_kernels(solver.discretisation)
+    return {
+        "density": OfParticles(solver, density, precision.real),
+        "pressure": Pressure(solver),
+        "speed": OfParticles(solver, speed, precision.real),
+        "vorticity": OfParticles(solver, vorticity, precision.vector, circulation, factor=circulation_factor),
+        "wall_force": WallForces(loads),
+        **{load_name(name): SolidLoads(loads, solver, solid) for name, solid in solver.system.solids.items()},
+    }

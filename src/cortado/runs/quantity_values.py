@@ -16,24 +16,12 @@ from cortado.arrays import require_names
 from cortado.device.launching import CapturedGraph
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import DivergedError, InputError
-from cortado.particles.state import Fields, Parameters, State
+from cortado.particles.state import Fields, Parameters, State, padded
 from cortado.rollout.rollout import Rollout
 from cortado.runs.particle_sums import in_the_scene
-from cortado.runs.quantity_formulas import (
-    Density,
-    OnDevice,
-    OnDeviceFormula,
-    Particles,
-    Pressure,
-    Pressures,
-    QuantityFormula,
-    SpeedQuantity,
-    Sums,
-    Vorticity,
-)
-from cortado.runs.wall_loads import SolidLoadQuantity, WallForceQuantity, WallLoads
+from cortado.runs.quantity_formulas import SIX, Bars, QuantityFormula, formulas
 from cortado.scene.parameter_values import Arrays
-from cortado.scene.parameters import LOAD, QUANTITIES, check_quantity, is_load, load_name
+from cortado.scene.parameters import LOAD, QUANTITIES, check_quantity, is_load
 from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
@@ -138,7 +126,7 @@ class QuantityEvaluator:
         self.solids: tuple[SolidTable, ...] = scene.solid
         """As they begin."""
         self.container: Container = scene.container
-        self._formulas = formulas(solver, scene.dimension, circulation_factor)
+        self._formulas = formulas(solver, circulation_factor)
         self._counts: Counts = ()
         """Of the step that was solved last."""
         self._graphs: dict[tuple[int, Counts], CapturedGraph] = {}
@@ -151,16 +139,16 @@ class QuantityEvaluator:
         """Return the lock that a thread holds while it uses the solver."""
         return self.solver.turn
 
-    def within(self, names: Iterable[str]) -> dict[str, OnDeviceFormula]:
+    def within(self, names: Iterable[str]) -> dict[str, QuantityFormula]:
         """Return by name the formulas of quantities that need a step, for steps of the solver that others take."""
-        return {name: cast(OnDeviceFormula, self._formulas[name]) for name in self._checked(names)}
+        return {name: self._formulas[name] for name in self._checked(names)}
 
     @in_turn
     def values(self, names: Iterable[str], moment: Moment) -> Arrays:
         """Compute quantities by name, float64."""
         wanted = self._checked(names)
-        at, sums = self._begin(wanted, moment, replay=False)
-        return {name: self._shown(name, self._formulas[name].value(at, sums)) for name in wanted}
+        step, p = self._begin(wanted, moment, replay=False)
+        return {name: self._shown(name, self._formulas[name].value(step, p)) for name in wanted}
 
     @in_turn
     def tangents(
@@ -169,14 +157,15 @@ class QuantityEvaluator:
         """Return tangents of quantities along those of the state, by fields, and of the parameters of the step, as
         `Moment` has them."""
         wanted, solver = self._checked(names), self.solver
-        at, sums = self._begin(wanted, moment, replay=True)
+        step, p = self._begin(wanted, moment, replay=True)
         state_dot, along = solver.new_state(), solver.new_parameters(1)
         state_dot.set(dot)
         along.set(parameters_dot)
-        tangent, pressure_dot = self._tangent(wanted, state_dot, along)
-        own = Particles.of(tangent.dot.fields, pressure_dot)
-        each = {name: self._formulas[name].tangent(at, sums, own, tangent.dot) for name in wanted}
-        return {name: self._shown(name, value) for name, value in each.items()}
+        tangent, *pressures_dot = self._tangent(wanted, state_dot, along)
+        each = {name: self._formulas[name] for name in wanted}
+        return {
+            name: self._shown(name, one.tangent(step, p, tangent.dot, *pressures_dot)) for name, one in each.items()
+        }
 
     @in_turn
     def adjoint(self, bars: Mapping[str, NDArray], moment: Moment) -> tuple[Arrays, Arrays]:
@@ -185,23 +174,17 @@ class QuantityEvaluator:
         wanted, solver = self._checked(bars), self.solver
         if wanted == [STRESS]:
             return self._from_stress(bars[STRESS], moment)
-        at, sums = self._begin(wanted, moment, replay=True)
+        step, p = self._begin(wanted, moment, replay=True)
         solved = any(map(_needs_the_step, wanted))
         adjoint = self._pressure_adjoint if solved else self._field_adjoint
         adjoint.begin()
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
-        on_device = OnDevice(replace(adjoint.bar, fields=fields), solver.vectors())
-        own = Particles.zeros(solver.numbers(), on_device)
+        own = Bars(replace(adjoint.bar, fields=fields), solver.numbers(), solver.numbers(), solver.vectors())
         for name in wanted:
-            self._formulas[name].adjoint(at, sums, self._sorted(name, bars[name]), own)
-        for name, array in own.fields.items():
-            fields[name].assign(fields[name].numpy() + array)
+            self._formulas[name].adjoint(step, p, self._sorted(name, bars[name]), own)
         state_bar = solver.new_state()
         if solved:
-            stress_bar = solver.numbers() if STRESS in wanted else None
-            if stress_bar is not None:
-                stress_bar.assign(own.stress)
-            within = WithinBar(fields, own.push, stress_bar, on_device.v_star)
+            within = WithinBar(fields, own.p, own.stress if STRESS in wanted else None, own.v_star)
             self._pressure_adjoint.from_within(self._counts, within, state_bar, self._rollout.parameters)
         else:
             self._from_fields(fields, state_bar)
@@ -212,7 +195,7 @@ class QuantityEvaluator:
         solver, (given, _, state_bar), adjoint = self.solver, self._of_stress, self._pressure_adjoint
         self._set(moment)
         if not moment.counts:
-            self._solve((), False)
+            self._solve(False)
         counts, *_ = moment.counts or [self._counts]
         given.assign(stress_bar.reshape(-1))
         adjoint.begin()
@@ -256,13 +239,12 @@ class QuantityEvaluator:
 
     # ---- the step ------------------------------------------------------------------------------------------------
 
-    def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[Particles, Sums]:
+    def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[StepContext, wp.array | None]:
         """Find the particles' neighbours and, where a pressure is wanted, take the step; ``replay`` it for
         derivatives."""
         self._set(moment)
         solved = any(map(_needs_the_step, names))
-        context, pressures = self._solve(names, replay) if solved else (self._look_around(), None)
-        return Particles.of(self.solver.fields, pressures), Sums(self.solver, context)
+        return self._solve(replay) if solved else (self._look_around(), None)
 
     def _set(self, moment: Moment) -> None:
         rollout = self._rollout
@@ -280,16 +262,14 @@ class QuantityEvaluator:
             context = solver.sort(rollout.initial, rollout.parameters)
         return context
 
-    def _solve(self, names: Iterable[str], replay: bool) -> tuple[StepContext, Pressures]:
-        """Take the step, and return it with its pressures as far as they are wanted."""
+    def _solve(self, replay: bool) -> tuple[StepContext, wp.array]:
+        """Take the step, and return it with the pressures by which particles push walls."""
         solver, rollout = self.solver, self._rollout
         rollout.forward(keep=False)
         found = solver.pressures()
         if found is None:
             raise InputError("This scene is computed without a pressure of particles, so that there is none to see.")
-        stresses = solver.stresses() if STRESS in names else None
-        stress = None if stresses is None else stresses.numpy().astype(np.float64)
-        pressures = Pressures(wp.clone(found), stress)  # a copy: a replay overwrites what was found
+        pressures = wp.clone(found)  # as a replay overwrites what was found
         self._counts = rollout.log.seek(0)
         rounds = rollout.diagnostics[solver.loops[0].iterations_name][0]
         self._rounds = [int(k) for k in np.atleast_1d(rounds)]
@@ -302,19 +282,20 @@ class QuantityEvaluator:
 
     def _tangent(
         self, names: Iterable[str], state_dot: State, along: Parameters
-    ) -> tuple[ParticleTangent | PressureTangent, Pressures | None]:
-        """Return the tangent of the sorted particles, and of their pressures."""
+    ) -> tuple[ParticleTangent | PressureTangent, wp.array | None, wp.array | None]:
+        """Return the tangent of the sorted particles, and of their two pressures, as far as they are wanted."""
         solver, parameters = self.solver, self._rollout.parameters
         if not any(map(_needs_the_step, names)):
             own = ParticleTangent(solver, along)
             own.sort(solver.context(parameters), state_dot)
-            return own, None
+            return own, None, None
         whole = cast(PressureTangent, solver.tangent(along))
         whole.step(self._counts, state_dot, parameters)
-        stresses = np.array(whole.stresses(self._rounds), dtype=np.float64) if STRESS in names else None
-        pushes = solver.numbers()
+        pushes, stresses = solver.numbers(), solver.numbers()
+        if STRESS in names:
+            stresses.assign(np.asarray(whole.stresses(self._rounds)))
         pushes.assign(whole.pressures(self._rounds))
-        return whole, Pressures(pushes, stresses)
+        return whole, pushes, stresses
 
     def _from_fields(self, fields: Fields, state_bar: State) -> None:
         adjoint, context = self._field_adjoint, self.solver.context(self._rollout.parameters)
@@ -342,47 +323,42 @@ class QuantityEvaluator:
     def _order(self) -> NDArray:
         return self.solver.search.order.numpy()[: self.solver.layout.all_particles]
 
-    def _shown(self, name: str, values: NDArray) -> NDArray:
+    def _shown(self, name: str, values: wp.array) -> NDArray:
         """Return a quantity in the scene's order; loads on solids have none."""
+        own = values.numpy().astype(np.float64)
         if is_load(name):
-            return values[0] if self.solver.layout.batch is None else values
-        found = np.empty(values.shape)
-        found[self._order] = values
-        return self._by_scene(found)
+            return self._load(own)
+        found = np.empty(own.shape)
+        found[self._order] = own
+        return self._by_scene(found[:, 2] if name == "vorticity" and self.dimension == 2 else found)
 
     def of_scene(self, name: str, values: NDArray) -> NDArray:
         """Return as `values` does a quantity that a step has left in the scene's order, or six numbers of a load."""
         found = values.astype(np.float64)
         found.flags.writeable = False
-        if is_load(name):
-            return self._shown(name, in_the_scene(found, self.dimension))
-        return self._by_scene(found if found.ndim == 1 else found[:, : self.dimension])
+        return self._load(found) if is_load(name) else self._by_scene(found)
+
+    def _load(self, six: NDArray) -> NDArray:
+        found = in_the_scene(six, self.dimension)
+        return found[0] if self.solver.layout.batch is None else found
 
     def _by_scene(self, found: NDArray) -> NDArray:
-        batch = self.solver.layout.batch
-        return found if batch is None else found.reshape(batch, -1, *found.shape[1:])
+        own, batch = found if found.ndim == 1 else found[:, : self.dimension], self.solver.layout.batch
+        return own if batch is None else own.reshape(batch, -1, *own.shape[1:])
 
-    def _sorted(self, name: str, values: NDArray) -> NDArray:
+    def _sorted(self, name: str, values: NDArray) -> wp.array:
+        """Return the adjoint of a quantity on the device, as its formula has the quantity there."""
+        given, layout = np.asarray(values, dtype=np.float64), self.solver.layout
         if is_load(name):
-            return np.asarray(values, dtype=np.float64).reshape(self.solver.layout.members, -1)
-        flat = values if self.solver.layout.batch is None else values.reshape(-1, *values.shape[2:])
-        return np.asarray(flat, dtype=np.float64)[self._order]
-
-
-def formulas(solver: ParticleSolver, dimension: int, circulation_factor: float) -> dict[str, QuantityFormula]:
-    """Make the formulas of a solver's particles, and of the loads on its solids, by their names."""
-    loads = WallLoads(solver)
-    return {
-        "density": Density(),
-        "pressure": Pressure(solver),
-        "speed": SpeedQuantity(),
-        "vorticity": Vorticity(circulation_factor, dimension),
-        "wall_force": WallForceQuantity(loads, dimension),
-        **{
-            load_name(name): SolidLoadQuantity(loads, solver, solid, dimension)
-            for name, solid in solver.system.solids.items()
-        },
-    }
+            six = np.zeros((layout.members, 6))
+            six[:, [0, 1, 5] if self.dimension == 2 else slice(None)] = given.reshape(layout.members, -1)
+            return wp.array(six, dtype=SIX, device=layout.device)
+        flat = given if layout.batch is None else given.reshape(-1, *given.shape[2:])
+        if name == "vorticity" and self.dimension == 2:
+            flat = np.pad(flat[:, None], ((0, 0), (2, 0)))
+        kind = layout.precision.real if flat.ndim == 1 else layout.precision.vector
+        sorted_ = flat[self._order] if flat.ndim == 1 else padded(flat[self._order])
+        return wp.array(sorted_, dtype=kind, device=layout.device)
 
 
 def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:

@@ -19,8 +19,7 @@ from cortado.discretise.shapes import in_space
 from cortado.errors import InputError
 from cortado.particles.state import Parameters, State, StateSeries
 from cortado.runs.particle_sums import LoadSum, ParticleSum, RegionSum, WeightedSum
-from cortado.runs.quantity_formulas import OnDeviceFormula
-from cortado.runs.wall_loads import SIX
+from cortado.runs.quantity_formulas import SIX, QuantityFormula
 from cortado.solvers.particles import ParticleSolver
 from cortado.sph.parts import unsort
 
@@ -163,7 +162,7 @@ class StepQuantities:
     """The quantities of particles and the loads on solids that every step of a chunk computes for the state at which it
     begins; they are kept until the next chunk."""
 
-    def __init__(self, formulas: Mapping[str, OnDeviceFormula], solver: ParticleSolver, length: int):
+    def __init__(self, formulas: Mapping[str, QuantityFormula], solver: ParticleSolver, length: int):
         """Make room for ``formulas`` by the names of their quantities in chunks of ``length`` steps."""
         self._formulas, self._solver, self._length, self.kept = formulas, solver, length, dict[str, wp.array]()
 
@@ -174,7 +173,7 @@ class StepQuantities:
         if pressures is None:
             raise InputError("This scene is computed without a pressure of particles, so that there is none to see.")
         for name, formula in self._formulas.items():
-            found = formula.on_device(context, pressures)
+            found = formula.value(context, pressures)
             if name not in self.kept:
                 self.kept[name] = wp.zeros(self._length * len(found), dtype=found.dtype, device=found.device)
             own = self.of_step(name, step)
