@@ -19,8 +19,10 @@ from cortado.discretise.walls import Places, RestLattice, WallLayers
 
 Near = Callable[[Points, float], Which]
 """Tells which points (n, d) [m] are less than a length [m] from something."""
-FINE = 3
-"""Number of points of a surface along a spacing, among which those that stay are chosen."""
+FINE = {2: 12, 3: 3}
+"""Number of points of a surface along a spacing, among which those that stay are chosen, by the number of dimensions.
+With 3 in the plane, wall particles of discs are 0.64 to 1.4 spacings apart, and first rows of fluid are pushed unevenly
+by 9 % (12: 3 %)."""
 CELLS = (3, 4)
 """Into how many parts, along each axis, cells are cut in which a surface is looked for, until these are fine; the last
 of them is even."""
@@ -54,7 +56,7 @@ def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
 
     Where a solid is thinner than twice the depth, they are in its middle.
     """
-    fine = spacing / FINE
+    fine = spacing / FINE[len(solid.extent()[0])]
     feet, away = surface_feet(solid, fine)
     points = feet - _reached(solid, feet, away, depth)[:, None] * away
     if depth <= 0.0:
@@ -287,7 +289,7 @@ class ExposedSurface:
         """Find the exposed surface of solids, and of the container near them, up to a support beyond the ends of a
         period that begins at ``lower`` (d,) [m]. Each point stands for a part that is a `FINE`th of a spacing long and
         wide."""
-        room, spacing, fine = container.room, container.spacing, container.spacing / FINE
+        room, spacing, fine = container.room, container.spacing, container.spacing / FINE[len(lower)]
         found = [surface_feet(side, fine, container.is_near) for side in container.solids]
         found += [surface_feet(solid, fine) for solid in solids]
         feet, away = (np.concatenate(parts) for parts in zip(*found, strict=True))
@@ -304,6 +306,11 @@ class ExposedSurface:
     def spacing(self) -> float:
         """Return the spacing of particles [m]."""
         return self.container.spacing
+
+    @property
+    def _fine(self) -> float:
+        """Return the distance of fine points [m]."""
+        return self.spacing / FINE[self.feet.shape[1]]
 
     @cached_property
     def _tree(self) -> Any:
@@ -337,12 +344,12 @@ class ExposedSurface:
         except where the container keeps its walls."""
         points = np.concatenate([self._at(depth), self._in_the_middle(depth)])
         points = points[_within_a_period(points, self.lower, self.room.periods, 0.0) & ~self.container.keeps(points)]
-        found = evenly_chosen(points, self.spacing / FINE, DENSITY * self.spacing)
+        found = evenly_chosen(points, self._fine, DENSITY * self.spacing)
         return SurfacePoints(found.points, found.shares * DENSITY ** (points.shape[1] - 1))
 
     def _at(self, depth: float) -> Points:
         """Return fine points (n, d) [m] at a depth."""
-        fine, found = self.spacing / FINE, []
+        fine, found = self._fine, []
         if not len(self.feet):
             return self.feet
 
@@ -369,7 +376,7 @@ class ExposedSurface:
     def _feet_of(self, points: Points, reach: Points, nearest: Numbers) -> Points:
         """Return the points (n, d) [m] of the surface, on a solid or where two of them meet, that are nearest to points
         (n, d) [m] beneath it. ``nearest`` (n,) are the nearest of the fine points, ``reach`` (n,) [m] away."""
-        fine = self.spacing / FINE
+        fine = self._fine
         found, owner = self.feet[nearest], self.owner[nearest]
         best, furthest = np.full(len(points), np.inf), float(reach.max(initial=0.0)) + fine
         for solid in self.solids:
