@@ -21,8 +21,7 @@ Near = Callable[[Points, float], Which]
 """Tells which points (n, d) [m] are less than a length [m] from something."""
 FINE = {2: 12, 3: 3}
 """Number of points of a surface along a spacing, among which those that stay are chosen, by the number of dimensions.
-With 3 in the plane, wall particles of discs are 0.64 to 1.4 spacings apart, and first rows of fluid are pushed unevenly
-by 9 % (12: 3 %)."""
+With 3 in the plane, wall particles of discs push first rows of fluid unevenly by 9 % (12: 3 %)."""
 CELLS = (3, 4)
 """Into how many parts, along each axis, cells are cut in which a surface is looked for, until these are fine; the last
 of them is even."""
