@@ -212,17 +212,6 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
     return np.concatenate([none, *first]), np.concatenate([none, *second]), np.concatenate([np.zeros(0), *distances])
 
 
-def pairs_among(points: Points, reach: float, lower: ArrayLike, lengths: ArrayLike) -> tuple[Numbers, Numbers]:
-    """Return the first and the second point (m,), i < j, of all pairs among points (n, d) [m]; the arguments are those
-    of `pairs_within`, which finds both orders and each point with itself."""
-    from scipy.spatial import cKDTree
-
-    lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), points.shape[1:])
-    tree = cKDTree(wrapped(points - np.asarray(lower, dtype=np.float64), lengths), boxsize=lengths)
-    first, second = tree.query_pairs(reach, output_type="ndarray").T
-    return first, second
-
-
 def apart(separations: Points, lengths: ArrayLike) -> Points:
     """Return separations (m, d) [m] of pairs with the nearest image, for a period's ``lengths`` (d,) [m]."""
     lengths = np.asarray(lengths, dtype=np.float64)

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.device.threads import WARP
-from cortado.discretise.shapes import Points, pairs_among
-from cortado.discretise.smoothing import circulation_factor, rest_volume, smoothing_kernel
+from cortado.discretise.shapes import Points
 from cortado.errors import InputError
 from cortado.files.image_encoding import moving_picture
 from cortado.files.terminal import track
@@ -326,40 +325,9 @@ def coloured_by(
         return ages(scene, trajectory)
     if name == "speed" or name in (*trajectory.quantities, *trajectory.others):
         return np.array([sizes(name, frame[name], scene.dimension) for frame in trajectory])
+    if simulation is None and name == "vorticity":
+        simulation = partial(Simulation, scene)  # whose parts have no say in it
     if simulation is not None:
         return sizes(name, simulation().quantity(name, trajectory), scene.dimension)
-    if name == "vorticity":
-        each = [vorticity(scene, frame.positions, frame.velocities) for frame in trajectory]
-        return sizes(name, np.array(each), scene.dimension)
     advice = f'record it, as in simulation.run(steps, record=["{name}"]), or use simulation.film(trajectory, path)'
     raise InputError(f"{name} was not recorded, and does not follow from positions and velocities: {advice}.")
-
-
-def vorticity(scene: Scene, positions: NDArray, velocities: NDArray) -> NDArray:
-    """Return the vorticity, (n,) in the plane and (n, 3) in space [1/s]: V / mu sum_j (v_i - v_j) x grad W_ij (Monaghan
-    1992) of particles of a scene at positions (n, d) [m] with velocities (n, d) [m/s].
-
-    It is `Simulation.quantity("vorticity")` without the division by the sum of W, which is 1 at the rest density.
-    """
-    x, v = np.asarray(positions, dtype=np.float64), np.asarray(velocities, dtype=np.float64)
-    kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
-    spacing = scene.discretisation.spacing
-    support = scene.discretisation.support * spacing
-    lower, lengths = scene.container.periods(dimension)
-    i, j = pairs_among(x, support, lower, lengths)
-    x_ij = x[i] - x[j]
-    x_ij -= np.where(lengths > 0.0, lengths, 0.0) * np.rint(x_ij / np.where(lengths > 0.0, lengths, np.inf))
-    size = (kernel, spacing, support, dimension)
-    factor = rest_volume(*size) / circulation_factor(*size)
-    v_ij, gradient = v[i] - v[j], factor * kernel.gradient(x_ij, support)
-    if dimension == 2:
-        turning = (v_ij[:, 0] * gradient[:, 1] - v_ij[:, 1] * gradient[:, 0])[:, None]
-    else:
-        turning = np.cross(v_ij, gradient)
-    found = _summed(i, turning, len(x)) + _summed(j, turning, len(x))
-    return found[:, 0] if dimension == 2 else found
-
-
-def _summed(of: NDArray, terms: NDArray, count: int) -> NDArray:
-    """Add up terms (m, k) by the number of the particle of each, (m,), to sums (count, k)."""
-    return np.stack([np.bincount(of, terms[:, k], minlength=count) for k in range(terms.shape[1])], axis=1)

@@ -5,7 +5,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial, singledispatch
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ import numpy as np
 from cortado.device.modules import compile_meanwhile
 from cortado.errors import InputError, SceneError
 from cortado.files.disk import read_columns
-from cortado.files.image_encoding import write_video
 from cortado.files.terminal import announce
 from cortado.losses import Snapshot
 from cortado.optimisation.fitting.experiment import Experiment
@@ -155,16 +153,7 @@ def _images(made: Setup, result: Result, folder: Path) -> TaskFigures:
     evaluations = np.unique(np.linspace(0, len(result.history) - 1, IMAGES).astype(int))
     shown = [image(result.history[k].parameters) for k in evaluations]
     path = images(shown, [f"evaluation {k}" for k in evaluations], folder / "progress.png")
-    search: Figures = [("The last image during the optimisation.", path)]
-    steps, picture = made.problem.steps, made.task.scene.picture or Picture()
-    if steps > 0 and picture.film_frames != 0 and find_spec("av"):
-        numbers = np.unique(np.linspace(0, steps, max(picture.searched_frames, 2)).astype(int)).tolist()
-        states = made.problem.states(made.search.parameters(result.parameters), numbers)
-        pace = step_pace(made.task.scene, numbers)
-        moving = (made.image(states[numbers[k]]) for k in pace.frames)
-        path = write_video(folder / "estimate.mp4", moving, pace.frames_per_second)
-        compared.append((f"The run with the parameters that were found, {pace.in_words}.", path))
-    return TaskFigures(compared=compared, search=search)
+    return TaskFigures(compared=compared, search=[("The last image during the optimisation.", path)])
 
 
 def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
