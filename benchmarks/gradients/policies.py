@@ -258,12 +258,12 @@ def draw(rows: list[Row], path: Path) -> None:
             for colour, method in zip(PALETTE, METHODS, strict=False):
                 own = [row for row in rows if (row["task"], row["method"]) == (name, method)]
                 for row in own:
-                    panel.plot(row["steps"], row["rewards"], color=colour, alpha=0.3, linewidth=0.8)
+                    panel.plot(np.array(row["steps"]) / 1e3, row["rewards"], color=colour, alpha=0.3, linewidth=0.8)
                 if own:
                     at = np.linspace(0.0, min(row["steps"][-1] for row in own), 50)
                     each = [np.interp(at, row["steps"], row["rewards"]) for row in own]
-                    panel.plot(at, np.median(each, axis=0), color=colour, linewidth=2.0, label=method)
-            panel.set(title=name, xlabel="simulated steps", ylabel="mean reward of an action, test episodes")
+                    panel.plot(at / 1e3, np.median(each, axis=0), color=colour, linewidth=2.0, label=method)
+            panel.set(title=name, xlabel="simulated steps [1,000]", ylabel="mean reward of an action, test episodes")
             panel.legend()
 
 
