@@ -1,6 +1,7 @@
 """Scenes that the tests share."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,17 @@ import numpy as np
 from cortado import Problem, Scene, Simulation
 from cortado.losses import FinalPositions
 from cortado.scene.stability import stability_limits
+
+
+def simulated(scene: Scene, precision: str = "float64") -> Simulation:
+    """The simulation of a scene, which tests of this process share, with its walls, its graphs and its kernels: a run
+    changes nothing of it."""
+    return _simulated(scene.to_json(), precision)
+
+
+@cache
+def _simulated(text: str, precision: str) -> Simulation:
+    return Simulation(Scene.from_json(text), precision=precision)
 
 
 def box(lower: Sequence[float], upper: Sequence[float], **more: Any) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from cortado import Problem, Simulation
 from cortado.particles.neighbourhood import neighbourhood_type
 from cortado.particles.state import to_device
 from reference_projection import Projection
-from scenes import OIL, box, plane, plane_of_three, scene, two_layers
+from scenes import OIL, box, plane, plane_of_three, scene, simulated, two_layers
 from still_fluids import still_water
 from test_faces import flume
 from test_moving_solids import ROTOR
@@ -209,7 +209,7 @@ def test_water_at_rest_has_the_pressure_of_its_depth():
 def test_pressures_beside_moving_solids_have_derivatives(name):
     """Reverse and forward mode to round-off, and differences, for gravity, viscosity, and what solids do."""
     own = SCENES[name]()
-    simulation = Simulation(own, precision="float64")
+    simulation = simulated(own)
     weights = np.random.default_rng(2).uniform(size=simulation.particles)
     point, along = point_of(own)
     point |= {"gravity": np.array(own.forces.gravity) + 0.5, "time_step": np.array(0.001)}

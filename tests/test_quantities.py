@@ -9,7 +9,7 @@ from cortado.cli import main
 from cortado.errors import InputError
 from cortado.scene.parameters import NAMES, QUANTITIES
 from finite_differences import both_modes, distance
-from scenes import jet, plane, scene, two_layers
+from scenes import jet, plane, scene, simulated, two_layers
 
 SCENES = {
     "plane": plane,
@@ -38,7 +38,7 @@ class Weighted:
 def problem_of(make, name, steps=6, precision="float64", seed=0):
     """A problem whose loss weighs a quantity, a point of it, and a direction there."""
     random = np.random.default_rng(seed)
-    simulation = cortado.Simulation(make(), precision=precision)
+    simulation = simulated(make(), precision)
     weights = random.uniform(size=simulation.quantity(name).shape)
     gravity, n = np.array(simulation.scene.forces.gravity), simulation.particles
     density = [phase.rest_density for phase in simulation.scene.phase]

@@ -20,7 +20,7 @@ from cortado.scene.shape_tables import NoContainer
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
 from cortado.watching import Watch
 from finite_differences import both_modes, distance
-from scenes import box, jet, plane, pool, scene
+from scenes import box, jet, plane, pool, scene, simulated
 from test_wave_gauges import Basin
 
 IN_THE_PLANE = {
@@ -45,7 +45,7 @@ NAMED = [f"{make.__name__}-{name}" for make, name, _ in CASES]
 def problem_of(make, sensor, precision="float64", steps=8):
     """One whose loss holds a sensor against a series, a point, and a direction there."""
     random = np.random.default_rng(3)
-    simulation = cortado.Simulation(make(), precision=precision)
+    simulation = simulated(make(), precision)
     d, dt = simulation.dimension, simulation.scene.solver.time_step
     wanted = random.normal(size=(4, len(sensor.columns(d))))
     loss = Series(sensor, np.linspace(0.0, steps * dt, 4), wanted, dt)
@@ -77,10 +77,10 @@ def test_what_a_sensor_makes_of_its_adjoint_is_its_derivative(make, name, sensor
     """With respect to the fields and quantities that it reads, taken as free."""
 
     class Fields(dict):
-        dimension, lattice, solids = make().dimension, cortado.Simulation(make()).lattice, ()
+        dimension, lattice, solids = make().dimension, simulated(make()).lattice, ()
         container = make().container
 
-    end = cortado.Problem(cortado.Simulation(make(), precision="float64"), 5, SensorMatch(sensor, 0.0)).end({})
+    end = cortado.Problem(simulated(make()), 5, SensorMatch(sensor, 0.0)).end({})
     names = ("positions", "velocities", "pressure", "wall_force")
     random, at = np.random.default_rng(2), Fields({key: end[key] for key in names})
     bar = random.normal(size=len(sensor.value(at)))
@@ -324,6 +324,7 @@ def test_a_series_in_a_batch_is_that_of_each_scene():
     assert together.tolist() == each and each[0] != each[1]
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_run_that_diverges_says_where_also_with_sensors(tmp_path, monkeypatch, cortado_command):
     monkeypatch.chdir(tmp_path)
     wild = ["--set", "solver.time_step=0.08", "--set", "forces.gravity=[3000.0, -9000.0]"]
@@ -339,6 +340,7 @@ def test_a_run_that_diverges_says_where_also_with_sensors(tmp_path, monkeypatch,
     assert rows[-1][1] == "nan"
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_an_interruption_between_two_sensors_keeps_what_was_read(cortado_command, tmp_path, monkeypatch):
     """And the run goes on with the same bits."""
     monkeypatch.chdir(tmp_path)
@@ -395,7 +397,7 @@ def channel(dimension):
         "discretisation": {"spacing": 0.025 if dimension == 2 else 0.05},
     }
     made = plane if dimension == 2 else scene
-    return cortado.Simulation(made(**tables), precision="float64"), long[0]
+    return simulated(made(**tables)), long[0]
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -7,6 +7,7 @@ from cortado import InputError, Problem, Scene, SceneError, Simulation
 from cortado.discretise.solid import Mass
 from cortado.losses import Series
 from cortado.sensors import SolidLoad, WallForce
+from scenes import simulated
 from test_free_bodies import RAFT
 from test_moving_solids import ROTOR, plane, space
 from test_quantities import Weighted
@@ -99,7 +100,7 @@ SEEN = {
 def test_loads_have_derivatives(name):
     """Reverse and forward mode to round-off, and differences, for gravity, viscosity, density, and what solids do."""
     scene = SEEN[name]()
-    problem = Problem(Simulation(scene, precision="float64"), STEPS, Loads(scene))
+    problem = Problem(simulated(scene), STEPS, Loads(scene))
     point, along = ({}, {}) if name == "raft" else point_of(scene)
     point |= {name: np.array(getattr(scene.phase[0], name)) for name in ("viscosity", "rest_density")}
     along |= {name: 0.3 * point[name] for name in ("viscosity", "rest_density")}
@@ -115,7 +116,7 @@ def test_loads_have_derivatives(name):
 def test_a_series_of_a_load_has_a_gradient():
     scene = plane(ROTOR)
     loss = Series(SolidLoad("rotor"), [0.0, 0.005], np.zeros((2, 3)), 0.001)
-    problem = Problem(Simulation(scene, precision="float64"), STEPS, loss)
+    problem = Problem(simulated(scene), STEPS, loss)
     check(problem, {"viscosity": np.array(1.0)}, {"viscosity": np.array(0.3)})
 
 
@@ -144,7 +145,7 @@ def test_a_load_is_a_quantity_and_a_sensor_of_the_scene():
 
 def test_after_the_last_step_a_solid_goes_on():
     """What is read of the last state is what a longer run reads there."""
-    simulation, sensors = Simulation(plane(ROTOR), precision="float64"), {"rotor": SolidLoad("rotor")}
+    simulation, sensors = simulated(plane(ROTOR)), {"rotor": SolidLoad("rotor")}
     short, long = (simulation.run(steps, sensors=sensors).sensors["rotor"].values for steps in (4, 6))
     np.testing.assert_allclose(short, long[:5], rtol=1e-9)
 

@@ -16,7 +16,7 @@ from cortado.pictures.exported import Exported
 from cortado.runs.frames import posed
 from cortado.sensors import PressureProbe, WallForce
 from finite_differences import both_modes, decades, distance
-from scenes import box
+from scenes import box, simulated
 from test_moving_solids import PADDLE, ROTOR, WATER, plane, space
 from test_quantities import Weighted
 
@@ -88,7 +88,7 @@ def point_of(scene, steps=STEPS, seed=0):
 
 
 def problem_of(scene, quantity="speed", precision="float64"):
-    simulation = Simulation(scene, precision=precision)
+    simulation = simulated(scene, precision)
     weights = np.random.default_rng(1).uniform(size=simulation.quantity(quantity).shape)
     return Problem(simulation, STEPS, Weighted(quantity, weights))
 
@@ -117,7 +117,7 @@ def test_losses_of_what_is_read_of_a_state_have_them(kind, quantity):
 def test_losses_of_sensors_have_them(sensor):
     scene = plane(ROTOR)
     loss = SensorMatch(sensor, np.zeros(len(sensor.columns(2))))
-    check(Problem(Simulation(scene, precision="float64"), STEPS, loss), *point_of(scene))
+    check(Problem(simulated(scene), STEPS, loss), *point_of(scene))
 
 
 def test_the_time_step_has_a_derivative_where_the_path_is_given():
@@ -166,7 +166,7 @@ def test_a_solid_that_is_told_how_large_it_is_has_the_walls_of_one_that_is(shape
 def test_a_displacement_and_a_turn_are_from_where_it_begins():
     scene = plane(ROTOR)
     point, _ = point_of(scene)
-    run = Simulation(scene, precision="float64").run(STEPS, point)
+    run = simulated(scene).run(STEPS, point)
     motion = run.solids["rotor"]
     np.testing.assert_allclose(motion.positions[0], point["rotor.position"], rtol=1e-15)
     np.testing.assert_allclose(motion.positions[1:], point["rotor.position"] + point["rotor.displacement"], rtol=1e-15)
@@ -176,7 +176,7 @@ def test_a_displacement_and_a_turn_are_from_where_it_begins():
 def test_scenes_of_a_batch_have_the_bits_of_single_ones():
     scene = plane(ROTOR, BALL)
     points = [point_of(scene, seed=seed)[0] for seed in range(2)]
-    one, loss = Simulation(scene, precision="float64"), CentreOfMass([0.5, 0.3])
+    one, loss = simulated(scene), CentreOfMass([0.5, 0.3])
     several = Problem(Simulation(scene, batch=2, precision="float64"), STEPS, loss)
     together = {name: np.stack([point[name] for point in points]) for name in points[0]}
     values, gradients = several.value_and_gradient(together)
@@ -190,7 +190,7 @@ def test_scenes_of_a_batch_have_the_bits_of_single_ones():
 def test_a_run_that_goes_on_has_the_bits_and_the_derivatives_of_a_whole_one():
     """With the same parameters, of those over time the rows that are left."""
     scene = plane(ROTOR)
-    simulation, (point, along) = Simulation(scene, precision="float64"), point_of(scene)
+    simulation, (point, along) = simulated(scene), point_of(scene)
 
     def some(values, rows):
         return {name: value[rows] if len(value.shape and value) == STEPS else value for name, value in values.items()}
