@@ -216,19 +216,19 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
         return int(wp.clamp(wp.ceil(s), real(0.0), real(n)))
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def colour_field_adjoint(
-        nodes: nodes_struct,
+        nodes,
         h: real,
         per_h: real,
         sigma: real,
         volume: real,
         order: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vector),
-        colour: wp.array(dtype=vector),
+        x,
+        colour,
         field_bar: wp.array3d(dtype=rgba),
-        # out
-        x_scene_bar: wp.array(dtype=vector),
-        colour_scene_bar: wp.array(dtype=vector),
+        x_scene_bar,
+        colour_scene_bar,
     ):
         p = wp.tid()
         x_p = x[p]

@@ -385,27 +385,29 @@ def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"step_sizes_{precision.name}")
 
+    typed = TypesByName(real, {pair: "greatest squares", vector: "v", wp.int32: "step"})
+
     @wp.kernel(module=module, enable_backward=False)
-    def speeds(v: wp.array(dtype=vector), squares: wp.array(dtype=pair)):
+    @typed.arrays
+    def speeds(v, squares):
         """Write for each particle a pair (0, squared speed), from which a reduction takes the maximum."""
         i = wp.tid()
         squares[i] = pair(real(0.0), wp.length_sq(v[i]))
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def choose(
         length: real,
         least: real,
         growth: real,
-        greatest: wp.array(dtype=pair),
+        greatest,
         bounds: wp.array2d(dtype=real),
-        first: wp.array(dtype=real),
-        step: wp.array(dtype=wp.int32),
-        # in and out
+        first,
+        step,
         times: wp.array2d(dtype=wp.float64),
         sizes: wp.array2d(dtype=real),
-        # out
         longest: wp.array2d(dtype=real),
-        time_step: wp.array(dtype=real),
+        time_step,
     ):
         """Write dt = min(bound, max(length / max |v|, least bound), growth dt of the step before), and the time at
         which it begins.

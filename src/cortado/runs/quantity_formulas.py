@@ -27,7 +27,7 @@ import warp as wp
 
 from cortado.device.launching import Named
 from cortado.device.modules import Kernels, kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import TreeReduction, add
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
@@ -123,17 +123,8 @@ def wall_force_kernels(discretisation: Discretisation) -> Kernels:
     ``by_images``."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
 
-    def wall_force(
-        scale: real,
-        power: real,
-        cell: real,
-        p_i: real,
-        n_i: real,
-        m_i: real,
-        push_i: vector,
-        rub_i: vector,
-        by_images_i: vector,
-    ) -> vector:
+    @TypesByName(real, {vector: "push rub by_images"})
+    def wall_force(scale, power, cell, p_i, n_i, m_i, push_i, rub_i, by_images_i) -> vector:
         return (scale * p_i / wp.pow(n_i, power)) * push_i - (cell * m_i) * rub_i + cell * by_images_i
 
     numbers, written, modules = (
@@ -174,25 +165,18 @@ def load_kernels(precision: Precision) -> Kernels:
     def six(force: wp.vec3d, torque: wp.vec3d) -> SIX:
         return SIX(force[0], force[1], force[2], torque[0], torque[1], torque[2])
 
+    typed = TypesByName(real, {vector: "period middle x f twist", SIX: "load"})
+
     @particle_kernel(module, "load", numbers=numbers)
-    def load(cell: real, period: vector, middle: vector, x_i: vector, m_i: real, f_i: vector, twist_i: vector) -> SIX:
+    @typed
+    def load(cell, period, middle, x_i, m_i, f_i, twist_i) -> SIX:
         force, mass = double(f_i), wp.float64(cell) * wp.float64(m_i)
         return six(force, mass * double(twist_i) + wp.cross(arm_of(x_i, middle, period), force))
 
     @particle_kernel(derivative, "load_dot", numbers=numbers)
+    @typed
     def load_tangent(
-        cell: real,
-        period: vector,
-        middle: vector,
-        middle_dot: vector,
-        x_i: vector,
-        x_dot_i: vector,
-        m_i: real,
-        m_dot_i: real,
-        f_i: vector,
-        f_dot_i: vector,
-        twist_i: vector,
-        twist_dot_i: vector,
+        cell, period, middle, middle_dot, x_i, x_dot_i, m_i, m_dot_i, f_i, f_dot_i, twist_i, twist_dot_i
     ) -> SIX:
         force, arm = double(f_dot_i), arm_of(x_i, middle, period)
         twisted = wp.float64(m_dot_i) * double(twist_i) + wp.float64(m_i) * double(twist_dot_i)
@@ -200,8 +184,9 @@ def load_kernels(precision: Precision) -> Kernels:
         return six(force, wp.float64(cell) * twisted + turned)
 
     @particle_kernel(derivative, "+x_bar +m_bar f_bar twist_bar middle_bar", numbers=numbers)
+    @typed
     def load_adjoint(
-        cell: real, period: vector, middle: vector, x_i: vector, m_i: real, f_i: vector, twist_i: vector, load_bar: SIX
+        cell, period, middle, x_i, m_i, f_i, twist_i, load_bar
     ) -> tuple[vector, real, vector, vector, vector]:
         force, torque = wp.vec3d(load_bar[0], load_bar[1], load_bar[2]), wp.vec3d(load_bar[3], load_bar[4], load_bar[5])
         x_bar = single(wp.cross(double(f_i), torque))  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.room import Domain
 from cortado.discretise.shapes import in_space
 from cortado.errors import InputError
@@ -55,7 +55,7 @@ class _Region:
 @cache
 def _kernels(precision: Precision) -> SimpleNamespace:
     """Make kernels of partial sums over every so many particles of a scene in one state, and of the sum of these."""
-    real, vector, six = precision.real, precision.vector, SIX
+    real, vector = precision.real, precision.vector
     module = kernel_module(f"particle_sums_{precision.name}")
 
     @wp.func(module=module)
@@ -95,21 +95,14 @@ def _kernels(precision: Precision) -> SimpleNamespace:
                     total += square * square * (wp.float64(1.0) + wp.float64(4.0) * q)
         return a.share * total
 
+    typed = TypesByName(vector, {SIX: "partial total"})
+
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def weighted(
-        particles: int,
-        before: int,
-        stride: int,
-        a: _Around,
-        x_first: wp.array(dtype=vector),
-        x: wp.array(dtype=vector),
-        v_first: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        q: wp.array(dtype=real),
-        # out
-        partial: wp.array(dtype=six),
+        particles: int, before: int, stride: int, a: _Around, x_first, x, v_first, v, q: wp.array(dtype=real), partial
     ):
-        row, total = wp.tid() // stride * particles, six()
+        row, total = wp.tid() // stride * particles, SIX()
         for i in range(row + wp.tid() % stride, row + particles, stride):
             w = weight(a, of_state(x_first, x, i, before))
             if w > wp.float64(0.0):
@@ -123,18 +116,9 @@ def _kernels(precision: Precision) -> SimpleNamespace:
         partial[wp.tid()] = total
 
     @wp.kernel(module=module, enable_backward=False)
-    def within(
-        particles: int,
-        before: int,
-        stride: int,
-        a: _Region,
-        x_first: wp.array(dtype=vector),
-        x: wp.array(dtype=vector),
-        q: wp.array(dtype=vector),
-        # out
-        partial: wp.array(dtype=six),
-    ):
-        row, total = wp.tid() // stride * particles, six()
+    @typed.arrays
+    def within(particles: int, before: int, stride: int, a: _Region, x_first, x, q, partial):
+        row, total = wp.tid() // stride * particles, SIX()
         for i in range(row + wp.tid() % stride, row + particles, stride):
             y = placed(of_state(x_first, x, i, before), a.start, a.lengths)
             inside = bool(True)
@@ -149,8 +133,9 @@ def _kernels(precision: Precision) -> SimpleNamespace:
         partial[wp.tid()] = total
 
     @wp.kernel(module=module, enable_backward=False)
-    def join(stride: int, partial: wp.array(dtype=six), total: wp.array(dtype=six)):
-        found = six()
+    @typed.arrays
+    def join(stride: int, partial, total):
+        found = SIX()
         for t in range(stride):
             found += partial[wp.tid() * stride + t]
         total[wp.tid()] = found

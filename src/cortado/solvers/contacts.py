@@ -75,7 +75,11 @@ def contact_kernels(precision: Precision) -> ContactKernels:
             found = way - length * wp.round(way / length)
         return found
 
+    vectors = "after other_after own face shift push twist other_sum"
+    typed = TypesByName(real, {vector: vectors, matrix: "turns other_turns", pair: "volumes", bool: "is_free"})
+
     @wp.kernel(module=modules[0], enable_backward=False)
+    @typed.arrays
     def look(
         particles: int,
         period: vector,
@@ -83,13 +87,12 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         origin: vector,
         inner: vector,
         side: real,
-        own: wp.array(dtype=vector),
-        after: wp.array(dtype=vector),
-        turns: wp.array(dtype=matrix),
-        other_after: wp.array(dtype=vector),
-        other_turns: wp.array(dtype=matrix),
-        other_scales: wp.array(dtype=real),
-        # in and out
+        own,
+        after,
+        turns,
+        other_after,
+        other_turns,
+        other_scales,
         of: bundle(face=vector, plane=real, shift=vector, depth=real),
     ):
         """Find the face. The mesh is about ``origin`` of a solid at rest, and about ``inner`` in the frame of one that
@@ -114,9 +117,6 @@ def contact_kernels(precision: Precision) -> ContactKernels:
             of.plane[j] = wp.dot(n, first + inner)
             of.shift[j] = way - x + origin
             of.depth[j] = d
-
-    vectors = "after other_after own face shift push twist other_sum"
-    typed = TypesByName(real, {vector: vectors, matrix: "turns other_turns", pair: "volumes", bool: "is_free"})
 
     @typed
     def push(

@@ -13,7 +13,7 @@ import warp as wp
 
 from cortado.device.launching import HostCopy, KernelLauncher
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.room import TOLERANCE
 from cortado.discretise.shapes import Points
 from cortado.particles.moving_walls import MovingWalls, matrix_of, pose_arrays
@@ -172,22 +172,24 @@ def lost_kernel(precision: Precision) -> Any:
     def below_rim(x: vector, b: bounds_struct) -> bool:
         return wp.dot(x, b.up) < b.rim
 
+    typed = TypesByName(vector, {wp.int32: "order bad count", real: "rho"})
+
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def find_lost(
         bounds: bounds_struct,
         solids: solids_struct,
         particles: int,
         first_waiting: int,
-        order: wp.array(dtype=wp.int32),
-        x_before: wp.array(dtype=vector),
-        rho_0: wp.array(dtype=real),
-        x_free: wp.array(dtype=vector),
-        v_free: wp.array(dtype=vector),
-        x: wp.array(dtype=vector),
-        bad_step: wp.array(dtype=wp.int32),
-        # in and out
-        bad: wp.array(dtype=wp.int32),
-        count: wp.array(dtype=wp.int32),
+        order,
+        x_before,
+        rho_0,
+        x_free,
+        v_free,
+        x,
+        bad_step,
+        bad,
+        count,
     ):
         """Write to ``bad`` the first lost particle of each scene, in scene order, and to ``count`` the number of lost
         ones. After a bad step nothing is looked for.

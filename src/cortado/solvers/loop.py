@@ -100,19 +100,18 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
         step[b] = step[b] + 1
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def record(
         particles: int,
         undecided: int,
         is_last: int,
-        sums: wp.array(dtype=pair),
-        bad: wp.array(dtype=wp.int32),
-        # in and out
-        step: wp.array(dtype=wp.int32),
-        iteration: wp.array(dtype=wp.int32),
-        bad_step: wp.array(dtype=wp.int32),
-        # out
-        rounds: wp.array(dtype=wp.int32),
-        active: wp.array(dtype=wp.int32),
+        sums,
+        bad,
+        step,
+        iteration,
+        bad_step,
+        rounds,
+        active,
         iterations: wp.array2d(dtype=wp.int32),
         errors: wp.array2d(dtype=pair),
     ):

@@ -13,6 +13,7 @@ import warp as wp
 from cortado.device.launching import BandLauncher
 from cortado.device.launching import launch as launch_once
 from cortado.device.modules import kernel_module
+from cortado.device.precision import TypesByName
 from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import ShownSolid, SolidMesh
 from cortado.pictures.stage import Stage
@@ -84,18 +85,25 @@ Placed = tuple[ShownSolid, SolidMesh]
 MODULE = kernel_module("shadow")
 
 
+typed = TypesByName(
+    wp.float32,
+    {
+        wp.int32: "first across",
+        Vec3s: "places",
+        wp.array(dtype=Look): "looks",
+        Floats: "volumes weights",
+        wp.vec3: "corner",
+        wp.vec2: "slope strength",
+        wp.vec2i: "begin",
+        Vec4s2d: "thickness sharp found key around",
+        Vec3s2d: "light",
+    },
+)
+
+
 @wp.kernel(module=MODULE, enable_backward=False)
-def cast(
-    places: Vec3s,
-    looks: wp.array(dtype=Look),
-    volumes: Floats,
-    corner: wp.vec3,
-    cell: wp.float32,
-    slope: wp.vec2,
-    fading: wp.float32,
-    begin: wp.vec2i,
-    thickness: Vec4s2d,
-):
+@typed
+def cast(places, looks, volumes, corner, cell, slope, fading, begin, thickness):
     """Add the shadow of each part of an object to the nearest four floor nodes along a slope: colour times thickness,
     and thickness, faded with height by ``fading`` [1/m]. ``begin``: index of the first node."""
     i = wp.tid()
@@ -116,7 +124,8 @@ def cast(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def blur(first: wp.int32, across: wp.int32, weights: Floats, sharp: Vec4s2d, found: Vec4s2d):
+@typed
+def blur(first, across, weights, sharp, found):
     """Blur thicknesses at nodes along one axis of the floor; with ``across`` along the other one."""
     n = first + wp.tid()
     i = n / sharp.shape[1]
@@ -140,17 +149,8 @@ def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def darken(
-    first: wp.int32,
-    key: Vec4s2d,
-    around: Vec4s2d,
-    strength: wp.vec2,
-    layer: wp.float32,
-    opacity: wp.float32,
-    tinted: wp.float32,
-    begin: wp.vec2i,
-    light: Vec3s2d,
-):
+@typed
+def darken(first, key, around, strength, layer, opacity, tinted, begin, light):
     """Darken the nodes from ``begin`` on by the shadows of the lamp and of the sky, of a ``strength`` each."""
     n = first + wp.tid()
     i = n / key.shape[1]

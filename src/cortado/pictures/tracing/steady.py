@@ -13,6 +13,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.launching import BandLauncher
+from cortado.device.precision import TypesByName
 from cortado.pictures.tracing.near_particles import (
     MODULE,
     Floats,
@@ -68,8 +69,25 @@ def nearness(j: wp.int32, before: wp.int32, window: wp.int32):
     return 1.0 - float(away) / float(window + 1)
 
 
+typed = TypesByName(
+    wp.int32,
+    {
+        Still: "own",
+        wp.array(dtype=Still): "others",
+        wp.vec2: "limits",
+        wp.float32: "width reach",
+        NearParticles: "s",
+        Ints2d: "touching indices",
+        Floats: "means bodies",
+        Floats2d: "ways shares levels",
+        Vec3s2d: "found",
+    },
+)
+
+
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_means(first: wp.int32, own: Still, s: NearParticles, reach: wp.float32, means: Floats, bodies: Floats):
+@typed
+def find_means(first, own, s, reach, means, bodies):
     n = first + wp.tid()
     total = wp.float32(0.0)
     for k in range(CUBES):
@@ -81,15 +99,8 @@ def find_means(first: wp.int32, own: Still, s: NearParticles, reach: wp.float32,
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_ways(
-    first: wp.int32,
-    own: Still,
-    others: wp.array(dtype=Still),
-    width: wp.float32,
-    touching: Ints2d,
-    indices: Ints2d,
-    ways: Floats2d,
-):
+@typed
+def find_ways(first, own, others, width, touching, indices, ways):
     """Find how far the fluid in each block, of a width in spacings, is from where it is in other frames, in spacings;
     which block of theirs it is; and which blocks touch it."""
     n = first + wp.tid()
@@ -110,16 +121,8 @@ def find_ways(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_shares(
-    first: wp.int32,
-    touching: Ints2d,
-    ways: Floats2d,
-    bodies: Floats,
-    before: wp.int32,
-    window: wp.int32,
-    limits: wp.vec2,
-    shares: Floats2d,
-):
+@typed
+def find_shares(first, touching, ways, bodies, before, window, limits, shares):
     """Find the shares of other frames in each block, by the root mean square of ways there and in blocks beside it."""
     n = first + wp.tid()
     left = bodies[n]
@@ -141,16 +144,8 @@ def find_shares(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def average_level(
-    first: wp.int32,
-    own: Still,
-    others: wp.array(dtype=Still),
-    before: wp.int32,
-    limits: wp.vec2,
-    indices: Ints2d,
-    shares: Floats2d,
-    levels: Floats2d,
-):
+@typed
+def average_level(first, own, others, before, limits, indices, shares, levels):
     n = (first + wp.tid()) / CUBES
     k = (first + wp.tid()) % CUBES
     level = own.b.levels[n, k]
@@ -169,15 +164,8 @@ def average_level(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def average_light(
-    first: wp.int32,
-    own: Still,
-    others: wp.array(dtype=Still),
-    before: wp.int32,
-    window: wp.int32,
-    limits: wp.vec2,
-    found: Vec3s2d,
-):
+@typed
+def average_light(first, own, others, before, window, limits, found):
     i = (first + wp.tid()) / found.shape[1]
     k = (first + wp.tid()) % found.shape[1]
     light = own.light[i, k]

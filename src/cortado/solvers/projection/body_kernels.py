@@ -22,7 +22,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import solid_sum
@@ -151,18 +151,9 @@ def motion_kernels(precision: Precision) -> MotionKernels:
     """Make the kernels that move rigid bodies by pressures and gravity, in a precision."""
     real, vector, matrix, rate = precision.real, precision.vector, matrix_of(precision), rate_function(precision)
 
+    @TypesByName(real, {vector: "gravity V W L pulled twisted", matrix: "inverse turns"})
     def move(
-        time_step_i: real,
-        gravity_i: vector,
-        density_i: real,
-        volume: real,
-        inverse: matrix,
-        turns_i: matrix,
-        V_0_i: vector,
-        W_0_i: vector,
-        L_0_i: vector,
-        pulled_sum_i: vector,
-        twisted_sum_i: vector,
+        time_step_i, gravity_i, density_i, volume, inverse, turns_i, V_0_i, W_0_i, L_0_i, pulled_sum_i, twisted_sum_i
     ) -> tuple[vector, vector, vector, vector, vector]:
         L = L_0_i + twisted_sum_i
         V = V_0_i + time_step_i * gravity_i + pulled_sum_i / (density_i * volume)

@@ -43,7 +43,7 @@ import warp as wp
 from cortado.device.cells import cell_grid_type
 from cortado.device.launching import Named, bundle
 from cortado.device.modules import Kernels, kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels
 from cortado.particles.state import Layout
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
@@ -277,18 +277,20 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
     module = kernel_module(f"coarse_bodies_{dimension}d_{precision.name}")
     CORNERS, FLAT = wp.constant(2**dimension), wp.constant(dimension == 2)
 
+    typed = TypesByName(real, {grid_type: "grid", vector: "x", matrix: "turns root", wp.int32: "order"})
+
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def gather(
-        grid: grid_type,
-        order: wp.array(dtype=wp.int32),
+        grid,
+        order,
         first: int,
-        density: wp.array(dtype=real),
+        density,
         volume: real,
         root: matrix,
-        turns: wp.array(dtype=matrix),
-        x: wp.array(dtype=vector),
+        turns,
+        x,
         of: bundle(coarse=real, gamma_of=vector, arm=vector),
-        # out
         B: wp.array2d(dtype=real),
     ):
         """Write a body's rows of B from row ``first`` on, by node; ``root`` is a square root of I^-1."""

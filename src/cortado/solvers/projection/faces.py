@@ -16,6 +16,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.launching import Named, bundle
+from cortado.device.precision import TypesByName
 from cortado.particles.mirrors import FACES, reflections
 from cortado.particles.moving_walls import matrix_of, turn_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
@@ -49,22 +50,11 @@ def face_share_kernel(discretisation: Discretisation) -> Any:
         n = R * normal
         return x - (real(2.0) * wp.dot(n, x - c - scale * (R * place))) * n
 
+    typed = TypesByName(real, {vector: "x u c place normal", matrix: "R", neighbourhood: "s"})
+
     @wp.func(module=module)
-    def work(
-        x_i: vector,
-        x_j: vector,
-        u_i: vector,
-        u_j: vector,
-        near: real,
-        spread: real,
-        pushed: real,
-        c: vector,
-        R: matrix,
-        scale: real,
-        place: vector,
-        normal: vector,
-        s: neighbourhood,
-    ) -> real:
+    @typed
+    def work(x_i, x_j, u_i, u_j, near, spread, pushed, c, R, scale, place, normal, s) -> real:
         x_ij = x_i - image_of(x_j, c, R, scale, place, normal)
         along = spread * (u_i - mirrored(u_j, R * normal)) - (real(0.5) * pushed) * x_ij
         return s.volume * (near * weight(x_ij, s) + wp.dot(gradient(x_ij, s), along))
@@ -74,18 +64,8 @@ def face_share_kernel(discretisation: Discretisation) -> Any:
         return x - c_0 - R_0 * (wp.transpose(R) * (x - c))
 
     @wp.func(module=module)
-    def sweep(
-        x_i: vector,
-        x_j: vector,
-        c: vector,
-        R: matrix,
-        c_0: vector,
-        R_0: matrix,
-        scale: real,
-        place: vector,
-        normal: vector,
-        s: neighbourhood,
-    ) -> real:
+    @typed
+    def sweep(x_i, x_j, c, R, c_0, R_0, scale, place, normal, s) -> real:
         image = image_of(x_j, c, R, scale, place, normal)
         swept = carried(image, c, R, c_0, R_0) - mirrored(carried(x_j, c, R, c_0, R_0), R * normal)
         return s.volume * wp.dot(gradient(x_i - image, s), swept)

@@ -277,15 +277,8 @@ def mirrored_term(discretisation: Discretisation) -> WallTerm:
 def _mirrored_work(d: Discretisation) -> Any:
     real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
 
-    def mirrored_work(
-        x_ij: vector,
-        image_i: real,
-        y_i: real,
-        f_i: vector,
-        mirrored: real,
-        foot: vector,
-        s: neighbourhood_type(d.precision),
-    ) -> real:
+    @TypesByName(real, {vector: "x f foot", neighbourhood_type(d.precision): "s"})
+    def mirrored_work(x_ij, image_i, y_i, f_i, mirrored, foot, s) -> real:
         return (-mirrored * image_i * y_i * s.volume) * wp.dot(normal(gradient(x_ij, s), foot), f_i)
 
     return mirrored_work
