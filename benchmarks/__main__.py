@@ -172,6 +172,29 @@ def probed(
 
 
 @command(app, answers=True)
+def estimating(
+    depth: int = 7, particles: int = 8000, steps: int = 10, repeats: int = 3, device: str = "cpu", json: Flag = False
+) -> Work:
+    """Time gradients by estimators that go back through one run, beside the exact one.
+
+    Args:
+        depth: Spacings in the depth of a tank in the plane, with 3.4 times its square of particles.
+        particles: Number of particles of a dam break in space, about.
+        steps: Steps of a run.
+        repeats: The least of so many repeats counts.
+        device: "cpu", or "cuda:0" for the first GPU.
+        json: Print JSON for machines instead of a table.
+    """
+    require_at_least(4, depth, "--depth")
+    require_at_least(8, particles, "--particles")
+    require_at_least(1, steps, "--steps")
+    require_at_least(1, repeats, "--repeats")
+    from benchmarks.bench.estimating import bench_estimating
+
+    return partial(bench_estimating, depth, particles, steps, repeats, device, json)
+
+
+@command(app, answers=True)
 def batches(
     scenes: tuple[int, ...] = (1, 256), steps: int = 100, repeats: int = 3, device: str = "cpu", json: Flag = False
 ) -> Work:
