@@ -179,6 +179,21 @@ def thrown(simulation):
     return {"initial_positions": x + inwards, "initial_velocities": v + 0.5 * random.standard_normal(v.shape)}
 
 
+class Weighed:
+    """A linear loss of positions, velocities and fractions, with random weights."""
+
+    def __init__(self, simulation: Simulation, seed: int = 8):
+        random, shape = np.random.default_rng(seed), simulation.positions.shape
+        self.weights = [random.standard_normal(each) for each in (shape, shape, simulation.mass_fractions.shape)]
+
+    def value(self, end: Any) -> float:
+        fields = (end.positions, end.velocities, end.mass_fractions)
+        return sum(float((w * field).sum()) for w, field in zip(self.weights, fields, strict=True))
+
+    def adjoint(self, end: Any) -> tuple[np.ndarray, ...]:
+        return tuple(self.weights)
+
+
 def aimed(simulation: Simulation, steps: int) -> Problem:
     """A problem that is solved where each particle has gone by 0.02 sin(7 x)."""
     return Problem(simulation, steps, FinalPositions(simulation.positions + 0.02 * np.sin(7.0 * simulation.positions)))

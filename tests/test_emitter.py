@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cortado import CortadoWarning, InputError, Problem, Scene, Simulation, gradients, losses
+from cortado import CortadoWarning, InputError, Problem, Scene, Simulation, losses
 from finite_differences import both_modes, decades, distance
-from scenes import box, jet, plane, pour, scene
+from scenes import Weighed, box, jet, plane, pour, scene
 from twins import nozzle_of
 
 STEPS = 30
@@ -20,24 +20,10 @@ SIZES = {"nozzle_path": 0.01, "flow_rate": 0.1, "time_step": 1e-4}
 DISTURBED = {"gravity": 1.0, "initial_positions": 0.01, "initial_velocities": 0.1}
 
 
-class Motion:
-    """A loss of positions and velocities."""
-
-    def __init__(self, simulation):
-        random, shape = np.random.default_rng(5), simulation.positions.shape
-        self.x, self.v, self.n = 0.2 * random.random(shape), random.standard_normal(shape), shape[0]
-
-    def value(self, end):
-        return (((end.positions - self.x) ** 2).sum() + 0.01 * ((end.velocities - self.v) ** 2).sum()) / self.n
-
-    def adjoint(self, end):
-        return 2.0 / self.n * (end.positions - self.x), 0.02 / self.n * (end.velocities - self.v)
-
-
 @cache
 def problem_of(name):
     simulation = Simulation(MAKERS[name](), precision="float64")
-    return Problem(simulation, STEPS, Motion(simulation))
+    return Problem(simulation, STEPS, Weighed(simulation))
 
 
 def point_of(problem, over_time=True):
@@ -89,19 +75,6 @@ def test_gradient_equals_tangent_and_differences(name, key):
 
 
 @scenes
-def test_gradient_equals_warps_tape(name):
-    problem = problem_of(name)
-    point = point_of(problem)
-    (loss, gathered), (taped_loss, taped) = (
-        problem.value_and_gradient(point, estimator) for estimator in (gradients.Exact(), gradients.Tape())
-    )
-    assert loss == taped_loss
-    for key, gradient in gathered.items():
-        assert np.linalg.norm(gradient) > 0.0
-        assert np.linalg.norm(gradient - taped[key]) <= 1e-9 * np.linalg.norm(gradient), key
-
-
-@scenes
 def test_a_place_at_rest_has_the_gradient_of_a_path_summed_up(name):
     problem = problem_of(name)
     point = point_of(problem, over_time=False)
@@ -136,7 +109,7 @@ def test_particles_are_let_go_without_a_jump(name):
     low = MAKERS[name]().emitter.model_dump()
     high = {**low, "outlet": [*low["outlet"][:1], 0.45, *low["outlet"][2:]]}
     simulation = Simulation(MAKERS[name](emitter=high, container={"shape": "none"}), precision="float64")
-    problem = Problem(simulation, STEPS, Motion(simulation))
+    problem = Problem(simulation, STEPS, Weighed(simulation))
     point = {key: value for key, value in simulation.parameters().items() if key in SIZES}
     trajectory = problem.run(point)
     first, dt = nozzle_of(problem.simulation).first, float(point["time_step"])
@@ -204,7 +177,7 @@ def test_gradients_go_through_a_reserve():
     simulation = Simulation(supplied(duration=0.4, flow_rate=0.3), precision="float64")
     point = {key: value for key, value in simulation.parameters().items() if key in SIZES}
     directions = {key: direction_of(key, value) for key, value in point.items()}
-    both_modes(Problem(simulation, STEPS, Motion(simulation)), point, directions)
+    both_modes(Problem(simulation, STEPS, Weighed(simulation)), point, directions)
 
 
 def test_a_run_says_when_its_emitter_runs_dry():

@@ -217,26 +217,6 @@ def test_pressures_beside_moving_solids_have_derivatives(name):
     check(Problem(simulation, STEPS, Weighted("pressure", weights)), point, along)
 
 
-def test_in_float32_pressures_and_their_gradient_are_near_those_of_float64():
-    found = {}
-    for precision in ("float32", "float64"):
-        simulation = Simulation(plane(solver=PROJECTION), precision=precision)
-        problem = Problem(simulation, STEPS, Weighted("pressure", np.ones(simulation.particles)))
-        found[precision] = problem.value_and_gradient({"gravity": np.array([0.3, -9.81])})
-    (loss, gradient), (wanted, exact) = found.values()
-    assert loss == pytest.approx(wanted, rel=1e-4)
-    assert np.linalg.norm(gradient["gravity"] - exact["gravity"]) < 1e-3 * np.linalg.norm(exact["gravity"])
-
-
-def test_pressures_of_a_batch_are_those_of_single_scenes():
-    simulation = Simulation(plane(solver=PROJECTION, solid=[ROTOR]), precision="float64")
-    gravities = [[0.0, -9.81], [1.0, -5.0]]
-    found = simulation.batch_of(2).run(4, {"gravity": [[g] for g in gravities]}, record=["pressure"])
-    for gravity, own in zip(gravities, found, strict=True):
-        alone = simulation.run(4, {"gravity": gravity}, record=["pressure"])
-        np.testing.assert_array_equal(own.quantity("pressure"), alone.quantity("pressure"))
-
-
 def test_loads_do_without_stresses():
     """Their kernels are not even made: loads are read in every step."""
     made = plane(solver=PROJECTION, solid=[ROTOR], discretisation={"spacing": 0.05})  # whose kernels others have too

@@ -21,7 +21,7 @@ from cortado import (
 from cortado.gradients import AdjointEstimator, Estimate, Filtered
 from cortado.gradients.reverse_mode import EddyViscosity
 from reference import complex_step
-from scenes import box, jet, plane, plane_of_three, pour, scene, splash
+from scenes import Weighed, box, jet, plane, plane_of_three, pour, scene, splash
 from twins import twin
 
 DROPS = [
@@ -42,22 +42,6 @@ MAKERS = {
     "emitter, two phases": pour,
 }
 kinds = pytest.mark.parametrize("kind", MAKERS)
-
-
-class Mixed:
-    """A linear loss of positions, velocities and fractions, with random weights."""
-
-    def __init__(self, simulation, seed=0):
-        random = np.random.default_rng(seed)
-        arrays = (simulation.positions, simulation.velocities, simulation.mass_fractions)
-        self.weights = tuple(random.standard_normal(array.shape) for array in arrays)
-
-    def value(self, end):
-        arrays = (end.positions, end.velocities, end.mass_fractions)
-        return float(sum((w * array).sum() for w, array in zip(self.weights, arrays, strict=True)))
-
-    def adjoint(self, end):
-        return self.weights
 
 
 @cache
@@ -189,7 +173,7 @@ ESTIMATORS = (
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=repr)
 def test_gradients_equal_those_of_the_twin(estimator, dimension):
     slow = twin_of(dimension)
-    loss = Mixed(slow.simulation)
+    loss = Weighed(slow.simulation)
     _, found = Problem(slow.simulation, STEPS, loss).value_and_gradient(slow.point, estimator)
     last = np.concatenate([w.ravel() for w in loss.weights[:2]])
     wanted, exact = slow.adjoint(last, estimator), slow.adjoint(last, gradients.Exact())
@@ -340,7 +324,7 @@ def test_a_viscosity_keeps_the_adjoint_of_a_long_run_from_growing(chaotic):
 # ---- observers ------------------------------------------------------------------------------------------------------
 def test_every_adjoint_of_a_state_can_be_observed():
     simulation = simulation_of("2-D")
-    problem, point = Problem(simulation, 7, Mixed(simulation)), point_of(simulation)
+    problem, point = Problem(simulation, 7, Weighed(simulation)), point_of(simulation)
     seen = {}
     norms = gradients.AdjointNorms(simulation.solver, 7)
 
@@ -803,7 +787,7 @@ def halve(a: wp.array(dtype=wp.vec3d)):
 def test_a_filter_in_numpy_acts_on_every_step():
     """It is not captured with the first of them, as one that only launches kernels is."""
     simulation = simulation_of("2-D")
-    problem, point = Problem(simulation, 9, Mixed(simulation)), point_of(simulation)
+    problem, point = Problem(simulation, 9, Weighed(simulation)), point_of(simulation)
     found, wanted = (problem.value_and_gradient(point, Halved(in_numpy))[1] for in_numpy in (True, False))
     exact = problem.value_and_gradient(point)[1]
     for name in ("gravity", "initial_velocities"):
@@ -831,7 +815,7 @@ class Returning:
 
 def test_an_estimate_comes_in_float64():
     simulation = simulation_of("2-D")
-    problem = Problem(simulation, 1, Mixed(simulation))
+    problem = Problem(simulation, 1, Weighed(simulation))
     found = problem.estimate({"gravity": [0.0, -9.81]}, Returning(Estimate(np.float32(1.0), {"gravity": [1, 2]})))
     assert type(found.loss) is float and found.gradient["gravity"].dtype == np.float64
 

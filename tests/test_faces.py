@@ -168,15 +168,3 @@ def test_the_pressure_as_a_fixed_point_has_the_same_gradient():
     gradients = (problem.value_and_gradient(point, gradient=one)[1] for one in (None, ImplicitPressure()))
     exact, fixed = (gradient["flap.position"] for gradient in gradients)
     assert exact @ fixed > 0.999 * np.linalg.norm(exact) * np.linalg.norm(fixed)
-
-
-def test_scenes_of_a_batch_have_faces_of_their_own():
-    """To the bit what single scenes have, and their gradients."""
-    paths = np.array([[[0.001, 0.0], [0.002, 0.001]], [[-0.001, 0.0], [-0.001, 0.002]]])
-    alone = Problem(Simulation(flume()), 2, CentreOfMass([0.5, 0.3]))
-    single = [alone.value_and_gradient({"flap.displacement": path}) for path in paths]
-    together = Problem(Simulation(flume(), batch=2), 2, CentreOfMass([0.5, 0.3]))
-    values, gradients = together.value_and_gradient({"flap.displacement": paths})
-    assert [value for value, _ in single] == values.tolist()
-    for (_, gradient), own in zip(single, gradients["flap.displacement"], strict=True):
-        np.testing.assert_array_equal(gradient["flap.displacement"], own)

@@ -18,7 +18,7 @@ from cortado.forces import Body
 from finite_differences import central_difference, decades, plateau
 from own_forces import Breeze
 from remembering_force import Memory
-from scenes import MIXING, box, jet, plane, plane_of_three, pour, scene, splash, two_layers
+from scenes import MIXING, Weighed, box, jet, plane, plane_of_three, pour, scene, splash, two_layers
 from test_faces import flume
 from test_free_bodies import touching
 from test_implicit_viscosity import cube, syrups, thick
@@ -27,7 +27,6 @@ from test_moving_solids import plane as beside
 from test_moving_solids import space as in_space
 from test_own_functions import FORCES
 from test_projection import C2, CASES, SOLVER, begun
-from test_ranges import Weighed
 from test_rheology import KINDS
 from test_rheology import thick as yielding
 
@@ -251,6 +250,7 @@ CERTIFIED = {
     "a force with kernels": ["breeze.k", "breeze.wind", "time_step"],
     "one that keeps a field in a jet": ["memory.k", "time_step"],
     "a network": ["net.w", "net.bias"],
+    "forces by mass fractions": ["mass_fractions", "oily.w"],
 }
 """Names of parameters that are certified, in float32 and, as problems in float64 are, in float64."""
 
@@ -268,6 +268,7 @@ def test_it_is_certified(name):
     [
         ("projection, plane", 'solver.kind "projection" has no '),
         ("implicit viscosity, no slip", r"implicit viscosity has no tape: try gradients\.Exact"),
+        ("beside a rotor, PCISPH", r"solids that move have no tape: try gradients\.Exact"),
     ],
 )
 def test_what_has_no_tape_says_so(name, words):

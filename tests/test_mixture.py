@@ -12,7 +12,7 @@ from cortado import InputError, Problem, Simulation, Trajectory, gradients, loss
 from cortado.scene.parameter_values import reference_density
 from cortado.sph.free_energy import FreeEnergy
 from finite_differences import both_modes, decades, distance
-from scenes import MIXING, OIL, plane, plane_of_three, scene, two_layers
+from scenes import MIXING, OIL, Weighed, plane, plane_of_three, scene, two_layers
 
 MAKERS = {"two layers": two_layers, "plane of three": plane_of_three}
 STEPS = {"two layers": 30, "plane of three": 50}
@@ -22,23 +22,6 @@ scenes = pytest.mark.parametrize("name", MAKERS)
 @cache
 def simulation_of(name, precision="float64"):
     return Simulation(MAKERS[name](), precision=precision)
-
-
-class Everything:
-    """A loss of positions, velocities and mass fractions."""
-
-    def __init__(self, simulation, seed=5):
-        random, (n, d), phases = np.random.default_rng(seed), simulation.positions.shape, len(simulation.scene.phase)
-        self.targets = [0.2 + 0.1 * random.random((n, d)), random.standard_normal((n, d)), random.random((n, phases))]
-        self.weights = (1.0 / n, 0.01 / n, 0.1 / n)
-
-    def value(self, end):
-        found = (end.positions, end.velocities, end.mass_fractions)
-        return sum(w * ((a - b) ** 2).sum() for w, a, b in zip(self.weights, found, self.targets, strict=True))
-
-    def adjoint(self, end):
-        found = (end.positions, end.velocities, end.mass_fractions)
-        return tuple(2.0 * w * (a - b) for w, a, b in zip(self.weights, found, self.targets, strict=True))
 
 
 SIZES = {
@@ -72,7 +55,7 @@ def directions_of(point, seed=5):
 def case(name):
     """A problem with its point, and the gradient there in all parameters together."""
     simulation = simulation_of(name)
-    problem, point = Problem(simulation, STEPS[name], Everything(simulation)), point_of(simulation)
+    problem, point = Problem(simulation, STEPS[name], Weighed(simulation)), point_of(simulation)
     return problem, point, problem.value_and_gradient(point)
 
 
@@ -185,8 +168,8 @@ QUARTIC = FreeEnergy("quartic", lambda c: 0.25 * (c**4).sum(1), curvature=3.0, f
 
 def test_a_free_energy_of_ones_own():
     simulation = Simulation(two_layers(), precision="float64", free_energy=QUARTIC)
-    problem, point = Problem(simulation, 20, Everything(simulation)), point_of(simulation)
-    assert problem.value(point) != Problem(simulation_of("two layers"), 20, Everything(simulation)).value(point)
+    problem, point = Problem(simulation, 20, Weighed(simulation)), point_of(simulation)
+    assert problem.value(point) != Problem(simulation_of("two layers"), 20, Weighed(simulation)).value(point)
     directions = directions_of(point)
     _, tangent = both_modes(problem, point, directions)
     assert distance(problem.value, point, directions, tangent, decades(3.0, 7.0), enough=1e-6) < 1e-6
@@ -238,7 +221,7 @@ def test_functions_that_are_none_of_a_free_energy_are_refused(functions, said):
 
 def test_a_loss_of_several_frames():
     simulation = simulation_of("plane of three")
-    frames = {step: Everything(simulation, seed=step) for step in (0, 3, 7, 12)}
+    frames = {step: Weighed(simulation, seed=step) for step in (0, 3, 7, 12)}
     problem, point = Problem(simulation, 12, losses.Frames(frames)), point_of(simulation)
     directions = directions_of(point)
     gradient, tangent = both_modes(problem, point, directions)
@@ -251,7 +234,7 @@ def test_a_loss_of_several_frames():
 
 def test_a_problem_of_no_steps_is_one_of_the_first_state():
     simulation = simulation_of("plane of three")
-    loss = Everything(simulation)
+    loss = Weighed(simulation)
     problem, point = Problem(simulation, 0, loss), point_of(simulation)
     value, gradient = problem.value_and_gradient(point)
     end = problem.end(point)
@@ -299,7 +282,7 @@ def test_a_mistake_is_a_sentence(words):
 def test_frames_that_do_not_exist_are_a_sentence():
     simulation = simulation_of("plane of three")
     with pytest.raises(InputError, match="frame 5, but must have frames from 0 to 4"):
-        Problem(simulation, 4, losses.Frames({5: Everything(simulation)}))
+        Problem(simulation, 4, losses.Frames({5: Weighed(simulation)}))
     with pytest.raises(InputError, match="at least one frame"):
         losses.Frames({})
 

@@ -310,11 +310,6 @@ def test_scenes_of_a_batch_have_their_own_mass_fractions():
             np.testing.assert_array_equal(bar, gradient[name][b])
 
 
-def test_the_certificate_knows_mass_fractions():
-    judged, point = mixed_a_little(two_layers(), steps=10)
-    assert cortado.certify(judged, point).right
-
-
 def test_mass_fractions_that_are_not_there_are_said():
     def second(x, v, mass_fractions):
         return mass_fractions[2] * v

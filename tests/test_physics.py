@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 from benchmarks.bench.scene import dam_break
 from cortado import CortadoWarning, DivergedError, Problem, Scene, Simulation, losses
 from cortado.losses import CentreOfMass, FinalPositions, Frames
-from scenes import jet, plane, plane_of_three, scene, splash
-from test_ranges import Weighed, set_parts
+from scenes import Weighed, jet, plane, plane_of_three, scene, splash
+from test_ranges import set_parts
 
 FREE = {"container": {"shape": "none"}}
 

@@ -12,7 +12,7 @@ import cortado
 from cortado import Problem, Simulation, forces, gradients
 from cortado.device import launching
 from cortado.device.launching import KernelLauncher
-from scenes import MIXING, box, jet, plane_of_three, scene, splash, two_layers
+from scenes import MIXING, Weighed, box, jet, plane_of_three, scene, splash, two_layers
 from test_faces import flume
 
 ROOT = Path(cortado.__file__).parent
@@ -71,21 +71,6 @@ CORES_AND_PARTS = ((2, 2), (2, 8), (5, 5))
 """All of them in the first case, and one of them in each of the others, in turn: how launches are cut does not depend
 on the kernel."""
 STEPS = 4
-
-
-class Weighed:
-    """A linear loss of positions, velocities and fractions, with random weights."""
-
-    def __init__(self, simulation):
-        random, shape = np.random.default_rng(8), simulation.positions.shape
-        self.weights = [random.standard_normal(each) for each in (shape, shape, simulation.mass_fractions.shape)]
-
-    def value(self, end):
-        fields = (end.positions, end.velocities, end.mass_fractions)
-        return sum(float((w * field).sum()) for w, field in zip(self.weights, fields, strict=True))
-
-    def adjoint(self, end):
-        return tuple(self.weights)
 
 
 class Seen(Weighed):

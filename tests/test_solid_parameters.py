@@ -8,8 +8,7 @@ import pytest
 
 from cortado import Problem, Scene, Simulation, certify
 from cortado.certificate.horizon import coherent_directions, scales
-from cortado.errors import CortadoWarning, InputError, MissingDerivativeError
-from cortado.gradients import Tape
+from cortado.errors import CortadoWarning, InputError
 from cortado.losses import CentreOfMass
 from cortado.losses.distances import SensorMatch
 from cortado.pictures.exported import Exported
@@ -248,12 +247,6 @@ def test_a_solid_at_rest_is_no_parameter():
     fixed = {name: ROTOR[name] for name in ("name", "shape", "lower", "upper")}
     with pytest.raises(InputError, match=r"'rotor.position' is unknown, as the solid 'rotor' is at rest: only those"):
         problem_of(plane(fixed)).value({"rotor.position": [0.3, 0.2]})
-
-
-def test_a_tape_beside_solids_that_move_is_refused():
-    problem = problem_of(SCENES["pcisph"]())
-    with pytest.raises(MissingDerivativeError, match=r"solids that move have no tape: try gradients.Exact"):
-        problem.value_and_gradient({"rotor.position": [0.3, 0.2]}, gradient=Tape())
 
 
 def test_a_solid_that_jumps_is_warned_of():
