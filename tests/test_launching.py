@@ -22,8 +22,7 @@ from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_ker
 from cortado.solvers.pcisph.steps import density_ratio_kernels, wall_kernels
 from cortado.sph.curvature import curvature_kernels
 from cortado.sph.density import density_kernels
-from cortado.sph.diffusion import Diffusion, diffusion_kernels
-from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
+from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE, Diffusion, diffusion_kernels
 from cortado.sph.integration import integration_kernels
 from cortado.sph.stress_forces import newtonian_law
 from cortado.sph.stress_kernels import stress_kernels

@@ -1,7 +1,7 @@
 """Phases that separate and mix on particles at rest, against closed forms; `validation/README.md` says what was found.
 
 Lengths are in spacings, and M = alpha = 1: an interface is 4.39 epsilon wide, what grows fastest from an even mixture
-is 4 pi epsilon long, and takes 16 epsilon^2 to grow by e. The equations are those of `cortado.sph.diffusion`.
+is 4 pi epsilon long, and takes 16 epsilon^2 to grow by e. The equations are those of `cortado.sph.free_energy`.
 """
 
 from collections.abc import Callable
@@ -74,7 +74,7 @@ def noise(simulation: Simulation, amplitude: float, seed: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Energy:
-    """The discrete free energy of `cortado.sph.diffusion`, for particles (n, 2) at rest; in NumPy."""
+    """The discrete free energy of `cortado.sph.free_energy`, for particles (n, 2) at rest; in NumPy."""
 
     simulation: Simulation
     positions: np.ndarray

@@ -56,8 +56,7 @@ from cortado.solvers.build import (
     solver_named,
 )
 from cortado.solvers.solver import Solver
-from cortado.sph.diffusion import stable_substeps
-from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
+from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy, stable_substeps
 from cortado.watching import Watch
 from cortado.words import counted
 
@@ -406,7 +405,7 @@ class Simulation(Stepping):
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
     ) -> int:
         """Return the number of explicit diffusion substeps per time step that is stable under these parameters; raises
-        `InputError` where there would be more than `cortado.sph.diffusion.MOST_SUBSTEPS`."""
+        `InputError` where there would be more than `cortado.sph.free_energy.MOST_SUBSTEPS`."""
         if len(self.scene.phase) == 1:
             return 0
         numbers = (float(time_step), float(mobility), float(interface_width), rest_density)

@@ -36,9 +36,8 @@ from cortado.solvers.contacts import Contacts, Touching
 from cortado.solvers.obstacles import FINE, ON, FlatFaces, NamedSolid, Obstacle, Walled, flat_faces
 from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.solver import Solver
-from cortado.sph.diffusion import Diffusion
 from cortado.sph.emitter import Nozzle
-from cortado.sph.free_energy import MOBILITIES, FreeEnergy
+from cortado.sph.free_energy import MOBILITIES, Diffusion, FreeEnergy
 from cortado.sph.free_solids import FreeSolids, FreeTable
 from cortado.sph.mixture import Phases
 from cortado.sph.moving_solids import MovingSolids

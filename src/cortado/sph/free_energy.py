@@ -11,6 +11,19 @@ into the interface of two, and lets equal parts of three or more stay mixed.
 
 delta keeps the mobility positive, and smooth, where a fraction strays out of [0, 1]: a negative one would feed the
 excursion. It leaves a pure phase delta / 2, and z <= 1 / 4 for two phases is hardly touched.
+
+The phases of a mixture diffuse by them (Cahn-Hilliard diffusion, after Yang et al. 2015):
+
+    chi_k,i = alpha P f'(c_i)_k - (eps^2 / m_i) B(m; c_k)_i,         P u = u - (1 / phases) sum_l u_l
+    c'_k,i  = c_k,i + (dt / m_i) B(m M; chi_k)_i,                    M_i = M_0 m(c_i)
+    B(w; u)_i = V sum_j (w_i / n_j + w_j / n_i) (u_i - u_j) F_ij,    F = x . G / (|x|^2 + 0.01 h^2)
+
+chi is the chemical potential. B is antisymmetric in i and j: each phase keeps its mass, sum_i m_i c_k,i, to round-off,
+and sum_k c_k stays what it was, by P. The same B in both lines makes the discrete free energy
+
+    E = V sum_i m_i alpha f(c_i) - (eps^2 V^2 / 4) sum_ij (m_i / n_j + m_j / n_i) F_ij |c_i - c_j|^2
+
+fall along the flow on particles at rest (F <= 0). Nothing is clipped: that would break both.
 """
 
 from collections.abc import Callable
@@ -25,9 +38,14 @@ import warp as wp
 from cortado.arrays import as_one_number, require_function
 from cortado.calls import public
 from cortado.code_words import code_words
-from cortado.device.modules import by_name, kernel_module
-from cortado.device.precision import Precision
-from cortado.errors import InputError, shown
+from cortado.device.modules import Kernels, by_name, kernel_module
+from cortado.device.precision import Precision, TypesByName
+from cortado.discretise.smoothing import laplacian_rate, smoothing_kernel
+from cortado.errors import InputError, OutOfRangeError, shown
+from cortado.particles.neighbourhood import Discretisation, pair_functions
+from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
+from cortado.particles.particle_kernels import dotted, over, particle_kernel
+from cortado.scene.scene import Scene
 from cortado.sph.formula import compiled
 
 FLOOR = 1e-3
@@ -187,3 +205,214 @@ FREE_ENERGIES = {energy.name: energy for energy in (DOUBLE_WELL, MISCIBLE)}
 CONSTANT = Mobility("constant", lambda phases: 1.0, _constant)
 DEGENERATE = Mobility("degenerate", lambda phases: 0.5 * (phases - 1) / phases, _degenerate)
 MOBILITIES = {mobility.name: mobility for mobility in (CONSTANT, DEGENERATE)}
+
+
+@cache
+def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) -> Kernels:
+    """Make the Warp functions of the raw sums of B / V over the neighbours, with their derivatives."""
+    real, vector, neighbourhood = discretisation.types
+    fractions = discretisation.precision.fractions(phases)
+    pair = pair_functions(discretisation)
+    factor, factor_gradient = pair.factor, pair.factor_gradient
+
+    typed = TypesByName(real, {vector: "x", fractions: "u y", neighbourhood: "s"})
+
+    @fluid_sum(discretisation)
+    @typed
+    def spread(x_ij, n_i, n_j, w_i, w_j, u_ij, s) -> fractions:
+        return ((w_i / n_j + w_j / n_i) * factor(x_ij, s)) * u_ij
+
+    @tangent_of(spread)
+    @fluid_sum(discretisation, ahead=False)
+    @typed
+    def spread_tangent(
+        x_ij, x_dot_ij, n_i, n_j, n_dot_i, n_dot_j, w_i, w_j, w_dot_i, w_dot_j, u_ij, u_dot_ij, s
+    ) -> fractions:
+        weight = w_i / n_j + w_j / n_i
+        weight_dot = (w_dot_i - w_i * n_dot_j / n_j) / n_j + (w_dot_j - w_j * n_dot_i / n_i) / n_i
+        f = factor(x_ij, s)
+        f_dot = wp.dot(factor_gradient(x_ij, s), x_dot_ij)
+        return (weight_dot * f + weight * f_dot) * u_ij + (weight * f) * u_dot_ij
+
+    @adjoint_of(spread)
+    @fluid_sum(discretisation)
+    @typed
+    def spread_adjoint(x_ij, n_i, n_j, w_i, w_j, u_ij, y_i, y_ij, s) -> tuple[vector, real, real, fractions, real]:
+        """Return a pair's adjoints of x_i, n_i, w_i and u_i for an adjoint y of the sums, and y_i times the sum."""
+        f = factor(x_ij, s)
+        weight = w_i / n_j + w_j / n_i
+        work = wp.dot(u_ij, y_ij)
+        x_bar = (weight * work) * factor_gradient(x_ij, s)
+        n_bar = -w_j * f * work / (n_i * n_i)
+        return x_bar, n_bar, f * work / n_j, (weight * f) * y_ij, weight * f * wp.dot(u_ij, y_i)
+
+    return Kernels(spread, spread_tangent, spread_adjoint)
+
+
+SAFETY = 0.5
+"""Part of the lattice's limit on a step of diffusion that is taken; the rest is for particles off the lattice
+(eigenvalues were at most 1.08 times those of the lattice on random particles) and for fractions that stray out of [0,
+1]."""
+MOST_SUBSTEPS = 10_000
+"""Most explicit steps of diffusion in a time step; with more the mobility is taken for a mistake."""
+
+
+def stable_substeps(
+    scene: Scene,
+    free_energy: FreeEnergy,
+    time_step: float,
+    mobility: float,
+    interface_width: float,
+    rest_density: np.ndarray,
+) -> int:
+    """Return how many substeps of diffusion are stable in a scene of several phases with a time step [s], a mobility
+    [m2/s], an interface width [m] and rest densities (phases,) [kg/m3]. Each is at most
+
+    dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian on the lattice,
+
+    with the mobility M, the width eps and the curvature max f'' of the free energy. Beside a particle that is so many
+    times as heavy a light one diffuses up to (1 + ratio) / 2 times as fast. Raises `OutOfRangeError` for more than
+    `MOST_SUBSTEPS`."""
+    mixture, cut, densities = scene.mixture, scene.discretisation, rest_density
+    rate = laplacian_rate(smoothing_kernel(cut.kernel), cut.spacing, cut.support_radius, scene.dimension)
+    rate *= 0.5 * (1.0 + float(np.max(densities) / np.min(densities)))
+    greatest = mobility * MOBILITIES[mixture.mobility_form].greatest(len(scene.phase))
+    speed = greatest * rate * (interface_width**2 * rate + mixture.strength * free_energy.curvature)
+    limit = 2.0 * SAFETY / speed if speed > 0.0 else np.inf
+    number = float(np.ceil(time_step / limit))
+    if number > MOST_SUBSTEPS:
+        raise OutOfRangeError(
+            f"mobility is {mobility:g} m2/s, which takes {number:.3g} explicit steps of diffusion in a time step, but "
+            f"must not take more than {MOST_SUBSTEPS}: lower it, interface_width or time_step."
+        )
+    return int(number)
+
+
+@dataclass(frozen=True)
+class Diffusion:
+    """The choices for which kernels of a mixture's diffusion are made: discretisation, phases, energy and mobility."""
+
+    discretisation: Discretisation
+    phases: int
+    energy: FreeEnergy
+    mobility: Mobility
+
+    @property
+    def modules(self) -> tuple[Any, Any, Any]:
+        """Return the Warp modules of forward, tangent and adjoint kernels."""
+        return self.discretisation.modules(f"diffusion_{self.phases}_{self.energy.name}_{self.mobility.name}")
+
+
+@cache
+def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
+    """Make the kernels of a substep of diffusion: ``potential`` and ``flux``, whose adjoint is two kernels, of the
+    scale of the sum and of the sum itself."""
+    discretisation, phases = diffusion.discretisation, diffusion.phases
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    fractions = precision.fractions(phases)
+    sums = pairwise_laplacian_functions(discretisation, phases)
+    spread, spread_tangent, spread_adjoint = sums.forward, sums.tangent, sums.adjoint
+    energy, form = diffusion.energy.functions(precision, phases), diffusion.mobility.functions(precision, phases)
+    energy_gradient, energy_hessian_product = energy.gradient, energy.hessian_product
+    mobile, mobile_gradient = form.value, form.gradient
+
+    module, tangent_module, adjoint_module = diffusion.modules
+    of_c, of_chi = {"w": "m", "u": "c"}, {"u": "chi"}
+    """What the sum is of in the potential and in the flux."""
+
+    @wp.func
+    def project(u: fractions) -> fractions:
+        mean = real(0.0)
+        for k in range(wp.static(phases)):
+            mean += u[k]
+        mean = mean / real(wp.static(phases))
+        result = fractions()
+        for k in range(wp.static(phases)):
+            result[k] = u[k] - mean
+        return result
+
+    typed = TypesByName(real, {fractions: "total c chi", neighbourhood: "s", vector: "x"})
+
+    @particle_kernel(module, "chi w", [over(spread, "total", **of_c)], numbers=["strength"])
+    @typed
+    def potential(total, strength, interface_width, mobility, m_i, c_i, s) -> tuple[fractions, real]:
+        """Return the chemical potential chi of a particle, and m M as ``w``."""
+        stiffness = interface_width * interface_width * s.volume / m_i
+        return strength * project(energy_gradient(c_i)) - stiffness * total, m_i * mobility * mobile(c_i)
+
+    @particle_kernel(module, "c_new", [over(spread, "total", **of_chi)], numbers=["substeps"])
+    @typed
+    def flux(total, substeps: int, time_step, m_i, c_i, s) -> fractions:
+        return c_i + (time_step / real(substeps) * s.volume / m_i) * total
+
+    both = [over(spread, "total", **of_c), over(spread_tangent, "total_dot", **of_c, **dotted(of_c))]
+
+    @particle_kernel(tangent_module, "chi_dot w_dot", both, numbers=["strength"])
+    @typed
+    def potential_tangent(
+        total,
+        total_dot,
+        strength,
+        interface_width,
+        interface_width_dot,
+        mobility,
+        mobility_dot,
+        m_i,
+        m_dot_i,
+        c_i,
+        c_dot_i,
+        s,
+    ) -> tuple[fractions, real]:
+        scale = s.volume / m_i
+        stiffness = interface_width * interface_width * scale
+        stiffness_dot = real(2.0) * interface_width * interface_width_dot * scale - stiffness * m_dot_i / m_i
+        chi_dot = (
+            strength * project(energy_hessian_product(c_i, c_dot_i)) - stiffness * total_dot - stiffness_dot * total
+        )
+        by_m = (m_dot_i * mobility + m_i * mobility_dot) * mobile(c_i)
+        return chi_dot, by_m + m_i * mobility * wp.dot(mobile_gradient(c_i), c_dot_i)
+
+    both = [over(spread, "total", **of_chi), over(spread_tangent, "total_dot", **of_chi, **dotted(of_chi))]
+
+    @particle_kernel(tangent_module, "c_new_dot", both, numbers=["substeps"])
+    @typed
+    def flux_tangent(total, total_dot, substeps: int, time_step, time_step_dot, m_i, m_dot_i, c_dot_i, s) -> fractions:
+        scale = time_step / real(substeps) * s.volume / m_i
+        return c_dot_i + scale * (total_dot + (time_step_dot / time_step - m_dot_i / m_i) * total)
+
+    @particle_kernel(adjoint_module, "y", numbers=["substeps"])
+    @typed
+    def scale_adjoint(substeps: int, time_step, m_i, c_bar_i, s) -> fractions:
+        """Return the adjoint y of the flux's raw sum from the adjoint of the new fractions."""
+        return (time_step / real(substeps) * s.volume / m_i) * c_bar_i
+
+    @particle_kernel(
+        adjoint_module,
+        "+x_bar +n_bar +m_bar +c_bar +time_step_bar +mobility_bar z",
+        [over(spread_adjoint, "x_sum n_sum w_bar chi_bar own", **of_chi)],
+        numbers=["strength"],
+    )
+    @typed
+    def flux_adjoint(
+        x_sum, n_sum, w_bar, chi_bar, own, strength, time_step, interface_width, mobility, m_i, c_i, s
+    ) -> tuple[vector, real, real, fractions, real, real, fractions]:
+        """Add to the adjoints of the flux's inputs, and return z, the adjoint of the potential's raw sum."""
+        m_part = w_bar * mobility * mobile(c_i) - own / m_i
+        c_part = (w_bar * m_i * mobility) * mobile_gradient(c_i)
+        c_part += strength * energy_hessian_product(c_i, project(chi_bar))
+        z = (-interface_width * interface_width * s.volume / m_i) * chi_bar
+        return x_sum, n_sum, m_part, c_part, own / time_step, w_bar * m_i * mobile(c_i), z
+
+    of_potential = [over(spread_adjoint, "x_sum n_sum m_sum c_sum own", y="z", **of_c)]
+
+    @particle_kernel(adjoint_module, "+x_bar +n_bar +m_bar +c_bar +interface_width_bar", of_potential)
+    @typed
+    def potential_adjoint(
+        x_sum, n_sum, m_sum, c_sum, own, interface_width, m_i
+    ) -> tuple[vector, real, real, fractions, real]:
+        return x_sum, n_sum, m_sum - own / m_i, c_sum, real(2.0) * own / interface_width
+
+    return SimpleNamespace(
+        potential=Kernels(potential, potential_tangent, potential_adjoint),
+        flux=Kernels(flux, flux_tangent, (scale_adjoint, flux_adjoint)),
+    )

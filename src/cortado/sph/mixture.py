@@ -22,8 +22,7 @@ from cortado.device.modules import Kernels, kernel_module, kind_of
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import Entry, Layout, State, StateField
-from cortado.sph.diffusion import Diffusion, diffusion_kernels
-from cortado.sph.free_energy import FREE_ENERGIES
+from cortado.sph.free_energy import FREE_ENERGIES, Diffusion, diffusion_kernels
 from cortado.sph.integration import order_kernels
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 

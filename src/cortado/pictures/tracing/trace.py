@@ -15,6 +15,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import kernel_module
+from cortado.device.precision import TypesByName
 from cortado.pictures.tracing.backdrop import (
     FAR,
     OPAQUE,
@@ -49,24 +50,30 @@ def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light
     return wp.lerp(BOUNCED * wp.cw_mul(colour, s.horizon), light, 0.35 * hit.t / reach)
 
 
+typed = TypesByName(
+    wp.float32,
+    {
+        wp.int32: "first",
+        Environment: "s",
+        LitSurface: "surface",
+        Vec3s: "points normals directions light image sun",
+        Vec3s2d: "shadow",
+        Ints: "pixels",
+        Vec2s: "offsets",
+        wp.vec3: "start direction",
+        SurfaceHit: "entered",
+    },
+)
+
+
 @cache
 def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
     """Make the kernel that finds the light on surfaces, for scenes with opaque or transparent solids or none."""
     module = shading_module(has_opaque, has_clear)
 
     @wp.kernel(module=module, enable_backward=False)
-    def illuminate(
-        first: wp.int32,
-        s: Environment,
-        surface: LitSurface,
-        points: Vec3s,
-        normals: Vec3s,
-        directions: Vec3s,
-        sun_directions: Vec3s,
-        reach: wp.float32,
-        clearness: wp.float32,
-        light: Vec3s,
-    ):
+    @typed
+    def illuminate(first, s, surface, points, normals, directions, sun_directions, reach, clearness, light):
         """Compute the light on each point of a surface with normals: from the lamp, and from all directions in which
         neither other fluid nor a solid is within ``reach`` [m]. ``clearness``, 0 to 1: the part of the light that goes
         through fluid."""
@@ -155,15 +162,8 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     meet, leave = surface_functions(has_opaque, has_clear)
 
     @wp.func
-    def within(
-        s: Environment,
-        shadow: Vec3s2d,
-        surface: LitSurface,
-        start: wp.vec3,
-        direction: wp.vec3,
-        entered: SurfaceHit,
-        spread: wp.float32,
-    ):
+    @typed
+    def within(s, shadow, surface, start, direction, entered, spread):
         """Return the light that comes out of the fluid against a ray that was refracted into it."""
         found = wp.vec3(0.0)
         through = wp.vec3(1.0)
@@ -273,16 +273,8 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         return toned(passed.light + passed.through * (reflectance * reflected + (1.0 - reflectance) * body))
 
     @wp.kernel(module=module, enable_backward=False)
-    def trace(
-        first: wp.int32,
-        eye: Eye,
-        s: Environment,
-        surface: LitSurface,
-        shadow: Vec3s2d,
-        pixels: Ints,
-        offsets: Vec2s,
-        image: Vec3s,
-    ):
+    @typed
+    def trace(first, eye: Eye, s, surface, shadow, pixels, offsets, image):
         """Compute the light of some pixels, the mean over points of each; ``offsets``: places in the pixel, from -0.5
         to 0.5."""
         pixel = pixels[first + wp.tid()]
