@@ -98,9 +98,7 @@ class Axis:
         """Make the axis of a gauge at a position, from its floor upwards."""
         in_dimension("position", position, at.dimension)
         spacing = at.lattice.cell ** (1.0 / at.dimension)
-        foot = position + (floor - position @ up) * up
-        step = min(FINE * spacing, reach / ACROSS_REACH)
-        return cls(tuple(foot.tolist()), tuple(up.tolist()), reach, step, FILM * spacing)
+        return _axis_of(spacing, tuple(position.tolist()), floor, tuple(up.tolist()), reach)
 
     def places(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the points (c, d) of the floor from its foot [m], and their weights (c,)."""
@@ -110,6 +108,13 @@ class Axis:
         places = grid([along] * (d - 1))
         weights = Weights.of(np.linalg.norm(places, axis=1) / self.reach).values
         return places[weights > 0.0] @ across, weights[weights > 0.0] / weights.sum()
+
+
+@lru_cache(maxsize=64)
+def _axis_of(spacing: float, position: tuple[float, ...], floor: float, up: tuple[float, ...], reach: float) -> Axis:
+    """Return the axis of a gauge, which is asked for in every step."""
+    foot = np.array(position) + (floor - np.dot(position, up)) * np.array(up)
+    return Axis(tuple(foot.tolist()), up, reach, min(FINE * spacing, reach / ACROSS_REACH), FILM * spacing)
 
 
 @dataclass(frozen=True)
