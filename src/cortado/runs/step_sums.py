@@ -1,7 +1,7 @@
 """What sensors read of a run on its device: quantities of each step, which captured steps keep, and sums over particles
 (`cortado.runs.particle_sums`) of all states of a chunk, launched behind it, in float64 and a fixed order."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from math import isqrt
 from types import SimpleNamespace
@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.launching import launch
+from cortado.device.launching import recorded
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.room import Domain
@@ -184,6 +184,8 @@ class ChunkSums:
         self._none, rows = wp.empty(0, dtype=layout.precision.real, device=solver.device), length * layout.members
         self._partial = wp.empty(rows * self._stride, dtype=SIX, device=solver.device)
         self._total = wp.empty(rows, dtype=SIX, device=solver.device)
+        self._launches: dict[tuple[int, int], list[Callable[[], None]]] = {}
+        """By the number of steps and the address of the first state, as in most chunks neither is another."""
         self._setting: Any = None
         if isinstance(summed, WeightedSum):
             self._setting = _around(summed, domain, solver.device)
@@ -193,9 +195,24 @@ class ChunkSums:
     def launch(self, count: int, first: State, later: StateSeries, kept: Mapping[str, wp.array]) -> wp.array:
         """Launch the sums over the states at which ``count`` steps began, the ``first`` and those ``later``, with the
         quantities that were ``kept``. Return them (at least count scenes,), which the next launch overwrites."""
-        summed = self._summed
-        if isinstance(summed, LoadSum):
-            return kept[summed.quantity]
+        if isinstance(self._summed, LoadSum):
+            return kept[self._summed.quantity]
+        key = count, first.positions.ptr
+        if key not in self._launches:
+            self._launches[key] = self._recorded(self._summed, count, first, later, kept)
+        for each in self._launches[key]:
+            each()
+        return self._total
+
+    def _recorded(
+        self,
+        summed: ParticleSum,
+        count: int,
+        first: State,
+        later: StateSeries,
+        kept: Mapping[str, wp.array],
+    ) -> list[Callable[[], None]]:
+        """Return functions that launch the sums, with arguments that are packed once."""
         rows = count * self._scenes
         sizes = {"particles": self._particles, "before": self._scenes * self._particles, "stride": self._stride}
         fields = {"x_first": first.positions, "x": later.whole("positions"), "a": self._setting}
@@ -204,9 +221,11 @@ class ChunkSums:
             kernel = self._kernels.weighted
             fields |= {"v_first": first.velocities, "v": later.whole("velocities")}
         fields["q"] = self._none if summed.quantity is None else kept[summed.quantity]
-        launch(kernel, rows * self._stride, self._device, sizes, fields, partial=self._partial)
-        launch(self._kernels.join, rows, self._device, sizes, partial=self._partial, total=self._total)
-        return self._total
+        join = {"stride": self._stride, "partial": self._partial, "total": self._total}
+        return [
+            recorded(kernel, rows * self._stride, self._device, **sizes, **fields, partial=self._partial),
+            recorded(self._kernels.join, rows, self._device, **join),
+        ]
 
 
 def _around(summed: WeightedSum, domain: Domain, device: Any) -> Any:
@@ -236,9 +255,13 @@ def _region(summed: RegionSum, domain: Domain) -> Any:
 
 
 def _wide(values: NDArray[Any], rest: float = 0.0) -> NDArray[Any]:
-    return np.pad(np.asarray(values, dtype=np.float64), (0, 3 - len(values)), constant_values=rest)
+    found = np.full(3, rest)
+    found[: len(values)] = values
+    return found
 
 
 def _square(matrix: NDArray[Any]) -> NDArray[Any]:
     """Return a matrix with zeros up to (3, 3), row by row."""
-    return np.pad(matrix, [(0, 3 - size) for size in matrix.shape]).ravel()
+    found = np.zeros((3, 3))
+    found[: matrix.shape[0], : matrix.shape[1]] = matrix
+    return found.ravel()
