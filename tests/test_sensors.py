@@ -66,10 +66,9 @@ def test_the_gradient_of_a_sensor_is_that_of_forward_mode_and_of_differences(mak
 
 @pytest.mark.parametrize(("name", "sensor"), IN_THE_PLANE.items(), ids=IN_THE_PLANE)
 def test_the_certificate_finds_the_gradient_of_a_sensor_right(name, sensor):
-    problem, point, _ = problem_of(plane, sensor)
+    """In float32; in float64 the test before finds it right."""
+    problem, point, _ = problem_of(plane, sensor, "float32")
     assert cortado.certify(problem, {"gravity": point["gravity"]}).right
-    single, _, _ = problem_of(plane, sensor, "float32")
-    assert cortado.certify(single, {"gravity": point["gravity"]}).right
 
 
 @pytest.mark.parametrize(("make", "name", "sensor"), CASES, ids=NAMED)
