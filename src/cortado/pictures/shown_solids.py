@@ -109,9 +109,8 @@ def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
     behind them the images a period away that reach into the container."""
     found, domain = [], scene.domain
     for table in scene.solid:
-        shape, middle = table.shape_about()
-        position, is_tank = middle if table.position is None else np.array(table.position), table.side == "inside"
-        position = domain.wrapped(position)
+        (shape, _), is_tank = table.shape_about(), table.side == "inside"
+        position = domain.wrapped(table.centroid())
         found.append(ShownSolid(table.name, shape, position, table.turn(scene.dimension), table.finish, is_tank))
     ends, lengths = scene.container.extent(), scene.periods[1]
     if ends is None or not lengths.any():

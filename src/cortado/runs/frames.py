@@ -443,7 +443,6 @@ def posed(scene: Scene, motions: Mapping[str, SolidMotion], frame: int) -> Scene
     tables = []
     for table in sized(scene, motions).solid:
         if motion := motions.get(table.name):
-            rotation = tuple(np.atleast_1d(motion.rotations[frame]).tolist())
-            table = table.model_copy(update={"position": tuple(motion.positions[frame].tolist()), "rotation": rotation})
+            table = table.moved(motion.positions[frame], tuple(np.atleast_1d(motion.rotations[frame]).tolist()))
         tables.append(table)
     return scene.model_copy(update={"solid": tuple(tables)})

@@ -195,8 +195,8 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
 def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
     """Return the distance from a solid's middle to its furthest point, at most [m], with values of parameters that
     replace the scene's."""
-    shape, _ = solid.shape_about()
-    return float(np.linalg.norm(np.abs(shape.extent()).max(axis=0)) * values.get(scale_name(solid.name), 1.0))
+    own = solid.shape_about()[0] if solid.motion != "free" else solid.own_solid()
+    return float(np.linalg.norm(np.abs(own.extent()).max(axis=0)) * values.get(scale_name(solid.name), 1.0))
 
 
 def _name(end: str) -> Callable[[str], str]:
@@ -219,7 +219,13 @@ velocity_name = _name("velocity")
 angular_velocity_name = _name("angular_velocity")
 """The parameter: how fast it turns, a free body at the start [rad/s]; the field of a free body."""
 density_name = _name("density")
-"""The parameter of a free body [kg/m3]."""
+mass_name = _name("mass")
+
+
+def weight_name(solid: SolidTable) -> str:
+    """Return the name of the parameter of a free body that is its density [kg/m3] or its mass [kg], as its table says
+    one or the other."""
+    return (density_name if solid.mass is None else mass_name)(solid.name)
 
 
 def solids_in(fields: Iterable[str]) -> list[str]:
@@ -240,7 +246,7 @@ def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
                 found.append(replace(known[name(solid.name)], role=Role.VIEW, in_place_of=of(solid.name)))
     begun = (position_name, rotation_name, velocity_name, angular_velocity_name)
     found += [replace(known[name(solid.name)], role=Role.STATE) for solid in free(solids) for name in begun]
-    return [*found, *(known[density_name(solid.name)] for solid in free(solids))]
+    return [*found, *(known[weight_name(solid)] for solid in free(solids))]
 
 
 def _parameters(solid: SolidTable) -> list[Parameter]:
@@ -262,7 +268,7 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
     spin = unturned if solid.angular_velocity is None else np.reshape(solid.angular_velocity, unturned.shape)
     displaced = f"how far the middle of the solid {name} is from where it began, after each step"
     turned = f"how far the solid {name} is turned from how it began, after each step"
-    heavy = f"the mass of the body {name} over its volume"
+    heavy, unit = f"the mass of the body {name}", "kg" if len(middle) == 3 else "kg/m"
     stretched = f"how many times as large as in the scene the solid {name} is, about its middle"
     return [
         made(position_name, "m", f"where the middle of the solid {name} is at the start", middle, **place),
@@ -274,7 +280,8 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
             velocity_name, "m/s", f"how fast the middle of the solid {name} is{when}", solid.velocity or still, **rate
         ),
         made(angular_velocity_name, "rad/s", f"how fast the solid {name} turns about its middle{when}", spin, **rate),
-        made(density_name, "kg/m³", heavy, solid.density or 0.0, range=Range.POSITIVE),
+        made(density_name, "kg/m³", f"{heavy} over its volume", solid.density or 0.0, range=Range.POSITIVE),
+        made(mass_name, unit, heavy, solid.mass or 0.0, range=Range.POSITIVE),
     ]
 
 

@@ -111,7 +111,7 @@ def _turned_off(scene: SceneTables) -> Iterator[Idle]:
         yield ("emitter",), emitter, ("length",), "duration is over before so much is out"
     for index, solid in enumerate(scene.solid):
         names = tuple(name for name in ("centre", "base") if any(getattr(solid, name, ())))
-        if not np.allclose(solid.middle(), solid.shape_about()[1]):
+        if not np.allclose(solid.centroid(), solid.shape_about()[1]):
             yield ("solid", index), solid, names, "position says where its middle is"
     for index, phase in enumerate(scene.phase):
         path, law = ("phase", index, "rheology"), phase.rheology

@@ -13,7 +13,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from cortado.arrays import unit
 from cortado.discretise.primitives import HalfSpace, Polygon, Revolved, Round
 from cortado.discretise.shapes import Points
-from cortado.discretise.solid import Hollow, Placed, Solid
+from cortado.discretise.solid import Hollow, Mass, Placed, Solid
 from cortado.errors import Words, shown
 from cortado.scene.appearance import FINISHES, Coloured, Finish
 from cortado.scene.shape_tables import (
@@ -31,6 +31,7 @@ from cortado.scene.tables import (
     FieldPath,
     Length,
     OneOf,
+    Radii,
     Rotation,
     Text,
     Turning,
@@ -64,6 +65,14 @@ class SolidTable(Coloured):
     steady `velocity`, `angular_velocity` or both; or is a rigid body, which fluid and gravity move."""
     density: Annotated[float, quantity("kg/m3", gt=0.0)] | None = None
     """Density of a free body: its mass over its volume [kg/m³]."""
+    mass: Annotated[float, quantity("kg", gt=0.0)] | None = None
+    """Mass of a free body, in place of its density; in 2-D that of a metre of it [kg]."""
+    centre_of_mass: tuple[Length, ...] | None = None
+    """(d,) Where the centre of mass of a free body is, from the centroid of its volume and along its own axes [m]; 0 if
+    left out."""
+    gyration_radius: Radii | None = None
+    """(3,) Radii of gyration of a free body about its own axes through its centre of mass, in 2-D one number: their
+    squares are its moments of inertia over its mass [m]. If left out they are those of its shape."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of the path, from 0 on, each greater than the one before [s]; between them it goes in straight lines,
     and after the last it rests."""
@@ -111,20 +120,36 @@ class SolidTable(Coloured):
         """Return True where it or its surface moves."""
         return self.motion != "fixed" or self.surface_velocity is not None
 
-    def middle(self) -> Points:
-        """Return the middle (d,) of the solid at the start [m]."""
+    def centroid(self) -> Points:
+        """Return the centroid (d,) of the solid's volume at the start [m]."""
         return self.shape_about()[1] if self.position is None else np.array(self.position)
+
+    def middle(self) -> Points:
+        """Return the middle (d,) of the solid at the start [m]: its centroid, or the centre of its mass if it has
+        one."""
+        return self.centroid() if self.centre_of_mass is None else self.centroid() + self._arm()
+
+    def moved(self, middle: Points, rotation: tuple[float, ...]) -> Self:
+        """Return the solid with its middle (d,) at a place [m], turned by a rotation."""
+        turned = self.model_copy(update={"rotation": rotation})
+        centroid = middle if self.centre_of_mass is None else middle - turned._arm()
+        return turned.model_copy(update={"position": tuple(centroid.tolist())})
+
+    def _arm(self) -> Points:
+        """Return the way (d,) from the centroid to the centre of mass at the start [m]."""
+        arm = np.array(self.centre_of_mass)
+        return np.asarray(self.turn(len(arm)) @ arm)
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the shape about its middle, not turned, and the middle by its measures, (d,) [m]."""
+        """Return the shape about its centroid, not turned, and the centroid by its measures, (d,) [m]."""
 
     def stretched(self, scale: float) -> Self:
         """Return the solid ``scale`` times as large about its middle."""
         if scale == 1.0:
             return self
         grown = {name: _times(scale, getattr(self, name)) for name in self.measures}
-        return self.model_copy(update={**grown, "position": tuple(self.middle().tolist())})
+        return self.model_copy(update={**grown, "position": tuple(self.centroid().tolist())})
 
     @abstractmethod
     def thinnest(self, spacing: float) -> float:
@@ -148,20 +173,32 @@ class SolidTable(Coloured):
     def own_solid(self) -> Solid:
         """Return the solid where fluid may not be, about its middle and not turned."""
         shape = self.shape_about()[0]
+        if self.centre_of_mass is not None:
+            return Placed(shape, -np.array(self.centre_of_mass), np.eye(len(self.centre_of_mass)))
         return Hollow(shape) if self.side == "inside" else shape
 
     def body(self) -> Solid:
         """Return the shape in its place."""
-        middle = self.middle()
-        return Placed(self.shape_about()[0], middle, self.turn(len(middle)))
+        centroid = self.centroid()
+        return Placed(self.shape_about()[0], centroid, self.turn(len(centroid)))
+
+    def mass_of_one(self) -> Mass:
+        """Return the mass of a free body, with its inertia about its centre of mass, if the density or the mass that is
+        given is 1."""
+        even = Mass.of(self.shape_about()[0])
+        size = even.volume if self.mass is None else 1.0
+        if self.gyration_radius is None:
+            return Mass(size, size / even.volume * even.inertia)
+        radii = (0.0, 0.0, *self.gyration_radius)[-3:]
+        return Mass(size, size * np.diag(np.square(radii)))
 
     def turn(self, dimension: int) -> NDArray[np.float64]:
         """Return the rotation matrix (d, d) at the start."""
         return rotation_matrix(self.rotation or (0.0,) * (2 * dimension - 3))
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        self.check_components(("position", "velocity", "surface_velocity"), dimension, path)
-        for name in ("rotation", "angular_velocity"):
+        self.check_components(("position", "velocity", "surface_velocity", "centre_of_mass"), dimension, path)
+        for name in ("rotation", "angular_velocity", "gyration_radius"):
             check_turn((*path, name), getattr(self, name), dimension)
         _check_motion(self, dimension, path)
         return super().in_dimension(dimension, path)
@@ -182,10 +219,10 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
     """Raise a `field_error` where the keys of a motion do not fit together."""
     rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
     given = [name for name in ("times", *rows, *steady) if getattr(solid, name) is not None]
-    if solid.density is not None and solid.motion != "free":
-        raise field_error(
-            (*path, "density"), solid.density, 'left out, as only a body whose motion is "free" has a mass'
-        )
+    for name in ("density", "mass", "centre_of_mass", "gyration_radius"):
+        if getattr(solid, name) is not None and solid.motion != "free":
+            wanted = 'left out, as only a body whose motion is "free" has a mass'
+            raise field_error((*path, name), getattr(solid, name), wanted)
     if solid.motion == "fixed":
         if given:
             raise field_error((*path, given[0]), Words("given"), 'left out, as motion is "fixed"')
@@ -207,9 +244,14 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
 
 
 def _check_free(solid: SolidTable, path: FieldPath) -> None:
-    """Check that a free body has a density, and that nothing tells it where to go."""
-    if solid.density is None:
-        raise field_error((*path, "density"), MISSING, 'a density in kg/m3, as motion is "free"')
+    """Check that a free body has one mass, and that nothing tells it where to go."""
+    if solid.density is None and solid.mass is None:
+        raise field_error((*path, "density"), MISSING, 'a density in kg/m3, or a mass, as motion is "free"')
+    if solid.density is not None and solid.mass is not None:
+        raise field_error((*path, "mass"), solid.mass, "left out, as there is a density")
+    if solid.centre_of_mass is not None and solid.gyration_radius is None:
+        wanted = "given, as the mass whose centre is told is not spread evenly"
+        raise field_error((*path, "gyration_radius"), MISSING, wanted)
     for name in ("times", "positions", "rotations", "surface_velocity"):
         if getattr(solid, name) is not None:
             raise field_error((*path, name), Words("given"), 'left out, as motion is "free"')

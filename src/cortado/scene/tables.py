@@ -143,6 +143,11 @@ Turning = Annotated[
     Field(min_length=1, max_length=3, fail_fast=True),
     BeforeValidator(_in_a_list),
 ]
+Radii = Annotated[
+    tuple[Annotated[float, quantity("m", gt=0.0)], ...],
+    Field(min_length=1, max_length=3, fail_fast=True),
+    BeforeValidator(_in_a_list),
+]
 
 
 def check_turn(path: FieldPath, value: tuple[float, ...] | None, dimension: int) -> None:

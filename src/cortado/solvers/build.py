@@ -16,7 +16,7 @@ from cortado.device.grid import Grid
 from cortado.device.lanes import lanes_for
 from cortado.device.precision import Precision
 from cortado.discretise.smoothing import SKIN
-from cortado.discretise.solid import Hollow, Mass, Solid
+from cortado.discretise.solid import Hollow, Solid
 from cortado.errors import InputError, shown
 from cortado.particles.mirrors import MOST_FACES, most_imaged
 from cortado.particles.moving_walls import WallArrays
@@ -25,7 +25,7 @@ from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout, padded
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
 from cortado.scene.fluid_particles import reserve_offset
-from cortado.scene.motions import motion_parameters, moving, solid_frames, wall_numbers
+from cortado.scene.motions import motion_parameters, moving, solid_frames, wall_numbers, weight_name
 from cortado.scene.parameter_values import REGISTRY, Known, checked_value
 from cortado.scene.parameters import PARAMETERS, Parameter, Source
 from cortado.scene.scene import Scene
@@ -344,10 +344,9 @@ def _parts(
 
 def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch, layout: Layout) -> FreeSolids | None:
     """Make the part that moves free bodies with the fluid; None for a scene without free bodies."""
+    cell = scene.discretisation.spacing**scene.dimension
     tables = [
-        FreeTable(
-            table.name, number, Mass.of(table.own_solid()).in_volumes(scene.discretisation.spacing**scene.dimension)
-        )
+        FreeTable(table.name, number, weight_name(table), table.mass_of_one().in_volumes(cell))
         for number, table in enumerate(moving(scene.solid))
         if table.motion == "free"
     ]

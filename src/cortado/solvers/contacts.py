@@ -27,7 +27,6 @@ from cortado.device.reduction import sum_of
 from cortado.particles.moving_walls import matrix_of
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout, Parameters, padded, zeros
-from cortado.scene.motions import density_name
 from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart, free_module
 from cortado.sph.parts import Adjoints, StepContext, Tangents
@@ -281,10 +280,7 @@ class Contacts:
     def densities(self, parameters: Parameters, number: int, suffix: str = "") -> Arrays:
         """Return the densities of both solids, or their tangents or adjoints, by the kernels' names."""
         names = (f"density{suffix}", f"other_density{suffix}")
-        return {
-            name: parameters[density_name(body.table.name)]
-            for name, body in zip(names, self.bodies(number), strict=True)
-        }
+        return {name: parameters[body.table.weight] for name, body in zip(names, self.bodies(number), strict=True)}
 
     def given(self, number: int, each: Sequence[FreeBody | Changes]) -> Arrays:
         """Return the momenta that both solids get, or their changes; ``pushed_bar`` of the other is

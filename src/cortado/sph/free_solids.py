@@ -6,9 +6,10 @@ which leaves V, W and L of the end in `FreeBody.moved`.
 A body's rotation is R = Q R(w_0) for the rotation w_0 that it began with. A state has how far the ends of the three
 unit axes of its frame have moved since, the columns of Q - I.
 
-A step has kernels with a thread for each scene. In it a body with the density rho is at c, turned by R. It has the
-velocities V and W and the angular momentum L = rho R I R^T W, for its inertia I at a density of 1; volumes are in those
-of a particle. A step begins by where it would go, c' = c + dt V and R' = R(dt W) R, where its walls are. What fluid,
+A step has kernels with a thread for each scene. In it the centre of mass of a body with the density rho is at c, and
+the body is turned by R. It has the velocities V and W and the angular momentum L = rho R I R^T W, for its inertia I at
+a density of 1; volumes are in those of a particle. Where a scene says its mass, that is rho, and I the inertia of a
+mass of 1. A step begins by where it would go, c' = c + dt V and R' = R(dt W) R, where its walls are. What fluid,
 gravity and contact give it leads to V_1 and L_1. It ends at c + dt V_1, turned by R(dt W_1) R, with W_1 = R' I^-1 R'^T
 L_1 / rho. It turns with the angular velocity that L_1 gives it there, so that both momenta are kept.
 """
@@ -31,7 +32,7 @@ from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Layout, State, StateField
-from cortado.scene.motions import AXES, angular_velocity_name, density_name, position_name, rotation_name, velocity_name
+from cortado.scene.motions import AXES, angular_velocity_name, position_name, rotation_name, velocity_name
 from cortado.scene.parameters import Axis
 from cortado.sph.moving_solids import rotations
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
@@ -179,8 +180,10 @@ class FreeTable:
     name: str
     number: int
     """Number among the solids that move."""
+    weight: str
+    """Name of the parameter that is its density, or its mass."""
     mass: Mass
-    """Mass and inertia for a density of 1, in volumes of a particle."""
+    """Mass and inertia if this parameter is 1, in volumes of a particle."""
 
 
 @dataclass(frozen=True)
@@ -256,7 +259,7 @@ class FreeBody:
 
     def known(self, step: StepContext) -> tuple[Named, ...]:
         """Return the arrays and constants of the body that all kernels take."""
-        density = step.parameters[density_name(self.table.name)]
+        density = step.parameters[self.table.weight]
         return self.constants, self.state(self.begun), {"density": density}
 
 
@@ -331,7 +334,7 @@ class FreeSolidsTangent(PartTangent):
         for own in self.bodies:
             body = own.body
             sizes = {"time_step_dot": dot.parameters["time_step"]}
-            sizes["density_dot"] = dot.parameters[density_name(body.table.name)]
+            sizes["density_dot"] = dot.parameters[body.table.weight]
             dots = {**body.state(state_dot, "_dot"), **body.state(state_dot, "_new_dot"), **sizes}
             moves = (own.before,) if begins else (own.moved, body.moved)
             step.launch(kernel, dots, *moves, *body.known(step), threads=part.layout.members)
@@ -366,5 +369,5 @@ class FreeSolidsAdjoint(PartAdjoint):
             own.clear()
 
     def _bars(self, own: Changes, bar: Any, state_bar: State) -> dict[str, wp.array]:
-        sizes = {"time_step_bar": bar["time_step"], "density_bar": bar[density_name(own.body.table.name)]}
+        sizes = {"time_step_bar": bar["time_step"], "density_bar": bar[own.body.table.weight]}
         return {**own.body.state(state_bar, "_bar"), **own.body.state(state_bar, "_new_bar"), **sizes}

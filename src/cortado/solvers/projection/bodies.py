@@ -9,7 +9,6 @@ import warp as wp
 from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.particles.state import Layout, zeros
-from cortado.scene.motions import density_name
 from cortado.solvers.projection.body_kernels import body_kernels, motion_kernels
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart
 from cortado.sph.parts import Adjoints, StepContext, Tangents
@@ -143,7 +142,7 @@ class BodiesTangent:
 
     def _known(self, context: StepContext, dot: Tangents, k: int) -> tuple[Named, ...]:
         bodies, held, own = self._bodies, self._bodies.held[k], self._held[k]
-        rates = {"density_dot": dot.parameters[density_name(held.body.table.name)]}
+        rates = {"density_dot": dot.parameters[held.body.table.weight]}
         dots = own.known, own.shares, own.faster, own.whole, own.start.motion, rates
         return *dots, *dot.named, *bodies.known(context, held)
 
@@ -204,7 +203,7 @@ class BodiesAdjoint:
 
     def _known(self, context: StepContext, bar: Adjoints, k: int) -> tuple[Named, ...]:
         held, own, table = self._bodies.held[k], self._held[k], self._bodies.held[k].body.table
-        rates = {"density_bar": bar.parameters[density_name(table.name)], "time_step_bar": bar.parameters["time_step"]}
+        rates = {"density_bar": bar.parameters[table.weight], "time_step_bar": bar.parameters["time_step"]}
         bars = own.known, own.start.motion, self._turned[k], self._sums_bar, rates
         return *bars, *bar.named, *self._bodies.known(context, held)
 
@@ -266,7 +265,7 @@ class BodiesAdjoint:
             known = self._known(context, bar, k)
             context.launch(bodies.kernels.weigh.adjoint, self._weighed, *known, a_bar=a_bar)
             sums = {name: self._sum[name](share) for name, share in self._weighed.items()}
-            add(sums["density_bar"], bar.parameters[density_name(held.body.table.name)])
+            add(sums["density_bar"], bar.parameters[held.body.table.weight])
             context.launch(bodies.kernels.share, sums, *known)
             context.launch(bodies.kernels.measure.adjoint, *known)
             given = bar.solids.of(held.body.table.number)

@@ -1,0 +1,113 @@
+"""Masses of free bodies as scenes say them: a mass, its centre and its radii of gyration."""
+
+import numpy as np
+import pytest
+
+from cortado import Problem, Simulation
+from cortado.discretise.solid import Mass
+from cortado.errors import SceneError
+from finite_differences import both_modes, decades, distance
+from scenes import box
+from test_free_bodies import BRICK, RAFT, plane, space
+from test_quantities import Weighted
+
+KEEL = {"centre_of_mass": [0.02, -0.04], "gyration_radius": 0.09}
+KEELS = {"centre_of_mass": [0.01, -0.03, 0.02], "gyration_radius": [0.07, 0.09, 0.08]}
+
+
+def massive(table, mass, **keys):
+    return {**{key: value for key, value in table.items() if key != "density"}, "mass": mass, **keys}
+
+
+@pytest.mark.parametrize(("scene_of", "table"), [(plane, RAFT), (space, BRICK)])
+def test_a_body_is_the_same_by_its_density_and_by_its_mass(scene_of, table):
+    """With the centre and the radii of its shape said, or not."""
+    scene = scene_of(table)
+    even = Mass.of(scene.solid[0].shape_about()[0])
+    radii = np.sqrt(np.diag(even.inertia) / even.volume)
+    radii = float(radii[2]) if scene.dimension == 2 else radii.tolist()
+    told = {"centre_of_mass": [0.0] * scene.dimension, "gyration_radius": radii}
+    wanted = Simulation(scene, precision="float64").run(20).positions[-1]
+    for keys in ({}, told):
+        one = scene_of(massive(table, table["density"] * even.volume, **keys))
+        np.testing.assert_allclose(Simulation(one, precision="float64").run(20).positions[-1], wanted, atol=1e-13)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_body_in_nothing_turns_about_the_centre_of_its_mass(dimension):
+    table, keys, scene_of = ((RAFT, KEEL, plane), (BRICK, KEELS, space))[dimension - 2]
+    scene = scene_of(massive(table, 20.0, **keys), container={"shape": "none"})
+    high = {**scene.solid[0].model_dump(exclude_none=True), "position": [0.3, 2.0, 0.2][:dimension]}
+    scene = scene_of(high, container={"shape": "none"})
+    run = Simulation(scene, precision="float64").run(50)
+    t, solid, arm = 0.001 * np.arange(51), run.solids["raft"], np.array(keys["centre_of_mass"])
+    start = np.array([0.3, 2.0, 0.2][:dimension]) + scene.solid[0].turn(dimension) @ arm
+    np.testing.assert_allclose(solid.positions[0], start, atol=1e-15)
+    fall = np.zeros((51, dimension))
+    fall[:, 1] = -9.81 * 0.001**2 * np.arange(51) * np.arange(1, 52) / 2.0
+    np.testing.assert_allclose(solid.positions, start + np.multiply.outer(t, table["velocity"]) + fall, atol=1e-13)
+    if dimension == 2:
+        np.testing.assert_allclose(solid.angular_velocities, 2.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("load", "sign"), [(0.1, -1.0), (0.25, 1.0)])
+def test_a_low_load_rights_a_box_and_a_high_one_capsizes_it(load, sign):
+    """A box 0.8 x 0.4 m, half as heavy as water, heels by 0.1 rad to the left. Its metacentre is 0.8^2 / (12 x 0.2) - 0.1
+    = 0.167 m above its middle: so much above it may its centre of mass be."""
+    body = box([1.6, 0.8], [2.4, 1.2], name="raft", motion="free", mass=160.0, rotation=0.1)
+    scene = plane(
+        {**body, "centre_of_mass": [0.0, load], "gyration_radius": 0.5},
+        discretisation={"spacing": 0.04},
+        fluid=[box([0.0, 0.0], [4.0, 1.0], phase="water")],
+        container=box([0.0, 0.0], [4.0, 2.0]),
+        solver={"kind": "projection", "time_step": 0.002},
+    )
+    run = Simulation(scene, precision="float64").run(100)
+    assert sign * run.solids["raft"].angular_velocities[-1] > 0.01
+
+
+@pytest.mark.parametrize(("scene_of", "table", "keys"), [(plane, RAFT, KEEL), (space, BRICK, KEELS)])
+def test_mass_has_derivatives(scene_of, table, keys):
+    scene = scene_of(massive(table, 20.0 if scene_of is plane else 3.0, **keys))
+    simulation = Simulation(scene, precision="float64")
+    weights = np.random.default_rng(1).uniform(size=simulation.quantity("speed").shape)
+    problem = Problem(simulation, 6, Weighted("speed", weights))
+    point = {"raft.mass": np.array(scene.solid[0].mass)}
+    tangent = both_modes(problem, point, {"raft.mass": 1.0})[1]
+    assert distance(problem.value, point, {"raft.mass": 1.0}, tangent, decades(2.0, 6.0), enough=1e-7) < 1e-6
+
+
+def test_a_picture_of_a_body_shows_its_shape_where_its_walls_are():
+    scene = plane(massive(RAFT, 20.0, **KEEL))
+    run = Simulation(scene, precision="float64").run(30)
+    from cortado.pictures.shown_solids import shown_solids
+    from cortado.runs.frames import posed
+
+    (one,) = shown_solids(posed(scene, run.solids, -1))
+    motion, table = run.solids["raft"], scene.solid[0]
+    angle = motion.rotations[-1]
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    np.testing.assert_allclose(one.position + turn @ np.array(KEEL["centre_of_mass"]), motion.positions[-1], atol=1e-12)
+    np.testing.assert_allclose(one.turn, turn, atol=1e-12)
+    assert table.own_solid().distance(-np.array([KEEL["centre_of_mass"]]))[0] == pytest.approx(-0.08)
+
+
+WRONG = {
+    "two masses": ({"density": 500.0, "mass": 20.0}, "left out, as there is a density"),
+    "none": ({}, "a density in kg/m3, or a mass"),
+    "no radius": ({"mass": 20.0, "centre_of_mass": [0.0, 0.1]}, "gyration_radius"),
+    "three radii": ({"mass": 20.0, "gyration_radius": [0.1, 0.1, 0.1]}, "one number in 2-D"),
+    "a centre in space": ({"mass": 20.0, "gyration_radius": 0.1, "centre_of_mass": [0.0, 0.1, 0.0]}, "centre_of_mass"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_masses_that_do_not_fit_together_are_refused(name):
+    keys, wanted = WRONG[name]
+    with pytest.raises(SceneError, match=wanted):
+        plane({**box([0.2, 0.32], [0.45, 0.48], name="raft", motion="free"), **keys})
+
+
+def test_only_a_free_body_has_a_mass():
+    with pytest.raises(SceneError, match="only a body whose motion"):
+        plane(box([0.2, 0.32], [0.45, 0.48], name="post", gyration_radius=0.1))
