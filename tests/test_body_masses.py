@@ -52,8 +52,8 @@ def test_a_body_in_nothing_turns_about_the_centre_of_its_mass(dimension):
 
 @pytest.mark.parametrize(("load", "sign"), [(0.1, -1.0), (0.25, 1.0)])
 def test_a_low_load_rights_a_box_and_a_high_one_capsizes_it(load, sign):
-    """A box 0.8 x 0.4 m, half as heavy as water, heels by 0.1 rad to the left. Its metacentre is 0.8^2 / (12 x 0.2) - 0.1
-    = 0.167 m above its middle: so much above it may its centre of mass be."""
+    """A box 0.8 x 0.4 m, half as heavy as water, heels by 0.1 rad to the left. Its metacentre is 0.167 m above its
+    middle, 0.8^2 / (12 x 0.2) - 0.1: so far up may its centre of mass be."""
     body = box([1.6, 0.8], [2.4, 1.2], name="raft", motion="free", mass=160.0, rotation=0.1)
     scene = plane(
         {**body, "centre_of_mass": [0.0, load], "gyration_radius": 0.5},

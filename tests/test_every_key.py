@@ -48,7 +48,7 @@ atexit.register(shutil.rmtree, FOLDER)
 BLOCK, POINTS, DROPS, AROUND = (str(FOLDER / name) for name in ("block.stl", "points.npy", "drops.npy", "around.npy"))
 trimesh.creation.box((1.0, 1.0, 1.0)).export(BLOCK)
 np.save(POINTS, [[0.45, 0.2], [0.5, 0.2]])
-BESIDE = [[0.48, 0.3], [0.62, 0.27], [0.81, 0.3], [1.3, 0.12], [1.46, 0.4]]
+BESIDE = [[0.48, 0.3], [0.62, 0.27], [0.81, 0.3], [1.3, 0.12], [1.46, 0.4], [0.95, 0.6]]
 """Where fluid is on its way to solids [m]."""
 np.save(DROPS, (np.array(BESIDE)[:, None] + 0.05 * np.array([[0.0, 0.0], [-1.0, 0.0], [-1.0, -1.0]])).reshape(-1, 2))
 np.save(AROUND, [[0.35, 0.3, 0.3], [0.6, 0.3, 0.3], [0.85, 0.3, 0.3]])
@@ -71,6 +71,10 @@ IN_THE_PLANE = [
     },
     {"name": "wedge", "shape": "polygon", "corners": [[1.2, 0.0], [1.5, 0.0], [1.5, 0.2]], "slip": "no"},
     {"name": "slope", "shape": "plane", "position": [1.5, 0.4], "normal": [-1.0, 0.3], "slip": "no"},
+    {
+        **box([1.0, 0.58], [1.15, 0.68], name="keel", motion="free", mass=9.0),
+        **{"centre_of_mass": [0.02, -0.02], "gyration_radius": 0.08},
+    },
 ]
 IN_SPACE = [
     {"name": "pole", "shape": "cylinder", "base": [0.2, 0.1, 0.3], "radius": 0.1, "height": 0.3, "slip": "no"},

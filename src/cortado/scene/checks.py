@@ -19,7 +19,7 @@ from cortado.scene.model import MixtureTable, SceneTables, SolidLoadTable
 from cortado.scene.motions import free
 from cortado.scene.parameters import BY_NAME
 from cortado.scene.shape_tables import MeshShape, check_length
-from cortado.scene.solids import check_solid
+from cortado.scene.solids import SolidTable
 from cortado.scene.stability import chosen_limits
 from cortado.scene.tables import MISSING, FieldPath, field_error, field_name
 from cortado.words import point_in_words
@@ -152,6 +152,14 @@ def _overlap(other: str, place: Points, spacing: float) -> tuple[Words, str]:
 MOST_PARTICLES = 2e8
 FURTHEST = 1e9
 """In spacings from the origin; further away, neighbours would not have distinct positions in float64."""
+
+
+def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
+    """Check that a solid is so thick that there is room for the particles of its walls."""
+    least = solid.least_thickness * spacing
+    if solid.side == "outside" and (thickness := solid.thinnest(spacing)) < least * (1.0 - 1e-6):
+        found, of = Words(f"only {thickness:g} m thick"), "one spacing" if least == spacing else "half a spacing"
+        raise field_error(path, found, f"at least {of}, {least:g} m, thick")
 
 
 def check_scene(scene: SceneTables) -> None:

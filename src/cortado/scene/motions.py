@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, create_model, model_validator
 
+from cortado.discretise.solid import Mass
 from cortado.errors import Words
 from cortado.scene.parameters import PARAMETERS, Axis, Parameter, Range, Role, Source
 from cortado.scene.solids import SolidTable
@@ -226,6 +227,17 @@ def weight_name(solid: SolidTable) -> str:
     """Return the name of the parameter of a free body that is its density [kg/m3] or its mass [kg], as its table says
     one or the other."""
     return (density_name if solid.mass is None else mass_name)(solid.name)
+
+
+def mass_of_one(solid: SolidTable) -> Mass:
+    """Return the mass of a free body, with its inertia about its centre of mass, if its density or its mass, whichever
+    its table says, is 1."""
+    even = Mass.of(solid.shape_about()[0])
+    size = even.volume if solid.mass is None else 1.0
+    if solid.gyration_radius is None:
+        return Mass(size, size / even.volume * even.inertia)
+    radii = (0.0, 0.0, *solid.gyration_radius)[-3:]
+    return Mass(size, size * np.diag(np.square(radii)))
 
 
 def solids_in(fields: Iterable[str]) -> list[str]:

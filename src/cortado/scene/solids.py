@@ -13,7 +13,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from cortado.arrays import unit
 from cortado.discretise.primitives import HalfSpace, Polygon, Revolved, Round
 from cortado.discretise.shapes import Points
-from cortado.discretise.solid import Hollow, Mass, Placed, Solid
+from cortado.discretise.solid import Hollow, Placed, Solid
 from cortado.errors import Words, shown
 from cortado.scene.appearance import FINISHES, Coloured, Finish
 from cortado.scene.shape_tables import (
@@ -71,8 +71,8 @@ class SolidTable(Coloured):
     """(d,) Where the centre of mass of a free body is, from the centroid of its volume and along its own axes [m]; 0 if
     left out."""
     gyration_radius: Radii | None = None
-    """(3,) Radii of gyration of a free body about its own axes through its centre of mass, in 2-D one number: their
-    squares are its moments of inertia over its mass [m]. If left out they are those of its shape."""
+    """(3,) Radii of gyration of a free body about its own axes through its centre of mass, in 2-D one number: roots of
+    its moments of inertia over its mass [m]. If left out they are those of its shape."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of the path, from 0 on, each greater than the one before [s]; between them it goes in straight lines,
     and after the last it rests."""
@@ -125,20 +125,18 @@ class SolidTable(Coloured):
         return self.shape_about()[1] if self.position is None else np.array(self.position)
 
     def middle(self) -> Points:
-        """Return the middle (d,) of the solid at the start [m]: its centroid, or the centre of its mass if it has
-        one."""
-        return self.centroid() if self.centre_of_mass is None else self.centroid() + self._arm()
+        """Return the middle (d,) of the solid at the start [m]: its centroid, or the centre of mass that it has."""
+        return self.centroid() + self._arm()
 
     def moved(self, middle: Points, rotation: tuple[float, ...]) -> Self:
         """Return the solid with its middle (d,) at a place [m], turned by a rotation."""
         turned = self.model_copy(update={"rotation": rotation})
-        centroid = middle if self.centre_of_mass is None else middle - turned._arm()
-        return turned.model_copy(update={"position": tuple(centroid.tolist())})
+        return turned.model_copy(update={"position": tuple((middle - turned._arm()).tolist())})
 
     def _arm(self) -> Points:
-        """Return the way (d,) from the centroid to the centre of mass at the start [m]."""
-        arm = np.array(self.centre_of_mass)
-        return np.asarray(self.turn(len(arm)) @ arm)
+        """Return the way (d,) from the centroid to the middle at the start [m], (1,) zero without a centre of mass."""
+        arm = self.centre_of_mass
+        return np.zeros(1) if arm is None else np.asarray(self.turn(len(arm)) @ np.array(arm))
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
@@ -182,16 +180,6 @@ class SolidTable(Coloured):
         centroid = self.centroid()
         return Placed(self.shape_about()[0], centroid, self.turn(len(centroid)))
 
-    def mass_of_one(self) -> Mass:
-        """Return the mass of a free body, with its inertia about its centre of mass, if the density or the mass that is
-        given is 1."""
-        even = Mass.of(self.shape_about()[0])
-        size = even.volume if self.mass is None else 1.0
-        if self.gyration_radius is None:
-            return Mass(size, size / even.volume * even.inertia)
-        radii = (0.0, 0.0, *self.gyration_radius)[-3:]
-        return Mass(size, size * np.diag(np.square(radii)))
-
     def turn(self, dimension: int) -> NDArray[np.float64]:
         """Return the rotation matrix (d, d) at the start."""
         return rotation_matrix(self.rotation or (0.0,) * (2 * dimension - 3))
@@ -220,9 +208,8 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
     rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
     given = [name for name in ("times", *rows, *steady) if getattr(solid, name) is not None]
     for name in ("density", "mass", "centre_of_mass", "gyration_radius"):
-        if getattr(solid, name) is not None and solid.motion != "free":
-            wanted = 'left out, as only a body whose motion is "free" has a mass'
-            raise field_error((*path, name), getattr(solid, name), wanted)
+        if (value := getattr(solid, name)) is not None and solid.motion != "free":
+            raise field_error((*path, name), value, 'left out, as only a body whose motion is "free" has a mass')
     if solid.motion == "fixed":
         if given:
             raise field_error((*path, given[0]), Words("given"), 'left out, as motion is "fixed"')
@@ -244,14 +231,13 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
 
 
 def _check_free(solid: SolidTable, path: FieldPath) -> None:
-    """Check that a free body has one mass, and that nothing tells it where to go."""
-    if solid.density is None and solid.mass is None:
+    """Check the mass of a free body, and that nothing tells it where to go."""
+    if solid.mass is None and solid.density is None:
         raise field_error((*path, "density"), MISSING, 'a density in kg/m3, or a mass, as motion is "free"')
-    if solid.density is not None and solid.mass is not None:
+    if None not in (solid.mass, solid.density):
         raise field_error((*path, "mass"), solid.mass, "left out, as there is a density")
     if solid.centre_of_mass is not None and solid.gyration_radius is None:
-        wanted = "given, as the mass whose centre is told is not spread evenly"
-        raise field_error((*path, "gyration_radius"), MISSING, wanted)
+        raise field_error((*path, "gyration_radius"), MISSING, "given, as there is a centre of mass")
     for name in ("times", "positions", "rotations", "surface_velocity"):
         if getattr(solid, name) is not None:
             raise field_error((*path, name), Words("given"), 'left out, as motion is "free"')
@@ -280,14 +266,6 @@ def _check_knots(solid: SolidTable, dimension: int, path: FieldPath) -> None:
         raise field_error((*path, "positions", 0), solid.positions[0], wanted)
     if solid.rotations is not None and any(solid.rotations[0]):
         raise field_error((*path, "rotations", 0), solid.rotations[0], "0, as it is not turned yet")
-
-
-def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
-    """Check that a solid is so thick that there is room for the particles of its walls."""
-    least = solid.least_thickness * spacing
-    if solid.side == "outside" and (thickness := solid.thinnest(spacing)) < least * (1.0 - 1e-6):
-        found, of = Words(f"only {thickness:g} m thick"), "one spacing" if least == spacing else "half a spacing"
-        raise field_error(path, found, f"at least {of}, {least:g} m, thick")
 
 
 ALONG = 1e-9

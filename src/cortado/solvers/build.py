@@ -25,7 +25,7 @@ from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout, padded
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
 from cortado.scene.fluid_particles import reserve_offset
-from cortado.scene.motions import motion_parameters, moving, solid_frames, wall_numbers, weight_name
+from cortado.scene.motions import mass_of_one, motion_parameters, moving, solid_frames, wall_numbers, weight_name
 from cortado.scene.parameter_values import REGISTRY, Known, checked_value
 from cortado.scene.parameters import PARAMETERS, Parameter, Source
 from cortado.scene.scene import Scene
@@ -346,7 +346,7 @@ def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch,
     """Make the part that moves free bodies with the fluid; None for a scene without free bodies."""
     cell = scene.discretisation.spacing**scene.dimension
     tables = [
-        FreeTable(table.name, number, weight_name(table), table.mass_of_one().in_volumes(cell))
+        FreeTable(table.name, number, weight_name(table), mass_of_one(table).in_volumes(cell))
         for number, table in enumerate(moving(scene.solid))
         if table.motion == "free"
     ]
