@@ -184,7 +184,6 @@ class DeviceStates(HostStates):
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
         """Set the first state of a rollout from a `DeviceState`, and its parameters; see `HostStates.begin`."""
         self._require_taken(state)
-        space.check_restarts(state.scenes, values)
         space.begin(rollout, values, varied, state.scenes, state.arrays)
         rollout.step_sizes.begin_at(rollout.initial)
 

@@ -134,13 +134,16 @@ class ParameterSpace:
         left out.
 
         ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
-        diffusion even where it is 0. ``states`` replace the scene's first one, with their fields or ``arrays``.
+        diffusion even where it is 0. ``states`` replace the scene's first one, with their fields or ``arrays``; those
+        with arrays are checked as `check_restarts` does.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         if arrays is not None and self._goes_on(rollout, values, varied, states):
             self._go_on(rollout, members, states, arrays)
             self._keep(rollout, values, varied, members, arrays)
             return
+        if arrays is not None:
+            self.check_restarts(states, values)
         sought = viscosity_sentence(simulation.scene, "the viscosity is a parameter") if "viscosity" in varied else None
         self._warn(sought)
         rollout.begin_evaluation()
