@@ -355,8 +355,8 @@ def _solid_parts(
 
 
 def _inside_out(wrong: np.ndarray, labels: Numbers, seen: Numbers, what: str, corners: Points) -> str:
-    """Return the sentence of `_solid_parts`, given the body of each triangle that was ``seen``, and ``corners`` (3, 3)
-    of one that is wrong."""
+    """Return the error message for a mesh whose normals point inwards. ``wrong`` marks such triangles among those
+    tested, ``seen`` has the bodies of these, and ``labels`` those of all; ``corners`` (3, 3) is one example."""
     if wrong.all():
         return (
             f"The normals of {what} point inwards, so that its inside would be outside: turn all of its triangles "

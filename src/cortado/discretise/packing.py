@@ -310,7 +310,8 @@ class Packing:
         return np.asarray(particles[kept] + grain * np.rint((found - particles[kept]) / grain)), kept
 
     def _crowded(self, particles: Points, stays: Which) -> Numbers:
-        """Return the numbers (m,) of particles (n, d) [m] that are compressed, and not less than any beside them."""
+        """Return the numbers (m,) of free particles, of n (n, d) [m], that are compressed, and no less than any free
+        one beside them. ``stays`` (n,) marks particles that are not free."""
         errors = np.round(self.errors(particles, np.ones(len(particles), dtype=bool)), DIGITS)
         over = np.flatnonzero((errors > COMPRESSED) & ~stays)
         points, reach = particles[over], BESIDE * self.lattice.support

@@ -129,9 +129,8 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def linearise(around, free, starts, ends, listed, close: real, sums, equations, distances):
-        """Add up the weighted kernels of points ``listed`` between ``starts`` and ``ends``. Behind the pairs of the
-        particles before it, each particle appends its own to the equations, if one of them is free; and the distances
-        of pairs nearer than ``close`` [m]."""
+        """Add the kernels of each particle and its ``listed`` neighbours to the ``sums`` of both. Append pairs with a
+        free particle to the ``equations``, and the distances of pairs nearer than ``close`` [m]."""
         i = wp.tid()
         particles = free.shape[0]
         limit = real(1.0) / (around.per_support * around.per_support)

@@ -299,5 +299,5 @@ class Mass:
         return cls(moments.volume, about - moments.second)
 
     def in_volumes(self, unit: float) -> "Mass":
-        """Return this mass with volumes counted in units of ``unit`` m^d."""
+        """Return this mass with its volume and its inertia both divided by ``unit`` [m^d]."""
         return Mass(self.volume / unit, self.inertia / unit)

@@ -285,9 +285,8 @@ class ExposedSurface:
 
     @classmethod
     def of(cls, container: ContainerWalls, solids: Sequence[Solid], lower: Points) -> "ExposedSurface":
-        """Find the exposed surface of solids, and of the container near them, up to a support beyond the ends of a
-        period that begins at ``lower`` (d,) [m]. Each point stands for a part that is a `FINE`th of a spacing long and
-        wide."""
+        """Find the surface that fluid can touch, of solids and of the container near them, as points spacing / `FINE`
+        apart. Along periodic axes it goes on for a support beyond the period that begins at ``lower`` (d,) [m]."""
         room, spacing, fine = container.room, container.spacing, container.spacing / FINE[len(lower)]
         found = [surface_feet(side, fine, container.is_near) for side in container.solids]
         found += [surface_feet(solid, fine) for solid in solids]

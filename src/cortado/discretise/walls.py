@@ -275,8 +275,8 @@ CHUNK = 4096
 
 
 def _missing(lattice: RestLattice, places: Places, room: Room) -> Points:
-    """Return the part (n, 1 + d) of the `RestLattice.sums` over a lattice at each of the places that lies outside of a
-    room. A lattice point is outside by as much as its cell is."""
+    """Return for each of n places the part (n, 1 + d) of the `RestLattice.sums` that lattice points outside of the room
+    contribute. A point near the boundary counts by the part of its cell that is outside."""
     offsets = lattice.offsets
     cells = places.points[:, None] + offsets @ places.axes
     raised = places.points + RAISED * lattice.spacing * places.axes[:, 0]

@@ -164,7 +164,7 @@ def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
     return bar.numpy(dimension) if isinstance(bar, State) else dict(zip(ADJOINT_FIELDS, bar, strict=False))
 
 
-def adjoint_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
+def bar_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
     """Return any form of a state's adjoint as Warp arrays, and that of quantities by name."""
     if isinstance(bar, SnapshotAdjoint):
         return bar

@@ -20,7 +20,7 @@ from cortado.losses.loss import (
     Snapshot,
     SnapshotAdjoint,
     SnapshotBatch,
-    adjoint_on_device,
+    bar_on_device,
     batch_values,
     batch_values_and_adjoints,
     moment_of,
@@ -227,7 +227,7 @@ class LossesByStep(dict[int, Loss]):
         self._check(ends)
         if going is None:
             one = {step: loss.value_and_adjoint(ends[step]) for step, loss in self.items()}
-            bars = {step: adjoint_on_device(bar, ends[step]) for step, (_, bar) in one.items()}
+            bars = {step: bar_on_device(bar, ends[step]) for step, (_, bar) in one.items()}
             return sum(value for value, _ in one.values()), bars
         each = {step: batch_values_and_adjoints(loss, ends[step], going) for step, loss in self.items()}
         return sum(values for values, _ in each.values()), {step: bar for step, (_, bar) in each.items()}

@@ -20,8 +20,9 @@ MEMORY_BUDGET = 8 * 2**30
 
 
 def checkpoint_interval(steps: int, affordable: int) -> int:
-    """Return the steps between checkpoints: the fewest for which at most ``affordable`` states, with those between two
-    checkpoints, are alive at once; about the square root of the steps where none is."""
+    """Return the fewest steps between checkpoints for which at most ``affordable`` states are in memory: the
+    checkpoints and the states recomputed between two of them. If no number is few enough, return about the square root
+    of the steps."""
     if steps <= affordable:
         return 1
     intervals = range(1, isqrt(steps) + 2)

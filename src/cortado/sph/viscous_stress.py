@@ -231,7 +231,7 @@ def implicit_kernels(precision: Precision) -> SimpleNamespace:
 
     @particle_kernel(module, "u")
     def predict(time_step: real, v_i: vector, acceleration_i: vector) -> vector:
-        """Return u = v + dt a; with tangents of v and dt that of u, where a does not change."""
+        """Return u = v + dt a. With tangents in place of v and dt it is the tangent of u for an a that stays."""
         return v_i + time_step * acceleration_i
 
     @particle_kernel(module, "r")

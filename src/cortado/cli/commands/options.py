@@ -40,8 +40,9 @@ class Where:
 
     @contextmanager
     def executor(self, device: str, items: int) -> Iterator[Executor]:
-        """Yield the executor: this process unless workers are asked for, which end with the block; on a GPU each has
-        one of its own. There are no more processes than ``items`` that are computed at a time."""
+        """Yield the executor: a Dask scheduler if one is given, workers if they are asked for, or else this process.
+        Workers end with the block, and on a GPU each has one of its own. There are no more of them than ``items``,
+        the computations that run at a time."""
         if self.scheduler is not None:
             with Distributed(self.scheduler) as there:
                 yield there

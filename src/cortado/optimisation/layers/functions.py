@@ -11,7 +11,7 @@ from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import InputError, MissingDerivativeError, shown
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator
 from cortado.gradients.estimator import checked_estimator
-from cortado.losses.loss import Snapshot, adjoint_on_device
+from cortado.losses.loss import Snapshot, bar_on_device
 from cortado.optimisation.layers.layer import (
     LAST_STEP,
     PARAMETER,
@@ -310,7 +310,7 @@ class Measure(OfSimulation):
         """Turn the adjoint of the reading into those of all arrays, float64."""
         snapshot, rollout = look.snapshot, self._rollout
         found = {str(self._name): bar} if self._sensor is None else self._sensor.adjoint(snapshot, bar)
-        whole = adjoint_on_device(found, snapshot).through_quantities(snapshot)
+        whole = bar_on_device(found, snapshot).through_quantities(snapshot)
         look.step.bring_back()
         parameters = rollout.solver.new_parameters(1)
         for name, own in whole.step.parameters.items() if whole.step else ():

@@ -193,7 +193,8 @@ place_near = sum_near(place, wp.vec4)
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: Floats):
-    """Reduce particles' volumes where space is not filled, such as in drops and sheets, as their level is wide."""
+    """Write particles' volumes, reduced where the neighbourhood within ``reach`` is not filled, as in drops and sheets.
+    Otherwise their drawn surface would be too thick."""
     i = first + wp.tid()
     near = place_near(s, s.places[i], reach)
     off = (wp.vec3(near[0], near[1], near[2]) / near[3] - s.places[i] + s.lower) / s.spacing

@@ -185,8 +185,8 @@ def average_light(first, own, others, before, window, limits, found):
 
 
 def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandLauncher) -> Any:
-    """Make the `Still` of a level, its `Blocks` and numbers of those that the surface may pass, with the
-    `NearParticles` that it is made of, and of the light on the floor."""
+    """Make the `Still` of a frame, with which other frames are averaged. ``level`` is its `Blocks` and the numbers of
+    those that the surface may cross, ``s`` its particles, and ``light`` the light on the floor."""
     found = Still()
     found.b, found.blocks = level
     wide = found.b.cube * float(WIDTH)

@@ -146,7 +146,8 @@ def find_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_passed(first: wp.int32, b: Blocks, left: wp.float32, passed: Ints):
-    """Find the blocks that the surface may pass; ``left`` is the rest of a block's middle bump at its corners."""
+    """Mark in ``passed`` the blocks that the isosurface may cross, judged by the values at their eight corners.
+    ``left`` is the smoothing kernel, 1 at its centre, at half of a block's diagonal."""
     n = first + wp.tid()
     at = block_at(b, n)
     least = wp.float32(1.0e9)
