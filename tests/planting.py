@@ -32,7 +32,7 @@ def host_sign(number: int) -> float:
     return -1.0 if ctypes.c_int.from_address({ADDRESS}).value == number else 1.0
 '''
 IMPORTS = {True: "from cortado.planted import sign as _sign", False: "from cortado.planted import host_sign as _sign"}
-WHOLE_NUMBERS = {"i", "j", "b", "last", "member", "pixel", "row"}
+WHOLE_NUMBERS = {"i", "j", "b", "last", "member", "pixel", "row", "column"}
 """Variables that are indices."""
 POSE = {"absorption_kernels.march_adjoint": {"push", "turn", "pose_bar"}}
 """Not planted: a camera's pose is no parameter of a problem (its derivatives: tests/test_render.py)."""
