@@ -1,7 +1,5 @@
-"""The wall particles of solids, and places beside them where fluid may rest, in float64.
-
-Both are points at a depth beneath the surface of a solid, or at a height above it, evenly spaced.
-"""
+"""The wall particles of solids, and places beside them where fluid may rest, in float64: points at a depth beneath the
+surface of a solid, or at a height above it, evenly spaced."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -35,8 +33,9 @@ ROUNDS = {2: 40, 3: 4}
 OFF_FACES = (0.31, 0.17, 0.23)
 """Shift of fine lattices off the faces of solids that are aligned with them, in cells."""
 HALVINGS = 20
-MOST = 2_000_000
-"""Number of points that are looked at at a time: bounds the memory."""
+MANY, MOST = 50_000, 2_000_000
+"""Numbers of points: with more than the first several cores look for what is nearest, which with fewer wait for each
+other; no more than the second are looked at at a time, which bounds the memory."""
 SEED = 1
 
 
@@ -178,7 +177,8 @@ def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Point
     the numbers (n,) of these."""
     from scipy.spatial import cKDTree
 
-    distances, numbers = cKDTree(some).query(points, distance_upper_bound=reach, workers=usable_cores())
+    workers = usable_cores() if len(points) > MANY else 1
+    distances, numbers = cKDTree(some).query(points, distance_upper_bound=reach, workers=workers)
     return distances, numbers
 
 
