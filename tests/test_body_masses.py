@@ -6,6 +6,8 @@ import pytest
 from cortado import Problem, Simulation
 from cortado.discretise.solid import Mass
 from cortado.errors import SceneError
+from cortado.pictures.shown_solids import shown_solids
+from cortado.runs.frames import posed
 from finite_differences import both_modes, decades, distance
 from scenes import box
 from test_free_bodies import BRICK, RAFT, plane, space
@@ -80,9 +82,6 @@ def test_mass_has_derivatives(scene_of, table, keys):
 def test_a_picture_of_a_body_shows_its_shape_where_its_walls_are():
     scene = plane(massive(RAFT, 20.0, **KEEL))
     run = Simulation(scene, precision="float64").run(30)
-    from cortado.pictures.shown_solids import shown_solids
-    from cortado.runs.frames import posed
-
     (one,) = shown_solids(posed(scene, run.solids, -1))
     motion, table = run.solids["raft"], scene.solid[0]
     angle = motion.rotations[-1]

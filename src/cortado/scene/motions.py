@@ -196,8 +196,8 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
 def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
     """Return the distance from a solid's middle to its furthest point, at most [m], with values of parameters that
     replace the scene's."""
-    own = solid.shape_about()[0] if solid.motion != "free" else solid.own_solid()
-    return float(np.linalg.norm(np.abs(own.extent()).max(axis=0)) * values.get(scale_name(solid.name), 1.0))
+    furthest = np.abs(solid.own_solid().extent()).max(axis=0)
+    return float(np.linalg.norm(furthest) * values.get(scale_name(solid.name), 1.0))
 
 
 def _name(end: str) -> Callable[[str], str]:
