@@ -31,7 +31,9 @@ def floating_box(long: int) -> dict[str, float]:
     }
 
 
-def disc_in_a_round_tank(density: float, file: str, spacing: float, steps: int, **solver: Any) -> np.ndarray:
+def disc_in_a_round_tank(
+    density: float, file: str, spacing: float, steps: int, freedom: Any = None, **solver: Any
+) -> np.ndarray:
     """How much faster a disc of the radius a = 0.15 m gets in each step, in the middle of a round tank of the radius
     b = 0.45 m that is full of water in rings, which a ``file`` takes on: over g (rho_0 - rho) / (rho + C rho_0) with
     the added mass C = (b^2 + a^2) / (b^2 - a^2) of theory."""
@@ -49,7 +51,7 @@ def disc_in_a_round_tank(density: float, file: str, spacing: float, steps: int, 
         container={"shape": "none"},
         solid=[
             {"name": "tank", **round_about, "radius": outer, "side": "inside"},
-            {"name": "disc", **round_about, "radius": inner, "motion": "free", "density": density},
+            {"name": "disc", **round_about, "radius": inner, "motion": "free", "density": density, "freedom": freedom},
         ],
         solver={"kind": "projection", "time_step": STEP, **solver},
     )

@@ -8,7 +8,8 @@ import numpy as np
 import trimesh
 
 from cortado import Scene, Simulation
-from cortado.scene.solids import BoxSolid, CupSolid, MeshSolid, SolidTable
+from cortado.scene.solid_shapes import BoxSolid, CupSolid, MeshSolid
+from cortado.scene.solids import SolidTable
 from cortado.scene.tables import rotation_matrix
 from scenes import box
 

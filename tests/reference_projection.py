@@ -23,9 +23,12 @@ class Body:
     """Which wall particles are its own."""
     middle: np.ndarray
     mobility: np.ndarray
-    """(6, 6) velocity and angular velocity for momentum and angular momentum, in volumes of a particle."""
-    greatest: float
-    """The largest eigenvalue of I^-1."""
+    """(6, 6) velocity and angular velocity for momentum and angular momentum, in volumes of a particle: P (P^T M P)^-1
+    P^T for the ways P in which it is free."""
+    mass: float
+    """In volumes of a particle."""
+    bounds: tuple[float, float]
+    """Of both halves of the mobility."""
 
     @classmethod
     def of(cls, held, solids, scene):
@@ -34,20 +37,35 @@ class Body:
         solid = next(one for one in scene.solid if one.name == table.name)
         turn, inverse = np.eye(3), np.linalg.pinv(mass.inertia)
         turn[:d, :d] = solid.turn(d)
-        mobility = np.zeros((6, 6))
-        mobility[:3, :3], mobility[3:, 3:] = np.eye(3) / mass.volume, turn @ inverse @ turn.T
-        greatest = np.linalg.eigvalsh(inverse).max()
-        return cls(solids == table.number, np.array(solid.middle()), mobility / solid.density, greatest / solid.density)
+        whole = solid.density * np.kron(np.diag([1.0, 0.0]), mass.volume * np.eye(3))
+        whole[3:, 3:] = solid.density * turn @ mass.inertia @ turn.T
+        ways = cls.ways(table.hold, turn)
+        mobility = ways @ np.linalg.pinv(ways.T @ whole @ ways) @ ways.T
+        goes, turns = (np.abs(half).any() for half in (mobility[:3], mobility[3:]))
+        bounds = goes / mass.volume / solid.density, turns * np.linalg.eigvalsh(inverse).max() / solid.density
+        return cls(solids == table.number, np.array(solid.middle()), mobility, whole[0, 0], bounds)
+
+    @staticmethod
+    def ways(hold, turn):
+        """(6, ways) the velocity and the angular velocity of each way that is free."""
+        axis, across = np.array(hold.axis), -turn @ hold.arm
+        kept = {0: np.zeros((3, 3)), 1: np.outer(axis, axis), 2: np.eye(3) - np.outer(axis, axis), 3: np.eye(3)}
+        turns = kept[hold.turning]
+        return np.block([[np.diag(hold.moving), np.cross(turns, across).T], [np.zeros((3, 3)), turns]])
 
     def rows(self, gamma, x):
         """(6, n) what pressures give to both momenta."""
         arm, force = (np.pad(a, ((0, 0), (0, 3 - a.shape[1]))) for a in (x - self.middle, gamma))
         return np.hstack([force, np.cross(arm, force)]).T
 
+    def falling(self, gravity, d, dt):
+        """(6,) what gravity adds to its motion in a step."""
+        return self.mobility[:, :d] @ np.broadcast_to(gravity, d) * (self.mass * dt)
+
     def diagonal(self, rows):
         """What it adds to a."""
         force, torque = np.linalg.norm(rows[:3], axis=0), np.linalg.norm(rows[3:], axis=0)
-        return self.mobility[0, 0] * force * force.sum() + self.greatest * torque * torque.sum()
+        return self.bounds[0] * force * force.sum() + self.bounds[1] * torque * torque.sum()
 
 
 @dataclass(frozen=True)
@@ -299,7 +317,9 @@ class Projection:
         for body, row in zip(self.bodies, rows, strict=True):
             a += body.diagonal(row)
             yielding += row.T @ body.mobility @ row
-        falls = sum((row[:d].T @ np.broadcast_to(gravity, d) * dt for row in rows), self.drift(x, h, dt))
+        falls = self.drift(x, h, dt)
+        for body, row in zip(self.bodies, rows, strict=True):
+            falls = falls + row.T @ body.falling(gravity, d, dt)
 
         def lift(k):
             both = (h * k)[:, None] + (h * k)[None, :]

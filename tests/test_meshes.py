@@ -17,7 +17,7 @@ from cortado.discretise.primitives import Box, Round, points_inside
 from cortado.discretise.solid import Hollow, Mass, Placed
 from cortado.discretise.solid_walls import surface_feet, surface_points
 from cortado.errors import CortadoWarning, InputError
-from cortado.scene.solids import MeshSolid, PolygonSolid
+from cortado.scene.solid_shapes import MeshSolid, PolygonSolid
 
 MAJOR, MINOR = 0.25, 0.1
 SPACING, SUPPORT = 0.05, 0.1

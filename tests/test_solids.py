@@ -6,7 +6,8 @@ import pytest
 from cortado import CortadoWarning, DivergedError, InputError, Problem, SceneError, Simulation
 from cortado.losses import CentreOfMass
 from cortado.scene.discrete_scene import discretise
-from cortado.scene.solids import BoxSolid, CapsuleSolid, CupSolid, CylinderSolid, PolygonSolid, SphereSolid, solids_of
+from cortado.scene.solid_shapes import BoxSolid, CapsuleSolid, CupSolid, CylinderSolid, PolygonSolid, SphereSolid
+from cortado.scene.solids import solids_of
 from finite_differences import both_modes, central_difference
 from held_water import cup_turned, meshes, stirred
 from scenes import box, pool

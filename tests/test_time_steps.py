@@ -13,7 +13,7 @@ import cortado
 from cortado import InputError, SceneError, Simulation, Trajectory
 from cortado.rollout.step_sizes import Retaken
 from cortado.scene.restart import Clock
-from cortado.scene.solids import PolygonSolid
+from cortado.scene.solid_shapes import PolygonSolid
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
 from cortado.sensors import PressureProbe
 from scenes import box, jet, plane, pool, pool_text, two_layers

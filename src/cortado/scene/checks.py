@@ -15,9 +15,10 @@ from cortado.discretise.solid import Solid
 from cortado.errors import InputError, Words, shown
 from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
-from cortado.scene.model import MixtureTable, SceneTables, SolidLoadTable
+from cortado.scene.model import MixtureTable, SceneTables
 from cortado.scene.motions import free
 from cortado.scene.parameters import BY_NAME
+from cortado.scene.sensor_tables import SolidLoadTable
 from cortado.scene.shape_tables import MeshShape, check_length
 from cortado.scene.solids import SolidTable
 from cortado.scene.stability import chosen_limits

@@ -1,4 +1,4 @@
-"""Solids, which fluid flows around or is held by: what all have, and the shapes that they may have."""
+"""Solids, which fluid flows around or is held by: what all have."""
 
 from abc import abstractmethod
 from dataclasses import replace
@@ -8,23 +8,12 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr, model_validator
 
-from cortado.arrays import unit
-from cortado.discretise.primitives import HalfSpace, Polygon, Revolved, Round
 from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Hollow, Placed, Solid
 from cortado.errors import Words, shown
 from cortado.scene.appearance import FINISHES, Coloured, Finish
-from cortado.scene.shape_tables import (
-    INDEX_OF_AXIS,
-    BoxShape,
-    Container,
-    CylinderShape,
-    MeshShape,
-    PolygonShape,
-    SphereShape,
-)
+from cortado.scene.shape_tables import Container
 from cortado.scene.tables import (
     MISSING,
     Colour,
@@ -35,12 +24,14 @@ from cortado.scene.tables import (
     Rotation,
     Text,
     Turning,
-    Vector,
     check_turn,
     field_error,
     quantity,
     rotation_matrix,
 )
+
+WAYS = {2: ("x", "y", "rotation"), 3: ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")}
+"""Names of a body's ways to move, by the dimension of the scene: first those of its middle, then its turns."""
 
 
 class SolidTable(Coloured):
@@ -73,6 +64,10 @@ class SolidTable(Coloured):
     gyration_radius: Radii | None = None
     """(3,) Radii of gyration of a free body about its own axes through its centre of mass, in 2-D one number: roots of
     its moments of inertia over its mass [m]. If left out they are those of its shape."""
+    freedom: tuple[Annotated[str, OneOf(sorted({*WAYS[2], *WAYS[3]}))], ...] | None = None
+    """Ways in which a free body can move, all if left out: of "x", "y" and "rotation", in 3-D of "x", "y", "z",
+    "rotation_x", "rotation_y" and "rotation_z". Its velocity along the other axes of space, and the part of its angular
+    velocity along them, are 0."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of the path, from 0 on, each greater than the one before [s]; between them it goes in straight lines,
     and after the last it rests."""
@@ -207,15 +202,17 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
     """Raise a `field_error` where the keys of a motion do not fit together."""
     rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
     given = [name for name in ("times", *rows, *steady) if getattr(solid, name) is not None]
-    for name in ("density", "mass", "centre_of_mass", "gyration_radius"):
+    for name in ("density", "mass", "centre_of_mass", "gyration_radius", "freedom"):
         if (value := getattr(solid, name)) is not None and solid.motion != "free":
-            raise field_error((*path, name), value, 'left out, as only a body whose motion is "free" has a mass')
+            has = "can be held" if name == "freedom" else "has a mass"
+            raise field_error((*path, name), value, f'left out, as only a body whose motion is "free" {has}')
     if solid.motion == "fixed":
         if given:
             raise field_error((*path, given[0]), Words("given"), 'left out, as motion is "fixed"')
         return
     if solid.motion == "free":
         _check_free(solid, path)
+        _check_freedom(solid, dimension, path)
         return
     if solid.times is None:
         if wrong := [name for name in rows if name in given]:
@@ -247,6 +244,19 @@ def _check_free(solid: SolidTable, path: FieldPath) -> None:
         raise field_error((*path, "slip"), solid.slip, '"free", as fluid does not rub bodies that are free')
 
 
+def _check_freedom(solid: SolidTable, dimension: int, path: FieldPath) -> None:
+    """Check how a free body is held, and that it begins to move in ways that are free."""
+    if solid.freedom is None:
+        return
+    ways, found = WAYS[dimension], Words(f"a list of {', '.join(map(repr, solid.freedom)) or 'nothing'}")
+    if not solid.freedom or len({*solid.freedom}) < len(solid.freedom) or not {*solid.freedom} <= {*ways}:
+        raise field_error((*path, "freedom"), found, f"some of {shown(list(ways))}, each once")
+    for name, own in (("velocity", ways[:dimension]), ("angular_velocity", ways[dimension:])):
+        for way, value in zip(own, getattr(solid, name) or (), strict=False):
+            if value != 0.0 and way not in solid.freedom:
+                raise field_error((*path, name), getattr(solid, name), f"0 where the body is held, in {way!r}")
+
+
 def _check_knots(solid: SolidTable, dimension: int, path: FieldPath) -> None:
     times = solid.times or ()
     if len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
@@ -266,185 +276,3 @@ def _check_knots(solid: SolidTable, dimension: int, path: FieldPath) -> None:
         raise field_error((*path, "positions", 0), solid.positions[0], wanted)
     if solid.rotations is not None and any(solid.rotations[0]):
         raise field_error((*path, "rotations", 0), solid.rotations[0], "0, as it is not turned yet")
-
-
-ALONG = 1e-9
-"""Component of a normal along a period, of one that is none."""
-
-
-class PlaneSolid(SolidTable):
-    """All that is behind a plane, such as a slope or a wall, at rest; fluid is on the side that `normal` points to. It
-    has no end, and so needs a container, which it cuts."""
-
-    shape: Literal["plane"] = "plane"
-    position: Vector[Length]
-    """(d,) A point of the plane [m]."""
-    normal: Vector[Annotated[float, quantity()]]
-    """(d,) Normal from the plane into the fluid, of any length."""
-    _ends: tuple[tuple[float, ...], ...] | None = PrivateAttr(None)
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        turned = super().in_dimension(dimension, path)
-        if not any(self.normal):
-            raise field_error((*path, "normal"), self.normal, "a vector that is not 0")
-        if self.side == "inside":
-            raise field_error((*path, "side"), self.side, '"outside": fluid is where the normal of a plane points')
-        if self.rotation is not None:
-            raise field_error((*path, "rotation"), self.rotation, "left out, as normal says how a plane is turned")
-        for name, value in (("motion", self.motion), ("surface_velocity", self.surface_velocity)):
-            if value not in ("fixed", None):
-                raise field_error((*path, name), value, 'left out, as a plane is at rest; a "box" may move')
-        return turned
-
-    def in_container(self, container: Container, path: FieldPath) -> Self:
-        ends, dimension = container.extent(), len(self.position)
-        if ends is None:
-            wanted = "another one in a scene without a container, as a plane has no end: give it a [container] to cut"
-            raise field_error((*path, "shape"), self.shape, f'{wanted}, or take a "box"')
-        along = (container.periods(dimension)[1] > 0.0) & (np.abs(self._unit()) > ALONG)
-        if along.any():
-            where = f"0 along axis {int(np.argmax(along))}, where the container is periodic"
-            raise field_error((*path, "normal"), self.normal, f"{where} and the plane would not meet itself")
-        corners = np.where(self._unit() > 0.0, *ends) - np.array(self.position)
-        if corners @ self._unit() >= 0.0:
-            found = Words("outside of the container, all of which is in front of it")
-            raise field_error((*path, "position"), found, "such that the plane cuts the container")
-        bounded = self.model_copy()
-        object.__setattr__(bounded, "__pydantic_private__", {"_ends": tuple(map(tuple, np.array(ends).tolist()))})
-        return bounded
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        position, unit = np.array(self.position), self._unit()
-        lower, upper = np.array(self._ends or (position - 1.0, position + 1.0))
-        return HalfSpace(unit, 0.0, lower - position, upper - position), position
-
-    def thinnest(self, spacing: float) -> float:
-        return np.inf
-
-    def _unit(self) -> Points:
-        return unit(np.array(self.normal))
-
-
-Size = Annotated[float, quantity("m", gt=0.0)]
-
-
-class BoxSolid(BoxShape, SolidTable):
-    """A solid box, or a rectangle in 2-D."""
-
-    measures: ClassVar = ("lower", "upper")
-
-    def thinnest(self, spacing: float) -> float:
-        return float(np.subtract(self.upper, self.lower).min())
-
-
-class SphereSolid(SphereShape, SolidTable):
-    """A solid sphere, or a disc in 2-D."""
-
-    measures: ClassVar = ("centre", "radius")
-
-    def thinnest(self, spacing: float) -> float:
-        return 2.0 * self.radius
-
-
-class CapsuleSolid(SolidTable):
-    """A solid capsule: all that is no further than a radius from a segment."""
-
-    measures: ClassVar = ("start", "end", "radius")
-    shape: Literal["capsule"] = "capsule"
-    start: Vector[Length]
-    """(d,) One end of the segment [m]."""
-    end: Vector[Length]
-    """(d,) The other end [m]."""
-    radius: Size
-    """From the segment to the surface [m]."""
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        start, end = np.array(self.start), np.array(self.end)
-        return Round(0.5 * (end - start), self.radius), 0.5 * (start + end)
-
-    def thinnest(self, spacing: float) -> float:
-        return 2.0 * self.radius
-
-
-class CylinderSolid(CylinderShape, SolidTable):
-    """A solid cylinder, in 3-D."""
-
-    measures: ClassVar = ("base", "radius", "height")
-    instead: ClassVar = '"box", "sphere", "capsule", "cup" or "polygon"'
-
-    def thinnest(self, spacing: float) -> float:
-        return min(2.0 * self.radius, self.height)
-
-
-class CupSolid(SolidTable):
-    """A cup that is open at the top; in 2-D its cut through the axis."""
-
-    measures: ClassVar = ("base", "radius", "height", "thickness")
-    shape: Literal["cup"] = "cup"
-    base: Vector[Length]
-    """(d,) Middle of the bottom, outside [m]."""
-    radius: Size
-    """From the axis to the side, inside [m]."""
-    height: Size
-    """From the bottom, outside, to the rim [m]."""
-    thickness: Size
-    """Thickness of the side and the bottom [m]."""
-    axis: Literal["x", "y", "z"] = "y"
-    """The axis of space along which it stands, before it is turned; in 2-D it stands along y."""
-
-    @model_validator(mode="after")
-    def _check_height(self) -> Self:
-        if self.thickness >= self.height:
-            raise field_error(("thickness",), self.thickness, f"less than height, {self.height:g}")
-        return self
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        if dimension == 2 and self.axis != "y":
-            raise field_error((*path, "axis"), self.axis, '"y" in 2-D')
-        return super().in_dimension(dimension, path)
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        dimension, middle = len(self.base), self._middle()
-        outside, rim, bottom = self.radius + self.thickness, self.height - middle, self.thickness - middle
-        half = [(outside, -middle), (outside, rim), (self.radius, rim), (self.radius, bottom)]
-        profile = Polygon(np.array([*half, *((-x, y) for x, y in half[::-1])]))
-        up = np.eye(dimension)[INDEX_OF_AXIS[self.axis]]
-        shape = profile if dimension == 2 else Revolved(profile, INDEX_OF_AXIS[self.axis])
-        return shape, np.array(self.base) + middle * up
-
-    def thinnest(self, spacing: float) -> float:
-        return self.thickness
-
-    def _middle(self) -> float:
-        """Return the height of its centroid above the base [m]."""
-        power = len(self.base) - 1
-        solid, hollow = (self.radius + self.thickness) ** power, self.radius**power
-        whole, cavity = solid * self.height, hollow * (self.height - self.thickness)
-        moment = 0.5 * whole * self.height - 0.5 * cavity * (self.height + self.thickness)
-        return moment / (whole - cavity)
-
-
-class PolygonSolid(PolygonShape, SolidTable):
-    """A solid polygon, in 2-D."""
-
-    measures: ClassVar = ("corners",)
-    least_thickness: ClassVar = 0.5
-
-    def thinnest(self, spacing: float) -> float:
-        return Polygon(np.array(self.corners)).thinnest()
-
-
-class MeshSolid(MeshShape, SolidTable):
-    """A solid inside a mesh of triangles, in 3-D."""
-
-    measures: ClassVar = ("scale",)
-    least_thickness: ClassVar = 0.5
-
-    def thinnest(self, spacing: float) -> float:
-        return self.thinnest_sheet(spacing)
-
-
-AnySolid = Annotated[
-    BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid | PlaneSolid | MeshSolid,
-    Field(discriminator="shape"),
-]

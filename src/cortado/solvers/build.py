@@ -25,6 +25,7 @@ from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout, padded
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
 from cortado.scene.fluid_particles import reserve_offset
+from cortado.scene.links import Hold
 from cortado.scene.motions import mass_of_one, motion_parameters, moving, solid_frames, wall_numbers, weight_name
 from cortado.scene.parameter_values import REGISTRY, Known, checked_value
 from cortado.scene.parameters import PARAMETERS, Parameter, Source
@@ -344,9 +345,10 @@ def _parts(
 
 def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch, layout: Layout) -> FreeSolids | None:
     """Make the part that moves free bodies with the fluid; None for a scene without free bodies."""
-    cell = scene.discretisation.spacing**scene.dimension
+    d = scene.dimension
+    cell = scene.discretisation.spacing**d
     tables = [
-        FreeTable(table.name, number, weight_name(table), mass_of_one(table).in_volumes(cell))
+        FreeTable(table.name, number, weight_name(table), mass_of_one(table).in_volumes(cell), Hold.of(table, d))
         for number, table in enumerate(moving(scene.solid))
         if table.motion == "free"
     ]

@@ -32,8 +32,10 @@ from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Layout, State, StateField
+from cortado.scene.links import Hold
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, rotation_name, velocity_name
 from cortado.scene.parameters import Axis
+from cortado.sph.held_bodies import hold_functions, hold_numbers, inertia_about_hinge
 from cortado.sph.moving_solids import rotations
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 
@@ -44,24 +46,13 @@ def free_module(precision: Precision) -> Any:
 
 
 @cache
-def rate_function(precision: Precision) -> Any:
-    """Make the Warp function R A R^T w of matrices R and A and a vector w."""
-    vector, matrix = precision.vector, matrix_of(precision)
-
-    @wp.func
-    def rate(R: matrix, A: matrix, w: vector) -> vector:
-        return R * (A * (wp.transpose(R) * w))
-
-    return rate
-
-
-@cache
 def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
     """Make the kernels of a free body in 2 or 3 dimensions, with a thread for each scene: of the pose in which its
     walls are, with V, W and L, and of the state after the step, from V_1, W_1 and L_1. The adjoint of the latter stands
     where that of the state before is written."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
-    flat, rotation, rate = rotations(precision, dimension), rotations(precision, 3).rotation, rate_function(precision)
+    flat, rotation, hold = rotations(precision, dimension), rotations(precision, 3).rotation, hold_functions(precision)
+    rate, freed, spin, held = hold.rate, hold.freed, hold.spin, hold.kind
     angle, begun_rotation, modules = flat.angle, flat.rotation, [free_module(precision)] * 3
 
     if dimension == 2:
@@ -95,8 +86,8 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
             n=3, dtype=real
         )
 
-    numbers = "time_step density" + " rotation angular_velocity" * (dimension == 2)
-    typed = TypesByName(vector, {real: numbers, matrix: "inertia inverse turns_before"})
+    numbers = "time_step density volume" + " rotation angular_velocity" * (dimension == 2)
+    typed = TypesByName(vector, {real: numbers, matrix: "inertia inverse turns_before", held: "hold"})
 
     @typed
     def predict(
@@ -109,14 +100,19 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
         velocity_i,
         angular_velocity_i,
         density_i,
+        gravity_i,
+        volume,
         inertia,
+        hold,
     ) -> tuple[vector, matrix, vector, matrix, vector, vector, vector]:
         R = (wp.identity(n=3, dtype=real) + wp.matrix_from_cols(turn_x_i, turn_y_i, turn_z_i)) * begun_rotation(
             rotation_i
         )
-        w = about(angular_velocity_i)
-        ahead, turned = position_i + time_step_i * velocity_i, rotation(time_step_i * w) * R
-        return position_i, R, ahead, turned, velocity_i, w, density_i * rate(R, inertia, w)
+        w, v = freed(about(angular_velocity_i), hold), wp.cw_mul(hold.moving, velocity_i)
+        turned, arm = rotation(time_step_i * w) * R, R * hold.arm
+        ahead, weight = position_i + time_step_i * v + (arm - turned * hold.arm), density_i * volume * gravity_i
+        L = density_i * rate(R, inertia, w) - time_step_i * wp.cross(arm, weight)
+        return position_i, R, ahead, turned, v - wp.cross(w, turned * hold.arm), w, L
 
     @typed
     def end(
@@ -131,12 +127,16 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
         W_i,
         L_i,
         density_i,
+        inertia,
         inverse,
+        hold,
     ) -> tuple[vector, vector, vector, vector, angle, vector, angle]:
         turning = rotation(time_step_i * W_i)
         Q = evened(turning * (wp.identity(n=3, dtype=real) + wp.matrix_from_cols(turn_x_i, turn_y_i, turn_z_i)))
-        spin = angle_of(rate(turning * turns_before_i, inverse, L_i) / density_i)
-        return position_i + time_step_i * V_i, column(Q, 0), column(Q, 1), column(Q, 2), rotation_i, V_i, spin
+        R = turning * turns_before_i
+        w, v, arm = spin(R, inertia, inverse, L_i, hold) / density_i, wp.cw_mul(hold.moving, V_i), R * hold.arm
+        x = position_i + time_step_i * v + (turns_before_i * hold.arm - arm)
+        return x, column(Q, 0), column(Q, 1), column(Q, 2), rotation_i, v - wp.cross(w, arm), angle_of(w)
 
     turned = {"turns": "turned", "turns_before": "turned_before"}
     poses, kept = ["before", "turns_before", "after", "turns"], ["position", "turn_x", "turn_y", "turn_z", "rotation"]
@@ -145,8 +145,9 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
         modules,
         lambda _: predict,
         [*poses, "V", "W", "L"],
-        numbers=["inertia"],
+        numbers=["volume", "inertia", "hold"],
         written=["velocity", "angular_velocity"],
+        told=["gravity"],
         turned=turned,
     )
     ends = pointwise_kernels(
@@ -155,7 +156,7 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
         lambda _: end,
         [f"{name}_new" for name in (*kept, "velocity", "angular_velocity")],
         {f"{name}_new": name for name in kept},
-        numbers=["inverse"],
+        numbers=["inertia", "inverse", "hold"],
         written=["V", "W", "L", "turns_before"],
         turned=turned,
     )
@@ -184,6 +185,21 @@ class FreeTable:
     """Name of the parameter that is its density, or its mass."""
     mass: Mass
     """Mass and inertia if this parameter is 1, in volumes of a particle."""
+    hold: Hold
+    """How the body is held."""
+
+    @property
+    def inertia(self) -> np.ndarray:
+        """Return the inertia (3, 3) about what the body turns about, its centre of mass or its hinge."""
+        return inertia_about_hinge(self.hold, self.mass)
+
+    @property
+    def bounds(self) -> dict[str, float]:
+        """Return the volume by which pressures push the body, infinite if its middle is held, and the greatest inverse
+        of its inertia, 0 if it does not turn, by kernels' names: both are bounds of what they are for a held body."""
+        goes, turns = any((*self.hold.moving, *self.hold.arm)), self.hold.turning > 0
+        greatest = np.linalg.eigvalsh(np.linalg.pinv(self.mass.inertia)).max()
+        return {"pushed_volume": self.mass.volume if goes else np.inf, "greatest": float(greatest) if turns else 0.0}
 
 
 @dataclass(frozen=True)
@@ -241,11 +257,12 @@ class FreeBody:
         self.begun = layout.state(self.fields)
         """What a step began from."""
         matrix = matrix_of(layout.precision)
-        inertia, inverse = table.mass.inertia, np.linalg.pinv(table.mass.inertia)
+        inertia, inverse = table.inertia, np.linalg.pinv(table.inertia)
         self.constants: dict[str, Any] = {**poses, "inertia": matrix(*inertia.ravel())}
         """Its poses too, which a step writes."""
-        self.constants |= {"inverse": matrix(*inverse.ravel()), "greatest": float(np.linalg.eigvalsh(inverse).max())}
-        self.constants |= {"volume": table.mass.volume, "solid": table.number}
+        self.constants |= {"inverse": matrix(*inverse.ravel()), "volume": table.mass.volume}
+        self.constants |= {"solid": table.number, "hold": hold_numbers(table.hold, layout.precision)}
+        self.constants |= table.bounds
         self.given = {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in GIVEN}
         """Momentum that it gets from what it touches, and its moment."""
         self.before, self.moved = (
@@ -333,7 +350,7 @@ class FreeSolidsTangent(PartTangent):
         part = self._part
         for own in self.bodies:
             body = own.body
-            sizes = {"time_step_dot": dot.parameters["time_step"]}
+            sizes = {f"{name}_dot": dot.parameters[name] for name in ("time_step", "gravity")}
             sizes["density_dot"] = dot.parameters[body.table.weight]
             dots = {**body.state(state_dot, "_dot"), **body.state(state_dot, "_new_dot"), **sizes}
             moves = (own.before,) if begins else (own.moved, body.moved)
@@ -369,5 +386,6 @@ class FreeSolidsAdjoint(PartAdjoint):
             own.clear()
 
     def _bars(self, own: Changes, bar: Any, state_bar: State) -> dict[str, wp.array]:
-        sizes = {"time_step_bar": bar["time_step"], "density_bar": bar[own.body.table.weight]}
+        sizes = {f"{name}_bar": bar[name] for name in ("time_step", "gravity")}
+        sizes["density_bar"] = bar[own.body.table.weight]
         return {**own.body.state(state_bar, "_bar"), **own.body.state(state_bar, "_new_bar"), **sizes}

@@ -8,7 +8,8 @@ impulses y, the body's density rho and its volume K in those of a particle,
     V = V_0 + dt g + sum y_i gamma_i / (rho K),   L = L_0 + sum y_i r_i x gamma_i,   W = R' I^-1 R'^T L / rho
 
 is the transpose of what its velocity adds to the divergence, - gamma_i . (V + W x r_i), of which that with the velocity
-(V_0, W_0) of its walls is counted with those of all walls. Linear momentum is kept to round-off.
+(V_0, W_0) of its walls is counted with those of all walls. Linear momentum is kept to round-off. A body that is held
+has less than 1 / (rho K) and R' I^-1 R'^T in their place (`cortado.sph.held_bodies`).
 
 The particles around a light body all move it. The diagonal a_i of the iteration gets |gamma_i| sum_j |gamma_j| / (rho
 K) + lambda |r_i x gamma_i| sum_j |r_j x gamma_j| / rho, with lambda the largest eigenvalue of I^-1. Divided by it the
@@ -29,7 +30,8 @@ from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
 from cortado.solvers.projection.names import types_by_name
 from cortado.solvers.projection.wall_sums import normal_part
-from cortado.sph.free_solids import free_module, rate_function
+from cortado.sph.free_solids import free_module
+from cortado.sph.held_bodies import hold_functions
 
 
 @dataclass(frozen=True)
@@ -105,8 +107,8 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
     def measure(gamma_of_i: vector, arm_i: vector) -> pair_of:
         return pair_of(wp.length(gamma_of_i), wp.length(wp.cross(arm_i, gamma_of_i)))
 
-    def weigh(density: real, volume: real, greatest: real, sizes_i: pair_of, whole: pair_of) -> real:
-        return wp.dot(sizes_i, pair_of(whole[0] / (density * volume), greatest * whole[1] / density))
+    def weigh(density: real, pushed_volume: real, greatest: real, sizes_i: pair_of, whole: pair_of) -> real:
+        return wp.dot(sizes_i, pair_of(whole[0] / (density * pushed_volume), greatest * whole[1] / density))
 
     @particle_kernel(adjoint_module, "+sizes_bar")
     def share(whole_bar: pair_of) -> pair_of:
@@ -129,7 +131,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
     return BodyKernels(
         Kernels(hold, hold_tangent, hold_adjoint),
         made(measure, ["sizes"]),
-        made(weigh, ["a:a"], numbers=["volume", "greatest"], written=["sizes", "whole", "density"]),
+        made(weigh, ["a:a"], numbers=["pushed_volume", "greatest"], written=["sizes", "whole", "density"]),
         share,
         replace(made(pull, sums, summed=sums), tangent=pull_tangent),
     )
@@ -149,15 +151,30 @@ class MotionKernels:
 @cache
 def motion_kernels(precision: Precision) -> MotionKernels:
     """Make the kernels that move rigid bodies by pressures and gravity, in a precision."""
-    real, vector, matrix, rate = precision.real, precision.vector, matrix_of(precision), rate_function(precision)
+    real, vector, matrix, hold = precision.real, precision.vector, matrix_of(precision), hold_functions(precision)
+    spin, vectors = hold.spin, "gravity V W L pulled twisted"
 
-    @TypesByName(real, {vector: "gravity V W L pulled twisted", matrix: "inverse turns"})
+    @TypesByName(real, {vector: vectors, matrix: "inertia inverse turns", hold.kind: "hold"})
     def move(
-        time_step_i, gravity_i, density_i, volume, inverse, turns_i, V_0_i, W_0_i, L_0_i, pulled_sum_i, twisted_sum_i
+        time_step_i,
+        gravity_i,
+        density_i,
+        volume,
+        inertia,
+        inverse,
+        hold,
+        turns_i,
+        V_0_i,
+        W_0_i,
+        L_0_i,
+        pulled_sum_i,
+        twisted_sum_i,
     ) -> tuple[vector, vector, vector, vector, vector]:
-        L = L_0_i + twisted_sum_i
+        arm = turns_i * hold.arm
+        L = L_0_i + twisted_sum_i - wp.cross(arm, pulled_sum_i)
+        W = spin(turns_i, inertia, inverse, L, hold) / density_i
         V = V_0_i + time_step_i * gravity_i + pulled_sum_i / (density_i * volume)
-        W = rate(turns_i, inverse, L) / density_i
+        V = wp.cw_mul(hold.moving, V) - wp.cross(W, arm)
         return V, L, W, V - V_0_i, W - W_0_i
 
     def carry(faster: vector, turned_faster: vector, gamma_of_i: vector, arm_i: vector) -> real:
@@ -169,7 +186,7 @@ def motion_kernels(precision: Precision) -> MotionKernels:
         modules,
         lambda _: move,
         ["V", "L", "W", "faster", "turned_faster"],
-        numbers=["volume", "inverse"],
+        numbers=["volume", "inertia", "inverse", "hold"],
         written=["pulled_sum", "twisted_sum"],
         told=["gravity"],
         turned={"turns": "turned"},

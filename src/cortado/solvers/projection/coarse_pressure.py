@@ -30,7 +30,8 @@ rho, which take (G y)_i = gamma_i . (V + W x r_i) from the divergence of particl
 
     B^T B,   B_I = (F_I / sqrt(rho K), S R'^T T_I / sqrt(rho)),   S S = I^-1,
 
-with F_I and T_I of y = phi_I c, to the matrix A: three rows for a body in the plane and six in space.
+with F_I and T_I of y = phi_I c, to the matrix A: three rows for a body in the plane and six in space. Of a body that is
+held it is what is left of them (`cortado.sph.held_bodies`).
 """
 
 from dataclasses import dataclass
@@ -50,6 +51,7 @@ from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTange
 from cortado.solvers.projection.coarse_nodes import ALONE, hat_functions, node_functions
 from cortado.solvers.projection.names import types_by_name, weights_type
 from cortado.solvers.projection.pressure import clamp_functions
+from cortado.sph.held_bodies import hold_functions
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
@@ -274,10 +276,11 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     grid_type, hats, among = cell_grid_type(precision), hat_functions(precision, dimension), node_functions(dimension)
     hat, at, beside, corner_step = hats.hat, hats.at, among.beside, among.corner_step
-    module = kernel_module(f"coarse_bodies_{dimension}d_{precision.name}")
+    module, holds = kernel_module(f"coarse_bodies_{dimension}d_{precision.name}"), hold_functions(precision)
     CORNERS, FLAT = wp.constant(2**dimension), wp.constant(dimension == 2)
 
-    typed = TypesByName(real, {grid_type: "grid", vector: "x", matrix: "turns root", wp.int32: "order"})
+    root, held = holds.root, holds.kind
+    typed = TypesByName(real, {grid_type: "grid", vector: "x", matrix: "turns", wp.int32: "order", held: "hold"})
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
@@ -287,13 +290,15 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
         first: int,
         density,
         volume: real,
-        root: matrix,
+        inertia: matrix,
+        half: matrix,
+        hold,
         turns,
         x,
         of: bundle(coarse=real, gamma_of=vector, arm=vector),
         B: wp.array2d(dtype=real),
     ):
-        """Write a body's rows of B from row ``first`` on, by node; ``root`` is a square root of I^-1."""
+        """Write a body's rows of B from row ``first`` on, by node; ``half`` is a square root of I^-1."""
         node, force, torque = wp.tid(), vector(), vector()
         member = node // (grid.shape[0] * grid.shape[1] * grid.shape[2])
         for corner in range(CORNERS):
@@ -303,8 +308,9 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
                 pushed = (hat(x[i], corner, grid).value * of.coarse[i]) * of.gamma_of[i]
                 force += pushed
                 torque += wp.cross(of.arm[i], pushed)
-        force = force / wp.sqrt(density[member] * volume)
-        torque = root * (wp.transpose(turns[member]) * torque) / wp.sqrt(density[member])
+        torque -= wp.cross(turns[member] * hold.arm, force)
+        force = wp.cw_mul(hold.moving, force) / wp.sqrt(density[member] * volume)
+        torque = root(turns[member], inertia, half, torque, hold) / wp.sqrt(density[member])
         B[first, node] = force[0]
         B[first + 1, node] = force[1]
         if FLAT:
@@ -355,7 +361,7 @@ class CoarseBodies:
         precision, matrix = layout.precision, matrix_type(layout.precision)
         self.bodies, self.kernels = bodies.at_rest(), coarse_body_kernels(precision, dimension)
         self._each = 3 * dimension - 3
-        self._roots = [matrix(*_root(held.body.table.mass.inertia).ravel()) for held in bodies.held]
+        self._roots = [matrix(*_root(held.body.table.inertia).ravel()) for held in bodies.held]
         self.rows = self._each * len(bodies.held)
         """Number of rows of all bodies."""
         self._none = layout.arrays(none=precision.real)["none"]
@@ -363,7 +369,7 @@ class CoarseBodies:
     def begin(self, context: StepContext, grid: Named, around: Named, B: wp.array) -> None:
         """Write the bodies' rows of a step to ``B`` (rows, nodes)."""
         for number, (held, root) in enumerate(zip(self.bodies.held, self._roots, strict=True)):
-            own, known = {"first": self._each * number, "root": root}, self.bodies.known(context, held)
+            own, known = {"first": self._each * number, "half": root}, self.bodies.known(context, held)
             context.launch(self.kernels.gather, grid, own, around, *known, B=B, threads=B.shape[1])
 
     def carried(self, context: StepContext, y: wp.array) -> wp.array:

@@ -1,0 +1,106 @@
+"""How free bodies that are held go and turn: a body whose freedoms are few, and one on a hinge.
+
+A body's velocities are V = D (V_0 + dt g + F / (rho K)) + W x s and W = G L. D is 0 along held axes. A hinge is at the
+arm a from the centre of mass in the body's frame, so that the centre is at s = - R a from the hinge, which stays where
+it is: D is 0, L is the angular momentum about the hinge, and I the inertia about it. Without a hinge s is 0.
+
+G is the inverse of the inertia J = R I R^T on the free axes A, G = A (A^T J A)^-1 A^T: J^-1 if all are free; a a^T / (a
+. J a) for one axis a; J^-1 - (J^-1 b) (J^-1 b)^T / (b . J^-1 b) where b alone is held; 0 if none is free. Of an angular
+velocity that a scene says counts the part along the free axes. What pressures do to the body, -G and D / (rho K), is so
+the transpose of what its velocity does to the fluid, as that of a body that nothing holds.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.precision import Precision
+from cortado.discretise.solid import Mass
+from cortado.particles.moving_walls import matrix_of
+from cortado.scene.links import Hold
+
+
+@cache
+def hold_type(precision: Precision) -> Any:
+    """Make the Warp struct of how a body is held."""
+    vector = precision.vector
+
+    class HoldNumbers:
+        moving: vector
+        """1 along the axes along which the body may go, else 0."""
+        arm: vector
+        """a, from the centre of mass to the hinge, in the body's frame [m]."""
+        axis: vector
+        """The axis about which it turns, if that is one; that about which it does not, if they are two."""
+        turning: wp.int32
+        """Number of axes about which it turns."""
+
+    HoldNumbers.__name__ = HoldNumbers.__qualname__ = f"HoldNumbers_{precision.name}"
+    return wp.struct(HoldNumbers)
+
+
+def hold_numbers(hold: Hold, precision: Precision) -> Any:
+    """Return a `hold_type` of how a body is held."""
+    made = hold_type(precision)()
+    for name in ("moving", "arm", "axis"):
+        setattr(made, name, precision.vector(*getattr(hold, name)))
+    made.turning = hold.turning
+    return made
+
+
+def inertia_about_hinge(hold: Hold, mass: Mass) -> np.ndarray:
+    """Return the inertia (3, 3) of a mass about the hinge, or about its centre without one, in the body's frame."""
+    arm = np.array(hold.arm)
+    return np.asarray(mass.inertia + mass.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm)))
+
+
+@cache
+def hold_functions(precision: Precision) -> SimpleNamespace:
+    """Make the Warp functions of a hold h: ``freed``, the part of an angular velocity w along free axes; ``rate``, R A
+    R^T w of matrices R and A; ``spin``, G L; and ``root``, S T with S^T S = G, by a square root of I^-1."""
+    vector, matrix, hold = precision.vector, matrix_of(precision), hold_type(precision)
+
+    @wp.func
+    def rate(R: matrix, A: matrix, w: vector) -> vector:
+        return R * (A * (wp.transpose(R) * w))
+
+    @wp.func
+    def freed(w: vector, h: hold) -> vector:
+        found = vector()
+        if h.turning == 3:
+            found = w
+        elif h.turning == 2:
+            found = w - wp.dot(h.axis, w) * h.axis
+        elif h.turning == 1:
+            found = wp.dot(h.axis, w) * h.axis
+        return found
+
+    @wp.func
+    def spin(R: matrix, inertia: matrix, inverse: matrix, L: vector, h: hold) -> vector:
+        found = vector()
+        if h.turning == 3:
+            found = rate(R, inverse, L)
+        elif h.turning == 2:
+            across = rate(R, inverse, h.axis)
+            found = rate(R, inverse, L) - wp.dot(across, L) / wp.dot(h.axis, across) * across
+        elif h.turning == 1:
+            found = wp.dot(h.axis, L) / wp.dot(h.axis, rate(R, inertia, h.axis)) * h.axis
+        return found
+
+    @wp.func
+    def root(R: matrix, inertia: matrix, half: matrix, T: vector, h: hold) -> vector:
+        found = vector()
+        if h.turning == 3:
+            found = half * (wp.transpose(R) * T)
+        elif h.turning == 2:
+            across = wp.normalize(half * (wp.transpose(R) * h.axis))
+            whole = half * (wp.transpose(R) * T)
+            found = whole - wp.dot(across, whole) * across
+        elif h.turning == 1:
+            found = wp.dot(h.axis, T) / wp.sqrt(wp.dot(h.axis, rate(R, inertia, h.axis))) * h.axis
+        return found
+
+    return SimpleNamespace(kind=hold, rate=rate, freed=freed, spin=spin, root=root)

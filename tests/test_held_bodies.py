@@ -1,0 +1,109 @@
+"""Free bodies that are held: fewer ways to move."""
+
+import numpy as np
+import pytest
+
+from cortado import Problem, SceneError, Simulation
+from cortado.losses import CentreOfMass, SolidPose
+from finite_differences import both_modes, decades, distance
+from floating_bodies import disc_in_a_round_tank
+from test_free_bodies import BRICK, RAFT, plane, space
+
+STILL = {"velocity": None, "angular_velocity": None}
+WAYS = [(plane, RAFT, ["x", "y"]), (plane, RAFT, ["x", "rotation"]), (space, BRICK, ["x", "y", "rotation_y"])]
+WAYS += [(space, BRICK, ["z", "rotation_x", "rotation_z"])]
+
+
+def held(table, *freedom):
+    """A body with these freedoms, which begins with what it may of its motion."""
+    flat = "rotation" in freedom or len(table["velocity"]) == 2
+    turns = ["rotation"] if flat else ["rotation_x", "rotation_y", "rotation_z"]
+    speeds = [speed * (way in freedom) for way, speed in zip("xyz", table["velocity"], strict=False)]
+    spins = [spin * (way in freedom) for way, spin in zip(turns, np.atleast_1d(table["angular_velocity"]), strict=True)]
+    return {**table, "freedom": list(freedom), "velocity": speeds, "angular_velocity": spins[0] if flat else spins}
+
+
+def derivatives_agree(simulation, loss, point, along, steps=6, least=1e-6):
+    """Reverse and forward mode, and both with differences."""
+    problem = Problem(simulation, steps, loss)
+    for name, change in along.items():
+        both_modes(problem, point, {name: change})
+    tangent = both_modes(problem, point, along)[1]
+    assert distance(problem.value, point, along, tangent, decades(3.0, 7.0), enough=least) < least
+
+
+@pytest.mark.parametrize(("scene_of", "table", "freedom"), WAYS)
+def test_a_body_in_nothing_moves_in_its_free_ways_alone(scene_of, table, freedom):
+    d = 2 if scene_of is plane else 3
+    body = {**held(table, *freedom), "position": [0.3, 3.0, 0.2][:d]}
+    run = Simulation(scene_of(body, container={"shape": "none"}), precision="float64").run(50)
+    solid, t = run.solids["raft"], 0.001 * np.arange(51)
+    for axis, way in enumerate("xyz"[:d]):
+        fall = -9.81 * 0.001**2 * np.arange(51) * np.arange(1, 52) / 2.0 if way == "y" else 0.0 * t
+        moved = body["velocity"][axis] * t + fall if way in freedom else 0.0 * t
+        np.testing.assert_allclose(solid.positions[:, axis], body["position"][axis] + moved, atol=1e-14)
+    spins, begun = solid.angular_velocities.reshape(51, -1), np.atleast_1d(body["angular_velocity"])
+    free = [way in freedom for way in (["rotation"] if d == 2 else ["rotation_x", "rotation_y", "rotation_z"])]
+    assert np.abs(spins[:, ~np.array(free)]).max(initial=0.0) < 1e-14
+    if sum(free) == 1:
+        np.testing.assert_allclose(spins[:, free][:, 0], begun[free][0], rtol=1e-12)
+
+
+def test_a_disc_that_may_only_rise_has_its_added_mass(tmp_path):
+    faster = disc_in_a_round_tank(200.0, str(tmp_path / "rings.npy"), 0.03, 6, freedom=["y"])
+    assert np.abs(faster[1:] - 1.0).max() < 0.1
+
+
+def test_a_box_that_may_not_move_is_a_solid_at_rest_to_the_fluid():
+    """But for its turn about its middle, to which the symmetric water gives nothing."""
+    boxed = {"shape": "box", "name": "raft", "lower": [0.4, 0.3], "upper": [0.6, 0.5]}
+    one = plane({**boxed, "motion": "free", "density": 500.0, "freedom": ["rotation"]})
+    other = plane({**boxed, "motion": "path", "velocity": [0.0, 0.0]})
+    runs = [Simulation(scene, precision="float64").run(30) for scene in (one, other)]
+    assert np.abs(runs[0].positions[-1] - runs[1].positions[-1]).max() < 1e-3
+
+
+@pytest.mark.parametrize(("scene_of", "table", "freedom"), WAYS)
+def test_held_bodies_have_derivatives(scene_of, table, freedom):
+    scene, d, random = scene_of(held(table, *freedom)), 2 if scene_of is plane else 3, np.random.default_rng(3)
+    body, flat = scene.solid[0], scene_of is plane
+    loss = CentreOfMass([0.5, 0.3]) if flat else SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)
+    values = {"position": body.middle(), "rotation": body.rotation, "velocity": body.velocity}
+    values |= {"angular_velocity": body.angular_velocity}
+    point = {f"raft.{name}": np.array(value) for name, value in values.items()}
+    point |= {"gravity": np.array([0.5, -9.81, 0.2][:d]), "raft.density": np.array(500.0)}
+    point = {n: value[0] if flat and np.shape(value) == (1,) else value for n, value in point.items()}
+    sizes = {"density": 50.0, "position": 0.01}
+    along = {n: sizes.get(n.split(".")[-1], 0.3) * random.normal(size=np.shape(v)) for n, v in point.items()}
+    derivatives_agree(Simulation(scene, precision="float64"), loss, point, along)
+
+
+def test_runs_of_held_bodies_go_on_and_are_those_of_batches_to_the_bit():
+    scene = space(held(BRICK, "x", "y", "rotation_y"))
+    simulation = Simulation(scene)
+    whole, first = simulation.run(12).last_state, simulation.run(5).last_state
+    rest = simulation.run(7, state=first).last_state
+    assert all(np.array_equal(whole[name], rest[name]) for name in rest.fields)
+    densities = [300.0, 600.0]
+    runs = Simulation(scene, batch=2).run(12, {"raft.density": densities})
+    for density, run in zip(densities, runs, strict=True):
+        alone = simulation.run(12, {"raft.density": density}).last_state
+        assert all(np.array_equal(alone[name], run.last_state[name]) for name in alone.fields)
+
+
+WRONG = {
+    "a way in space": ({"freedom": ["x", "rotation_x"]}, r"solid\[0\]\.freedom is a list of 'x', 'rotation_x', but"),
+    "no way": ({"freedom": []}, "freedom is a list of nothing, but must be some of"),
+    "twice": ({"freedom": ["x", "x"]}, "each once"),
+    "unknown": ({"freedom": ["up"]}, "freedom"),
+    "on a path": ({"freedom": ["x"], "motion": "path", "density": None}, "left out, as only a body whose motion is"),
+    "a speed": ({"freedom": ["x", "rotation"], **STILL, "velocity": [0.0, 1.0]}, "0 where the body is held, in 'y'"),
+    "a turn": ({"freedom": ["x"], **STILL, "angular_velocity": 1.0}, "0 where the body is held, in 'rotation'"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_freedoms_that_are_none_are_a_sentence(name):
+    changes, sentence = WRONG[name]
+    with pytest.raises(SceneError, match=sentence):
+        plane({key: value for key, value in {**RAFT, **changes}.items() if value is not None})
