@@ -45,7 +45,10 @@ SQUARE = [[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.0, 0.2]]
 COARSE = {"spacing": 0.1, "support": 2.0, "kernel": "cubic_spline"}
 FOLDER = Path(mkdtemp())
 atexit.register(shutil.rmtree, FOLDER)
-BLOCK, POINTS, DROPS, AROUND = (str(FOLDER / name) for name in ("block.stl", "points.npy", "drops.npy", "around.npy"))
+NAMES = ("block.stl", "points.npy", "drops.npy", "around.npy", "path.csv", "sway.csv")
+BLOCK, POINTS, DROPS, AROUND, PATH, SWAY = (str(FOLDER / name) for name in NAMES)
+Path(PATH).write_text("time [s],x [mm],rotation [deg]\n0,0,0\n0.01,5,2\n0.02,1,1\n0.03,4,1\n")
+Path(SWAY).write_text("time [s],x [m/s^2],y [m/s^2]\n0,0,-9.81\n0.01,2,-9\n0.02,1,-9\n0.03,4,-9\n")
 trimesh.creation.box((1.0, 1.0, 1.0)).export(BLOCK)
 np.save(POINTS, [[0.45, 0.2], [0.5, 0.2]])
 BESIDE = [[0.48, 0.3], [0.62, 0.27], [0.81, 0.3], [1.3, 0.12], [1.46, 0.4], [0.95, 0.6]]
@@ -72,6 +75,10 @@ IN_THE_PLANE = [
     },
     {"name": "wedge", "shape": "polygon", "corners": [[1.2, 0.0], [1.5, 0.0], [1.5, 0.2]], "slip": "no"},
     {"name": "slope", "shape": "plane", "position": [1.5, 0.4], "normal": [-1.0, 0.3], "slip": "no"},
+    {
+        **{"name": "stick", "shape": "capsule", "start": [0.7, 0.65], "end": [0.85, 0.65], "radius": 0.05},
+        **{"motion": "path", "path": PATH, "interpolation": "spline", "ramp": 0.02},
+    },
     {
         **box([1.0, 0.58], [1.15, 0.68], name="keel", motion="free", mass=9.0),
         **{"centre_of_mass": [0.02, -0.02], "gyration_radius": 0.08},
@@ -100,6 +107,7 @@ BASES = {
         phase=[{**WATER, "rheology": {"kind": "power_law", "flow_index": 0.6, "least_shear_rate": 0.1}}],
         solver={"kind": "pcisph", "time_step": "auto", "courant": 0.02},
         forces={"surface_tension": 0.07},
+        schedule={"gravity": {"file": SWAY, "interpolation": "spline", "ramp": 0.02}},
     ),
     "mixture": lambda: plane_of_three(render={**RENDER, "background": [0.5, 0.6, 0.7], "extinction": 5.0}),
     "bodies": lambda: plane(

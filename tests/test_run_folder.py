@@ -376,12 +376,12 @@ def test_a_mesh_that_has_changed_since_is_told_of(tmp_path):
     mesh.write_bytes(b"a ball")
     made = json.dumps({**json.loads(SCENE), "solid": [{"name": "ball", "shape": "mesh", "file": str(mesh)}]})
     folder = RunFolder.create(tmp_path / "run", made, COMMAND)
-    folder.require_meshes()
+    folder.require_files()
     mesh.write_bytes(b"a cube")
     with pytest.raises(InputError, match=r"ball.stl has changed since the run in .* put the former file back"):
-        folder.require_meshes()
+        folder.require_files()
     with pytest.raises(InputError, match="has changed"):
         RunFolder.resume(folder.path, made, COMMAND)
     mesh.unlink()
     with pytest.raises(InputError, match=r"ball.stl is missing, but the run in"):
-        folder.require_meshes()
+        folder.require_files()

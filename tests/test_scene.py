@@ -99,7 +99,7 @@ def test_a_scene_with_other_values_is_another_one():
     scene = scene_from_dict(full_data())
     tilt = "schedule.tilt.times=[0, 1]", "schedule.tilt.values=[[0, 0], [9, 0]]"
     other = scene.replaced("solver.time_step=0.0005", *tilt)
-    assert scene.replaced() == scene and other.schedule.courses["tilt"].times == (0.0, 1.0)
+    assert scene.replaced() == scene and other.schedule.tilt.times == (0.0, 1.0)
     assert other.solver.time_step == 0.0005 != scene.solver.time_step
     for wrong in ("solver.timestep=1", "solver.time_step=-1", "x", 3):
         with one_sentence(error=SceneError):

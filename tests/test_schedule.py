@@ -36,14 +36,14 @@ def jetting(**schedule):
 
 # ---- the course itself -------------------------------------------------------------------------------------------
 def test_a_course_is_linear_between_its_times_and_constant_beyond():
-    course = Course(**SWAY)
+    course = Course(**SWAY).knots
     np.testing.assert_allclose(course.at(np.array([0.0, 0.003, 0.0115, 0.02, 0.025, 9.0])), [
         [0.0, -9.81], [0.0, -9.81], [3.0, -7.405], [6.0, -5.0], [1.5, -8.5], [-3.0, -12.0]
     ])  # fmt: skip
     times = np.array([0.001, 0.01, 0.024, 0.5])
     slope = (course.at(times + 1e-7) - course.at(times - 1e-7)) / 2e-7
     np.testing.assert_allclose(course.rates(times), slope, atol=1e-6)
-    np.testing.assert_array_equal(Course(times=[1.0], values=[[2.0]]).rates(times), np.zeros((4, 1)))
+    np.testing.assert_array_equal(Course(times=[1.0], values=[[2.0]]).knots.rates(times), np.zeros((4, 1)))
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_the_limit_of_stability_is_that_of_the_strongest_gravity():
 # ---- runs --------------------------------------------------------------------------------------------------------
 def rows(table, moment, steps=STEPS, time_step=None):
     made = plane()
-    return Course(**table).at((np.arange(steps) + moment) * (time_step or made.solver.time_step))
+    return Course(**table).knots.at((np.arange(steps) + moment) * (time_step or made.solver.time_step))
 
 
 def assert_same_run(one, other):
@@ -149,7 +149,7 @@ def test_in_free_fall_fluid_gains_what_gravity_gives():
 def test_a_nozzle_is_where_its_path_is_at_the_end_of_each_step():
     made = jetting()
     trajectory = Simulation(made, precision="float64").run(STEPS)
-    wanted = Course(**nozzle(made)).at(trajectory.times)
+    wanted = Course(**nozzle(made)).knots.at(trajectory.times)
     np.testing.assert_allclose(trajectory.others["outlet"][:, 0], wanted, rtol=1e-12)
     assert np.ptp(wanted, axis=0).max() > 0.02
 

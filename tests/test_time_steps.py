@@ -178,7 +178,7 @@ def test_a_schedule_is_read_at_the_true_times(name):
     state = fixed.state()
     for time, size in zip(run.times, sizes_of(run), strict=False):
         at = time + (1.0 if name == "nozzle_path" else 0.5) * size
-        state = fixed.step(state, {name: getattr(scene.schedule, name).at(np.array([at]))[0], "time_step": size})
+        state = fixed.step(state, {name: scene.schedule.courses[name].at(np.array([at]))[0], "time_step": size})
     assert state["positions"].tobytes() == run.positions[-1].tobytes()
 
 
@@ -246,7 +246,7 @@ def test_the_gradient_is_the_limit_of_differences_with_the_steps_held(scheduled)
         state = fixed.state({"initial_velocities": moved.pop("initial_velocities")})
         for size, time in zip(sizes, times, strict=False):
             middle = np.array([time + 0.5 * size])
-            course = {"gravity": chosen.scene.schedule.gravity.at(middle)[0]} if scheduled else {}
+            course = {"gravity": chosen.scene.schedule.courses["gravity"].at(middle)[0]} if scheduled else {}
             state = fixed.step(state, {**moved, **course, "time_step": size})
         return Spread().value(SimpleNamespace(**{name: state[name] for name in ("positions", "velocities")}))
 

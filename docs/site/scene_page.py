@@ -279,8 +279,9 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     ),
     (
         "## Changes over time: `[schedule]`",
-        "What changes while a scene runs, as values at some times, with straight lines between them. So a box is "
-        "shaken and a cup is tilted: walls stay where they are, and gravity changes ([runs](runs.md)).",
+        "What changes while a scene runs, as values at some times, with straight lines or a spline between them. So a "
+        "box is shaken and a cup is tilted: walls stay where they are, and gravity changes ([runs](runs.md)). Values "
+        "may be in [a file](solids.md#paths-from-files).",
         (
             ("Schedule", "", "[schedule.gravity]\ntimes = [0.0, 0.1]\nvalues = [[0.0, -9.81, 0.0], [3.0, -9.81, 0.0]]"),
             (

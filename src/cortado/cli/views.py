@@ -441,7 +441,7 @@ def opened(path: Path, overrides: list[str], device: str, precision: str | None,
     folder = RunFolder.open(path)
     if not folder.trajectory.exists():
         raise InputError(f"{path} has no trajectory, but must be the folder of `cortado run`, or a scene file.")
-    folder.require_meshes()
+    folder.require_files()
     scene = folder.read_scene()
     simulation = cache(lambda: Simulation(scene, device))
     return RecordedView(scene, Trajectory.load(folder.trajectory), simulation, port)

@@ -108,6 +108,12 @@ def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     return dict(zip(names, np.array(rows).T, strict=True))
 
 
+def name_and_unit(head: str) -> tuple[str, str | None]:
+    """Split the head of a column into name and unit; None where it has no unit in brackets."""
+    name, bracket, unit = head.partition("[")
+    return name.strip(), unit.rstrip().removesuffix("]").strip() if bracket else None
+
+
 def _number(entry: str, where: str) -> float:
     if not entry.strip():
         return np.nan

@@ -20,8 +20,11 @@ from cortado.pictures.stage import Stage
 from cortado.pictures.tracing.near_particles import mixed
 from cortado.pictures.tracing.space import SpacePainter
 from cortado.scene.appearance import Picture
+from cortado.scene.courses import Knots
+from cortado.scene.motions import courses
 from cortado.scene.parameters import QUANTITIES
 from cortado.scene.scene import Scene
+from cortado.scene.solids import SolidTable
 
 FINER = 3
 """How many times finer than pixels lines are drawn, for smooth edges."""
@@ -37,6 +40,8 @@ UNITS = {"age": "s", **{name: quantity.unit for name, quantity in QUANTITIES.ite
 """Units of the quantities that all scenes have, by name."""
 MOVING = np.array([0.75, 0.20, 0.02])
 """Linear colour of paths and of an emitter's jet."""
+POSES = 60
+"""About how many places of a path are shown, at most twice as many."""
 ARROW = 0.18
 """Length of an arrow, in sizes of the contents, and of its head, in lengths of the arrow."""
 HEAD = 0.22
@@ -93,17 +98,25 @@ def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") 
 
 def _paths(scene: Scene) -> list[Points]:
     """Return the paths (k, d) [m] of solids' middles, and that of an emitter's opening."""
-    found = [np.array(table.positions) for table in scene.solid if table.positions is not None]
+    found = [places for table in scene.solid if (places := _places(table)) is not None]
     course = scene.schedule.courses.get("nozzle_path")
-    return found if course is None else [*found, np.array(course.values, dtype=np.float64)]
+    return found if course is None else [*found, course.seen]
+
+
+def _places(table: SolidTable) -> Points | None:
+    """Return the places (k, d) [m] of the middle of a solid along its path; None for one without a path."""
+    shifts = courses(table)[0] if table.motion == "path" else None
+    return table.middle() + shifts.seen if isinstance(shifts, Knots) else None
 
 
 def _poses(scene: Scene) -> list[Scene]:
     """Return scenes with one of the solids at each place of its path."""
     found = []
     for k, table in enumerate(scene.solid):
-        for place in table.positions or ():
-            moved = (*scene.solid[:k], table.model_copy(update={"position": place}), *scene.solid[k + 1 :])
+        places = _places(table)
+        several = () if places is None else places[:: max(len(places) // POSES, 1)].tolist()
+        for place in several:
+            moved = (*scene.solid[:k], table.model_copy(update={"position": tuple(place)}), *scene.solid[k + 1 :])
             found.append(scene.model_copy(update={"solid": moved}))
     return found
 

@@ -26,7 +26,7 @@ from cortado.rollout.run_checks import (
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
 from cortado.rollout.step_bounds import ROOM, begin_choosing, counted_steps, expected_steps, greatest_step
 from cortado.rollout.step_sizes import ChosenSteps
-from cortado.scene.motions import Steady
+from cortado.scene.courses import Steady
 from cortado.scene.parameter_values import Arrays, Values, check_known, checked_value, entry, scene_values, stacked
 from cortado.scene.parameters import Role
 from cortado.scene.restart import Clock, RestartState

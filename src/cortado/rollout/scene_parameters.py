@@ -13,8 +13,8 @@ from cortado.device.precision import Precision
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError
 from cortado.particles.state import State, first_values
+from cortado.scene.courses import Steady
 from cortado.scene.discrete_scene import Lattice
-from cortado.scene.motions import Steady
 from cortado.scene.parameter_values import (
     Arrays,
     Known,
@@ -80,6 +80,7 @@ class SceneParameters:
 
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._steps, self._known = simulation, steps, simulation.known
+        self._scheduled = simulation.scene.schedule.courses
         absent = {name: np.zeros(self.shapes(name)[0]) for name in self._known.run}
         self.values: Arrays = absent | scene_values(simulation, self._known)
         """As the scene has them."""
@@ -96,7 +97,7 @@ class SceneParameters:
     def courses(self, values: Arrays) -> dict[str, Changing]:
         """Return the courses, by parameter, that apply; a given gravity or tilt replaces either."""
         replaced = {"gravity", "tilt"} if not values.keys().isdisjoint(("gravity", "tilt")) else set()
-        courses = {**self._simulation.scene.schedule.courses, **self._known.courses}
+        courses = {**self._scheduled, **self._known.courses}
         found = {name: course for name, course in courses.items() if name not in values and name not in replaced}
         return found | {name: Steady(values[rate]) for rate, name in self._rates(values).items()}
 

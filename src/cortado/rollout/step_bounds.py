@@ -13,8 +13,9 @@ from cortado.errors import InputError
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters, Simulated
 from cortado.rollout.step_sizes import GROWTH, ChosenSteps
+from cortado.scene.courses import Knots, fastest
 from cortado.scene.model import SceneTables
-from cortado.scene.motions import Course, Knots, displacement_name, reach, told, turn_name
+from cortado.scene.motions import displacement_name, reach, told, turn_name
 from cortado.scene.parameter_values import Arrays, Tilt, stacked
 from cortado.scene.parameters import Changing
 from cortado.scene.scene import Scene
@@ -88,12 +89,9 @@ class Travel:
     @classmethod
     def of(cls, scene: Scene, values: Arrays, moved: Iterable[Moved]) -> "Travel":
         """Make the travel of what moves in a scene, given parameter values."""
-        known = [[(arm, c) for arm, c in one if isinstance(c, Knots | Course)] for one in moved]
-        times = np.unique(np.concatenate([[0.0], *(c.times for one in known for _, c in one)]))
-        speeds = np.zeros(len(times))
-        for one in known:
-            rates = [arm * np.linalg.norm(c.rates(times).reshape(len(times), -1), axis=1) for arm, c in one]
-            speeds = np.maximum(speeds, sum(rates, np.zeros(len(times))))
+        known = [[(arm, c) for arm, c in one if isinstance(c, Knots)] for one in moved]
+        times = np.unique(np.concatenate([[0.0], *(c.breaks for one in known for _, c in one)]))
+        speeds = np.maximum.reduce([np.zeros(len(times)), *(fastest(one, times) for one in known)])
         lengths = np.concatenate([[0.0], np.cumsum(speeds[:-1] * np.diff(times))])
         furthest = SOLID_STEP * scene.discretisation.spacing
         return cls(times, speeds, lengths, furthest, LEAST * greatest_step(scene, values))
@@ -127,7 +125,7 @@ class Pull:
     """The bound that a gravity changing over time, as such or by a tilt, sets on steps."""
 
     scene: Scene
-    course: Course
+    course: Knots
     upright: Callable[[NDArray], NDArray]
     """Function from values of the course to gravity (k, d) [m/s2]."""
     greatest: float
@@ -143,13 +141,13 @@ class Pull:
         return {
             f"the scheduled {name}": cls(scene, one, upright[name], greatest)
             for name, one in courses.items()
-            if name in upright and isinstance(one, Course)
+            if name in upright and isinstance(one, Knots)
         }
 
     def longest(self, time: float) -> float:
         """Return the longest step [s] that may begin at a time [s], before gravity becomes too strong for it."""
         ways = np.linspace(0.0, self.greatest, PARTS + 1)
-        known = np.array(self.course.times) - time
+        known = self.course.breaks - time
         ways = np.concatenate([ways, known[(known > 0.0) & (known < self.greatest)]])
         limits = np.minimum.reduce([*gravity_limits(self.scene, self.upright(self.course.at(time + ways))).values()])
         return float(np.maximum(limits, ways).min())

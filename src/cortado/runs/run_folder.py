@@ -1,6 +1,6 @@
 """The folder of one run: its scene, where and how it ran, its metrics, its trajectory and its pictures.
 
-Its files are read again where they are damaged, of an earlier Cortado, or made of a mesh that has changed since.
+Its files are read again where they are damaged, of an earlier Cortado, or made of a file that has changed since.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cortado.errors import LONGEST, InputError, SceneError, shown, unwarned
 from cortado.files.disk import UNFINISHED, content, parsed_json, reason, sentences, write_atomically
 from cortado.runs.sensor import Readings, as_csv, from_csv
 from cortado.scene.parameter_values import NAMES
-from cortado.scene.scene import Scene
+from cortado.scene.scene import Scene, files_named
 from cortado.version import __version__
 
 LARGEST = 2**31
@@ -127,7 +127,7 @@ class RunFolder:
         """
         folder = cls(Path(path).absolute())
         noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
-        noted["meshes"] = mesh_marks(scene_json)
+        noted["files"] = file_marks(scene_json)
         with sentences(folder.path):
             folder._make_room(kind, overwrite)
             folder.path.mkdir(parents=True, exist_ok=True)
@@ -188,11 +188,12 @@ class RunFolder:
             require_same(computed(read_json(self.scene)), computed(json.loads(scene_json)), self.path)
         if "settings" in noted:
             require_same(noted["settings"], as_json(settings or {}), self.path)
-        self.require_meshes()
+        self.require_files()
 
-    def require_meshes(self) -> None:
-        """Raise `InputError` for a mesh file that has changed since the run began, or is missing."""
-        require_meshes(read_json(self.environment).get("meshes", {}), self.path)
+    def require_files(self) -> None:
+        """Raise `InputError` for a file of the scene, such as a mesh, that has changed since the run began, or is
+        missing."""
+        require_files(read_json(self.environment).get("files", {}), self.path)
 
     def write_sensors(self, readings: Mapping[str, Readings]) -> None:
         """Write sensors.csv, whole or not at all; nothing without sensors."""
@@ -415,14 +416,12 @@ def _version(package: str) -> str | None:
         return None
 
 
-def mesh_marks(scene_json: str) -> dict[str, str]:
-    """Return the mark of each mesh file in a resolved scene, by its path."""
-    tables = json.loads(scene_json)
-    meshes = [table for kind in ("solid", "fluid") for table in tables.get(kind) or () if table.get("file")]
-    return {table["file"]: _mark(Path(table["file"])) for table in meshes}
+def file_marks(scene_json: str) -> dict[str, str]:
+    """Return the mark of each file that a resolved scene names, such as a mesh, by its path."""
+    return {table[key]: _mark(Path(table[key])) for table, key in files_named(json.loads(scene_json))}
 
 
-def require_meshes(marks: Mapping[str, str], run: Path) -> None:
+def require_files(marks: Mapping[str, str], run: Path) -> None:
     """Raise `InputError` for a file that is no longer the one a run was made with."""
     for name, mark in marks.items():
         if not Path(name).is_file():

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cortado.arrays import as_numbers, as_one_number, read_only, require_methods, unit
 from cortado.errors import DivergedError, InputError, shown
-from cortado.files.disk import read_columns
+from cortado.files.disk import name_and_unit, read_columns
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
@@ -278,7 +278,7 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
         InputError: a file that is no such table, columns of no sensor or in another unit, or no point within the run.
     """
     columns = read_columns(path)
-    named = {_name_and_unit(head): values for head, values in columns.items()}
+    named = {name_and_unit(head): values for head, values in columns.items()}
     times = named.get(("time", "s"), named.get(("time", None)))
     known = {f"{name}.{column}": (own, column) for name, own in readings.items() for column in own.units}
     if times is None:
@@ -304,9 +304,3 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
     if not found:
         raise InputError(f"{path} has times alone, but must have some of {', '.join(known)}.")
     return found
-
-
-def _name_and_unit(head: str) -> tuple[str, str | None]:
-    """Split the head of a column into name and unit; None where it has no unit in brackets."""
-    name, bracket, unit = head.partition("[")
-    return name.strip(), unit.rstrip().removesuffix("]").strip() if bracket else None

@@ -360,17 +360,20 @@ def _check_schedule(scene: SceneTables) -> None:
     if "gravity" in courses and "tilt" in courses:
         raise field_error(("schedule", "gravity"), Words("given"), "left out, as the tilt says where gravity points")
     usual = type(scene.forces).model_fields["gravity"].default[: scene.dimension]
-    if "gravity" in courses and scene.forces.gravity not in (usual, first := courses["gravity"].values[0]):
+    if "gravity" in courses and scene.forces.gravity not in (
+        usual,
+        first := tuple(courses["gravity"].values[0].tolist()),
+    ):
         wanted = f"left out, or {shown(first)}, with which schedule.gravity begins, as that acts in its place"
         raise field_error(("forces", "gravity"), scene.forces.gravity, wanted)
     path = courses.get("nozzle_path")
     if path is None or scene.emitter is None:
         return
-    if np.abs(np.array(path.values[0]) - scene.emitter.outlet).max() > 1e-6 * spacing:
+    if np.abs(path.values[0] - scene.emitter.outlet).max() > 1e-6 * spacing:
         wanted = f"emitter.outlet, {shown(scene.emitter.outlet)}, where the opening is at the start"
-        raise field_error(("schedule", "nozzle_path", "values", 0), path.values[0], wanted)
+        raise field_error(("schedule", "nozzle_path", "values", 0), path.values[0].tolist(), wanted)
     opening = scene.emitter.opening(spacing) - np.array(scene.emitter.outlet)
-    for index, place in enumerate(path.values):
-        if not scene.region.contains(np.array(place) + opening, 1e-6 * spacing).all():
+    for index, place in enumerate(path.seen):
+        if not scene.region.contains(place + opening, 1e-6 * spacing).all():
             wanted = "where all of the opening is inside the container"
-            raise field_error(("schedule", "nozzle_path", "values", index), place, wanted)
+            raise field_error(("schedule", "nozzle_path", "values", index), place.tolist(), wanted)

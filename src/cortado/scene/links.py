@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import Self
 
-from cortado.scene.solids import WAYS, SolidTable
+from cortado.scene.courses import WAYS
+from cortado.scene.solids import SolidTable
 
 Three = tuple[float, float, float]
 

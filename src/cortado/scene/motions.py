@@ -3,80 +3,54 @@ change their size. States have the fields of solids by the names that are made h
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, create_model, model_validator
+from pydantic import Field, PrivateAttr, create_model, model_validator
 
 from cortado.discretise.solid import Mass
-from cortado.errors import Words
+from cortado.errors import InputError, Words
+from cortado.scene.courses import Columns, Interpolation, Knots, Ramp, Steady, path_of, values_in_file
 from cortado.scene.parameters import PARAMETERS, Axis, Parameter, Range, Role, Source
+from cortado.scene.shape_tables import File
 from cortado.scene.solids import SolidTable
-from cortado.scene.tables import FieldPath, Several, Table, field_error, quantity
-
-
-@dataclass(frozen=True, eq=False)
-class Steady:
-    """A quantity that is 0 at time 0 and grows by the same in every second."""
-
-    rate: NDArray[np.float64]
-    """() or (components,), a second"""
-
-    def at(self, times: NDArray) -> NDArray:
-        """Return values (n,) or (n, components) at times (n,) [s]."""
-        return np.multiply.outer(times, self.rate)
-
-    def greatest(self) -> float:
-        """Return the size of the rate."""
-        return float(np.linalg.norm(self.rate))
-
-    def rates(self, times: NDArray) -> NDArray:
-        """Return the derivatives with respect to time, (n,) or (n, components), at times (n,) [s]."""
-        return np.broadcast_to(self.rate, (*np.shape(times), *self.rate.shape))
-
-
-@dataclass(frozen=True, eq=False)
-class Knots:
-    """A quantity on straight lines between values at some times, constant before the first and after the last."""
-
-    times: NDArray[np.float64]
-    """(k,) [s]"""
-    values: NDArray[np.float64]
-    """(k,) or (k, components)"""
-
-    def at(self, times: NDArray) -> NDArray:
-        """Return values (n,) or (n, components) at times (n,) [s], between the knots by linear interpolation."""
-        columns = self.values.reshape(len(self.times), -1).T
-        found = np.stack([np.interp(times, self.times, column) for column in columns], axis=-1)
-        return found.reshape(len(times), *self.values.shape[1:])
-
-    def greatest(self) -> float:
-        """Return the size of the greatest rate."""
-        return float(np.linalg.norm(self._slopes.reshape(len(self.times), -1), axis=1).max())
-
-    def rates(self, times: NDArray) -> NDArray:
-        """Return the time derivatives, (n,) or (n, components), at times (n,) [s]; at a knot, those just after it."""
-        return self._slopes[np.searchsorted(self.times, times, side="right") - 1]
-
-    @property
-    def _slopes(self) -> NDArray[np.float64]:
-        """Return the slopes (k,) or (k, components) after each of the times; the last, 0, also before the first."""
-        lengths = np.diff(self.times).reshape(-1, *(1,) * (self.values.ndim - 1))
-        return np.concatenate([np.diff(self.values, axis=0) / lengths, np.zeros_like(self.values[:1])])
+from cortado.scene.tables import MISSING, FieldPath, Several, Table, field_error, quantity
 
 
 class Course(Table):
-    """One parameter over time: linear between the times, constant before the first and after the last."""
+    """One parameter over time, constant before the first of some times and after the last."""
 
-    times: Several[Annotated[float, quantity("s", ge=0.0)]]
+    columns: ClassVar[Callable[[int], Columns]]
+    """Columns that its file has, by the number of dimensions."""
+    grows_from: ClassVar[float | None] = 0.0
+    """What a ramp begins with; None for the first value."""
+    times: Several[Annotated[float, quantity("s", ge=0.0)]] | None = None
     """(k,) counted from the first state of the run, each greater than the one before [s]"""
-    values: Any
+    values: Any = None
     """(k, components) in the parameter's unit"""
+    file: File | None = None
+    """A CSV file in the place of `times` and `values`, with a column time [s] and one with a unit for each component:
+    x, y and z; tilt, in 3-D tilt_x and tilt_z. It is beside the scene file, and absolute once read."""
+    interpolation: Interpolation = "linear"
+    """Between the times: straight lines, or a cubic spline, which is level at both ends."""
+    ramp: Ramp | None = None
+    """How long the values, or the way from the first place, are multiplied by a number that grows smoothly (C2) from 0
+    at the start to 1 [s]; not if left out."""
+    _dimension: int = PrivateAttr(0)
 
     @model_validator(mode="after")
     def _check_times(self) -> Self:
+        if self.file is not None:
+            if given := [name for name in ("times", "values") if getattr(self, name) is not None]:
+                raise field_error((given[0],), Words("given"), "left out, as there is a file")
+            return self
+        for name in ("times", "values"):
+            if getattr(self, name) is None:
+                raise field_error((name,), MISSING, "a list, or a file in its place")
+        assert self.times is not None
         for index, (before, after) in enumerate(pairwise(self.times), 1):
             if after <= before:
                 raise field_error(("times", index), after, f"greater than the time before, {before:g} s")
@@ -86,25 +60,48 @@ class Course(Table):
         return self
 
     @property
-    def _knots(self) -> Knots:
-        return Knots(np.array(self.times), np.array(self.values, dtype=np.float64))
+    def knots(self) -> Knots:
+        """Return the values (k, components) at the times; raise `InputError` for a file that cannot be used."""
+        if self.file is None:
+            times, values = np.array(self.times), np.array(self.values, dtype=np.float64)
+        else:
+            times, found = values_in_file(self.file, type(self).columns(self._dimension), True)
+            values = np.stack([found[name] for name, _ in type(self).columns(self._dimension)], axis=1)
+        begun = values[0] if self.grows_from is None else self.grows_from
+        return Knots(times, values, self.interpolation, self.ramp or 0.0, begun)
 
-    def at(self, times: NDArray) -> NDArray:
-        """Return the parameter's values (n, components) at times (n,) [s]."""
-        return self._knots.at(times)
-
-    def rates(self, times: NDArray) -> NDArray:
-        """Return the parameter's time derivatives (n, components) at times (n,) [s], as those of `Knots`."""
-        return self._knots.rates(times)
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        placed = self.model_copy()
+        object.__setattr__(placed, "__pydantic_private__", {"_dimension": dimension})
+        try:
+            rows = placed.knots.values if self.values is None else self.values
+        except InputError as error:
+            raise field_error((*path, "file"), self.file, "a table over time", f"cannot be used: {error}") from None
+        size = len(type(self).columns(dimension))
+        for index, row in enumerate(rows):
+            if len(row) != size:
+                wanted = f"a list of {size}, as the scene has {dimension} dimensions"
+                raise field_error((*path, "values", index), row, wanted)
+        return placed
 
 
 def _course_table(parameter: Parameter) -> type[Course]:
     """Make the table of one parameter over time, whose values have its unit."""
     unit = parameter.unit.replace("²", "2").replace("°", "degrees")
     row = Annotated[tuple[Annotated[float, quantity(unit)], ...], Field(min_length=1, max_length=3, fail_fast=True)]
-    values: Any = (Several[row], Field(description="(k, components) one row for each of the times"))
+    values: Any = (Several[row] | None, Field(None, description="(k, components) one row for each of the times"))
     words = f"The parameter `{parameter.name}` over time: {parameter.meaning}."
-    return create_model(f"Course_{parameter.name}", __base__=Course, __module__=__name__, __doc__=words, values=values)
+    made = create_model(f"Course_{parameter.name}", __base__=Course, __module__=__name__, __doc__=words, values=values)
+    made.columns, made.grows_from = partial(_columns, parameter, unit), None if parameter.unit == "m" else 0.0
+    return made
+
+
+def _columns(parameter: Parameter, unit: str, dimension: int) -> Columns:
+    """Return the columns of a file with a parameter over time: x, y and z of a vector of space, or its own name."""
+    size = 1 if parameter.components is None else parameter.components(dimension, 1)
+    if size == dimension:
+        return tuple((axis, unit) for axis in "xyz"[:size])
+    return tuple((name, unit) for name in ([parameter.name] if size == 1 else [f"{parameter.name}_{k}" for k in "xz"]))
 
 
 _OVER_TIME = [p for p in PARAMETERS if p.axis is Axis.STEP]
@@ -117,26 +114,24 @@ class _Schedule(Table):
     """The changes of parameters while the scene runs; a parameter that is left out does not change."""
 
     @property
-    def courses(self) -> dict[str, Course]:
+    def courses(self) -> dict[str, Knots]:
         """Return the courses that are given, by the names of their parameters."""
+        return {name: course.knots for name, course in self._tables.items()}
+
+    @property
+    def _tables(self) -> dict[str, Course]:
         found = {name: getattr(self, name) for name in _COURSES}
         return {name: course for name, course in found.items() if course is not None}
 
     @property
     def leads_gravity(self) -> bool:
         """Return True where gravity changes, as such or by a tilt."""
-        return not self.courses.keys().isdisjoint(("gravity", "tilt"))
+        return not self._tables.keys().isdisjoint(("gravity", "tilt"))
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         """Return this table, with rows of as many components as their parameters have in 2 or 3 dimensions."""
-        for name, course in self.courses.items():
-            components = next(p.components for p in _OVER_TIME if p.name == name)
-            size = 1 if components is None else components(dimension, 1)
-            for index, row in enumerate(course.values):
-                if len(row) != size:
-                    wanted = f"a list of {size}, as the scene has {dimension} dimensions"
-                    raise field_error((*path, name, "values", index), row, wanted)
-        return self
+        placed = {name: course.in_dimension(dimension, (*path, name)) for name, course in self._tables.items()}
+        return self.model_copy(update=placed)
 
 
 Schedule: Any = create_model("Schedule", __base__=_Schedule, __module__=__name__, __doc__=_Schedule.__doc__, **_COURSES)
@@ -254,7 +249,7 @@ def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
     found = [known[name(solid.name)] for solid in told(solids) for name in names]
     for solid in told(solids):
         for name, of in ((velocity_name, displacement_name), (angular_velocity_name, turn_name)):
-            if solid.times is None:
+            if solid.is_steady:
                 found.append(replace(known[name(solid.name)], role=Role.VIEW, in_place_of=of(solid.name)))
     begun = (position_name, rotation_name, velocity_name, angular_velocity_name)
     found += [replace(known[name(solid.name)], role=Role.STATE) for solid in free(solids) for name in begun]
@@ -308,17 +303,16 @@ def _shape_of(components: int) -> tuple[int, ...]:
 def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
     """Return displacement [m] and turn [rad] of a solid whose motion is prescribed, over time, from where it begins."""
     d = len(solid.middle())
-    return _course(solid, "positions", "velocity", d), _course(solid, "rotations", "angular_velocity", 2 * d - 3)
+    times, shifts, turns = path_of(solid, d) or (None, None, None)
 
+    def course(rows: NDArray | None, steady: Any, components: int) -> Steady | Knots:
+        shape = _shape_of(components)
+        if rows is not None:
+            assert times is not None
+            return Knots(times, rows.reshape(len(rows), *shape), solid.interpolation, solid.ramp or 0.0)
+        return Steady(np.zeros(shape) if steady is None else np.array(steady, dtype=np.float64).reshape(shape))
 
-def _course(solid: SolidTable, values: str, rate: str, components: int) -> Steady | Knots:
-    shape = _shape_of(components)
-    known: Any = getattr(solid, values)
-    if known is not None:
-        table = np.array(known, dtype=np.float64).reshape(len(known), *shape)
-        return Knots(np.array(solid.times), table - table[0])
-    steady: Any = getattr(solid, rate)
-    return Steady(np.zeros(shape) if steady is None else np.array(steady, dtype=np.float64).reshape(shape))
+    return course(shifts, solid.velocity, d), course(turns, solid.angular_velocity, 2 * d - 3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -204,6 +204,12 @@ def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
         raise (error.in_file(file) if file else error) from None
 
 
+def files_named(tables: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
+    """Return the tables, among those that `Scene.to_json` wrote, that name a file, each with the key that does."""
+    found = [*(tables.get("solid") or ()), *(tables.get("fluid") or ()), *(tables.get("schedule") or {}).values()]
+    return [(table, key) for table in found if table for key in ("file", "path") if table.get(key)]
+
+
 def scene_in_words(scene: Scene, particles: int) -> str:
     """Describe a scene of a number of particles in one sentence: its contents, its container, and its forces."""
     phases = " and ".join(

@@ -9,9 +9,10 @@ import numpy as np
 from cortado.discretise.room import Room
 from cortado.discretise.solid_walls import surface_feet
 from cortado.scene.appearance import Keyframes, Picture
+from cortado.scene.courses import Steady
 from cortado.scene.fluids import PointsFluid
 from cortado.scene.model import Carreau, SceneTables, Thinning, Yielding
-from cortado.scene.motions import Steady, courses, told
+from cortado.scene.motions import courses, told
 from cortado.scene.shape_tables import BoxContainer
 from cortado.scene.solids import SolidTable
 from cortado.scene.solvers import what_suits
@@ -193,7 +194,7 @@ def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
         return False
     if isinstance(shifts, Steady):
         return bool(shifts.rate[axis] == 0.0)
-    return bool(np.ptp(shifts.values[:, axis]) < 0.5 * spacing)
+    return bool(np.ptp(shifts.seen[:, axis]) < 0.5 * spacing)
 
 
 ONE_LAYER, TWO_LAYERS = 1.1, 1.5

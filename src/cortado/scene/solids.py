@@ -3,7 +3,6 @@
 from abc import abstractmethod
 from dataclasses import replace
 from functools import lru_cache
-from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -11,11 +10,10 @@ from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Hollow, Placed, Solid
-from cortado.errors import Words, shown
 from cortado.scene.appearance import FINISHES, Coloured, Finish
-from cortado.scene.shape_tables import Container
+from cortado.scene.courses import WAYS, Interpolation, Ramp, check_motion
+from cortado.scene.shape_tables import Container, File
 from cortado.scene.tables import (
-    MISSING,
     Colour,
     FieldPath,
     Length,
@@ -25,13 +23,9 @@ from cortado.scene.tables import (
     Text,
     Turning,
     check_turn,
-    field_error,
     quantity,
     rotation_matrix,
 )
-
-WAYS = {2: ("x", "y", "rotation"), 3: ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")}
-"""Names of a body's ways to move, by the dimension of the scene: first those of its middle, then its turns."""
 
 
 class SolidTable(Coloured):
@@ -52,8 +46,9 @@ class SolidTable(Coloured):
     """How it is turned about its middle [rad], not at all if left out: in 3-D a rotation vector, in 2-D one number,
     counterclockwise."""
     motion: Literal["fixed", "path", "free"] = "fixed"
-    """Whether it stays where it is; moves as it is told, by `times` with `positions`, `rotations` or both, or with a
-    steady `velocity`, `angular_velocity` or both; or is a rigid body, which fluid and gravity move."""
+    """Whether it stays where it is; moves as it is told, by `times` with `positions`, `rotations` or both, by the file
+    `path`, or with a steady `velocity`, `angular_velocity` or both; or is a rigid body, which fluid and gravity
+    move."""
     density: Annotated[float, quantity("kg/m3", gt=0.0)] | None = None
     """Density of a free body: its mass over its volume [kg/m³]."""
     mass: Annotated[float, quantity("kg", gt=0.0)] | None = None
@@ -69,13 +64,22 @@ class SolidTable(Coloured):
     "rotation_x", "rotation_y" and "rotation_z". Its velocity along the other axes of space, and the part of its angular
     velocity along them, are 0."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
-    """(k,) Times of the path, from 0 on, each greater than the one before [s]; between them it goes in straight lines,
-    and after the last it rests."""
+    """(k,) Times of the path, from 0 on, each greater than the one before [s]; after the last it rests."""
     positions: tuple[tuple[Length, ...], ...] | None = None
     """(k, d) Where the middle is at these times [m]; the first is where it begins."""
     rotations: tuple[Rotation, ...] | None = None
     """(k, 3) Rotation vectors by which it is turned from how it begins at these times, in 2-D (k,) angles; the first is
     0 [rad]."""
+    path: File | None = None
+    """A CSV file in the place of `times`, with columns such as time [s], x [mm], y [mm] and rotation [deg], in 3-D
+    rotation_x [deg] and so on. Only how they differ from their first line counts; a column that is not there stays 0.
+    It is beside the scene file, and absolute once read."""
+    interpolation: Interpolation = "linear"
+    """How it gets from one of the times to the next: in straight lines, or along a cubic spline, whose velocity and
+    acceleration are continuous, and which is at rest at both ends."""
+    ramp: Ramp | None = None
+    """Displacement and turn of the path are multiplied by a number that grows smoothly (C2) from 0 at the start to 1
+    after this time [s]; not if left out."""
     velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
     """(d,) Velocity of the middle, if it is steady; of a free body at the start [m/s]."""
     angular_velocity: Turning | None = None
@@ -109,6 +113,11 @@ class SolidTable(Coloured):
     def sticks(self) -> bool:
         """Return True where fluid has no slip along it."""
         return self.slip == "no"
+
+    @property
+    def is_steady(self) -> bool:
+        """Return True where no table says where it is over time."""
+        return self.times is None and self.path is None
 
     @property
     def moves(self) -> bool:
@@ -183,7 +192,7 @@ class SolidTable(Coloured):
         self.check_components(("position", "velocity", "surface_velocity", "centre_of_mass"), dimension, path)
         for name in ("rotation", "angular_velocity", "gyration_radius"):
             check_turn((*path, name), getattr(self, name), dimension)
-        _check_motion(self, dimension, path)
+        check_motion(self, dimension, path)
         return super().in_dimension(dimension, path)
 
 
@@ -196,83 +205,3 @@ def solids_of(tables: tuple[SolidTable, ...]) -> tuple[Solid, ...]:
 def _times(scale: float, value: Any) -> Any:
     """Multiply a number by a scale, or one by one those of a tuple."""
     return tuple(_times(scale, part) for part in value) if isinstance(value, tuple) else scale * value
-
-
-def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
-    """Raise a `field_error` where the keys of a motion do not fit together."""
-    rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
-    given = [name for name in ("times", *rows, *steady) if getattr(solid, name) is not None]
-    for name in ("density", "mass", "centre_of_mass", "gyration_radius", "freedom"):
-        if (value := getattr(solid, name)) is not None and solid.motion != "free":
-            has = "can be held" if name == "freedom" else "has a mass"
-            raise field_error((*path, name), value, f'left out, as only a body whose motion is "free" {has}')
-    if solid.motion == "fixed":
-        if given:
-            raise field_error((*path, given[0]), Words("given"), 'left out, as motion is "fixed"')
-        return
-    if solid.motion == "free":
-        _check_free(solid, path)
-        _check_freedom(solid, dimension, path)
-        return
-    if solid.times is None:
-        if wrong := [name for name in rows if name in given]:
-            raise field_error((*path, "times"), MISSING, f"a list of times, as there are {wrong[0]}")
-        if not given:
-            raise field_error((*path, "velocity"), MISSING, 'given, or times with positions, as motion is "path"')
-    elif not set(rows) & set(given):
-        raise field_error((*path, "positions"), MISSING, "given, or rotations, as there are times")
-    else:
-        _check_knots(solid, dimension, path)
-        if wrong := [name for name in steady if name in given]:
-            raise field_error((*path, wrong[0]), Words("given"), "left out, as there are times")
-
-
-def _check_free(solid: SolidTable, path: FieldPath) -> None:
-    """Check the mass of a free body, and that nothing tells it where to go."""
-    if solid.mass is None and solid.density is None:
-        raise field_error((*path, "density"), MISSING, 'a density in kg/m3, or a mass, as motion is "free"')
-    if None not in (solid.mass, solid.density):
-        raise field_error((*path, "mass"), solid.mass, "left out, as there is a density")
-    if solid.centre_of_mass is not None and solid.gyration_radius is None:
-        raise field_error((*path, "gyration_radius"), MISSING, "given, as there is a centre of mass")
-    for name in ("times", "positions", "rotations", "surface_velocity"):
-        if getattr(solid, name) is not None:
-            raise field_error((*path, name), Words("given"), 'left out, as motion is "free"')
-    if solid.side == "inside":
-        raise field_error((*path, "side"), solid.side, '"outside", as motion is "free"')
-    if solid.slip == "no":
-        raise field_error((*path, "slip"), solid.slip, '"free", as fluid does not rub bodies that are free')
-
-
-def _check_freedom(solid: SolidTable, dimension: int, path: FieldPath) -> None:
-    """Check how a free body is held, and that it begins to move in ways that are free."""
-    if solid.freedom is None:
-        return
-    ways, found = WAYS[dimension], Words(f"a list of {', '.join(map(repr, solid.freedom)) or 'nothing'}")
-    if not solid.freedom or len({*solid.freedom}) < len(solid.freedom) or not {*solid.freedom} <= {*ways}:
-        raise field_error((*path, "freedom"), found, f"some of {shown(list(ways))}, each once")
-    for name, own in (("velocity", ways[:dimension]), ("angular_velocity", ways[dimension:])):
-        for way, value in zip(own, getattr(solid, name) or (), strict=False):
-            if value != 0.0 and way not in solid.freedom:
-                raise field_error((*path, name), getattr(solid, name), f"0 where the body is held, in {way!r}")
-
-
-def _check_knots(solid: SolidTable, dimension: int, path: FieldPath) -> None:
-    times = solid.times or ()
-    if len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
-        raise field_error((*path, "times"), times, "at least two times, from 0 on, each greater than the one before")
-    for name, size in (("positions", dimension), ("rotations", 2 * dimension - 3)):
-        values = getattr(solid, name)
-        if values is None:
-            continue
-        if len(values) != len(times):
-            raise field_error((*path, name), Words(f"a list of {len(values)}"), f"a list of {len(times)}, as are times")
-        for index, row in enumerate(values):
-            if len(row) != size:
-                wanted = "one number in 2-D" if size == 1 else f"a list of {size} components"
-                raise field_error((*path, name, index), row, wanted)
-    if solid.positions is not None and np.abs(np.subtract(solid.positions[0], solid.middle())).max() > 1e-9:
-        wanted = f"{shown([float(f'{x:.9g}') for x in solid.middle()])}, where its middle is at the start"
-        raise field_error((*path, "positions", 0), solid.positions[0], wanted)
-    if solid.rotations is not None and any(solid.rotations[0]):
-        raise field_error((*path, "rotations", 0), solid.rotations[0], "0, as it is not turned yet")

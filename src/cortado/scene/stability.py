@@ -118,7 +118,7 @@ def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str,
     which they act. So do paths of solids. Where nothing else bounds the steps, the strongest gravity and the fastest
     part of a path bound them all."""
     own = {name: value for name, value in (values or {}).items() if name != "gravity"}
-    found = standing_limits(scene, own, [solid for solid in scene.solid if solid.times is None])
+    found = standing_limits(scene, own, [solid for solid in scene.solid if solid.is_steady])
     if scene.schedule.leads_gravity:
         found |= {name: float(limits.max()) for name, limits in gravity_limits(scene, _gravity(scene)).items()}
     greatest = scene.solver.greatest_time_step
@@ -232,8 +232,8 @@ def _gravity(scene: SceneTables) -> Points:
     """Return gravity (d,) or (k, d) [m/s2] of the scene, at the times of its schedule if that changes it."""
     courses = scene.schedule.courses
     if "tilt" in courses:
-        return Tilt(scene.forces.gravity).gravity(np.array(courses["tilt"].values))
-    return np.array(courses["gravity"].values if "gravity" in courses else scene.forces.gravity)
+        return Tilt(scene.forces.gravity).gravity(courses["tilt"].seen)
+    return courses["gravity"].seen if "gravity" in courses else np.array(scene.forces.gravity)
 
 
 def _first_speed(scene: SceneTables, values: Arrays) -> float:

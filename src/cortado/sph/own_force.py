@@ -34,7 +34,7 @@ from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum
 from cortado.particles.particle_kernels import pointwise_kernels, sum_kernels
 from cortado.particles.state import padded
-from cortado.scene.motions import Course
+from cortado.scene.courses import Knots
 from cortado.scene.parameter_values import TIME, Arrays
 from cortado.scene.parameters import Axis, Parameter, Source
 from cortado.scene.scene import Scene
@@ -64,19 +64,18 @@ class OverTime:
             raise InputError(f"OverTime values have shape {self.values.shape}, but must be {wanted}.")
         if not np.isfinite(self.values).all():
             raise InputError("OverTime values have one that is not finite, but must be numbers.")
-        rows = self.values.reshape(len(self.times), -1)
-        self._course = Course.model_construct(times=tuple(self.times), values=tuple(map(tuple, rows)))
+        self._course = Knots(self.times, self.values)
 
     def __repr__(self) -> str:
         return f"OverTime({self.times.tolist()}, {self.values.tolist()})"
 
     def at(self, times: np.ndarray) -> np.ndarray:
         """Return the parameter's values at times (n,) [s]."""
-        return self._course.at(times).reshape(-1, *self.values.shape[1:])
+        return self._course.at(times)
 
     def rates(self, times: np.ndarray) -> np.ndarray:
         """Return the parameter's derivatives with respect to time at times (n,) [s]."""
-        return self._course.rates(times).reshape(-1, *self.values.shape[1:])
+        return self._course.rates(times)
 
 
 @fixed

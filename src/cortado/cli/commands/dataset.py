@@ -25,7 +25,7 @@ from cortado.files.terminal import keeping, track, untracked
 from cortado.optimisation.dataset_files import PARTS, DatasetFolder, metadata
 from cortado.optimisation.datasets import KINDS, MORE_FLUID, DatasetTable, DatasetTables, Sample, bounds_of, one_run
 from cortado.runs.run_folder import differences, read_json
-from cortado.scene.scene import Scene, load_scene
+from cortado.scene.scene import Scene, files_named, load_scene
 from cortado.scene.tables import MISSING
 from cortado.scene.tables import sentences as in_sentences
 from cortado.scene.toml import overrides_of, read_toml
@@ -196,13 +196,10 @@ def _asked(member: Member) -> dict[str, Any]:
     return {**asked, "--precision": member.precision, "cortado": __version__}
 
 
-def _put_digests(table: Any) -> None:
+def _put_digests(tables: Any) -> None:
     """Put a digest of the content beside the name of each file in the tables of a scene, such as one with a mesh."""
-    for value in list(table.values()) if isinstance(table, dict) else table:
-        if isinstance(value, dict | list):
-            _put_digests(value)
-    if isinstance(table, dict) and "file" in table:
-        table["file content"] = sha256(Path(table["file"]).read_bytes()).hexdigest()
+    for table, key in files_named(tables):
+        table[f"{key} content"] = sha256(Path(table[key]).read_bytes()).hexdigest()
 
 
 def _are_one(member: Member, *overrides: list[str]) -> bool:

@@ -42,7 +42,7 @@ def scene_of_run(folder: RunFolder, overrides: list[str]) -> Scene:
     for override in overrides:
         if not override.startswith("picture."):
             raise InputError(f"--set is {override}, but must begin with picture., as the run is there already.")
-    folder.require_meshes()
+    folder.require_files()
     return folder.read_scene(overrides)
 
 

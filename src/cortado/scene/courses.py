@@ -1,0 +1,330 @@
+"""Values over time: steady ones, and those between values at some times, which a scene or a CSV file gives; and whether
+the keys by which a solid is moved fit together."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.errors import InputError, Words, shown
+from cortado.files.disk import name_and_unit, read_columns, reason, regular_file
+from cortado.scene.tables import GREATEST, MISSING, FieldPath, field_error, quantity
+
+Interpolation = Literal["linear", "spline"]
+Ramp = Annotated[float, quantity("s", gt=0.0)]
+WITHIN = np.minimum(np.arange(9) / 8.0, 1.0 - 1e-9)
+"""Parts of the way from one time to the next at which a curve is looked at."""
+RAMP_PARTS = 16
+"""Number of parts into which a ramp is cut to be looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Steady:
+    """A quantity that is 0 at time 0 and grows by the same in every second."""
+
+    rate: NDArray[np.float64]
+    """() or (components,), a second"""
+
+    def at(self, times: NDArray) -> NDArray:
+        """Return values (n,) or (n, components) at times (n,) [s]."""
+        return np.multiply.outer(times, self.rate)
+
+    def greatest(self) -> float:
+        """Return the size of the rate."""
+        return float(np.linalg.norm(self.rate))
+
+    def rates(self, times: NDArray) -> NDArray:
+        """Return the derivatives with respect to time, (n,) or (n, components), at times (n,) [s]."""
+        return np.broadcast_to(self.rate, (*np.shape(times), *self.rate.shape))
+
+
+@dataclass(frozen=True, eq=False)
+class Knots:
+    """A quantity between values at some times, constant before the first and after the last: on straight lines, or on
+    a cubic spline (C2) that is at rest at both ends. With a ramp, its way from where it begins is multiplied by
+    10 s^3 - 15 s^4 + 6 s^5, where s goes from 0 to 1 with the time."""
+
+    times: NDArray[np.float64]
+    """(k,) [s]"""
+    values: NDArray[np.float64]
+    """(k,) or (k, components)"""
+    interpolation: Interpolation = "linear"
+    """How values are found between the times."""
+    ramp: float = 0.0
+    """How long the ramp is, from time 0 on [s]; 0 is none."""
+    begun: Any = 0.0
+    """Value where the ramp begins."""
+
+    def at(self, times: NDArray) -> NDArray:
+        """Return values (n,) or (n, components) at times (n,) [s]."""
+        found = self._curve(times)
+        return found if not self.ramp else self.begun + self._weights(times)[0] * (found - self.begun)
+
+    def rates(self, times: NDArray) -> NDArray:
+        """Return the time derivatives, (n,) or (n, components), at times (n,) [s]; at a knot, those just after it."""
+        found = self._slopes(times)
+        if not self.ramp:
+            return found
+        weights, growth = self._weights(times)
+        return weights * found + growth * (self._curve(times) - self.begun)
+
+    def greatest(self) -> float:
+        """Return the size of the greatest rate."""
+        return float(fastest([(1.0, self)], self.breaks).max())
+
+    @cached_property
+    def breaks(self) -> NDArray[np.float64]:
+        """Return the times (m,) [s] between which it has no corner: its own, and some along a ramp."""
+        along = np.linspace(0.0, self.ramp, RAMP_PARTS + 1) if self.ramp else self.times[:1]
+        return np.unique(np.concatenate([self.times, along]))
+
+    @property
+    def seen(self) -> NDArray[np.float64]:
+        """Return values (m,) or (m, components) between which it has no others: those of the table if it has straight
+        lines and no ramp, and many more else."""
+        straight = self.interpolation == "linear" and not self.ramp
+        return self.values if straight else self.at(np.append(_within(self.breaks).ravel(), self.breaks[-1]))
+
+    @cached_property
+    def _spline(self) -> Any:
+        from scipy.interpolate import CubicSpline
+
+        return CubicSpline(self.times, self.values, bc_type="clamped")
+
+    def _curve(self, times: NDArray) -> NDArray:
+        """Return values without the ramp."""
+        if self.interpolation == "spline" and len(self.times) > 1:
+            return np.asarray(self._spline(np.clip(times, self.times[0], self.times[-1])))
+        columns = self.values.reshape(len(self.times), -1).T
+        found = np.stack([np.interp(times, self.times, column) for column in columns], axis=-1)
+        return found.reshape(len(times), *self.values.shape[1:])
+
+    def _slopes(self, times: NDArray) -> NDArray:
+        """Return time derivatives without the ramp."""
+        if self.interpolation == "spline" and len(self.times) > 1:
+            found = np.asarray(self._spline(times, 1)).T
+            return np.where((times >= self.times[0]) & (times < self.times[-1]), found, 0.0).T
+        lengths = np.diff(self.times).reshape(-1, *(1,) * (self.values.ndim - 1))
+        slopes = np.concatenate([np.diff(self.values, axis=0) / lengths, np.zeros_like(self.values[:1])])
+        return slopes[np.searchsorted(self.times, times, side="right") - 1]
+
+    def _weights(self, times: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the factor of the ramp and its time derivative [1/s], each (n,) or (n, 1) as values are."""
+        s = np.clip(np.asarray(times) / self.ramp, 0.0, 1.0).reshape(-1, *(1,) * (self.values.ndim - 1))
+        return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * (s * (1.0 - s)) ** 2 / self.ramp
+
+
+def fastest(moved: Iterable[tuple[float, Knots]], times: NDArray) -> NDArray[np.float64]:
+    """Return for each of the times (k,) [s] the greatest speed until the next one, and 0 for the last: the sum of the
+    sizes of several rates, each times a factor."""
+    inner = _within(times).ravel()
+    sizes = [factor * np.linalg.norm(one.rates(inner).reshape(len(inner), -1), axis=1) for factor, one in moved]
+    most = sum(sizes, np.zeros(len(inner))).reshape(-1, len(WITHIN)).max(axis=1)
+    return np.append(most, 0.0)
+
+
+def _within(times: NDArray) -> NDArray[np.float64]:
+    """Return times (k - 1, parts) [s] between times (k,) [s]."""
+    return np.asarray(times[:-1, None] + np.diff(times)[:, None] * WITHIN)
+
+
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
+    "rad": {"rad": 1.0, "deg": np.pi / 180.0},
+    "degrees": {"deg": 1.0, "rad": 180.0 / np.pi},
+    "m/s2": {"m/s^2": 1.0, "m/s2": 1.0, "m/s²": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3, "g": 9.80665},
+}
+"""Factors of the units that columns of a file may have, by the unit in which a scene has them."""
+MOST_BYTES = 2**25
+"""Most bytes of a file: half a million to a million lines."""
+Columns = tuple[tuple[str, str], ...]
+"""Names of columns, and the unit in which a scene has each."""
+
+
+def values_in_file(file: str, columns: Columns, needed: bool) -> tuple[NDArray, dict[str, NDArray]]:
+    """Return the times (k,) [s] of a CSV file and its columns, each (k,), in the units of a scene.
+
+    Raises `InputError`, a sentence that names the file and the column, and says what was found and what was wanted.
+
+    Args:
+        file: with a line of names with units, such as ``time [s],x [mm],rotation [deg]``, and lines of numbers at times
+            that increase.
+        columns: those that it may have beside the time.
+        needed: whether it must have all of them, not just one.
+    """
+    try:
+        stat = regular_file(file, MOST_BYTES)
+    except OSError as problem:
+        raise InputError(f"{file} cannot be read: {reason(problem)}.") from None
+    return _values(file, columns, needed, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=8)
+def _values(file: str, columns: Columns, needed: bool, changed: int, size: int) -> tuple[NDArray, dict[str, NDArray]]:
+    """Read a version of a file, which is known by the time of its last change and its size, once."""
+    known, found = dict((("time", "s"), *columns)), dict[str, NDArray]()
+    listed = ", ".join(f"{name} [{next(iter(UNITS[unit]))}]" for name, unit in known.items())
+    for head, values in read_columns(file).items():
+        name, unit = name_and_unit(head)
+        if name not in known:
+            raise InputError(f"{file} has the column {head!r}, but its columns must be among {listed}.")
+        if name in found:
+            raise InputError(f"{file} has two columns {name!r}, but must have each of them once.")
+        units = UNITS[known[name]]
+        if unit is None or unit not in units:
+            has = f"{head!r} without a unit in brackets" if unit is None else f"{name!r} in {shown(Words(unit))}"
+            raise InputError(f"{file} has the column {has}, but must have it in one of {', '.join(units)}: {listed}.")
+        wrong = np.flatnonzero(~(np.abs(values) <= GREATEST))
+        if len(wrong):
+            raise InputError(f"{file} has no number of finite size in column {head!r}, line {wrong[0] + 2}.")
+        found[name] = values * units[unit]
+        found[name].flags.writeable = False
+    missing = [name for name in known if name not in found]
+    if "time" in missing or len(found) < 2 or (needed and missing):
+        what = f"all of {listed}" if needed else f"time [s] and one or more of {listed.partition(', ')[2]}"
+        raise InputError(f"{file} has no column {missing[0]!r}, but must have {what}.")
+    times = found.pop("time")
+    later = np.flatnonzero(np.diff(times, prepend=np.nextafter(min(0.0, times[0]), -1.0)) <= 0.0)
+    if len(later) or times[0] < 0.0 or len(times) < 2:
+        row = int(later[0]) if len(later) else 0
+        has = f"the time {times[row]:g} s in line {row + 2}" if len(later) or times[0] < 0.0 else "one line of numbers"
+        wanted = "times from 0 on, each greater than the one before, at least two of them"
+        raise InputError(f"{file} has {has}, but must have {wanted}.")
+    return times, found
+
+
+WAYS = {2: ("x", "y", "rotation"), 3: ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")}
+"""Names of a body's ways to move, by the dimension of the scene: first those of its middle, then its turns."""
+
+
+def path_columns(dimension: int) -> Columns:
+    """Return the columns that a file with the path of a solid may have."""
+    return tuple((way, "m" if k < dimension else "rad") for k, way in enumerate(WAYS[dimension]))
+
+
+Rows = NDArray[np.float64]
+
+
+def path_of(solid: Any, dimension: int) -> tuple[Rows, Rows | None, Rows | None] | None:
+    """Return the times (k,) [s] of a solid's path, its displacements (k, d) [m] and rotations (k, 1) or (k, 3) [rad]
+    since the first of them; None for a solid without a path. Raises `InputError` for a file that cannot be used."""
+    if solid.path is None:
+        if solid.times is None:
+            return None
+        return np.array(solid.times), _since_first(solid.positions), _since_first(solid.rotations)
+    times, found = values_in_file(solid.path, path_columns(dimension), False)
+    names = [name for name, _ in path_columns(dimension)]
+    shifts, turns = (_stacked(found, some, len(times)) for some in (names[:dimension], names[dimension:]))
+    if turns is not None and np.count_nonzero(turns.any(axis=0)) > 1 and turns[0].any():
+        raise InputError(f"{solid.path} begins with a rotation of {turns[0].tolist()} rad, but must begin with 0.")
+    return times, _since_first(shifts), _since_first(turns)
+
+
+def _since_first(rows: Any) -> Rows | None:
+    return None if rows is None else np.array(rows, dtype=np.float64) - rows[0]
+
+
+def _stacked(found: Mapping[str, NDArray], names: Sequence[str], count: int) -> Rows | None:
+    """Return columns by name as rows (count, names), 0 for those that are not there; None where none is."""
+    if found.keys().isdisjoint(names):
+        return None
+    return np.stack([found.get(name, np.zeros(count)) for name in names], axis=1)
+
+
+def check_motion(solid: Any, dimension: int, path: FieldPath) -> None:
+    """Raise a `field_error` where the keys of a motion do not fit together."""
+    rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
+    given = [name for name in ("path", "times", *rows, *steady, "ramp") if getattr(solid, name) is not None]
+    if solid.interpolation != "linear":
+        given.append("interpolation")
+    for name in ("density", "mass", "centre_of_mass", "gyration_radius", "freedom"):
+        if (value := getattr(solid, name)) is not None and solid.motion != "free":
+            has = "can be held" if name == "freedom" else "has a mass"
+            raise field_error((*path, name), value, f'left out, as only a body whose motion is "free" {has}')
+    if solid.motion == "fixed":
+        if given:
+            raise field_error((*path, given[0]), Words("given"), 'left out, as motion is "fixed"')
+        return
+    if solid.motion == "free":
+        _check_free(solid, given, path)
+        _check_freedom(solid, dimension, path)
+        return
+    if solid.path is not None:
+        _check_file(solid, dimension, path)
+        refused, reason = ["times", *rows, *steady], "the file of its path says where it is"
+    elif solid.times is None:
+        if wrong := [name for name in rows if name in given]:
+            raise field_error((*path, "times"), MISSING, f"a list of times, as there are {wrong[0]}")
+        if not set(steady) & set(given):
+            raise field_error((*path, "velocity"), MISSING, 'given, or times with positions, as motion is "path"')
+        refused, reason = ["ramp", "interpolation"], "there are no times, and no file of its path"
+    elif not set(rows) & set(given):
+        raise field_error((*path, "positions"), MISSING, "given, or rotations, as there are times")
+    else:
+        _check_knots(solid, dimension, path)
+        refused, reason = [*steady], "there are times"
+    if wrong := [name for name in refused if name in given]:
+        raise field_error((*path, wrong[0]), Words("given"), f"left out, as {reason}")
+
+
+def _check_file(solid: Any, dimension: int, path: FieldPath) -> None:
+    try:
+        path_of(solid, dimension)
+    except InputError as error:
+        raise field_error((*path, "path"), solid.path, "the file of a path", f"cannot be used: {error}") from None
+
+
+def _check_free(solid: Any, given: Sequence[str], path: FieldPath) -> None:
+    """Check the mass of a free body, and that nothing tells it where to go."""
+    if solid.mass is None and solid.density is None:
+        raise field_error((*path, "density"), MISSING, 'a density in kg/m3, or a mass, as motion is "free"')
+    if None not in (solid.mass, solid.density):
+        raise field_error((*path, "mass"), solid.mass, "left out, as there is a density")
+    if solid.centre_of_mass is not None and solid.gyration_radius is None:
+        raise field_error((*path, "gyration_radius"), MISSING, "given, as there is a centre of mass")
+    for name in (*given, "surface_velocity"):
+        if name not in ("velocity", "angular_velocity") and getattr(solid, name) is not None:
+            raise field_error((*path, name), Words("given"), 'left out, as motion is "free"')
+    if solid.side == "inside":
+        raise field_error((*path, "side"), solid.side, '"outside", as motion is "free"')
+    if solid.slip == "no":
+        raise field_error((*path, "slip"), solid.slip, '"free", as fluid does not rub bodies that are free')
+
+
+def _check_freedom(solid: Any, dimension: int, path: FieldPath) -> None:
+    """Check how a free body is held, and that it begins to move in ways that are free."""
+    if solid.freedom is None:
+        return
+    ways, found = WAYS[dimension], Words(f"a list of {', '.join(map(repr, solid.freedom)) or 'nothing'}")
+    if not solid.freedom or len({*solid.freedom}) < len(solid.freedom) or not {*solid.freedom} <= {*ways}:
+        raise field_error((*path, "freedom"), found, f"some of {shown(list(ways))}, each once")
+    for name, own in (("velocity", ways[:dimension]), ("angular_velocity", ways[dimension:])):
+        for way, value in zip(own, getattr(solid, name) or (), strict=False):
+            if value != 0.0 and way not in solid.freedom:
+                raise field_error((*path, name), getattr(solid, name), f"0 where the body is held, in {way!r}")
+
+
+def _check_knots(solid: Any, dimension: int, path: FieldPath) -> None:
+    times: Sequence[float] = solid.times or ()
+    if len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
+        raise field_error((*path, "times"), times, "at least two times, from 0 on, each greater than the one before")
+    for name, size in (("positions", dimension), ("rotations", 2 * dimension - 3)):
+        values = getattr(solid, name)
+        if values is None:
+            continue
+        if len(values) != len(times):
+            raise field_error((*path, name), Words(f"a list of {len(values)}"), f"a list of {len(times)}, as are times")
+        for index, row in enumerate(values):
+            if len(row) != size:
+                wanted = "one number in 2-D" if size == 1 else f"a list of {size} components"
+                raise field_error((*path, name, index), row, wanted)
+    if solid.positions is not None and np.abs(np.subtract(solid.positions[0], solid.middle())).max() > 1e-9:
+        wanted = f"{shown([float(f'{x:.9g}') for x in solid.middle()])}, where its middle is at the start"
+        raise field_error((*path, "positions", 0), solid.positions[0], wanted)
+    if solid.rotations is not None and any(solid.rotations[0]):
+        raise field_error((*path, "rotations", 0), solid.rotations[0], "0, as it is not turned yet")
