@@ -47,6 +47,7 @@ LINKS = {
     "emitter": ("[table](#a-jet-emitter)", "An opening out of which fluid comes; its particles come after all others."),
     "container": ("[table](#walls-container)", "What holds the fluid."),
     "solid": ("[tables](#solids-solid)", "What fluid flows around or is held by, besides the container."),
+    "hinge": ("[tables](#hinges-hinge)", "Hinges, about which free bodies turn."),
     "mixture": ("[table](#fluids-that-mix-mixture)", "How phases mix."),
     "forces": ("[table](#forces-forces)", "Which forces act."),
     "force": ("[tables](#forces-of-packages-force)", "Forces of installed packages, which act besides."),
@@ -312,6 +313,19 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         "package registers one. Their parameters, such as `drag.k`, are differentiated and searched for as others are; "
         "two forces of one kind need names of their own.",
         (),
+    ),
+    (
+        "## Hinges: `[[hinge]]`",
+        'About them bodies with `motion = "free"` turn ([bodies that are held](solids.md#bodies-that-float)).',
+        (
+            (
+                "HingeTable",
+                "",
+                '[[solid]]\nname = "flap"\nshape = "box"\nlower = [0.7, 0.1, 0.1]\nupper = [0.8, 0.6, 0.4]\n'
+                'motion = "free"\ndensity = 300.0\n\n[[hinge]]\nname = "pin"\nsolid = "flap"\n'
+                "position = [0.75, 0.15, 0.25]\naxis = [0.0, 0.0, 1.0]",
+            ),
+        ),
     ),
     (
         "## Time steps: `[solver]`",

@@ -15,6 +15,7 @@ from cortado.discretise.solid import Solid
 from cortado.errors import InputError, Words, shown
 from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
+from cortado.scene.links import check_hinges
 from cortado.scene.model import MixtureTable, SceneTables
 from cortado.scene.motions import free
 from cortado.scene.parameters import BY_NAME
@@ -189,6 +190,7 @@ def check_scene(scene: SceneTables) -> None:
         _check_near(("solid", index), solid.body().extent(), spacing)
     for index, solid in enumerate(scene.solid):
         check_solid(("solid", index), solid, spacing)
+    check_hinges(scene.hinge, scene.solid, scene.dimension)
     check_free(scene)
     _check_sensors(scene)
     for index, fluid in enumerate(scene.fluid):

@@ -1,12 +1,41 @@
-"""How free bodies are held: which ways they may go and turn."""
+"""How free bodies are held: which ways they may go and turn, and on which hinges."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Annotated, Any, Self
 
+import numpy as np
+
+from cortado.arrays import unit
+from cortado.errors import Words, shown
 from cortado.scene.courses import WAYS
 from cortado.scene.solids import SolidTable
+from cortado.scene.tables import FieldPath, Length, Table, Text, Vector, field_error, quantity
 
 Three = tuple[float, float, float]
+
+
+class HingeTable(Table):
+    """A hinge, about which a free body turns: one point of the body stays where it is."""
+
+    name: Text
+    """Name of the hinge."""
+    solid: Text
+    """Name of the body."""
+    position: Vector[Length]
+    """(d,) Where the hinge is [m]."""
+    axis: tuple[Annotated[float, quantity()], ...] | None = None
+    """(3,) Direction of its axis in 3-D, of any length; left out, the body turns about it in every way. In 2-D there is
+    none."""
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        if self.axis is not None:
+            if dimension == 2:
+                raise field_error((*path, "axis"), self.axis, "left out in 2-D, where bodies turn about z")
+            self.check_components(("axis",), dimension, path)
+            if not any(self.axis):
+                raise field_error((*path, "axis"), self.axis, "a vector that is not 0")
+        return super().in_dimension(dimension, path)
 
 
 @dataclass(frozen=True)
@@ -23,8 +52,13 @@ class Hold:
     """From its centre of mass to its hinge, in its own frame [m]; 0 without a hinge."""
 
     @classmethod
-    def of(cls, table: SolidTable, dimension: int) -> Self:
-        """Return how the table of a free body holds it."""
+    def of(cls, table: SolidTable, dimension: int, hinges: Sequence[HingeTable] = ()) -> Self:
+        """Return how the table of a free body, or its hinge among others, holds it."""
+        for hinge in hinges:
+            if hinge.solid == table.name:
+                arm = (np.array(hinge.position) - table.middle()) @ table.turn(dimension)
+                axis = np.zeros(3) if hinge.axis is None else unit(np.array(hinge.axis))
+                return cls((0.0, 0.0, 0.0), 3 if hinge.axis is None else 1, _three(axis), _three(arm))
         if table.freedom is None:
             return cls()
         free = [float(way in table.freedom) for way in WAYS[dimension]]
@@ -32,3 +66,32 @@ class Hold:
         turning = sum(map(int, turns))
         marked = [abs(turn - float(turning == 2)) for turn in turns]
         return cls((x, y, z), turning, (marked[0], marked[1], marked[2]))
+
+
+def _three(vector: Any) -> Three:
+    """Return a vector (d,) as three numbers."""
+    x, y, z = (*map(float, vector), 0.0)[:3]
+    return x, y, z
+
+
+def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dimension: int) -> None:
+    """Check that hinges are of free bodies, one of each, which nothing else holds and which begin to turn about it."""
+    free = [solid.name for solid in solids if solid.motion == "free"]
+    for index, hinge in enumerate(hinges):
+        path = ("hinge", index)
+        if hinge.solid not in free:
+            wanted = f"the name of a free body, of {shown(free)}" if free else 'of a solid whose motion is "free"'
+            raise field_error((*path, "solid"), hinge.solid, wanted)
+        if hinge.solid in [other.solid for other in hinges[:index]]:
+            raise field_error((*path, "solid"), hinge.solid, "another one, as this one is on a hinge already")
+        number = next(k for k, solid in enumerate(solids) if solid.name == hinge.solid)
+        solid = solids[number]
+        for key in ("freedom", "velocity"):
+            if getattr(solid, key) is not None:
+                wanted = f"left out, as the solid is on the hinge {hinge.name!r}"
+                raise field_error(("solid", number, key), Words("given"), wanted)
+        if hinge.axis is not None and solid.angular_velocity is not None:
+            across = np.cross(unit(np.array(hinge.axis)), solid.angular_velocity)
+            if np.abs(across).max() > 1e-9 * np.abs(solid.angular_velocity).max():
+                wanted = f"along the axis of the hinge {hinge.name!r}, {shown(hinge.axis)}"
+                raise field_error(("solid", number, "angular_velocity"), solid.angular_velocity, wanted)

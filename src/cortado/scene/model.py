@@ -14,6 +14,7 @@ from cortado.discretise.shapes import Points
 from cortado.scene.appearance import LIQUIDS, Coloured, Picture, Render
 from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.fluids import AnyFluid, turned
+from cortado.scene.links import HingeTable
 from cortado.scene.motions import Schedule
 from cortado.scene.packages import AnyForces
 from cortado.scene.parameters import PARAMETERS
@@ -247,6 +248,8 @@ class SceneTables(Table):
     """What holds the fluid."""
     solid: tuple[AnySolid, ...] = ()
     """Solids, which fluid flows around or is held by, besides the container."""
+    hinge: tuple[HingeTable, ...] = ()
+    """Hinges, about which free bodies turn."""
     mixture: MixtureTable = MixtureTable()
     """How phases mix; the default if there is only one."""
     forces: Forces = Field(default=Forces(), validate_default=True)
@@ -321,7 +324,7 @@ class SceneTables(Table):
         given = table is not None and "dimension" in info.data
         return table.in_dimension(info.data["dimension"]) if given else table
 
-    @field_validator("sensor", "solid")
+    @field_validator("sensor", "solid", "hinge")
     @classmethod
     def _resolve_named(cls, tables: Any, info: ValidationInfo) -> Any:
         for index, table in enumerate(tables):

@@ -345,13 +345,12 @@ def _parts(
 
 def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch, layout: Layout) -> FreeSolids | None:
     """Make the part that moves free bodies with the fluid; None for a scene without free bodies."""
-    d = scene.dimension
-    cell = scene.discretisation.spacing**d
-    tables = [
-        FreeTable(table.name, number, weight_name(table), mass_of_one(table).in_volumes(cell), Hold.of(table, d))
-        for number, table in enumerate(moving(scene.solid))
-        if table.motion == "free"
-    ]
+    cell = scene.discretisation.spacing**scene.dimension
+    tables = []
+    for number, table in enumerate(moving(scene.solid)):
+        if table.motion == "free":
+            mass, hold = mass_of_one(table).in_volumes(cell), Hold.of(table, scene.dimension, scene.hinge)
+            tables.append(FreeTable(table.name, number, weight_name(table), mass, hold))
     if not tables:
         return None
     spacing, touching, periods = scene.discretisation.spacing, _touching(scene, discrete), discrete.periods
