@@ -325,12 +325,10 @@ class Projection:
             both = (h * k)[:, None] + (h * k)[None, :]
             return sum((np.einsum("ij,ija->ia", both, image) for _, image in images), np.zeros((n, d)))
 
-        def from_fluid(k):
-            pull = k[:, None, None] * L
-            return np.einsum("iab,ijb->ia", pull, g) + np.einsum("jab,ijb->ia", pull, g)
-
         def force(k):
-            return from_fluid(k) + k[:, None] * gamma + lift(k)
+            pull = k[:, None, None] * L
+            from_fluid = np.einsum("iab,ijb->ia", pull, g) + np.einsum("jab,ijb->ia", pull, g)
+            return from_fluid + k[:, None] * gamma + lift(k)
 
         def divergence(v):
             apart = v[:, None] - v[None, :]
@@ -342,11 +340,7 @@ class Projection:
         share = between(H + 2 * nu, 0.7, 0.95)
         if (share > 0).all():
             tension = np.ones(n)
-        correct = (
-            self.coarse(x, m, from_fluid(share) + share[:, None] * walled, L, g, share, yielding)
-            if self.nodes
-            else None
-        )
+        correct = self.coarse(x, m, force(share), L, g, share, h, yielding) if self.nodes else None
         wanted = (1 - full) * np.maximum(1 - density, 0) / dt
         far = dt * np.linalg.norm(before[1], axis=1) > 0.1 * self.spacing
         taken = np.where(far & ((before[1] * walled).sum(1) > 0), 0, full)
@@ -388,7 +382,7 @@ class Projection:
         share = between(H + 2 * nu, 0.7, 0.95)
         return now, v, (k, kick), np.sqrt((share * missed**2).sum() / share.sum())
 
-    def coarse(self, x, m, push, L, g, c, yielding):
+    def coarse(self, x, m, push, L, g, c, h, yielding):
         """The function that gives the coarse pressure of a residual, from hat functions written out node by node."""
         (first, frequency, counts), (n, d) = self.nodes, x.shape
         shape = counts.astype(int)
@@ -403,7 +397,9 @@ class Projection:
             for axis in range(d):
                 others = np.delete(weight, axis, 1).prod(1)
                 slope[np.arange(n), node, axis] += sign[axis] * others
-        moment = np.einsum("j,jab,ijb,ijk->iak", c, L, g, -self.pairs(x, x)[0])
+        apart = self.pairs(x, x)[0]
+        moment = np.einsum("j,jab,ijb,ijk->iak", c, L, g, -apart)
+        moment += sum(np.einsum("j,ija,ijk->iak", h * c, image, -apart) for *_, image, _ in self.images(x))
         q = np.einsum("iab,iIb->iIa", moment, slope) + phi[:, :, None] * push[:, None, :]
         A = np.einsum("iIa,iJa,i->IJ", q, q, 1 / m) + np.diag(touched)
         A += (phi.T * c) @ yielding @ (phi.T * c).T

@@ -25,7 +25,7 @@ UNNAMED = {
     },
     "sph.viscous_stress": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
     "solvers.projection.effects": {f"image_sums.{name}_back" for name in ("lift", "mirror_walls", "behind")},
-    "solvers.projection.coarse_levels": {"coarse_sums.push_back"},
+    "solvers.projection.coarse_push": {"coarse_sums.push_back", "coarse_image_sums.push_back"},
     "solvers.projection.sums": {
         *("projection_sums.moments_back", "projection_sums.force_back"),
         *("projection_sums.divergence_back", "projection_sums.velocity_gradient_back", "projection_sums.push_back"),

@@ -78,6 +78,19 @@ def test_a_step_is_that_of_the_twin(case):
     assert (k > 0.0).any() and (k < 0.0).any()
 
 
+@pytest.mark.parametrize(("deep", "wide"), [(50, [5.0]), (100, [10.0]), (25, [5.0, 5.0])])
+def test_a_first_step_has_the_pressure_of_a_narrow_tank(deep, wide):
+    """Where the coarse push had wall particles in place of images, the first pressures were 8, 11 and 9 % off."""
+    s, size = 1.0 / deep, np.array([wide[0], deep, *wide[1:]]) / deep
+    lower, upper, room = np.zeros_like(size).tolist(), size.tolist(), (size + np.eye(len(size))[1]).tolist()
+    tables = {"fluid": [box(lower, upper, phase="water")], "container": box(lower, room)}
+    solver, make = {**SOLVER, "time_step": 0.1 * s}, plane if len(wide) == 1 else scene
+    made = make(discretisation={"spacing": s}, forces={"gravity": [0.0, -9.81, *lower[2:]]}, solver=solver, **tables)
+    state = Simulation(made).run(1).last_state.fields
+    missed = state["pressure_impulse"] / (0.1 * s) / 9810.0 - (1.0 - state["positions"][:, 1])
+    assert np.sqrt((missed**2).mean()) < 0.02
+
+
 def test_water_that_is_shut_in_stays():
     """Without a coarse grid the pressure has come half way in ten steps; where walls let no tension through, the level
     of the pressure is found late, and 0.17 of the fall is left in four."""
@@ -139,10 +152,10 @@ def test_more_images_than_have_numbers_are_refused(monkeypatch):
 @pytest.mark.filterwarnings("ignore:solver.time_step is")
 def test_a_divergence_that_is_left_is_told():
     """In steps that are nearly twice as long as they may be."""
-    with pytest.warns(CortadoWarning, match=r"a divergence of 0\.1 in step 5, .* and more than 0\.015 in 11 of 12"):
+    with pytest.warns(CortadoWarning, match=r"a divergence of 0\.12 in step 9, .* and more than 0\.015 in 11 of 12"):
         run = Simulation(resting(time_step=0.035), precision="float64").run(12)
     told = divergence_sentence(run.diagnostics, run.scene)
-    assert told is not None and run.diagnostics["divergence"].argmax() == 4
+    assert told is not None and run.diagnostics["divergence"].argmax() == 8
     told = divergence_sentence({"divergence": np.array([[0.0, 0.01], [np.nan, 0.03]])}, run.scene)
     assert "0.03 in step 2 of scene 1, times the step, and more than 0.015 in 1 of 4 steps" in told
     with warnings.catch_warnings():

@@ -54,6 +54,8 @@ OVER_IMAGES = """\
 """
 """The text of a loop over images, see `cortado.particles.pair_sums`."""
 OF_IMAGES = {
+    "direct": "_separation(_x_i, x[_j], s)",
+    "direct_dot": "_x_dot_i - x_dot[_j]",
     "swept": "_swept(_one, x[_j], _member, s)",
     "swept_dot": "_swept_dot(_one, x[_j], x_dot[_j], _member, s)",
     "owned": "wp.where(_mirrors_by(_one, solid, s), _real(1.0), _real(0.0))",

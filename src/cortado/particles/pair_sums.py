@@ -14,6 +14,7 @@ is the Warp function ``force(i, x, c, s)`` of particle i, the arrays x and c, an
     mirrored           of a particle of a wall, 1 where the wall mirrors about particle i, or 0; in works of walls
     turn_dot           of a particle of a wall, the tangent of how its solid is turned; in tangents of terms of walls
     swept              of an image, how far a step of its mirror takes it, where solids move; and swept_dot, its tangent
+    direct             of an image, the separation from the particle that it mirrors; and direct_dot, its tangent
     owned              of an image, 1 where it is by the walls of ``solid``, or of all walls, or 0
     s                  the neighbourhood
     any other          what is the same for all neighbours of a particle, and stands between the arrays and s
@@ -197,12 +198,13 @@ def over_fluid(
 
 def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
     """Return the text of a loop over the images of the fluid and of the particle itself, which have their particles'
-    numbers and mirrored vectors."""
+    numbers, mirrored vectors, and matrices that are mirrored from the left."""
 
     def of_j(array: str, kind: Any) -> str:
         of = array.removesuffix("_dot")
-        if kind is d.precision.real:
-            return f"{array}[_j]"
+        if kind is d.precision.real or not _is_vector_of(d.precision.real, kind):
+            turned = "" if kind is d.precision.real else "_R * " if d.moving else "wp.diag(_R) * "
+            return f"{turned}{array}[_j]"
         if of in (array, "") or not d.moving:
             return f"_turned(_R, {array}[_j])"
         return f"_{'image' if of == 'x' else 'turned'}_dot(_one, {of}[_j], {array}[_j], _member, s)"

@@ -10,7 +10,8 @@ namespace cortado {
 // A pair of a particle and an image.
 template <class Scalar, int D>
 struct Image : Pair<Scalar, D> {
-    Vector<Scalar, D> flip;  // what the reflection does to a vector
+    Vector<Scalar, D> flip;    // what the reflection does to a vector
+    Vector<Scalar, D> direct;  // the separation from the particle that it mirrors
 
     Vector<Scalar, D> of(const Vector<Scalar, D>& v) const { return flip.cwiseProduct(v); }
 };
@@ -68,6 +69,7 @@ void each_image(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, co
             image.a = model.smoothing.slope(q);
             image.b = model.smoothing.bend(q);
             image.flip = flip;
+            image.direct = model.period.nearest(x[i] - x[j]);
             body(image);
         };
         for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) visit(pair->other);

@@ -206,11 +206,15 @@ private:
         for (std::size_t i = 0; i < x.size(); ++i) c[i] = effects[i].shared;
         coarse.pushes = Pushes<Scalar, D>(x.size());
         each_particle(x.size(), model.threads, [&](std::size_t i) {
-            coarse.pushes.h[i] = push(model, fluid, c, i) + c[i] * moments[i].gamma;
+            coarse.pushes.h[i] = push(model, fluid, c, i) + walled(model, fluid, x, c, i);
             for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
                 const Matrix<Scalar, D> T = c[pair->other] * effects[pair->other].L;
                 coarse.pushes.N[i] -= T * (model.volume * pair->gradient()) * pair->x.transpose();
             }
+            each_image(model, fluid, x, i, [&](const Image<Scalar, D>& image) {
+                const Scalar pushed = model.volume * effects[image.other].image * c[image.other];
+                coarse.pushes.N[i] -= pushed * image.gradient() * image.direct.transpose();
+            });
         });
         coarse.find(model, x);
     }

@@ -244,8 +244,8 @@ private:
         f_ = pushes_bar_.h;
         pulled(c, c_bar);
         each([&](std::size_t i) {
-            c_bar[i] += at_.moments[i].gamma.dot(f_[i]);
-            moments_bar_[i].gamma += c[i] * f_[i];
+            c_bar[i] += walled(i, c);
+            Real pushed_bar = 0;
             const Matrix<Real, D> &N_bar = pushes_bar_.N[i], T = c[i] * at_.effects[i].L;
             Matrix<Real, D> T_bar = Matrix<Real, D>::Zero();
             each_pair(i, [&](int j, const auto& pair, const Vector<Real, D>& g, Vector<Real, D>& bent) {
@@ -254,6 +254,18 @@ private:
                 bent = -T_j * (N_bar * pair.x) - T * (other * pair.x);
                 x_bar_[i] -= N_bar.transpose() * (T_j * g) + other.transpose() * (T * g);
             });
+            each_image(model_, step_.fluid, state_.x, i, [&](const Image<Real, D>& image) {
+                const int j = image.other;
+                const Real own = at_.effects[i].image * c[i], pushed = at_.effects[j].image * c[j];
+                const Vector<Real, D> g = model_.volume * image.gradient();
+                const Matrix<Real, D> other = image.flip.asDiagonal() * pushes_bar_.N[j];
+                const Vector<Real, D> back = own * (other * image.direct) + pushed * (N_bar * image.direct);
+                x_bar_[i] -= model_.volume * image.hessian_product(back);
+                x_bar_[i] -= pushed * (N_bar.transpose() * g) + own * (other.transpose() * g);
+                pushed_bar -= g.dot(other * image.direct);
+            });
+            effects_bar_[i].image += c[i] * pushed_bar;
+            c_bar[i] += at_.effects[i].image * pushed_bar;
             T_bar = even<Real, D>(T_bar);
             effects_bar_[i].L += c[i] * T_bar;
             effects_bar_[i].shared += c_bar[i] + at_.effects[i].L.cwiseProduct(T_bar).sum();

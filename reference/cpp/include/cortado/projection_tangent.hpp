@@ -90,8 +90,8 @@ Vectors<Real, D> pull_tangent(const Model<Real, D>& model, const Step<Real, D>& 
 
 // Of h and N of the coarse grid.
 template <class Real, int D>
-Pushes<Real, D> pushes_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const Vectors<Real, D>& dx,
-                               const ManyMoments<Real, D>& moments_dot, const ManyEffects<Real, D>& effects_dot) {
+Pushes<Real, D> pushes_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const Vectors<Real, D>& x,
+                               const Vectors<Real, D>& dx, const ManyEffects<Real, D>& effects_dot) {
     const Projection<Real, D>& at = step.projection;
     Values<Real> c(dx.size()), dc(dx.size());
     for (std::size_t i = 0; i < dx.size(); ++i) {
@@ -101,7 +101,15 @@ Pushes<Real, D> pushes_tangent(const Model<Real, D>& model, const Step<Real, D>&
     Pushes<Real, D> dot(dx.size());
     dot.h = pull_tangent(model, step, dx, effects_dot, c, dc);
     each_particle(dx.size(), model.threads, [&](std::size_t i) {
-        dot.h[i] += dc[i] * at.moments[i].gamma + c[i] * moments_dot[i].gamma;
+        dot.h[i] += walled_tangent(model, step, x, dx, effects_dot, c, dc, i);
+        each_image(model, step.fluid, x, i, [&](const Image<Real, D>& image) {
+            const int j = image.other;
+            const Real pushed = model.volume * at.effects[j].image * c[j];
+            const Real pushed_dot = model.volume * (effects_dot[j].image * c[j] + at.effects[j].image * dc[j]);
+            const Vector<Real, D> dg = image.hessian_product(Vector<Real, D>(dx[i] - image.of(dx[j])));
+            const Vector<Real, D> dpush = pushed_dot * image.gradient() + pushed * dg, direct_dot = dx[i] - dx[j];
+            dot.N[i] -= dpush * image.direct.transpose() + pushed * image.gradient() * direct_dot.transpose();
+        });
         for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
             const int j = pair->other;
             const Matrix<Real, D> T = c[j] * at.effects[j].L, dT = dc[j] * at.effects[j].L + c[j] * effects_dot[j].L;
@@ -166,7 +174,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
         }
     };
     Pushes<Real, D> pushes_dot;
-    if (!at.corrections.empty()) pushes_dot = pushes_tangent(model, step, dot.x, moments_dot, effects_dot);
+    if (!at.corrections.empty()) pushes_dot = pushes_tangent(model, step, state.x, dot.x, effects_dot);
     const auto correct = [&](std::size_t k) {
         const Correction<Real, D>& before = at.corrections[k];
         std::vector<CorrectionChange<Real>> change(count);

@@ -19,7 +19,7 @@ from cortado.device.precision import FLOAT32
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
-from cortado.solvers.projection.coarse_levels import Levels, coarse_push_kernels, residual_kernels
+from cortado.solvers.projection.coarse_levels import Levels
 from cortado.solvers.projection.coarse_nodes import node_kernels
 from cortado.solvers.projection.coarse_pressure import (
     CoarseBodies,
@@ -28,6 +28,7 @@ from cortado.solvers.projection.coarse_pressure import (
     coarse_pressure_kernels,
     length_kernels,
 )
+from cortado.solvers.projection.coarse_push import coarse_push_kernels, residual_kernels
 from cortado.solvers.projection.faces import FaceShares
 from cortado.solvers.projection.lattice import SPACING
 from cortado.solvers.projection.sums import velocity_kernels
@@ -264,7 +265,10 @@ class CoarseAdjoint:
             self._bodies.add_source(context, every, new["e"], self._multiplier)
         context.launch(own.residual.adjoint, steps, found, at, *known)
 
-    def finish(self, context: StepContext, known: tuple[Named, ...]) -> None:
-        """Turn the adjoints of the coarse push h and N into those of particles and their surroundings."""
+    def finish(self, context: StepContext, known: tuple[Named, ...], share: wp.array) -> None:
+        """Turn the adjoints of the coarse push h and N into those of particles and their surroundings, given their
+        ``share`` c of a coarse pressure."""
         for kernel in self._coarse.push.adjoint:
             context.launch(kernel, *known, self._bars, self._coarse.pushed)
+        given = {"u": self._bars["h_bar"], "slope": self._bars["N_bar"]}
+        self._faces.add(context, self._bar, *known, given, spread=share)

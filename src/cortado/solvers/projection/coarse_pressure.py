@@ -1,6 +1,6 @@
 """A pressure on a coarse grid of hat functions phi_I, one at each node of a `CellSort`'s grid.
 
-With the share c of each particle, and N and h of `cortado.solvers.projection.coarse_levels`,
+With the share c of each particle, and N and h of `cortado.solvers.projection.coarse_push`,
 
     q_iI = N_i grad phi_I(x_i) + phi_I(x_i) h_i        what the coarse pressure phi_I c pushes particle i with,
     A_IJ = sum_i (q_iI . q_iJ + (eps + h_i^2 / 100) delta_IJ) / m_i    over the particles of the cells around I and J,

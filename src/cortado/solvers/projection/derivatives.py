@@ -263,7 +263,7 @@ class ProjectionAdjoint(ParticleAdjoint):
             self._press(context, known, solver.iterates[k + 1], self._y_bar)
             self._back(context, known, solver.corrected[k], solver.momentum(k), moves=k == iterations - 1)
             solver.coarse.where_due(k, partial(self._correct, context, known, k))
-        self._coarse.finish(context, known)
+        self._coarse.finish(context, known, solver.around["coarse"])
 
     def _correct(self, context: StepContext, known: tuple[Named, ...], k: int) -> None:
         """Apply the adjoint of the coarse correction before iteration ``k``, to the adjoints of its pressure and

@@ -2,11 +2,11 @@
 
 In reverse mode a sum over images is a work that is linear in adjoints,
 
-    W = sum V ((b_i + h_i c_i) W_i' + h_i d_i (u_i - R u_j) . g_i' + e_i swept . g_i' / dt
+    W = sum V ((b_i + h_i c_i) W_i' + h_i d_i (u_i - R (u_j + B_j x_ij)) . g_i' + e_i swept . g_i' / dt
                - 1/2 h_i k_i (q_i + q_j) x_i' . g_i'),
 
-as the lift is the transpose of the spread. Warp makes its gradients by the poses of the solid before and after the
-step. Those by positions stand elsewhere, but for what e gives.
+as the lift is the transpose of the spread. The slope B is that of the push by a coarse pressure. Warp makes gradients
+of W by the poses of the solid before and after the step. Those by positions stand elsewhere, but for what e gives.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ from cortado.particles.wall_terms import ALL_WALLS, share_kinds
 from cortado.sph.parts import Adjoints, StepContext
 
 NUMBERS = ("image", "density", "weighted", "spread", "swept", "k", "q")
-"""h, b, c, d, e, k and q."""
+"""h, b, c, d, e, k and q; B is the ``slope``."""
 
 
 @cache
@@ -35,9 +35,10 @@ def face_share_kernel(discretisation: Discretisation) -> Any:
     precision = d.precision
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     pair, neighbourhood, turning = pair_functions(d), neighbourhood_type(precision), turn_functions(precision)[0]
-    weight, gradient, neighbour, mirrors_by = pair.weight, pair.gradient, pair.neighbour, pair.mirrors_by
+    weight, gradient, separation = pair.weight, pair.gradient, pair.separation
+    neighbour, mirrors_by = pair.neighbour, pair.mirrors_by
     module = replace(d, taped=False).module(False, "projection_faces")
-    seen = bundle(x=vector, u=vector, **dict.fromkeys(NUMBERS, real))
+    seen = bundle(x=vector, u=vector, slope=matrix, **dict.fromkeys(NUMBERS, real))
     bars = bundle(x=vector, time_step=real, **share_kinds(precision))
     REFLECTIONS, FIRST = wp.constant(reflections(d.moving)), wp.constant(FACES)
 
@@ -83,9 +84,9 @@ def face_share_kernel(discretisation: Discretisation) -> Any:
             j, f = image // REFLECTIONS, image % REFLECTIONS - FIRST
             if mirrors_by(f + FIRST, solid, s):
                 x_j, e_j, place, normal = at.x[j], per * at.swept[j], s.face_places[f], s.face_frames[f][0]
-                pushed = h * at.k[i] * (at.q[i] + at.q[j])
+                pushed, u_j = h * at.k[i] * (at.q[i] + at.q[j]), at.u[j] + at.slope[j] * separation(x_i, x_j, s)
                 _i, _j, _u, _v, _a, _b, _d, by_c, by_R, by_scale, _p, _m, _ = wp.grad(work)(
-                    x_i, x_j, u_i, at.u[j], near, spread, pushed, c, R, scale, place, normal, s
+                    x_i, x_j, u_i, u_j, near, spread, pushed, c, R, scale, place, normal, s
                 )
                 by_x, _j, along_c, along_R, by_c_0, by_R_0, along_scale, _p, _m, _ = wp.grad(sweep)(
                     x_i, x_j, c, R, c_0, R_0, scale, place, normal, s
@@ -132,8 +133,8 @@ class FaceShares:
     def __init__(self, discretisation: Discretisation, layout: Layout, faces: int):
         """Prepare the adjoint of images in so many ``faces``; without any, nothing is added."""
         self._kernel, self._faces = partial(face_share_kernel, discretisation), faces
-        own = dict.fromkeys(NUMBERS, layout.precision.real)
-        self._nothing = layout.arrays(u=layout.precision.vector, **own) if faces else {}
+        own = {"u": layout.precision.vector, "slope": matrix_of(layout.precision)}
+        self._nothing = layout.arrays(**own, **dict.fromkeys(NUMBERS, layout.precision.real)) if faces else {}
 
     def add(
         self, context: StepContext, bar: Adjoints, *groups: Named, over: int = ALL_WALLS, **arrays: wp.array

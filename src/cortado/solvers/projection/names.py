@@ -23,7 +23,7 @@ def types_by_name(precision: Precision, more: Mapping[Any, str] | None = None) -
     common = {
         neighbourhood_type(precision): "s",
         precision.vector: "x v u g f h gamma beside mirror normal whole crowd apart arm kick thrust delta foot turn "
-        "total lifted row diagonal others",
+        "total lifted row lift direct diagonal others",
         matrix_type(precision): "A L M N Q",
         symmetric(precision).kind: "S T",
         weights_type(precision): "weights",
