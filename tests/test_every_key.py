@@ -35,6 +35,12 @@ SENSORS = [
     {"name": "c", "kind": "flow_rate", "position": [0.3, 0.15], "normal": [1.0, 1.0], "reach": 0.1},
     {"name": "d", "kind": "wall_force", "lower": [0.28, -0.3], "upper": [0.4, 0.3], "about": [0.1, 0.1]},
 ]
+ON_THE_ROD = [
+    {"name": "e", "kind": "solid_load", "solid": "rod", "axes": "body"},
+    {"name": "f", "kind": "pressure_probe", "position": [0.5, 0.28], "radius": 0.12, "on": "rod"},
+    {"name": "g", "kind": "wave_gauge", "position": [0.5, 0.28], "on": "rod", "axes": "body"},
+    {"name": "h", "kind": "wall_force", "lower": [0.3, 0.1], "upper": [0.7, 0.5], "on": "rod", "axes": "body"},
+]
 PICTURE = {"width": 80, "height": 64, "background": [0.2, 0.3, 0.4], "film_frames": 7, "film_speed": 0.5}
 SPACE = {"width": 64, "height": 64, "camera": [0.9, 0.7, 0.9], "look_at": [0.1, 0.1, 0.1], "transparency": 0.5}
 ABOUT = {"gravity": {"times": [0.0, 1.0], "values": [[0.1, -9.0], [2.0, -9.0]]}}
@@ -125,7 +131,7 @@ BASES = {
         container={**ROOM, "upper": [1.6, 0.8], "colour": [0.3, 0.2, 0.1]},
         solid=IN_THE_PLANE,
         hinge=[{"name": "pin", "solid": "keel", "position": [1.1, 0.66]}],
-        sensor=[{"name": "e", "kind": "solid_load", "solid": "rod"}],
+        sensor=ON_THE_ROD,
         picture={"width": 80, "height": 64},
     ),
     "solids": lambda: scene(

@@ -5,13 +5,14 @@ They are NumPy in float64, on the host. In a run `cortado.runs.step_sums` comput
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import grid, in_space
+from cortado.runs.riding import Carrier, Ride
 from cortado.runs.sensor import Cut, Reading, SensedScene, Sensor
 
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}
@@ -53,6 +54,14 @@ class Around:
     across: Across
     parts: NDArray[Any] | None = None
     """(m, d) places of the parts of a particle from it [m], which weigh the same; None for one point."""
+
+    def carried(self, carrier: Carrier, turns: bool) -> "Around":
+        """Return the view where a solid has carried its place to, and its axes and parts where it ``turns``."""
+        place, turn = carrier.place(self.place), carrier.flat
+        if not turns:
+            return replace(self, place=place)
+        parts = None if self.parts is None else self.parts @ turn.T
+        return replace(self, place=place, across=lambda way: self.across(way @ turn), parts=parts)
 
     def shifts(self) -> NDArray[Any]:
         """Return the ways (m, k) from a particle to its parts, as they are seen."""
@@ -190,13 +199,20 @@ class WeightedSum:
     around: Around
     quantity: str | None = None
     along: NDArray[Any] | None = None
+    ride: Ride | None = None
+    """Solid that carries the place, which is that of the scene as it begins."""
 
     def on_host(self, at: Reading) -> NDArray[Any]:
-        weights, found = Seen.of(at, self.around).weights, np.zeros(6)
+        weights, found = self.seen(at).weights, np.zeros(6)
         found[0] = weights.sum()
         if self.quantity is not None or self.along is not None:
             found[1] = (weights * self.values(at)).sum()
         return found
+
+    def seen(self, at: Reading) -> Seen:
+        """Find the particles around the place."""
+        ride, around = self.ride, self.around
+        return Seen.of(at, around if ride is None else around.carried(ride.carrier(at), ride.turns))
 
     def values(self, at: Reading) -> NDArray[Any]:
         """Return q (n,)."""
@@ -212,6 +228,9 @@ class RegionSum:
     upper: NDArray[Any]
     about: NDArray[Any]
     quantity: str = "wall_force"
+    ride: Ride | None = None
+    """Solid that carries the region and the point: arms and forces are then along the axes of the scene as it begins,
+    turned with the solid."""
 
     def on_host(self, at: Reading) -> NDArray[Any]:
         arms, force = map(in_space, self.chosen(at))
@@ -219,6 +238,12 @@ class RegionSum:
 
     def chosen(self, at: Reading) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the arms (n, d) of the particles, and their forces, 0 outside of the region."""
+        if self.ride is not None:
+            carrier, force = self.ride.carrier(at), at["wall_force"]
+            arms = (at["positions"] - carrier.place(self.about)) @ carrier.flat
+            places = self.about + arms
+            inside = np.all((places >= self.lower) & (places < self.upper), axis=1)
+            return arms, np.where(inside[:, None], force @ carrier.flat, 0.0)
         places, inside = at.lattice.domain.within(at["positions"], self.lower, self.upper)
         return places - self.about, np.where(inside[:, None], at["wall_force"], 0.0)
 
@@ -232,6 +257,18 @@ class LoadSum:
     def on_host(self, at: Reading) -> NDArray[Any]:
         load, d = at[self.quantity], at.dimension
         return np.concatenate([in_space(load[:d]), load[d:] if d == 3 else np.pad(load[d:], (2, 0))])
+
+
+def load_bars(bar: NDArray[Any], dimension: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return derivatives by the three components each of a force and a torque, from those by what a scene has."""
+    if dimension == 3:
+        return bar[:3], bar[3:]
+    return in_space(bar[:2]), np.array([0.0, 0.0, bar[2]])
+
+
+def turned(found: NDArray[Any], turn: NDArray[Any]) -> NDArray[Any]:
+    """Return force and torque (6,) turned by a matrix (3, 3)."""
+    return np.asarray((found.reshape(2, 3) @ turn.T).ravel())
 
 
 def in_the_scene(found: NDArray[Any], dimension: int) -> NDArray[Any]:

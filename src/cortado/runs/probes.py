@@ -19,9 +19,13 @@ from cortado.runs.particle_sums import (
     Seen,
     Summed,
     WeightedSum,
+    in_the_scene,
+    load_bars,
     parts_of,
     reach_of,
+    turned,
 )
+from cortado.runs.riding import Axes, Carrier, Ride, axes_of, named, ride_of, together
 from cortado.runs.sensor import Cut, Reading, SensedScene, Sensor, corner, direction, in_dimension, point, positive
 from cortado.runs.wave_gauge import WaveGauge
 from cortado.scene.parameters import load_name
@@ -38,11 +42,12 @@ class PressureProbe(Summed):
     Here r_i is a particle's distance from the point. Without fluid within the radius it is 0.
     """
 
-    def __init__(self, position: Any, radius: float | None = None):
+    def __init__(self, position: Any, radius: float | None = None, on: str | None = None):
         """Place the probe at ``position`` (d,) [m]; ``radius`` [m] is the smoothing kernel's support radius if left
-        out."""
+        out. ``on`` names a solid that carries it from there."""
         self.position = point("position", position)
         self.radius = None if radius is None else positive("radius", radius)
+        self.on = named(on)
 
     def columns(self, dimension: int) -> dict[str, str]:
         return {"pressure": "Pa"}
@@ -50,19 +55,23 @@ class PressureProbe(Summed):
     def summed(self, at: SensedScene) -> WeightedSum:
         radius = at.lattice.support if self.radius is None else self.radius
         place = in_dimension("position", self.position, at.dimension)
-        return WeightedSum(Around(place, radius, lambda way: way), "pressure")
+        return WeightedSum(Around(place, radius, lambda way: way), "pressure", ride=ride_of(self.on, False, at))
 
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
         return np.array([found[1] / found[0] if found[0] else 0.0])
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        around, pressure = Seen.of(at, self.summed(at).around), at["pressure"]
+        summed, pressure = self.summed(at), at["pressure"]
+        around = summed.seen(at)
         weights = around.weights
         total = weights.sum()
         if not total:
             return {"positions": np.zeros_like(at["positions"]), "pressure": np.zeros_like(pressure)}
         weights_bar = bar[0] * (pressure - self.value(at)[0]) / total
-        return {"positions": around.pulled(weights_bar), "pressure": bar[0] * weights / total}
+        pulled, bars = around.pulled(weights_bar), {"pressure": bar[0] * weights / total}
+        if summed.ride is not None:
+            bars |= summed.ride.carrier(at).lifted(-pulled.sum(axis=0), self.position)
+        return bars | {"positions": pulled}
 
 
 @fixed
@@ -121,9 +130,12 @@ class WallForce(LoadSensor):
     two walls.
     """
 
-    def __init__(self, lower: Any = None, upper: Any = None, about: Any = None):
+    def __init__(
+        self, lower: Any = None, upper: Any = None, about: Any = None, on: str | None = None, axes: Axes = "world"
+    ):
         """Take corners ``lower``, ``upper`` (d,) of the region [m], which has no end there if left out, and the point
-        ``about`` (d,) of the torque [m], the origin if left out."""
+        ``about`` (d,) of the torque [m], the origin if left out. ``on`` names a solid that carries and turns both;
+        ``axes`` of the "world" or the "body", as it begins, are those of the force and the torque."""
         self.lower, self.upper, self.about = (
             None if values is None else read(what, values)
             for what, values, read in (("lower", lower, corner), ("upper", upper, corner), ("about", about, point))
@@ -133,6 +145,8 @@ class WallForce(LoadSensor):
             raise InputError("lower, upper and about must have as many components as one another.")
         if self.lower is not None and self.upper is not None and not (self.lower < self.upper).all():
             raise InputError(f"upper is {self.upper.tolist()}, but must be greater than lower, {self.lower.tolist()}.")
+        self.on = named(on)
+        self.axes = axes_of(axes, on is not None)
 
     def summed(self, at: SensedScene) -> RegionSum:
         def place(what: str, values: NDArray[Any] | None, end: float) -> NDArray[Any]:
@@ -140,16 +154,36 @@ class WallForce(LoadSensor):
             return np.full(d, end) if values is None else in_dimension(what, values, d)
 
         lower, upper = place("lower", self.lower, -np.inf), place("upper", self.upper, np.inf)
-        return RegionSum(lower, upper, place("about", self.about, 0.0))
+        return RegionSum(lower, upper, place("about", self.about, 0.0), ride=ride_of(self.on, True, at))
+
+    def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
+        ride = ride_of(self.on, True, at)
+        if ride is not None and self.axes == "world":
+            found = turned(found, ride.carrier(at).turn)
+        return super().reading(at, found)
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
         summed, d = self.summed(at), at.dimension
-        (arms, force), torque_bar = summed.chosen(at), bar[d:] if d == 3 else np.array([0.0, 0.0, bar[d]])
-        inside = at.lattice.domain.within(at["positions"], summed.lower, summed.upper)[1]
-        return {
-            "positions": np.cross(in_space(force), torque_bar)[:, :d],
-            "wall_force": np.where(inside[:, None], bar[:d] + np.cross(torque_bar, in_space(arms))[:, :d], 0.0),
-        }
+        (arms, force), (force_bar, torque_bar) = summed.chosen(at), load_bars(bar, d)
+        if summed.ride is None:
+            inside = at.lattice.domain.within(at["positions"], summed.lower, summed.upper)[1]
+            return {
+                "positions": np.cross(in_space(force), torque_bar)[:, :d],
+                "wall_force": np.where(inside[:, None], bar[:d] + np.cross(torque_bar, in_space(arms))[:, :d], 0.0),
+            }
+        carrier = summed.ride.carrier(at)
+        if self.axes == "world":
+            force_bar, torque_bar = force_bar @ carrier.turn, torque_bar @ carrier.turn
+        inside = np.all((summed.about + arms >= summed.lower) & (summed.about + arms < summed.upper), axis=1)
+        pulled = np.cross(in_space(force), torque_bar)[:, :d] @ carrier.flat.T
+        pushed = (force_bar + np.cross(torque_bar, in_space(arms)))[:, :d] @ carrier.flat.T
+        pushed = np.where(inside[:, None], pushed, 0.0)
+        twist = -np.cross(in_space(at["wall_force"]), in_space(pushed)).sum(axis=0)
+        if self.axes == "world":
+            force, torque = in_space(force).sum(axis=0), np.cross(in_space(arms), in_space(force)).sum(axis=0)
+            twist = twist + carrier.turn @ (np.cross(force, force_bar) + np.cross(torque, torque_bar))
+        moved = together(carrier.carried(pulled, at["positions"]), carrier.bars(np.zeros(d), twist))
+        return {"positions": pulled, "wall_force": pushed} | moved
 
 
 @fixed
@@ -164,17 +198,30 @@ class SolidLoad(LoadSensor):
     gravity and buoyancy in air are not in it, nor forces of one's own between fluid and walls.
     """
 
-    def __init__(self, solid: str):
-        """Take the name of a ``solid`` in the scene."""
+    def __init__(self, solid: str, axes: Axes = "world"):
+        """Take the name of a ``solid`` in the scene, and whether the force and the torque are along ``axes`` of the
+        "world", or of the "body" of a solid that moves, as it begins."""
         if not isinstance(solid, str) or not solid:
             raise InputError(f"solid is {shown(solid)}, but must be the name of a solid.")
-        self.solid = solid
+        self.solid, self.axes = solid, axes_of(axes, True)
 
     def summed(self, at: SensedScene) -> LoadSum:
         return LoadSum(load_name(self.solid))
 
+    def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
+        return super().reading(at, found if self.axes == "world" else turned(found, self._carrier(at).turn.T))
+
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        return {load_name(self.solid): bar}
+        name, d = load_name(self.solid), at.dimension
+        if self.axes == "world":
+            return {name: bar}
+        carrier, found = self._carrier(at), self.summed(at).on_host(at)
+        world = turned(np.concatenate(load_bars(bar, d)), carrier.turn)
+        twist = -np.cross(found.reshape(2, 3), world.reshape(2, 3)).sum(axis=0)
+        return carrier.bars(np.zeros(d), twist) | {name: in_the_scene(world, d)}
+
+    def _carrier(self, at: Reading) -> Carrier:
+        return Ride(self.solid, False).carrier(at)
 
 
 SENSORS: dict[str, Callable[..., Sensor]] = {

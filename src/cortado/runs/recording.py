@@ -280,7 +280,7 @@ class StepReader:
         self.sensors, self._scene, self._rollout = dict(sensors), scene, rollout
         length, layout, first = rollout.longest_chunk, rollout.solver.layout, rollout.initial
         summed = {name: one.summed(scene) for name, one in sensors.items()}
-        made = (ChunkSums(one, scene.lattice.domain, scene.solver, length) for one in summed.values())
+        made = (ChunkSums(one, scene, scene.solver, length) for one in summed.values())
         self._sums = dict(zip(summed, made, strict=True))
         self._needs_the_step = {name for name, one in summed.items() if one.quantity is not None}
         self.quantities = tuple(sorted({one.quantity for one in summed.values() if one.quantity is not None}))

@@ -2,7 +2,7 @@
 (`cortado.runs.particle_sums`) of all states of a chunk, launched behind it, in float64 and a fixed order."""
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from math import isqrt
 from types import SimpleNamespace
 from typing import Any
@@ -13,14 +13,18 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import recorded
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import FLOAT64, Precision, TypesByName
 from cortado.discretise.room import Domain
 from cortado.discretise.shapes import in_space
 from cortado.errors import InputError
 from cortado.particles.state import Parameters, State, StateSeries
 from cortado.runs.particle_sums import LoadSum, ParticleSum, RegionSum, WeightedSum
 from cortado.runs.quantity_formulas import SIX, QuantityFormula
+from cortado.runs.riding import Ride, square
+from cortado.runs.sensor import SensedScene
+from cortado.scene.motions import AXES
 from cortado.solvers.particles import ParticleSolver
+from cortado.sph.moving_solids import rotations
 from cortado.sph.parts import unsort
 
 
@@ -52,6 +56,48 @@ class _Region:
     about: wp.vec3d
 
 
+@wp.struct
+class _Ride:
+    """A point that a solid carries, and R_0^T of that: see `cortado.runs.riding`."""
+
+    arm: wp.vec3d
+    own: wp.mat33d
+    turns: int
+
+
+@cache
+def _rides(precision: Precision, dimension: int) -> SimpleNamespace:
+    """Make kernels of the places to which a solid carries a point, and of how it turns a view back; a thread a row."""
+    angle, of = rotations(precision, dimension).angle, rotations(FLOAT64, dimension)
+    module = kernel_module(f"sensors_on_solids_{precision.name}_{dimension}")
+    wide = wp.float64 if dimension == 2 else wp.vec3d
+    typed = TypesByName(precision.vector, {angle: "rotation turn", wp.vec3d: "places", wp.mat33d: "views"})
+
+    @wp.func(module=module)
+    def carry(
+        k: int, a: _Ride, c: wp.vec3d, r: wp.mat33d, places: wp.array(dtype=wp.vec3d), views: wp.array(dtype=wp.mat33d)
+    ):
+        turn = r * a.own
+        places[k] = c + turn * a.arm
+        views[k] = wp.where(a.turns > 0, wp.transpose(turn), wp.identity(n=3, dtype=wp.float64))
+
+    @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
+    def told(a: _Ride, position, rotation, turn, places, views):
+        k = wp.tid()
+        begun = of.rotation(wide(rotation[k]))
+        carry(k, a, wp.vec3d(position[k]), of.rotation(wide(turn[k])) * begun, places, views)
+
+    @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
+    def free(a: _Ride, position, rotation, x, y, z, places, views):
+        k = wp.tid()
+        q = wp.matrix_from_cols(wp.vec3d(x[k]), wp.vec3d(y[k]), wp.vec3d(z[k])) + wp.identity(n=3, dtype=wp.float64)
+        carry(k, a, wp.vec3d(position[k]), q * of.rotation(wide(rotation[k])), places, views)
+
+    return SimpleNamespace(told=told, free=free)
+
+
 @cache
 def _kernels(precision: Precision) -> SimpleNamespace:
     """Make kernels of partial sums over every so many particles of a scene in one state, and of the sum of these."""
@@ -81,9 +127,22 @@ def _kernels(precision: Precision) -> SimpleNamespace:
         return y
 
     @wp.func(module=module)
-    def weight(a: _Around, x: vector) -> wp.float64:
+    def from_a_solid(
+        row: int, y: wp.vec3d, places: wp.array(dtype=wp.vec3d), views: wp.array(dtype=wp.mat33d)
+    ) -> wp.vec3d:
+        """Return the way from the place of a row to a point, as a solid sees it that has carried the place."""
+        return views[row] * (y - places[row])
+
+    @wp.func(module=module)
+    def weight(
+        a: _Around, x: vector, row: int, places: wp.array(dtype=wp.vec3d), views: wp.array(dtype=wp.mat33d)
+    ) -> wp.float64:
         """Return the weight of a particle, the mean over its parts, summed over their images."""
-        way = a.seen * (placed(x, a.lower, a.lengths) - a.place)
+        y = placed(x, a.lower, a.lengths)
+        way = y - a.place
+        if places.shape[0] > 0:
+            way = from_a_solid(row, y, places, views)
+        way = a.seen * way
         turns = a.turns * way
         way = way - a.steps * wp.vec3d(wp.rint(turns[0]), wp.rint(turns[1]), wp.rint(turns[2]))
         total = wp.float64(0.0)
@@ -95,16 +154,28 @@ def _kernels(precision: Precision) -> SimpleNamespace:
                     total += square * square * (wp.float64(1.0) + wp.float64(4.0) * q)
         return a.share * total
 
-    typed = TypesByName(vector, {SIX: "partial total"})
+    typed = TypesByName(vector, {SIX: "partial total", wp.vec3d: "places", wp.mat33d: "views"})
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def weighted(
-        particles: int, before: int, stride: int, a: _Around, x_first, x, v_first, v, q: wp.array(dtype=real), partial
+        particles: int,
+        before: int,
+        stride: int,
+        a: _Around,
+        x_first,
+        x,
+        v_first,
+        v,
+        q: wp.array(dtype=real),
+        places,
+        views,
+        partial,
     ):
-        row, total = wp.tid() // stride * particles, SIX()
+        state, total = wp.tid() // stride, SIX()
+        row = state * particles
         for i in range(row + wp.tid() % stride, row + particles, stride):
-            w = weight(a, of_state(x_first, x, i, before))
+            w = weight(a, of_state(x_first, x, i, before), state, places, views)
             if w > wp.float64(0.0):
                 value = wp.float64(0.0)
                 if q.shape[0] > 0:
@@ -117,15 +188,20 @@ def _kernels(precision: Precision) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
-    def within(particles: int, before: int, stride: int, a: _Region, x_first, x, q, partial):
-        row, total = wp.tid() // stride * particles, SIX()
+    def within(particles: int, before: int, stride: int, a: _Region, x_first, x, q, places, views, partial):
+        state, total = wp.tid() // stride, SIX()
+        row = state * particles
         for i in range(row + wp.tid() % stride, row + particles, stride):
             y = placed(of_state(x_first, x, i, before), a.start, a.lengths)
+            if places.shape[0] > 0:
+                y = a.about + from_a_solid(state, y, places, views)
             inside = bool(True)
             for k in range(3):
                 inside = inside and y[k] >= a.lower[k] and y[k] < a.upper[k]
             if inside:
                 f = doubled(q[i])
+                if places.shape[0] > 0:
+                    f = views[state] * f
                 torque = wp.cross(y - a.about, f)
                 for k in range(3):
                     total[k] = total[k] + f[k]
@@ -173,12 +249,46 @@ class StepQuantities:
         return self.kept[name][step * size : (step + 1) * size]
 
 
+class CarriedRows:
+    """Where a solid has carried the place of a sensor in each state of a chunk of a run."""
+
+    def __init__(self, ride: Ride, point: NDArray[Any], scene: SensedScene, solver: ParticleSolver, rows: int):
+        """Make room for ``rows`` states; ``point`` (d,) is the place in the ``scene`` as it begins [m]."""
+        table, layout = ride.table(scene), solver.layout
+        self._device, self._members, self._ride = solver.device, layout.members, _Ride()
+        self._ride.arm = wp.vec3d(*_wide(point - table.middle()))
+        self._ride.own = wp.mat33d(*square(table.turn(scene.dimension)).T.ravel())
+        self._ride.turns = int(ride.turns)
+        kernels, is_free = _rides(layout.precision, scene.dimension), table.motion == "free"
+        self._kernel = kernels.free if is_free else kernels.told
+        last = dict(zip("xyz", AXES, strict=True)) if is_free else {"turn": "turn"}
+        fields = {
+            label: f"{table.name}.{end}"
+            for label, end in {"position": "position", "rotation": "rotation", **last}.items()
+        }
+        like = layout.state(tuple(field for field in solver.state_fields if field.name in fields.values()))
+        self._fields = {name: wp.empty(rows, dtype=like[name].dtype, device=solver.device) for name in fields.values()}
+        self._arguments = {label: self._fields[name] for label, name in fields.items()}
+        self.places = wp.empty(rows, dtype=wp.vec3d, device=solver.device)
+        self.views = wp.empty(rows, dtype=wp.mat33d, device=solver.device)
+
+    def recorded(self, rows: int, first: State, later: StateSeries) -> list[Callable[[], None]]:
+        """Return functions that find the places in ``rows`` states, the first of which is in arrays of its own."""
+        members, behind = self._members, rows - self._members
+        copies = [partial(wp.copy, own, first[name], count=members) for name, own in self._fields.items()]
+        if behind:
+            series = ((own, later.whole(name)) for name, own in self._fields.items())
+            copies += [partial(wp.copy, own, whole, dest_offset=members, count=behind) for own, whole in series]
+        found = {"places": self.places, "views": self.views}
+        return [*copies, recorded(self._kernel, rows, self._device, a=self._ride, **self._arguments, **found)]
+
+
 class ChunkSums:
     """The sums of one sensor over the particles of each state of a chunk of a run."""
 
-    def __init__(self, summed: ParticleSum, domain: Domain, solver: ParticleSolver, length: int):
-        """Prepare the sum in chunks of up to ``length`` steps; ``domain`` is the period of the scene."""
-        layout, self._summed = solver.layout, summed
+    def __init__(self, summed: ParticleSum, scene: SensedScene, solver: ParticleSolver, length: int):
+        """Prepare the sum over particles of a scene in chunks of up to ``length`` steps."""
+        layout, self._summed, domain = solver.layout, summed, scene.lattice.domain
         self._scenes, self._particles, self._device = layout.members, layout.particles, solver.device
         self._stride, self._kernels = isqrt(layout.particles - 1) + 1, _kernels(layout.precision)
         self._none, rows = wp.empty(0, dtype=layout.precision.real, device=solver.device), length * layout.members
@@ -187,10 +297,13 @@ class ChunkSums:
         self._launches: dict[tuple[int, int], list[Callable[[], None]]] = {}
         """By the number of steps and the address of the first state, as in most chunks neither is another."""
         self._setting: Any = None
+        point: NDArray[Any] | None = None
         if isinstance(summed, WeightedSum):
-            self._setting = _around(summed, domain, solver.device)
+            self._setting, point = _around(summed, domain, solver.device), summed.around.place
         elif isinstance(summed, RegionSum):
-            self._setting = _region(summed, domain)
+            self._setting, point = _region(summed, domain), summed.about
+        ride = getattr(summed, "ride", None)
+        self._carried = None if ride is None or point is None else CarriedRows(ride, point, scene, solver, rows)
 
     def launch(self, count: int, first: State, later: StateSeries, kept: Mapping[str, wp.array]) -> wp.array:
         """Launch the sums over the states at which ``count`` steps began, the ``first`` and those ``later``, with the
@@ -222,7 +335,11 @@ class ChunkSums:
             fields |= {"v_first": first.velocities, "v": later.whole("velocities")}
         fields["q"] = self._none if summed.quantity is None else kept[summed.quantity]
         join = {"stride": self._stride, "partial": self._partial, "total": self._total}
+        carried = self._carried
+        none = (wp.empty(0, dtype=dtype, device=self._device) for dtype in (wp.vec3d, wp.mat33d))
+        fields["places"], fields["views"] = none if carried is None else (carried.places, carried.views)
         return [
+            *([] if carried is None else carried.recorded(rows, first, later)),
             recorded(kernel, rows * self._stride, self._device, **sizes, **fields, partial=self._partial),
             recorded(self._kernels.join, rows, self._device, **join),
         ]

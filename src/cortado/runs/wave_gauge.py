@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 
 from cortado.calls import fixed
 from cortado.discretise.room import Domain
-from cortado.discretise.shapes import corners, grid
+from cortado.discretise.shapes import corners, grid, in_space
 from cortado.discretise.solid import Solid
 from cortado.particles.state import padded
-from cortado.runs.particle_sums import ACROSS, Around, Seen, Summed, WeightedSum, Weights, parts_of, reach_of
+from cortado.runs.particle_sums import ACROSS, Around, Summed, WeightedSum, Weights, parts_of, reach_of
+from cortado.runs.riding import Axes, Carrier, axes_of, named, ride_of, square, together
 from cortado.runs.sensor import Cut, Reading, SensedScene, direction, in_dimension, point, positive
 from cortado.scene.motions import Pose, position_name, scale_name
-from cortado.scene.shape_tables import Container
+from cortado.scene.shape_tables import Container, NoContainer
 from cortado.scene.solids import SolidTable
 
 FINE = 0.5
@@ -92,6 +93,8 @@ class Axis:
     """Distance from point to point [m]."""
     film: float
     """`FILM` [m]"""
+    beside: tuple[tuple[float, ...], ...]
+    """(d - 1, d) unit vectors across it"""
 
     @classmethod
     def of(cls, at: Cut, position: NDArray[Any], floor: float, up: NDArray[Any], reach: float) -> "Axis":
@@ -103,18 +106,26 @@ class Axis:
     def places(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the points (c, d) of the floor from its foot [m], and their weights (c,)."""
         d, count = len(self.foot), int(np.ceil(self.reach / self.step))
-        across = np.linalg.svd(np.array([self.up]))[2][1:]
         along = np.asarray(self.step * np.arange(-count, count + 1), dtype=np.float64)
         places = grid([along] * (d - 1))
         weights = Weights.of(np.linalg.norm(places, axis=1) / self.reach).values
-        return places[weights > 0.0] @ across, weights[weights > 0.0] / weights.sum()
+        return places[weights > 0.0] @ np.array(self.beside), weights[weights > 0.0] / weights.sum()
+
+    def carried(self, carrier: Carrier, turns: bool) -> "Axis":
+        """Return the axis where a solid has carried its foot to, turned with it if it ``turns``."""
+        foot = tuple(carrier.place(np.array(self.foot)).tolist())
+        if not turns:
+            return replace(self, foot=foot)
+        up, *beside = (np.array([self.up, *self.beside]) @ carrier.flat.T).tolist()
+        return replace(self, foot=foot, up=tuple(up), beside=tuple(map(tuple, beside)))
 
 
 @lru_cache(maxsize=64)
 def _axis_of(spacing: float, position: tuple[float, ...], floor: float, up: tuple[float, ...], reach: float) -> Axis:
     """Return the axis of a gauge, which is asked for in every step."""
     foot = np.array(position) + (floor - np.dot(position, up)) * np.array(up)
-    return Axis(tuple(foot.tolist()), up, reach, min(FINE * spacing, reach / ACROSS_REACH), FILM * spacing)
+    beside = tuple(map(tuple, np.linalg.svd(np.array([up]))[2][1:].tolist()))
+    return Axis(tuple(foot.tolist()), up, reach, min(FINE * spacing, reach / ACROSS_REACH), FILM * spacing, beside)
 
 
 @dataclass(frozen=True)
@@ -193,24 +204,41 @@ class Column:
         below = np.where(levels < ends[low], 1.0, np.where(levels < ends[low + 1], part, 0.0))
         return step * (ends[low] + part * (ends[low + 1] - ends[low])), below, float(slope)
 
-    def solid_bars(self, depth: float, bar: float, domain: Domain) -> dict[str, NDArray[Any]]:
-        """Turn the derivative with respect to the level at a depth [m] into derivatives by fields of moving solids."""
+    def pushes(self, depth: float, bar: float, domain: Domain) -> "list[Push]":
+        """Turn the derivative with respect to the level at a depth [m] into those with respect to motions of solids."""
         _, below, slope = self.level(depth)
-        shares, found = bar * slope * below, dict[str, NDArray[Any]]()
+        shares, found = bar * slope * below, list[Push]()
         for one, far in self.solids:
-            if one.pose is None:
-                continue
             k, c = np.nonzero((np.abs(far) < 0.5 * self.axis.step) & (self._taken < 1.0))
             local, share = one.local(self.points[k, c], domain), shares[k] * self.weights[c]
             pushed = share[:, None] * one.own.outward(local)
             twisted = np.cross(padded(one.scale * local), padded(pushed))
-            name = one.pose.name
-            found[position_name(name)] = (one.turn @ pushed.sum(axis=0))[None]
-            found |= one.pose.turning_bars(one.pose.rotation @ twisted.sum(axis=0))
-            if not one.pose.is_free:
-                grown = (pushed * local).sum() - (share * far[k, c]).sum() / one.scale
-                found[scale_name(name)] = np.array([grown])
+            grown = float((pushed * local).sum() - (share * far[k, c]).sum() / one.scale)
+            turn = square(one.turn) if one.pose is None else one.pose.rotation
+            found.append(Push(one, one.turn @ pushed.sum(axis=0), turn @ twisted.sum(axis=0), grown))
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class Push:
+    """The derivative of a gauge's level with respect to the motion of a solid in its column."""
+
+    solid: Standing
+    shift: NDArray[Any]
+    """(d,) by its place"""
+    twist: NDArray[Any]
+    """(3,) by a further turn about its middle"""
+    grown: float
+    """By its scale."""
+
+    @property
+    def bars(self) -> dict[str, NDArray[Any]]:
+        """Return derivatives by fields of the state, of which a solid at rest has none."""
+        pose = self.solid.pose
+        if pose is None:
+            return {}
+        found = {position_name(pose.name): self.shift[None]} | pose.turning_bars(self.twist)
+        return found if pose.is_free else found | {scale_name(pose.name): np.array([self.grown])}
 
 
 def column_of(axis: Axis, at: Reading) -> Column | None:
@@ -246,6 +274,12 @@ def _at_rest(axis: Axis, tables: tuple[SolidTable, ...], domain: Domain, contain
     return Column.of(axis, [Standing.of(table, len(axis.foot)) for table in tables], domain, container)
 
 
+def _on_a_solid(axis: Axis, at: Reading) -> Column | None:
+    """Return the column of a gauge on a solid, as solids stand in it in a state; None where none does."""
+    solids = [Standing.of(table, at.dimension, at) for table in at.solids]
+    return Column.of(axis, solids, at.lattice.domain, NoContainer())
+
+
 FINER = 4.0
 """Factor of a particle's number of parts along an axis where solids are in the column of a gauge."""
 
@@ -264,13 +298,25 @@ class WaveGauge(Summed):
     the column.
     """
 
-    def __init__(self, position: Any, floor: float = 0.0, radius: float | None = None, up: Any = None):
+    def __init__(
+        self,
+        position: Any,
+        floor: float = 0.0,
+        radius: float | None = None,
+        up: Any = None,
+        on: str | None = None,
+        axes: Axes = "world",
+    ):
         """Place a gauge at ``position`` (d,) [m], of which the component along ``up`` does not matter. ``floor``: from
         where on the column is filled, along ``up`` [m]. ``radius`` [m], two support radii of the scene's smoothing
-        kernel, but at least five spacings, if left out; ``up`` (d,), +y if left out."""
+        kernel, but at least five spacings, if left out; ``up`` (d,), +y if left out. ``on`` names a solid that carries
+        the foot of the column. With ``axes`` of the "body" the column turns with it, and the height is that in the
+        solid as it begins; else it stands along ``up``, and the height is that of the "world". Sides of the container
+        do not bound a column on a solid."""
         self.position, self.floor = point("position", position), float(floor)
         self.radius = None if radius is None else positive("radius", radius)
         self.up = direction("up", np.eye(len(self.position))[1] if up is None else up)
+        self.on, self.axes = named(on), axes_of(axes, on is not None)
 
     def columns(self, dimension: int) -> dict[str, str]:
         return {"height": "m"}
@@ -278,7 +324,10 @@ class WaveGauge(Summed):
     def summed(self, at: SensedScene) -> WeightedSum:
         """Return the sum of weights of the horizontal distances of particles, as vectors (n, d). Where the column has
         sides, or solids may come into it, particles have more parts."""
-        axis, across = self._axis(at), at.dimension - 1
+        axis, across, ride = self._axis(at), at.dimension - 1, ride_of(self.on, self.axes == "body", at)
+        if ride is not None:
+            parts = parts_of(axis.reach / FINER, at, self._across, across)
+            return WeightedSum(Around(np.array(axis.foot), axis.reach, self._across, parts), ride=ride)
         whole = cut_by(axis, at.container) is None and not any(table.moves for table in at.solids)
         whole = whole and _at_rest(axis, at.solids, at.lattice.domain, at.container) is None
         parts = parts_of(axis.reach if whole else axis.reach / FINER, at, self._across, across)
@@ -286,24 +335,43 @@ class WaveGauge(Summed):
 
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
         axis = self._axis(at)
-        column, depth = column_of(axis, at), self._scale(axis, at) * float(found[0])
-        return np.array([self.floor + (depth if column is None else column.level(depth)[0])])
+        depth, ride = self._scale(axis, at) * float(found[0]), ride_of(self.on, self.axes == "body", at)
+        if ride is None:
+            column, floor = column_of(axis, at), self.floor
+        else:
+            axis = axis.carried(ride.carrier(at), ride.turns)
+            column = _on_a_solid(axis, at)
+            floor = self.floor if ride.turns else float(np.dot(axis.foot, axis.up))
+        return np.array([floor + (depth if column is None else column.level(depth)[0])])
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        axis, around = self._axis(at), Seen.of(at, self.summed(at).around)
-        column, scale = column_of(axis, at), self._scale(axis, at)
-        if column is None:
-            return {"positions": around.pulled(bar[0] * scale)}
-        depth = float(scale * around.weights.sum())
-        bars = column.solid_bars(depth, bar[0], at.lattice.domain)
-        return bars | {"positions": around.pulled(bar[0] * column.level(depth)[2] * scale)}
+        axis, summed = self._axis(at), self.summed(at)
+        around, scale, ride = summed.seen(at), self._scale(axis, at), summed.ride
+        if ride is None:
+            column = column_of(axis, at)
+        else:
+            carrier, begun = ride.carrier(at), np.array(axis.foot)
+            axis = axis.carried(carrier, ride.turns)
+            column = _on_a_solid(axis, at)
+        depth, slope, pushes = float(scale * around.weights.sum()), 1.0, list[Push]()
+        if column is not None:
+            slope, pushes = column.level(depth)[2], column.pushes(depth, bar[0], at.lattice.domain)
+        pulled, bars = around.pulled(bar[0] * slope * scale), [push.bars for push in pushes]
+        against = -sum((push.shift for push in pushes), np.zeros(at.dimension))
+        if ride is not None and ride.turns:
+            pulled = pulled @ carrier.flat.T
+            back = [-push.twist - np.cross(carrier.arms(push.solid.middle), in_space(push.shift)) for push in pushes]
+            bars += [carrier.carried(pulled, at["positions"]), carrier.bars(against, sum(back, np.zeros(3)))]
+        elif ride is not None:
+            bars.append(carrier.lifted(against - pulled.sum(axis=0) + bar[0] * self.up, begun))
+        return together(*bars, {"positions": pulled})
 
     def _axis(self, at: SensedScene) -> Axis:
         return Axis.of(at, self.position, self.floor, self.up, reach_of(self.radius, at))
 
     def _scale(self, axis: Axis, at: SensedScene) -> float:
         """Return the volume of a particle over the column's cross-section [m]."""
-        across, inside = at.dimension - 1, cut_by(axis, at.container)
+        across, inside = at.dimension - 1, cut_by(axis, at.container) if self.on is None else None
         open_part = 1.0 if inside is None else float(axis.places()[1] @ inside)
         return float(at.lattice.cell * ACROSS[across] / axis.reach**across / open_part)
 

@@ -19,7 +19,7 @@ from cortado.scene.links import check_hinges
 from cortado.scene.model import MixtureTable, SceneTables
 from cortado.scene.motions import free
 from cortado.scene.parameters import BY_NAME
-from cortado.scene.sensor_tables import SolidLoadTable
+from cortado.scene.sensor_tables import FlowRateTable, PressureProbeTable, SolidLoadTable
 from cortado.scene.shape_tables import MeshShape, check_length
 from cortado.scene.solids import SolidTable
 from cortado.scene.stability import chosen_limits
@@ -241,10 +241,21 @@ def _check_phases(scene: SceneTables) -> None:
 
 def _check_sensors(scene: SceneTables) -> None:
     names = [solid.name for solid in scene.solid]
+    moving = [solid.name for solid in scene.solid if solid.moves]
+    on_moving = f"the name of a solid that moves, of {shown(moving)}" if moving else "left out, as no solid moves"
     for index, sensor in enumerate(scene.sensor):
-        if isinstance(sensor, SolidLoadTable) and sensor.solid not in names:
-            wanted = f"the name of a solid, of {shown(names)}" if names else "of a scene with solids"
-            raise field_error(("sensor", index, "solid"), sensor.solid, wanted)
+        path = "sensor", index
+        if isinstance(sensor, SolidLoadTable):
+            if sensor.solid not in names:
+                wanted = f"the name of a solid, of {shown(names)}" if names else "of a scene with solids"
+                raise field_error((*path, "solid"), sensor.solid, wanted)
+            if sensor.axes == "body" and sensor.solid not in moving:
+                raise field_error((*path, "axes"), sensor.axes, '"world", as the solid is at rest')
+        elif not isinstance(sensor, FlowRateTable):
+            if sensor.on is not None and sensor.on not in moving:
+                raise field_error((*path, "on"), sensor.on, on_moving)
+            if not isinstance(sensor, PressureProbeTable) and sensor.axes == "body" and sensor.on is None:
+                raise field_error((*path, "axes"), sensor.axes, '"world", as the sensor is on no solid')
 
 
 def _check_files(scene: SceneTables) -> None:

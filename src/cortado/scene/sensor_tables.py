@@ -10,6 +10,7 @@ from cortado.scene.tables import FieldPath, Length, Table, Text, Vector, field_e
 
 Reach = Annotated[float, quantity("m", gt=0.0)] | None
 Corner = tuple[Length, ...] | None
+Axes = Literal["world", "body"]
 
 
 class SensorTable(Table):
@@ -42,6 +43,8 @@ class PressureProbeTable(SensorTable):
     """(d,) the point [m]."""
     radius: Reach = None
     """How far away particles count [m]; the support radius if left out."""
+    on: Text | None = None
+    """The name of a solid that moves, which carries the point from where it is as the scene begins."""
 
 
 class WaveGaugeTable(SensorTable):
@@ -56,6 +59,11 @@ class WaveGaugeTable(SensorTable):
     """From where on the column is filled [m], against gravity: the bottom of the container as a rule."""
     radius: Reach = None
     """Radius of the column [m]; two support radii, but at least five spacings, if left out."""
+    on: Text | None = None
+    """The name of a solid that moves, which carries the column from where it is as the scene begins."""
+    axes: Axes = "world"
+    """Along which axes a column on a solid stands: "body", it turns with the solid and has the height that is read in
+    the solid, as that begins; "world", it stands upright, and the height is that in the scene."""
 
 
 class FlowRateTable(SensorTable):
@@ -90,6 +98,11 @@ class WallForceTable(SensorTable):
     """(d,) upper corner of the region [m]; without an end there if left out."""
     about: Corner = None
     """(d,) the point of the torque [m]; the origin if left out."""
+    on: Text | None = None
+    """The name of a solid that moves, which carries and turns the region and the point from where they are as the scene
+    begins."""
+    axes: Axes = "world"
+    """The axes of force and torque of a region on a solid: "world", or "body", those that turn with the solid."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -105,6 +118,8 @@ class SolidLoadTable(SensorTable):
     """Which sensor it is."""
     solid: Text
     """The name of the solid."""
+    axes: Axes = "world"
+    """The axes of force and torque: "world", or "body", those that turn with the solid."""
 
 
 AnySensor = Annotated[
