@@ -1,8 +1,11 @@
 """How deep does a body float, and how much water goes along with one that gets faster?"""
 
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import j1, jvp, y1, yvp
 
 from cortado import Scene, Simulation
 from scenes import box, pool
@@ -31,6 +34,14 @@ def floating_box(long: int) -> dict[str, float]:
     }
 
 
+def rings(file: str, inner: float, outer: float, spacing: float) -> None:
+    """Write particles in rings between two radii about 0."""
+    radii = np.arange(inner + 0.5 * spacing, outer, spacing)
+    angles = [2.0 * np.pi * (np.arange(n) + 0.3 * n) / n for n in np.round(2.0 * np.pi * radii / spacing)]
+    made = [r * np.stack([np.cos(angle), np.sin(angle)], axis=1) for r, angle in zip(radii, angles, strict=True)]
+    np.save(file, np.concatenate(made))
+
+
 def disc_in_a_round_tank(
     density: float, file: str, spacing: float, steps: int, freedom: Any = None, **solver: Any
 ) -> np.ndarray:
@@ -38,10 +49,7 @@ def disc_in_a_round_tank(
     b = 0.45 m that is full of water in rings, which a ``file`` takes on: over g (rho_0 - rho) / (rho + C rho_0) with
     the added mass C = (b^2 + a^2) / (b^2 - a^2) of theory."""
     inner, outer = 0.15, 0.45
-    radii = np.arange(inner + 0.5 * spacing, outer, spacing)
-    angles = [2.0 * np.pi * (np.arange(n) + 0.3 * n) / n for n in np.round(2.0 * np.pi * radii / spacing)]
-    rings = [r * np.stack([np.cos(angle), np.sin(angle)], axis=1) for r, angle in zip(radii, angles, strict=True)]
-    np.save(file, np.concatenate(rings))
+    rings(file, inner, outer, spacing)
     round_about = {"shape": "sphere", "centre": [0.0, 0.0]}
     scene = Scene(
         dimension=2,
@@ -95,3 +103,91 @@ def added_mass(across: int, deep: int, settling: int, iterations: int, steps: in
         more = faster(density) - alone * 1500.0 / (density + 500.0)
         found[f"at {density:g} kg/m3"] = (-9.81 * (density - 1000.0) / more - density) / 1000.0
     return found
+
+
+def stopping_wave_number(inner: float, outer: float, density: float, viscosity: float) -> float:
+    """k [1/m] of the slowest way in which a turning cylinder in a fluid of 1000 kg/m3, within a cylinder at rest, comes
+    to rest, at the rate nu k^2: that of velocities J_1(k r) Y_1(k b) - Y_1(k r) J_1(k b) whose torque on it takes its
+    angular momentum."""
+
+    def lack(k: float) -> float:
+        at, slope = _mode(k * inner, k * outer), _mode_slope(k * inner, k * outer)
+        rate = viscosity / 1000.0 * k**2
+        return float(0.25 * rate * density * inner * at + viscosity * (k * slope - at / inner))
+
+    ks = np.linspace(1e-3, np.pi / (outer - inner), 400)
+    signs = np.sign([lack(k) for k in ks])
+    first = int(np.argmax(signs != signs[0]))
+    return float(brentq(lack, ks[first - 1], ks[first]))
+
+
+def _mode(x: Any, b: float) -> Any:
+    return j1(x) * y1(b) - y1(x) * j1(b)
+
+
+def _mode_slope(x: float, b: float) -> Any:
+    return jvp(1, x) * y1(b) - yvp(1, x) * j1(b)
+
+
+def stopping_cylinder(across: int, density: float = 8000.0, viscosity: float = 30.0) -> dict[str, float]:
+    """A cylinder without slip, so many particles across, that turns in a round tank of three times its radius, full of
+    syrup that goes along: the rate at which it stops over that of theory."""
+    inner, outer, step, steps = 0.15, 0.45, 0.005, 60
+    k = stopping_wave_number(inner, outer, density, viscosity)
+    with TemporaryDirectory() as folder:
+        rings(f"{folder}/rings.npy", inner, outer, 2.0 * inner / across)
+        round_about = {"shape": "sphere", "centre": [0.0, 0.0], "slip": "no"}
+        disc = {"name": "disc", **round_about, "radius": inner, "motion": "free", "density": density}
+        scene = Scene(
+            dimension=2,
+            discretisation={"spacing": 2.0 * inner / across},
+            phase=[{"name": "syrup", "rest_density": 1000.0, "viscosity": viscosity}],
+            fluid=[{"shape": "points", "file": f"{folder}/rings.npy", "phase": "syrup"}],
+            container={"shape": "none"},
+            solid=[
+                {"name": "tank", **round_about, "radius": outer, "side": "inside"},
+                {**disc, "angular_velocity": 1.0},
+            ],
+            forces={"gravity": [0.0, 0.0]},
+            solver={"kind": "projection", "time_step": step},
+        )
+        simulation = Simulation(scene, precision="float64")
+        x, y = simulation.positions.T
+        r = np.hypot(x, y)
+        speed = inner * _mode(k * r, k * outer) / _mode(k * inner, k * outer)
+        first = {"initial_velocities": (speed / r)[:, None] * np.stack([-y, x], axis=1)}
+        turning = simulation.run(steps, first, record_every=1).solids["disc"].angular_velocities
+    late = np.log(turning[steps // 3 :])
+    rate, exact = -np.polyfit(step * np.arange(len(late)), late, 1)[0], viscosity / 1000.0 * k**2
+    return {"particles": len(simulation.positions), "rate over the exact one": float(rate / exact)}
+
+
+def settling_disc(across: int, step: float, duration: float, device: str = "cpu") -> dict[str, float]:
+    """A disc without slip, so many particles across and of the density of steel, that sinks in syrup midway
+    between two walls three times its diameter apart: its speed in the last quarter of a ``duration`` [s] over that of
+    Faxen (1946), and by how much of that it swings about its course there."""
+    radius, viscosity, density, wide, high = 0.05, 200.0, 7850.0, 0.3, 0.9
+    disc = {"name": "disc", "shape": "sphere", "centre": [0.5 * wide, 0.6 * high], "radius": radius, "slip": "no"}
+    spacing = 2.0 * radius / across
+    scene = Scene(
+        dimension=2,
+        discretisation={"spacing": spacing},
+        phase=[{"name": "syrup", "rest_density": 1000.0, "viscosity": viscosity}],
+        fluid=[box([0.0, 0.0], [wide, high], phase="syrup")],
+        container=box([0.0, 0.0], [wide, high + 4.0 * spacing], slip="no"),
+        solid=[{**disc, "motion": "free", "density": density}],
+        solver={"kind": "projection", "time_step": step},
+    )
+    simulation, steps = Simulation(scene, device, precision="float64"), round(duration / step)
+    run = simulation.run(steps, record_every=1)
+    k = 2.0 * radius / wide
+    part = -np.log(k) - 0.9157 + 1.7244 * k**2 - 1.7302 * k**4 + 2.4056 * k**6 - 4.5913 * k**8
+    exact = (density - 1000.0) * 9.81 * radius**2 * part / (4.0 * viscosity)
+    late = run.solids["disc"].velocities[3 * steps // 4 :, 1]
+    course = np.polyval(np.polyfit(np.arange(len(late)), late, 2), np.arange(len(late)))
+    return {
+        "particles": len(simulation.positions),
+        "Reynolds number": 1000.0 * exact * 2.0 * radius / viscosity,
+        "speed over the exact one": float(-late.mean() / exact),
+        "swing": float(np.abs(late - course).max() / exact),
+    }

@@ -53,13 +53,21 @@ class Stress:
 
     def acceleration(self, x, v, slopes, wall_slopes, mass, viscosity):
         """(n, d) [m/s2] given the slopes a of grad W = a x between particles (n, n), and to those of walls (n, b)."""
+        pull = self.pulls(x, v, slopes, wall_slopes, viscosity)[0]
+        return -self.volume / mass[:, None] * (pull.sum(1) - pull[:, : len(x)].sum(0))
+
+    def pulls(self, x, v, slopes, wall_slopes, viscosity, wall_velocity=np.zeros_like):
+        """What each particle's stress pulls neighbours with, (n, n + b, d), and places (n, b, d) on the walls, which
+        have the velocities ``wall_velocity(places)``."""
+        places = None
         weights, apart = -self.volume * slopes, x[:, None] - x[None, :]
         moving, fluidity = v[:, None] - v[None, :], 1 / (viscosity + LEAST_VISCOSITY)
         thin = np.broadcast_to(fluidity, weights.shape)
         if self.feet is not None:
             wall_weights, falls = self._contact(x, wall_slopes)
             weights, apart = np.concatenate([weights, wall_weights], 1), np.concatenate([apart, falls], 1)
-            moving = np.concatenate([moving, np.broadcast_to(v[:, None], falls.shape)], 1)
+            places = x[:, None] - falls
+            moving = np.concatenate([moving, v[:, None] - wall_velocity(places)], 1)
             thin = np.concatenate([thin, np.broadcast_to(fluidity[:, None], wall_weights.shape)], 1)
         M = np.einsum("ij,ija,ijb->iab", weights, apart, apart)
         full, regular = fullness(M)
@@ -71,9 +79,7 @@ class Stress:
         mu = full * 2 / (fluidity + resistance)
         # What moving i against a neighbour adds to half of E_i, as a force on i, and its reaction on the neighbour.
         sheared = np.einsum("iab,ibc,ijc->ija", G + G.transpose(0, 2, 1), outer, apart)
-        pull = (mu[:, None] * weights)[..., None] * (sheared + self.control * rest)
-        reaction = pull[:, : len(x)].sum(0)
-        return -self.volume / mass[:, None] * (pull.sum(1) - reaction)
+        return (mu[:, None] * weights)[..., None] * (sheared + self.control * rest), places
 
     def _contact(self, x, wall_slopes):
         """Weights (n, b) of walls without slip, and separations (n, b, d) from the points of the surface below."""

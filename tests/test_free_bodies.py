@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from cortado import InputError, Problem, SceneError, Simulation, Trajectory
+from cortado import InputError, Problem, Scene, SceneError, Simulation, Trajectory
 from cortado.discretise.solid import Mass
 from cortado.errors import MissingDerivativeError
 from cortado.gradients import ImplicitPressure, Tape
@@ -67,6 +67,18 @@ def touching_across():
     raft |= {"lower": [0.7, -0.002], "upper": [0.95, 0.18]}
     ball["centre"], arm["lower"], arm["upper"] = [0.02, 0.14], [0.8, 0.175], [0.86, 0.3]
     return plane(raft, ball, arm, container=AROUND)
+
+
+def rough(scene, **changes):
+    """Of a scene, one with syrup that rubs its free bodies."""
+    own = scene.model_dump(exclude_none=True)
+    own["phase"] = [{**own["phase"][0], "viscosity": 30.0, **changes}]
+    for solid in own["solid"]:
+        solid["slip"] = "no"
+    return Scene.model_validate(own)
+
+
+SHEAR_THINNING = {"rheology": {"kind": "power_law", "flow_index": 0.5, "least_shear_rate": 0.1}}
 
 
 def touching_in_space():
@@ -243,8 +255,15 @@ def test_bodies_touch_across_a_period():
         (touching, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
         (touching_across, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
         (touching_in_space, SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
+        (lambda: rough(plane(RAFT)), SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
+        (lambda: rough(plane(RAFT), **SHEAR_THINNING), CentreOfMass([0.5, 0.3])),
+        (lambda: rough(space(BRICK)), SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
+        (lambda: rough(touching_across()), SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
     ],
-    ids=["plane", "space", "touching", "touching across a period", "touching in space"],
+    ids=[
+        *("plane", "space", "touching", "touching across a period", "touching in space", "rough"),
+        *("rough, with a law of viscosity", "rough, in space", "rough, touching across a period"),
+    ],
 )
 def test_derivatives_of_bodies(made, loss):
     """Reverse and forward mode to round-off, and differences, of all that a body begins with, of its density, and of
@@ -252,7 +271,8 @@ def test_derivatives_of_bodies(made, loss):
     scene = made()
     problem, random = Problem(Simulation(scene, precision="float64"), 6, loss), np.random.default_rng(3)
     values = {**begun(scene), "gravity": np.array([0.5, -9.81, 0.2][: scene.dimension])}
-    scales = {"density": 50.0, "position": 0.01, "scale": 0.1}
+    values |= {name: np.array(getattr(scene.phase[0], name)) for name in ("viscosity", "rest_density")}
+    scales = {"density": 50.0, "position": 0.01, "scale": 0.1, "rest_density": 50.0}
     along = {n: scales.get(n.split(".")[-1], 0.3) * random.normal(size=np.shape(v)) for n, v in values.items()}
     _, gradient = problem.value_and_gradient(values)
     for name, change in along.items():
@@ -264,14 +284,15 @@ def test_derivatives_of_bodies(made, loss):
 
 
 def test_the_time_step_has_a_derivative_beside_bodies():
-    problem = Problem(Simulation(space(BRICK), precision="float64"), 6, SolidPose("raft", [0.3, 0.2, 0.2]))
+    scene = rough(space(BRICK))
+    problem = Problem(Simulation(scene, precision="float64"), 6, SolidPose("raft", [0.3, 0.2, 0.2]))
     _, gradient = problem.value_and_gradient({"time_step": 0.001})
     value = [problem.value({"time_step": 0.001 + h}) for h in (-1e-8, 1e-8)]
     assert gradient["time_step"] == pytest.approx(problem.tangent({"time_step": 0.001}, {"time_step": 1.0}), rel=1e-10)
     assert gradient["time_step"] == pytest.approx((value[1] - value[0]) / 2e-8, rel=1e-5)
 
 
-@pytest.mark.parametrize("made", [touching, touching_in_space])
+@pytest.mark.parametrize("made", [touching, touching_in_space, lambda: rough(touching())])
 def test_a_run_goes_on_from_a_state_and_from_a_file_with_the_same_bits(made, tmp_path):
     simulation = Simulation(made())
     whole, first = simulation.run(20).last_state, simulation.run(8)
@@ -304,7 +325,6 @@ def test_bodies_are_drawn_where_they_are(made):
         ({"density": None}, {}, r"solid\[0\]\.density is missing, but must be a density"),
         ({"density": -1.0}, {}, r"solid\[0\]\.density"),
         ({"motion": "fixed"}, {}, r"solid\[0\]\.density is 500"),
-        ({"slip": "no"}, {}, r"solid\[0\]\.slip .* fluid does not rub"),
         ({"side": "inside"}, {}, r"solid\[0\]\.side"),
         ({"times": [0.0, 1.0]}, {}, r"solid\[0\]\.times"),
         ({"surface_velocity": [1.0, 0.0]}, {}, r"solid\[0\]\.surface_velocity"),

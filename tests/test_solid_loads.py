@@ -60,14 +60,17 @@ def test_solids_get_the_momentum_that_the_fluid_loses(kind):
         np.testing.assert_allclose(torque, twisted, atol=atol)
 
 
-def test_what_fluid_does_to_a_free_body_is_what_moves_it():
-    """M (V' - V) / dt = M g + F, where it touches nothing."""
-    scene = plane(RAFT, container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]})
+@pytest.mark.parametrize("slip", ["free", "no"])
+def test_what_fluid_does_to_a_free_body_is_what_moves_it(slip):
+    """M (V' - V) / dt = M g + F, where it touches nothing, and so its torque."""
+    scene = plane({**RAFT, "slip": slip}, container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]})
     run = Simulation(scene, precision="float64").run(STEPS, sensors=loads_of(scene))
-    load, motion = run.sensors["raft"].values[:-1, :2], run.solids["raft"]
-    mass = RAFT["density"] * Mass.of(scene.solid[0].own_solid()).volume
+    load, motion, own = run.sensors["raft"].values[:-1, :2], run.solids["raft"], Mass.of(scene.solid[0].own_solid())
+    mass = RAFT["density"] * own.volume
     gained = mass * (np.diff(motion.velocities, axis=0) / scene.solver.time_step - scene.forces.gravity)
     np.testing.assert_allclose(load, gained, atol=1e-10 * np.abs(load).max())
+    torque, turned = run.sensors["raft"].values[:-1, 2], np.diff(motion.angular_velocities) / scene.solver.time_step
+    np.testing.assert_allclose(torque, RAFT["density"] * own.inertia[2, 2] * turned, atol=1e-10 * np.abs(torque).max())
 
 
 class Loads(Weighted):
@@ -93,6 +96,7 @@ SEEN = {
     "paste": lambda: pasty(PROJECTION),
     "paste, implicit": lambda: pasty(PROJECTION, viscous_solve="implicit"),
     "raft": lambda: plane(RAFT),
+    "raft without slip": lambda: plane({**RAFT, "slip": "no"}),
 }
 
 
@@ -101,11 +105,11 @@ def test_loads_have_derivatives(name):
     """Reverse and forward mode to round-off, and differences, for gravity, viscosity, density, and what solids do."""
     scene = SEEN[name]()
     problem = Problem(simulated(scene), STEPS, Loads(scene))
-    point, along = ({}, {}) if name == "raft" else point_of(scene)
+    point, along = ({}, {}) if "raft" in name else point_of(scene)
     point |= {name: np.array(getattr(scene.phase[0], name)) for name in ("viscosity", "rest_density")}
     along |= {name: 0.3 * point[name] for name in ("viscosity", "rest_density")}
     point["gravity"], along["gravity"] = np.array(scene.forces.gravity) + 0.5, np.ones(scene.dimension)
-    if name == "raft":
+    if "raft" in name:
         point |= {"raft.density": np.array(500.0), "raft.velocity": np.array([0.1, -0.2])}
         along |= {"raft.density": np.array(50.0), "raft.velocity": np.array([0.2, 0.3])}
     if name == "projection":

@@ -34,8 +34,9 @@ def twin(simulation):
     )
 
 
-def stress_twin(simulation, walls, wall_weights):
-    """The slow twin of its viscosity as a stress, given its walls (b, d) and their weights."""
+def stress_twin(simulation, walls, wall_weights, sticks=None):
+    """The slow twin of its viscosity as a stress, given its walls (b, d) and their weights, all of which ``sticks`` may
+    be told of."""
     solver, scene, d = simulation.solver, simulation.scene, simulation.dimension
     lattice, spacing = solver.lattice, scene.discretisation.spacing
     feet = solver.search.walls["wall_feet"].numpy()[:, :d].astype(np.float64)
@@ -45,7 +46,7 @@ def stress_twin(simulation, walls, wall_weights):
         0.25 * spacing,
         walls,
         wall_weights,
-        feet if getattr(scene.container, "slip", "free") == "no" else None,
+        feet if sticks or (sticks is None and getattr(scene.container, "slip", "free") == "no") else None,
     )
 
 

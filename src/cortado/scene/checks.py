@@ -44,6 +44,10 @@ def check_free(scene: SceneTables) -> None:
         raise field_error(("solver", "kind"), scene.solver.kind, f'"projection", {why}')
     if not scene.forces.pressure:
         raise field_error(("forces", "pressure"), False, f"true, as the solid {bodies[0].name!r} is free")
+    rubbed = next((body for body in bodies if body.sticks), None)
+    if rubbed is not None and scene.forces.viscous_solve == "explicit":
+        wanted = f'"implicit" or "automatic", as the solid {rubbed.name!r} is free and has no slip'
+        raise field_error(("forces", "viscous_solve"), "explicit", wanted)
     spacing, lengths = scene.discretisation.spacing, scene.periods[1]
     for index, table in enumerate(scene.solid):
         if table.motion != "free":

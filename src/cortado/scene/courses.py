@@ -292,8 +292,6 @@ def _check_free(solid: Any, given: Sequence[str], path: FieldPath) -> None:
             raise field_error((*path, name), Words("given"), 'left out, as motion is "free"')
     if solid.side == "inside":
         raise field_error((*path, "side"), solid.side, '"outside", as motion is "free"')
-    if solid.slip == "no":
-        raise field_error((*path, "slip"), solid.slip, '"free", as fluid does not rub bodies that are free')
 
 
 def _check_freedom(solid: Any, dimension: int, path: FieldPath) -> None:

@@ -221,7 +221,7 @@ def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
     values = values or {}
     if scene.forces.viscosity != "stress" or scene.forces.viscous_solve == "explicit":
         return False
-    if scene.forces.viscous_solve == "implicit":
+    if scene.forces.viscous_solve == "implicit" or any(body.sticks for body in free(scene.solid)):
         return True
     size = values.get("time_step", scene.solver.time_step)
     longest = min(_other_limits(scene, values).values()) if isinstance(size, str) else float(size)

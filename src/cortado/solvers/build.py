@@ -279,7 +279,8 @@ def _search(
     for number, (middle, turn) in enumerate(zip(middles, turns, strict=True)):
         own = walls.solid == number
         positions[own], feet[own] = (positions[own] - middle) @ turn, feet[own] @ turn
-    grips = walls.weights * walls.sticks
+    free = [number for number, table in enumerate(moving(scene.solid)) if table.motion == "free"]
+    grips = walls.weights * (walls.sticks & ~np.isin(walls.solid, free))  # `FreeFriction` has that of free bodies
     positions, feet = padded(positions), padded(feet)
     behind = faces.behind(walls.solid, positions, feet, ON * scene.discretisation.spacing)
     arrays = WallArrays(positions, walls.weights, grips, feet, padded(walls.slides), walls.solid, behind)
@@ -350,7 +351,7 @@ def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch,
     for number, table in enumerate(moving(scene.solid)):
         if table.motion == "free":
             mass, hold = mass_of_one(table).in_volumes(cell), Hold.of(table, scene.dimension, scene.hinge)
-            tables.append(FreeTable(table.name, number, weight_name(table), mass, hold))
+            tables.append(FreeTable(table.name, number, weight_name(table), mass, hold, table.sticks))
     if not tables:
         return None
     spacing, touching, periods = scene.discretisation.spacing, _touching(scene, discrete), discrete.periods

@@ -11,6 +11,7 @@ from cortado.particles.state import Fields, Parameters, State
 from cortado.particles.wall_terms import SolidShares
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import WithinBar
+from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent
 from cortado.sph.integration import begin_adjoint_kernel
 from cortado.sph.parts import Adjoints, Carried, Shares, StepContext, Tangents
 
@@ -21,12 +22,14 @@ class ParticleTangent:
     def __init__(self, solver: ParticleSolver, parameters_dot: Parameters):
         self._solver = solver
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
-        self.dot = Tangents(fields, solver.new_fractions(), parameters_dot)
-        """Of the sorted particles, once `sort` has been called, and of the parameters."""
+        self._parts = [part.new_tangent() for part in solver.parts]
+        bodies = [own for part in self._parts if isinstance(part, FreeSolidsTangent) for own in part.bodies]
         self.carried_dot = Carried(solver.carried_fields, solver.layout)
+        kick = self.carried_dot[solver.kick_name] if solver.kick_name else None
+        self.dot = Tangents(fields, solver.new_fractions(), parameters_dot, bodies, kick)
+        """Of the sorted particles, once `sort` has been called, and of the parameters."""
         self.density = solver.density.new_tangent()
         self._accelerations_dot = [solver.vectors() for _ in range(len(solver.forces) + 1)]
-        self._parts = [part.new_tangent() for part in solver.parts]
         finalize(self, solver.launch.forget)
 
     def sort(self, context: StepContext, state_dot: State) -> None:
@@ -82,18 +85,20 @@ class ParticleAdjoint:
         of_forces = (name for force in solver.forces for name in force.shares)
         names = ["time_step", *of_parts, *solver.shares, *of_forces]
         self._solver = solver
+        self._parts = [part.new_adjoint() for part in reversed(solver.parts)]
         self.bar = Adjoints(
             Fields.zeros(layout.all_particles, layout.precision, layout.device),
             solver.new_fractions(),
             solver.new_parameters(steps),
             Shares(names, layout),
             SolidShares(solver.search.moving, layout),
+            [own for part in self._parts if isinstance(part, FreeSolidsAdjoint) for own in part.bodies],
+            solver.vectors() if any(body.table.sticks for body in solver.free) else None,
         )
         """Adjoints; those of the parameters are complete after `collect`."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
         """Of what the step carries on, once `unsort` has been called."""
         self.density, self._acceleration_bar = solver.density.new_adjoint(), solver.vectors()
-        self._parts = [part.new_adjoint() for part in reversed(solver.parts)]
         self._collect = CapturedGraph(partial(self.bar.shares.collect, self.bar.parameters), solver.launch)
         finalize(self, solver.launch.forget)
 
@@ -103,6 +108,8 @@ class ParticleAdjoint:
         self.bar.shares.clear()
         self.bar.parameters.clear()
         self.bar.solids.clear()
+        if self.bar.kick is not None:
+            self.bar.kick.zero_()
 
     def collect(self) -> Parameters:
         """Return the adjoints of the parameters, summed over all steps since `begin`."""

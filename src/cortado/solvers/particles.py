@@ -29,6 +29,7 @@ from cortado.solvers.loop import IterationLog, Loop, convergence_kernels
 from cortado.solvers.obstacles import FlatFaces, NamedSolid, Walled
 from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint, StepTangent
 from cortado.sph.density import Density, WallAction, WallSums, wall_slope_term
+from cortado.sph.free_solids import FreeSolidsPart
 from cortado.sph.integration import integration_kernels
 from cortado.sph.parts import Carried, Force, Part, PartMaker, StepContext
 
@@ -71,6 +72,8 @@ class ParticleSolver(Staying):
 
     carried_fields: tuple[StateField, ...] = ()
     """Fields of particles that the solver itself carries from step to step."""
+    kick_name = ""
+    """Name of the carried field of velocities that pressures gave to particles; empty where none is."""
     topic = "density"
     """Topic of the Warp modules that have the kernels of the density."""
     density_power = 2
@@ -93,10 +96,13 @@ class ParticleSolver(Staying):
             *(maker.part(layout, requires_grad) for maker in system.parts),
             *(force for force in self.forces if isinstance(force, Part)),
         )
+        self.free = [body for part in self.parts if isinstance(part, FreeSolidsPart) for body in part.bodies]
+        """The bodies that fluid moves."""
         self.substeps = 0
         """Number of substeps of diffusion in each step."""
         self.carried = Carried(self.carried_fields, layout, requires_grad)
         """Sorted, as they were at the start of the step."""
+        self.kick = self.carried[self.kick_name] if self.kick_name else None
         of_parts = (field for part in self.parts for field in part.fields)
         self.state_fields = (POSITIONS, VELOCITIES, *of_parts, *self.carried_fields)
         """The fields of a state."""
@@ -202,7 +208,7 @@ class ParticleSolver(Staying):
         if self._context is None or self._context.parameters is not parameters:
             order, step, particles = self.search.order, self.step_number, self.layout.particles
             own = (self.launch, particles, self._neighbourhood, order, step, self.lattice.cell)
-            self._context = StepContext(*own, self.fields, self.fractions, parameters)
+            self._context = StepContext(*own, self.fields, self.fractions, parameters, self.free, self.kick)
         return self._context
 
     def sort(self, state: State, parameters: Parameters) -> StepContext:

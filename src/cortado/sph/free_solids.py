@@ -163,6 +163,49 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
     return begins, ends
 
 
+@cache
+def move_kernels(precision: Precision) -> Kernels:
+    """Make the kernels of V, L and W of a body by gravity and by the sums of momenta that it gets, with a thread for
+    each scene, and of the velocity changes V - V_0 and W - W_0, ``faster`` and ``turned_faster``. Adjoints of the sums
+    are written."""
+    real, vector, matrix, hold = precision.real, precision.vector, matrix_of(precision), hold_functions(precision)
+    spin, vectors = hold.spin, "gravity V W L pulled twisted"
+
+    @TypesByName(real, {vector: vectors, matrix: "inertia inverse turns", hold.kind: "hold"})
+    def move(
+        time_step_i,
+        gravity_i,
+        density_i,
+        volume,
+        inertia,
+        inverse,
+        hold,
+        turns_i,
+        V_0_i,
+        W_0_i,
+        L_0_i,
+        pulled_sum_i,
+        twisted_sum_i,
+    ) -> tuple[vector, vector, vector, vector, vector]:
+        arm = turns_i * hold.arm
+        L = L_0_i + twisted_sum_i - wp.cross(arm, pulled_sum_i)
+        W = spin(turns_i, inertia, inverse, L, hold) / density_i
+        V = V_0_i + time_step_i * gravity_i + pulled_sum_i / (density_i * volume)
+        V = wp.cw_mul(hold.moving, V) - wp.cross(W, arm)
+        return V, L, W, V - V_0_i, W - W_0_i
+
+    return pointwise_kernels(
+        precision,
+        [free_module(precision)] * 3,
+        lambda _: move,
+        ["V", "L", "W", "faster", "turned_faster"],
+        numbers=["volume", "inertia", "inverse", "hold"],
+        written=["pulled_sum", "twisted_sum"],
+        told=["gravity"],
+        turned={"turns": "turned"},
+    )
+
+
 NAMES = {
     "position": position_name,
     "rotation": rotation_name,
@@ -187,6 +230,8 @@ class FreeTable:
     """Mass and inertia if this parameter is 1, in volumes of a particle."""
     hold: Hold
     """How the body is held."""
+    sticks: bool = False
+    """True where fluid has no slip along it."""
 
     @property
     def inertia(self) -> np.ndarray:
@@ -264,7 +309,9 @@ class FreeBody:
         self.constants |= {"solid": table.number, "hold": hold_numbers(table.hold, layout.precision)}
         self.constants |= table.bounds
         self.given = {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in GIVEN}
-        """Momentum that it gets from what it touches, and its moment."""
+        """Momentum that it gets from what it touches, and from fluid that rubs it, and its moment."""
+        self.pressed = {name: wp.zeros_like(array) for name, array in self.given.items()}
+        """Those that the pressures of the step before would give it; of bodies without slip alone."""
         self.before, self.moved = (
             {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in MOTION} for _ in range(2)
         )
@@ -319,13 +366,14 @@ class Changes:
         vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
         self.body = body
         self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
-        self.given = {f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN}
+        self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
         self.turned_end = wp.zeros(**vectors)
         """The adjoint of a further turn of R, by the end of the step."""
 
     def clear(self) -> None:
         """Set all of the body's tangents or adjoints to 0."""
-        for array in (*self.before.values(), *self.moved.values(), *self.given.values(), self.turned_end):
+        groups = self.before, self.moved, self.given, self.pressed
+        for array in (*(array for group in groups for array in group.values()), self.turned_end):
             array.zero_()
 
 

@@ -10,14 +10,15 @@ B is symmetric and positive with respect to the product sum_i w_i a_i . b_i with
 measured here. Each scene of a batch goes on until |r| has fallen to a part of the first, and stays as it is then.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
+from cortado.device.launching import Named
 from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import FLOAT32, Precision, TypesByName
 from cortado.device.reduction import type_name
@@ -186,6 +187,23 @@ def round_off(precision: Precision) -> float:
     return 3e-7 if precision is FLOAT32 else 1e-14
 
 
+class Rows(Protocol):
+    """Further unknowns of a solve, a few for each scene, beside those of particles. Each method but `begin` acts in
+    scenes that are ``going``, and adds to a sum (members,) over particles what the rows add to it."""
+
+    def begin(self, step: StepContext, total: wp.array) -> None:
+        """Begin with the unknowns at 0, and add the square of the residual."""
+
+    def multiply(self, step: StepContext, curvature: wp.array) -> None:
+        """Write the rows of B p, and add their part of the product p . B p."""
+
+    def descend(self, step: StepContext, scene: Named, total: wp.array) -> None:
+        """Take a step along p, and add the square of the new residual; ``scene`` has what kernels know of a scene."""
+
+    def turn(self, step: StepContext, scene: Named, total: wp.array) -> None:
+        """Write the next p."""
+
+
 class ConjugateGradients:
     """A solver by conjugate gradients for the particles, or other entries, of a layout, with arrays of its own."""
 
@@ -211,11 +229,12 @@ class ConjugateGradients:
         w: wp.array,
         r: wp.array,
         y: wp.array,
+        rows: Sequence[Rows] = (),
     ) -> None:
         """Write to ``y`` the solution of B y = r, (n,) both, with weights ``w``, and overwrite ``r``.
 
         ``multiply`` launches what writes B p, for ``p``, its first argument, to the ``product`` of its second, and the
-        w p B p of each particle to the ``share``.
+        w p B p of each particle to the ``share``. Further ``rows`` of B are solved along.
         """
         kernels, members, (sum_shares, sum_curvatures) = self._kernels, self._layout.members, self._sums
         n = self._layout.all_particles
@@ -223,13 +242,24 @@ class ConjugateGradients:
         p, product, share = self._own.values()
         step.launch(kernels.begin, own, threads=n)
         self._active.zero_()
-        step.launch(kernels.start, scene, total=sum_shares(share), threads=members)
+        total = sum_shares(share)
+        for row in rows:
+            row.begin(step, total)
+        step.launch(kernels.start, scene, total=total, threads=members)
 
         def iterate() -> None:
             multiply(p, {"product": product, "share": share})
-            step.launch(kernels.descend, scene, own, self._sizes, curvature=sum_curvatures(share), threads=n)
+            curvature = sum_curvatures(share)
+            for row in rows:
+                row.multiply(step, curvature)
+            known = {**scene, "curvature": curvature}
+            step.launch(kernels.descend, known, own, self._sizes, threads=n)
             total = sum_shares(share)
+            for row in rows:
+                row.descend(step, known, total)
             step.launch(kernels.turn, scene, own, self._sizes, total=total, threads=n)
+            for row in rows:
+                row.turn(step, scene, total)
             step.launch(kernels.decide, scene, self._limits, total=total, threads=members)
 
         step.join()  # a loop of a graph cannot begin while something is computed aside

@@ -17,7 +17,7 @@ A solver too carries fields of particles from step to step, such as the pressure
 has them in the scene's order of particles, a step works on sorted ones. The adjoint of sorting is the way back.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,6 +57,10 @@ class StepContext:
     fractions: wp.array
     """Mass fractions of the sorted particles, of which the rest of the step is made: after its diffusion."""
     parameters: Parameters
+    bodies: Sequence[Any] = ()
+    """The free bodies of the solver, each a `cortado.sph.free_solids.FreeBody`."""
+    kick: Any = None
+    """(n,) Velocities that the pressures of the step before gave to particles; None of a solver that carries none."""
 
     @cached_property
     def _known(self) -> tuple[Named, ...]:
@@ -87,6 +91,10 @@ class Tangents:
     fields: Fields
     fractions: wp.array
     parameters: Parameters
+    bodies: Sequence[Any] = ()
+    """Tangents of free bodies in the step, each a `cortado.sph.free_solids.Changes`."""
+    kick: Any = None
+    """Tangent of the `StepContext.kick`."""
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
@@ -132,6 +140,10 @@ class Adjoints:
     shares: Shares
     solids: SolidShares
     """Adjoints of the poses of solids that move."""
+    bodies: Sequence[Any] = ()
+    """Adjoints of free bodies in the step, each a `cortado.sph.free_solids.Changes`."""
+    kick: Any = None
+    """What friction with free bodies adds to the adjoint of the `StepContext.kick`; None without any."""
 
     @cached_property
     def named(self) -> tuple[Named, ...]:

@@ -15,7 +15,7 @@ adjoint, as B is symmetric in the product weighted with masses.
 """
 
 from collections.abc import Sequence
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -38,6 +38,7 @@ from cortado.scene.scene import Scene
 from cortado.scene.stability import is_implicit
 from cortado.sph.density import WallSums
 from cortado.sph.formula import Packed, compiled
+from cortado.sph.free_friction import FreeFriction
 from cortado.sph.moment_functions import ConjugateGradients, matrix_type, round_off
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import Law, newtonian_law, stress_couple_work, stress_sums, stress_work
@@ -62,12 +63,16 @@ class ViscousStress:
         self._kernels, self._layout = stress_kernels(*self._made_for), layout
         control = stress_control(discretisation.smoothing, cut.spacing, cut.support_radius, scene.dimension)
         self.constants: dict[str, Any] = {"control": control, "least": CLOSEST * cut.spacing}
+        self.free = FreeFriction(setting, self.constants)
+        """Friction with free bodies, which only an implicit solve has."""
         self._packed = Packed(parameters, layout, discretisation.taped)
         self._of = self.arrays("M", "A", "R", "T", "eta", taped=discretisation.taped)
         self._change = self.arrays("M", "A", "A_u", "R", "T", "eta")
         """Tangents or adjoints."""
-        self.wall_action = StressWalls(setting, self, stress_work, "acceleration_bar") if scene.sticks else None
-        self.wall_couple = StressWalls(setting, self, stress_couple_work, "couple_bar") if scene.sticks else None
+        sums = (stress_work, "acceleration_bar", "rub"), (stress_couple_work, "couple_bar", "couple")
+        self.wall_action, self.wall_couple = (
+            StressWalls(setting, self, *one) if scene.sticks else None for one in sums
+        )
 
     def arrays(self, *names: str, taped: bool = False) -> dict[str, wp.array]:
         """Make arrays (n,) of particles by name, all 0: R and eta are numbers, and all others matrices."""
@@ -86,7 +91,9 @@ class ViscousStress:
 
     def _measure(self, step: StepContext) -> None:
         """Write M, A, R, T and mu of the velocities at the start."""
+        self.free.begin(step)
         step.launch(self._kernels.moments.forward, self.constants, self._of)
+        self.free.gather(step, self._of)
         known = {"A_u": self._of["A"], "theta": self._packed.theta(step)}
         step.launch(self._kernels.stress.forward, known, self.constants, self._of)
 
@@ -98,9 +105,13 @@ class ViscousStress:
         """Write the tangents of T and mu. Velocities other than those at the start may be ``resisted``, given as ``v``
         with their tangent, and their A as ``A_u``."""
         change, known = {f"{name}_dot": a for name, a in self._change.items()}, (*dot.named, self.constants, self._of)
+        free = self.free.dots
+        free.begin(step, dot)
         if resisted is not None:
             step.launch(self._kernels.moments.tangent, {"A_dot": change["A_u_dot"]}, resisted, change, *known)
+            free.lean(step, dot, change["A_u_dot"], resisted)
         step.launch(self._kernels.moments.tangent, change, *known)
+        free.gather(step, dot, change)
         resisted = resisted or {"A_u": self._of["A"], "A_u_dot": change["A_dot"]}
         theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
         step.launch(self._kernels.stress.tangent, theta, resisted, change, *known)
@@ -117,6 +128,7 @@ class ViscousStress:
         known = bars, now, *bar.named, self.constants, self._of, {"acceleration_bar": acceleration_bar}
         of_stress, of_particles = self._kernels.force.adjoint
         step.launch(of_stress, *known)
+        self.free.bars.push(step, bar, acceleration_bar, *known)
         self.back_to_sums(step, bar, bars, now)
         step.launch(of_particles, *known)
         self._give(step, bar, 1, *known)
@@ -131,6 +143,8 @@ class ViscousStress:
         if at_the_start:
             add(bars["A_bar"], A_bar)
         self._back_to_particles(step, bar, {"A_bar": A_bar}, bars, now)
+        self.free.bars.lean(step, bar, A_bar, bars, now)
+        self.free.bars.gather(step, bar, {name: bars[name] for name in ("M_bar", "A_bar", "R_bar")})
         if not (at_the_start or self._law.is_newtonian):
             self._back_to_particles(step, bar, {"A_bar": bars["A_bar"]}, self._no_bars)
         self._packed.collect(step, bar)
@@ -168,25 +182,32 @@ class ViscousStress:
 class StressWalls:
     """The sums by which walls act on particles through viscous stress: a `cortado.sph.density.WallAction`."""
 
-    def __init__(self, setting: Setting, stress: ViscousStress, work: WorkMaker, bar: str):
+    def __init__(self, setting: Setting, stress: ViscousStress, work: WorkMaker, bar: str, name: str):
         """Take ``work`` and ``bar`` of its `WallTerm`: `stress_work` for accelerations, `stress_couple_work` for their
-        couples."""
-        self._stress, self._layout = stress, setting.layout
+        couples; and the ``name`` that these have in the friction with free bodies."""
+        self._stress, self._layout, self._name = stress, setting.layout, name
         term = WallTerm(setting.discretisation, "viscous_stress", work, bar, rubs=True)
         self._sums = WallSums(term, setting.layout, (stress.constants["least"], stress.constants["control"]))
 
     def total(self, step: StepContext, solid: int) -> wp.array:
-        return self._sums.total(step, solid, self._stress.resisted(step))
+        now = self._stress.resisted(step)
+        found = self._sums.total(step, solid, now)
+        self._stress.free.act(step, solid, self._name, found, now)
+        return found
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
         known = self._stress.resisted_tangent(step, dot), self._stress.resisted(step)
-        return self._sums.tangent(step, dot, solid, *known)
+        found = self._sums.tangent(step, dot, solid, *known)
+        self._stress.free.dots.act(step, dot, solid, self._name, found, *known)
+        return found
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
         now, bars = self._stress.resisted(step), self._bars
         for name in ("T_bar", "eta_bar", "v_bar"):
             bars[name].zero_()
         self._sums.adjoint(step, bar, solid, total_bar, v_star_bar, bars, now)
+        self._stress.free.bars.begin(step, bar)
+        self._stress.free.bars.act(step, bar, solid, self._name, total_bar, bars, now)
         self._stress.back_to_sums(step, bar, bars, now)
         self._stress.resisted_adjoint(step, bars["v_bar"], bar, v_star_bar)
 
@@ -259,21 +280,31 @@ class Solve(ConjugateGradients):
 
     name, most = "viscous_iterations", MOST
 
-    def __init__(self, layout: Layout, operator: tuple[Any, Any]):
-        """Prepare solves with an ``operator``: the kernels that `operator_kernels` gives."""
+    def __init__(self, layout: Layout, operator: tuple[Any, Any], free: FreeFriction):
+        """Prepare solves with an ``operator``: the kernels that `operator_kernels` gives, and the friction with free
+        bodies."""
         precision = layout.precision
         super().__init__(layout, precision.vector, round_off(precision), MOST)
-        self._pull, self._multiply = operator
+        (self._pull, self._multiply), self._free = operator, free
 
     def __call__(self, step: StepContext, known: Any, r: wp.array, y: wp.array) -> None:
         """Write to ``y`` the solution of B y = r, (n,) vectors both, and overwrite ``r``; ``known`` has arguments of
-        B's kernels."""
+        B's kernels. The rows of bodies are solved along."""
 
-        def multiply(p: wp.array, found: dict[str, wp.array]) -> None:
-            step.launch(self._pull, *known, v=p)
-            step.launch(self._multiply, *known, found, v=p)
+        self.solve(step, partial(self._apply, step, known), step.fields["m"], r, y, self._free.rows)
 
-        self.solve(step, multiply, step.fields["m"], r, y)
+    def _apply(self, step: StepContext, known: Any, p: wp.array, found: Named) -> None:
+        """Write B p."""
+        step.launch(self._pull, *known, v=p)
+        self._free.lean(step, known, p)
+        step.launch(self._multiply, *known, found, v=p)
+        self._free.multiply(step, known, p, found)
+
+    def respond(self, step: StepContext, known: Any, still: wp.array, r: wp.array) -> None:
+        """Add to ``r`` the product of B with velocities of bodies alone; those of particles are 0, ``still``."""
+        found = {name: self._own[name] for name in ("product", "share")}
+        self._apply(step, known, still, found)
+        add(found["product"], r)
 
 
 class ImplicitViscousStress(ViscousStress):
@@ -289,7 +320,7 @@ class ImplicitViscousStress(ViscousStress):
         layout, (discretisation, *others) = setting.layout, self._made_for
         self._implicit = implicit_kernels(layout.precision)
         self._pull = operator_kernels(*self._made_for)[0]
-        self.solve = Solve(layout, operator_kernels(discretisation.still, *others))
+        self.solve = Solve(layout, operator_kernels(discretisation.still, *others), self.free)
         vectors = layout.arrays(**dict.fromkeys(("u", "r", "y", "still"), layout.precision.vector))
         self._u, self._r, self._y, self._still = vectors.values()
         self._at_end = self.arrays("A", "T")
@@ -311,10 +342,15 @@ class ImplicitViscousStress(ViscousStress):
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         self._measure(step)
         step.launch(self._implicit.predict, acceleration=before, u=self._u)
+        self.free.kick(step, self._u)
         known = self._known()
+        self.free.start(step)
         step.launch(self._pull, *known, v=self._u)
+        self.free.pull(step, *known, v=self._u)
         step.launch(self._kernels.force.forward, *known, v=self._u, acceleration_in=self._still, acceleration=self._r)
+        self.free.push(step, *known, v=self._u, acceleration=self._r)
         self.solve(step, known, self._r, self._y)
+        self.free.finish(step)
         wp.copy(after, before)
         add(self._y, after)
         self._after = after
@@ -322,16 +358,22 @@ class ImplicitViscousStress(ViscousStress):
     def _find_end(self, step: StepContext) -> None:
         """Write the velocities u = v + dt a' at the end of the step, and their velocity sum A and stress T."""
         step.launch(self._implicit.predict, acceleration=self._after, u=self._u)
+        self.free.kick(step, self._u)
         step.launch(self._pull, *self._known(), v=self._u)
+        self.free.pull(step, *self._known(), v=self._u)
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         self._find_end(step)
         u_dot, along = self._y, {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}
         step.launch(self._implicit.predict, along, acceleration=self._after, u=u_dot)
+        self.free.kick(dot, u_dot)
+        self.free.dots.start(step, dot)
         change = self._stress_along(step, dot, self._end_along(u_dot))
         now = {"v": self._u, "v_dot": u_dot, "acceleration_in_dot": before, "acceleration_dot": self._r}
         step.launch(self._kernels.force.tangent, now, change, *self._known(*dot.named))
+        self.free.dots.push(step, dot, self._r, now, change, *self._known())
         self.solve(step, self._known(), self._r, after)
+        self.free.dots.finish(step, dot)
         self._after_dot = after
 
     def _end_along(self, u_dot: wp.array) -> dict[str, wp.array]:
@@ -346,21 +388,30 @@ class ImplicitViscousStress(ViscousStress):
         by_time, u_dot = {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}, self._y
         step.launch(self._implicit.predict, by_time, acceleration=self._after, u=self._r)
         step.launch(self._implicit.predict, v=self._r, acceleration=self._after_dot, u=u_dot)
+        self.free.kick(dot, u_dot)
+        self.free.dots.start(step, dot)
         return {**self._stress_along(step, dot, self._end_along(u_dot)), "v_dot": u_dot}
 
     def resisted_adjoint(self, step: StepContext, v_bar: wp.array, bar: Adjoints, v_star_bar: wp.array) -> None:
         own = {"v_bar": v_star_bar, "u_bar": v_bar, "acceleration": self._after}
         step.launch(self._implicit.end_adjoint, own, *bar.named)
+        self.free.bars.finish(step, bar, v_bar)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array:
         """Apply the adjoint of the force, and return the adjoint of the acceleration by all other forces."""
         step.launch(self._implicit.weigh, acceleration_bar=acceleration_bar, r=self._r)
+        if self.free.rows:
+            self.free.bars.take(step, bar)
+            self.solve.respond(step, self._known(), self._still, self._r)
+            self.free.bars.heed(step, bar)
         self.solve(step, self._known(), self._r, self._y)
         step.launch(self._implicit.unweigh, y=self._y, r=self._r)
         now, u_bar = self.resisted(step), self._y
         u_bar.zero_()
+        self.free.bars.begin(step, bar)
         self._back(step, bar, self._r, now, u_bar)
         step.launch(self._implicit.end_adjoint, {"u_bar": u_bar, "acceleration": self._after}, *bar.named)
+        self.free.bars.finish(step, bar, u_bar)
         return self._r
 
 

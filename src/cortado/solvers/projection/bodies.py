@@ -92,13 +92,18 @@ class Bodies:
         own = held.known, held.shares, held.faster, held.whole, held.start.motion
         return *own, *held.body.known(context)
 
-    def begin(self, context: StepContext, around: Arrays) -> None:
-        """Find which particles bodies push in a step, and add the bodies' part to the pressure matrix' diagonal."""
+    def begin(self, context: StepContext, around: Arrays, k: wp.array) -> None:
+        """Find which particles bodies push in a step, and add the bodies' part to the pressure matrix' diagonal; find
+        what the pressures ``k`` of the step before would give to bodies without slip."""
         for held in self.held:
             context.launch(self.kernels.hold.forward, *self.known(context, held), edge=around["edge"])
             context.launch(self.kernels.measure.forward, *self.known(context, held))
             held.add_sizes()
             context.launch(self.kernels.weigh.forward, *self.known(context, held), a=around["a"])
+            if held.body.table.sticks:
+                context.launch(self.kernels.pull.forward, *self.known(context, held), y=k)
+                for total, pressed in zip(held.sums().values(), held.body.pressed.values(), strict=True):
+                    wp.copy(pressed, total)
 
     def move(self, context: StepContext, held: Held, y: wp.array, moved: Arrays) -> Arrays:
         """Write V, W and L of a body pushed by pressures y, and return the sums of y gamma and y r x gamma."""
@@ -146,7 +151,15 @@ class BodiesTangent:
         dots = own.known, own.shares, own.faster, own.whole, own.start.motion, rates
         return *dots, *dot.named, *bodies.known(context, held)
 
-    def begin(self, context: StepContext, dot: Tangents, around: Arrays, around_dot: Arrays) -> None:
+    def begin(
+        self,
+        context: StepContext,
+        dot: Tangents,
+        around: Arrays,
+        around_dot: Arrays,
+        pressures: tuple[wp.array, wp.array],
+    ) -> None:
+        """Apply the tangent of `Bodies.begin`, given the pressures of the step before and their tangents."""
         kernels = self._bodies.kernels
         edges = {"edge": around["edge"], "edge_dot": around_dot["edge_dot"]}
         for k, own in enumerate(self._held):
@@ -154,6 +167,10 @@ class BodiesTangent:
             context.launch(kernels.measure.tangent, *self._known(context, dot, k))
             own.add_sizes()
             context.launch(kernels.weigh.tangent, *self._known(context, dot, k), a_dot=around_dot["a_dot"])
+            if own.body.table.sticks:
+                context.launch(kernels.pull.tangent, *self._known(context, dot, k), y=pressures[0], y_dot=pressures[1])
+                for total, pressed in zip(own.sums().values(), self._changes[k].pressed.values(), strict=True):
+                    wp.copy(pressed, total)
 
     def _move(
         self, context: StepContext, dot: Tangents, k: int, y: tuple[wp.array, wp.array], moved: Arrays, out: Arrays
@@ -256,6 +273,26 @@ class BodiesAdjoint:
             for array, total in zip(faster.values(), held.sums().values(), strict=True):
                 wp.copy(array, total)
             self._move(context, bar, k, y, held.moved, {**faster, **self._none}, y_bar)
+
+    def release(
+        self,
+        context: StepContext,
+        bar: Adjoints,
+        around: Arrays,
+        around_bar: Arrays,
+        pressures: tuple[wp.array, wp.array],
+    ) -> None:
+        """Apply the adjoint of what `Bodies.begin` finds of bodies without slip, given the pressures of the step before
+        and their adjoints, after `finish`."""
+        self.begin()
+        for k, held in enumerate(self._bodies.held):
+            if held.body.table.sticks:
+                known, pressed = self._known(context, bar, k), self._changes[k].pressed.values()
+                sums = dict(zip(self._sums_bar, pressed, strict=True))
+                context.launch(self._bodies.kernels.pull.adjoint, sums, *known, y=pressures[0], y_bar=pressures[1])
+                edges = {"edge": around["edge"], "edge_bar": around_bar["edge_bar"]}
+                given = bar.solids.of(held.body.table.number)
+                context.launch(self._bodies.kernels.hold.adjoint, given, *known, edges)
 
     def finish(self, context: StepContext, bar: Adjoints, around: Arrays, around_bar: Arrays) -> None:
         """Apply the adjoint of `Bodies.begin`: add to the adjoints of particles, surroundings and poses."""

@@ -23,15 +23,13 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision, TypesByName
-from cortado.particles.moving_walls import matrix_of
+from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
 from cortado.solvers.projection.names import types_by_name
 from cortado.solvers.projection.wall_sums import normal_part
-from cortado.sph.free_solids import free_module
-from cortado.sph.held_bodies import hold_functions
+from cortado.sph.free_solids import free_module, move_kernels
 
 
 @dataclass(frozen=True)
@@ -142,8 +140,7 @@ class MotionKernels:
     """Kernels that move rigid bodies by pressures and gravity, with their tangents and adjoints."""
 
     move: Kernels
-    """V, L and W from the sums of y gamma and y r x gamma, with a thread for each scene, and the velocity changes
-    V - V_0 and W - W_0, ``faster`` and ``turned_faster``. Adjoints of the sums are written."""
+    """The kernels of `cortado.sph.free_solids.move_kernels`, by the sums of y gamma and y r x gamma."""
     carry: Kernels
     """The drift of walls by the velocity changes, particles' shares of whose adjoints are written."""
 
@@ -151,47 +148,11 @@ class MotionKernels:
 @cache
 def motion_kernels(precision: Precision) -> MotionKernels:
     """Make the kernels that move rigid bodies by pressures and gravity, in a precision."""
-    real, vector, matrix, hold = precision.real, precision.vector, matrix_of(precision), hold_functions(precision)
-    spin, vectors = hold.spin, "gravity V W L pulled twisted"
-
-    @TypesByName(real, {vector: vectors, matrix: "inertia inverse turns", hold.kind: "hold"})
-    def move(
-        time_step_i,
-        gravity_i,
-        density_i,
-        volume,
-        inertia,
-        inverse,
-        hold,
-        turns_i,
-        V_0_i,
-        W_0_i,
-        L_0_i,
-        pulled_sum_i,
-        twisted_sum_i,
-    ) -> tuple[vector, vector, vector, vector, vector]:
-        arm = turns_i * hold.arm
-        L = L_0_i + twisted_sum_i - wp.cross(arm, pulled_sum_i)
-        W = spin(turns_i, inertia, inverse, L, hold) / density_i
-        V = V_0_i + time_step_i * gravity_i + pulled_sum_i / (density_i * volume)
-        V = wp.cw_mul(hold.moving, V) - wp.cross(W, arm)
-        return V, L, W, V - V_0_i, W - W_0_i
+    real, vector = precision.real, precision.vector
 
     def carry(faster: vector, turned_faster: vector, gamma_of_i: vector, arm_i: vector) -> real:
         return wp.dot(gamma_of_i, faster + wp.cross(turned_faster, arm_i))
 
-    modules = [free_module(precision)] * 3
-    moves = pointwise_kernels(
-        precision,
-        modules,
-        lambda _: move,
-        ["V", "L", "W", "faster", "turned_faster"],
-        numbers=["volume", "inertia", "inverse", "hold"],
-        written=["pulled_sum", "twisted_sum"],
-        told=["gravity"],
-        turned={"turns": "turned"},
-    )
-    written = ["faster", "turned_faster"]
-    return MotionKernels(
-        moves, pointwise_kernels(precision, modules, lambda _: carry, ["drift:drift_in"], written=written)
-    )
+    modules, written = [free_module(precision)] * 3, ["faster", "turned_faster"]
+    carries = pointwise_kernels(precision, modules, lambda _: carry, ["drift:drift_in"], written=written)
+    return MotionKernels(move_kernels(precision), carries)

@@ -48,7 +48,8 @@ class ProjectionTangent(ParticleTangent):
         self.sort(context, state_dot)
         known = (*self.dot.named, self._around, solver.around)
         if self._bodies is not None:
-            self._bodies.begin(context, self.dot, solver.around, self._around)
+            pressures = solver.carried[IMPULSE], self.carried_dot[IMPULSE]
+            self._bodies.begin(context, self.dot, solver.around, self._around, pressures)
         self.predict(context, solver.v_star, self._x_star_dot, self._v_star_dot)
         self._project(context, known, counts[0])
         v_new = {"v_new": solver.iterates[counts[0]]["u"], "v_new_dot": self._u_dot}
@@ -230,6 +231,11 @@ class ProjectionAdjoint(ParticleAdjoint):
             self._bodies.finish(context, self.bar, solver.around, self._around)
         context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
         self.predict(context, within)
+        if self._bodies is not None and self.bar.kick is not None:
+            add(self.bar.kick, self._kick_before_bar)
+            self.bar.kick.zero_()
+            pressures = solver.carried[IMPULSE], self._k_before_bar
+            self._bodies.release(context, self.bar, solver.around, self._around, pressures)
         self.mix(context, state_bar)
         self.sort(context, state_bar, **{IMPULSE: self._k_before_bar, KICK: self._kick_before_bar})
 

@@ -1,0 +1,405 @@
+"""Free bodies without slip in the implicit viscous solve, with derivatives: see `cortado.sph.friction_kernels`.
+
+Their velocities are unknowns of the solve beside those of particles (Weiler, Koschier, Brand and Bender 2018). With the
+momenta M of a body, a force F(u, U) on it and the velocities U of the start of the step with gravity and contact,
+
+    U' = U + M^-1 J,   J = dt F(u', U'),
+
+are further rows of the operator B (`cortado.sph.viscous_stress`), which is symmetric in the product weighted with the
+masses of particles and M. J comes to the momenta that contact gives, before pressures do. So a light body neither
+swings nor needs smaller steps.
+"""
+
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any
+
+import warp as wp
+
+from cortado.device.launching import Named
+from cortado.device.reduction import add
+from cortado.particles.mirrors import ALL_WALLS
+from cortado.particles.moving_walls import matrix_of
+from cortado.particles.state import Layout, zeros
+from cortado.scene.motions import free
+from cortado.sph.free_solids import Changes, FreeBody, move_kernels
+from cortado.sph.friction_kernels import friction_kernels, row_kernels
+from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
+
+Arrays = dict[str, wp.array]
+VELOCITIES = ("V", "L", "W", "faster", "turned_faster")
+
+
+SUMS = ("pulled_sum", "twisted_sum")
+
+
+def begun(body: FreeBody | Changes) -> Arrays:
+    """Return the velocities at the start of a step, or their changes, as `move_kernels` know them."""
+    return {f"{name[0]}_0{name[1:]}": array for name, array in body.before.items()}
+
+
+class BodyFriction:
+    """The arrays of the friction with one body, or with a ``suffix`` of names their tangents or adjoints."""
+
+    def __init__(self, layout: Layout, suffix: str = ""):
+        precision = layout.precision
+        real, vector, six = precision.real, precision.vector, precision.six
+        self.suffix = suffix
+        self.known = layout.arrays(suffix, H=real, Y=vector, N=matrix_of(precision), arm=vector)
+        self.found = layout.arrays(suffix, rub=vector, couple=vector)
+        self.load = layout.arrays(suffix, load=six)
+        self._sum = layout.sum_of(six)
+        kinds = {f"{name}{suffix}": (layout.members, vector) for name in VELOCITIES}
+        self.motion = zeros(kinds, layout.device)
+        """V and W of the start with gravity and contact, and after the solve those of its end."""
+        self.turned, self.none = (wp.zeros(layout.members, dtype=vector, device=layout.device) for _ in range(2))
+        """The adjoint of a further turn, and 0."""
+        self.none_total = wp.zeros(layout.members, dtype=real, device=layout.device)
+        """A total that nobody reads."""
+        self.momenta = {
+            f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=layout.device) for name in SUMS
+        }
+        """What a body gets by contact and friction and has got by pressures, as `move_kernels` know it."""
+        self.impulse = {"impulse": wp.zeros(layout.members, dtype=six, device=layout.device)}
+        """J."""
+
+    def add_up(self, body: FreeBody | Changes) -> None:
+        """Add up the momenta that a body gets, or their tangents."""
+        for total, given, pressed in zip(
+            self.momenta.values(), body.given.values(), body.pressed.values(), strict=True
+        ):
+            wp.copy(total, given)
+            add(pressed, total)
+
+    def whole(self) -> wp.array:
+        """Return the sum (members,) of the load over the particles of a scene."""
+        return self._sum(self.load[f"load{self.suffix}"])
+
+
+class BodyRows:
+    """The rows of one body in a solve: `cortado.sph.moment_functions.Rows`."""
+
+    def __init__(self, layout: Layout):
+        six, vector = layout.precision.six, layout.precision.vector
+        kinds = {**dict.fromkeys(("r", "rise", "p", "y", "product", "first"), six), "V": vector, "W": vector}
+        self.arrays = zeros({name: (layout.members, kind) for name, kind in kinds.items()}, layout.device)
+        self.kernels, self._members = row_kernels(layout.precision), layout.members
+        self.known: tuple[Named, ...] = ()
+        """What kernels know of the body in the present step."""
+        self.load: Any = None
+        """The load by p, as the particles have written it."""
+
+    def launch(self, step: StepContext, kernel: Any, *groups: Named, **arrays: Any) -> None:
+        """Launch a kernel with a thread for each scene."""
+        step.launch(kernel, self.arrays, *groups, *self.known, threads=self._members, **arrays)
+
+    def begin(self, step: StepContext, total: wp.array) -> None:
+        self.launch(step, self.kernels.lift, total=total)
+        self.launch(step, self.kernels.begin)
+
+    def multiply(self, step: StepContext, curvature: wp.array) -> None:
+        self.launch(step, self.kernels.multiply, load=self.load, curvature=curvature)
+
+    def descend(self, step: StepContext, scene: Named, total: wp.array) -> None:
+        self.launch(step, self.kernels.descend, scene)
+        self.launch(step, self.kernels.lift, total=total)
+
+    def turn(self, step: StepContext, scene: Named, total: wp.array) -> None:
+        self.launch(step, self.kernels.turn, scene, total=total)
+
+
+class FreeFriction:
+    """The friction between the fluid and all free bodies without slip of one solver, forward; without any it does
+    nothing."""
+
+    def __init__(self, setting: Setting, constants: Named):
+        """Prepare the friction with the ``constants`` of the viscous stress."""
+        layout, scene = setting.layout, setting.scene
+        self.layout, self.constants = layout, constants
+        names = [table.name for table in free(scene.solid) if table.sticks]
+        self.own = {name: BodyFriction(layout) for name in names}
+        self._rows = {name: BodyRows(layout) for name in names}
+        self.rows = list(self._rows.values())
+        self.kernels: Any = None
+        if names:
+            self.kernels = friction_kernels(setting.discretisation, scene.dimension)
+            self.move = move_kernels(layout.precision)
+
+        self.dots, self.bars = FrictionTangent(self), FrictionAdjoint(self)
+
+    def each(self, step: StepContext) -> Iterator[tuple[FreeBody, BodyFriction, BodyRows]]:
+        """Yield the bodies that rub, with their arrays and rows."""
+        for body in step.bodies:
+            if body.table.sticks:
+                yield body, self.own[body.table.name], self._rows[body.table.name]
+
+    def begin(self, step: StepContext) -> None:
+        """Write H, Y, N and r of a step."""
+        for body, own, rows in self.each(step):
+            rows.known = body.known(step)
+            step.launch(self.kernels.hold.forward, own.known, self.constants, *rows.known)
+
+    def gather(self, step: StepContext, sums: Named) -> None:
+        """Add to M, A and R of the velocities at the start."""
+        for body, own, _ in self.each(step):
+            step.launch(self.kernels.thicken.forward, own.known, sums)
+            step.launch(self.kernels.lean.forward, own.known, sums, body.before)
+
+    def kick(self, step: StepContext | Tangents, u: wp.array) -> None:
+        """Add to velocities u, or their tangents, the kicks by the pressures of the step before."""
+        if self.rows:
+            add(step.kick, u)
+
+    def kick_back(self, bar: Adjoints, u_bar: wp.array) -> None:
+        """Apply the adjoint of `kick`."""
+        if self.rows:
+            add(u_bar, bar.kick)
+
+    def start(self, step: StepContext) -> None:
+        """Write the velocities of bodies by gravity, by the momenta that they have got so far, and by the pressures of
+        the step before."""
+        for body, own, _ in self.each(step):
+            own.add_up(body)
+            self.launch(step, self.move.forward, own, body)
+
+    def launch(self, step: StepContext, kernel: Any, own: BodyFriction, body: FreeBody, *groups: Named) -> None:
+        """Launch a kernel of the motion of a body, with a thread for each scene."""
+        known = *groups, own.motion, own.momenta, begun(body), *body.known(step)
+        step.launch(kernel, *known, threads=self.layout.members)
+
+    def pull(self, step: StepContext, *known: Named, v: wp.array) -> None:
+        """Add to A and T of velocities v beside bodies with their velocities of now."""
+        for _, own, _ in self.each(step):
+            step.launch(self.kernels.pull, own.known, own.motion, self.constants, *known, v=v)
+
+    def push(self, step: StepContext, *known: Named, v: wp.array, acceleration: wp.array) -> None:
+        """Add to the accelerations by the stress of velocities v, and write the residual of the bodies' rows."""
+        for _, own, rows in self.each(step):
+            self.rub(step, own, *known, v=v)
+            add(own.found["rub"], acceleration)
+            step.launch(self.kernels.bear.forward, own.known, own.found, own.load)
+            wp.copy(rows.arrays["r"], own.whole())
+
+    def rub(self, step: StepContext, own: BodyFriction, *known: Named, v: wp.array) -> None:
+        """Write the accelerations and the couples by a body with its velocities of now."""
+        step.launch(self.kernels.rub.forward, own.known, own.found, own.motion, self.constants, *known, v=v)
+
+    def multiply(self, step: StepContext, known: tuple[Named, ...], p: wp.array, found: Named) -> None:
+        """Add to B p and its share of the product p . B p, and write the loads of the bodies' rows."""
+        for _, own, rows in self.each(step):
+            velocities = {"v": p, **{name: rows.arrays[name] for name in "VW"}}
+            step.launch(self.kernels.push, own.known, own.load, self.constants, found, *known, velocities)
+            rows.load = own.whole()
+
+    def lean(self, step: StepContext, known: tuple[Named, ...], p: wp.array) -> None:
+        """Add to A and T of p beside bodies that move by the rows of p."""
+        for _, own, rows in self.each(step):
+            velocities = {"v": p, **{name: rows.arrays[name] for name in "VW"}}
+            step.launch(self.kernels.pull, own.known, self.constants, *known, velocities)
+
+    def finish(self, step: StepContext) -> None:
+        """Give bodies the impulses that the solve has found, and write their velocities at its end."""
+        for body, own, rows in self.each(step):
+            rows.launch(step, rows.kernels.give, body.given, own.impulse)
+        self.start(step)
+
+    def act(self, step: StepContext, solid: int, name: str, total: wp.array, now: Named) -> None:
+        """Add to the sum over the walls of a solid, or of all, what bodies do to particles after the step: ``rub`` or
+        ``couple``. ``now`` has the arrays of the resisted velocities."""
+        for body, own, _ in self.each(step):
+            if solid in (ALL_WALLS, body.table.number):
+                self.rub(step, own, now, v=now["v"])
+                add(own.found[name], total)
+
+
+class FrictionTangent:
+    """The tangent of the friction with free bodies, for forward mode."""
+
+    def __init__(self, friction: FreeFriction):
+        self._friction = friction
+
+    @cached_property
+    def _own(self) -> dict[str, BodyFriction]:
+        """Make the tangents of arrays when they are first asked for, as runs do without."""
+        return {name: BodyFriction(self._friction.layout, "_dot") for name in self._friction.own}
+
+    def _each(self, step: StepContext, dot: Tangents) -> Iterator[tuple[Changes, BodyFriction, BodyFriction, BodyRows]]:
+        for (body, own, rows), change in zip(
+            self._friction.each(step), (one for one in dot.bodies if one.body.table.sticks), strict=True
+        ):
+            yield change, self._own[body.table.name], own, rows
+
+    def begin(self, step: StepContext, dot: Tangents) -> None:
+        """Write the tangents of H, Y, N and r."""
+        of = self._friction
+        for change, dots, _, _ in self._each(step, dot):
+            step.launch(of.kernels.hold.tangent, dots.known, *dot.named, of.constants, *change.body.known(step))
+
+    def gather(self, step: StepContext, dot: Tangents, sums: Named) -> None:
+        """Add to the tangents of M, A and R of the velocities at the start."""
+        kernels = self._friction.kernels
+        for change, dots, own, _ in self._each(step, dot):
+            known = sums, dots.known, own.known, *dot.named
+            step.launch(kernels.thicken.tangent, *known)
+            step.launch(kernels.lean.tangent, *known, change.before, change.body.before)
+
+    def start(self, step: StepContext, dot: Tangents) -> None:
+        """Write the tangents of the bodies' velocities at the end, by those of the momenta that they have got so
+        far."""
+        of = self._friction
+        for change, dots, own, _ in self._each(step, dot):
+            dots.add_up(change)
+            rates = {"density_dot": dot.parameters[change.body.table.weight]}
+            known = dots.motion, dots.momenta, begun(change), rates, *dot.named
+            of.launch(step, of.move.tangent, own, change.body, *known)
+
+    def lean(self, step: StepContext, dot: Tangents, A_dot: wp.array, *known: Named) -> None:
+        """Add to the tangent of A of the velocities at the end."""
+        for _, dots, own, _ in self._each(step, dot):
+            groups = *known, dots.known, own.known, dots.motion, own.motion, *dot.named
+            step.launch(self._friction.kernels.lean.tangent, *groups, A_dot=A_dot)
+
+    def push(self, step: StepContext, dot: Tangents, acceleration_dot: wp.array, *known: Named) -> None:
+        """Add to the tangent of the accelerations, and write the residual of the bodies' rows."""
+        kernels, time_step_dot = self._friction.kernels, dot.parameters["time_step"]
+        for _, dots, own, rows in self._each(step, dot):
+            self._rub(step, dot, dots, own, *known)
+            add(dots.found["rub_dot"], acceleration_dot)
+            known_dots = dots.known, dots.found, *dot.named, own.known, own.found
+            step.launch(kernels.bear.tangent, dots.load, *known_dots)
+            load = dots.whole()
+            rows.launch(step, rows.kernels.lengthen, own.impulse, time_step_dot=time_step_dot, load=load)
+            wp.copy(rows.arrays["r"], load)
+
+    def _rub(self, step: StepContext, dot: Tangents, dots: BodyFriction, own: BodyFriction, *known: Named) -> None:
+        groups = *known, dots.known, dots.motion, *dot.named, own.known, own.motion, self._friction.constants
+        step.launch(self._friction.kernels.rub.forward, own.found, *groups)
+        step.launch(self._friction.kernels.rub.tangent, dots.found, *groups)
+
+    def finish(self, step: StepContext, dot: Tangents) -> None:
+        """Write the tangents of what bodies get by the solution, and of their velocities at the end."""
+        for change, dots, _, rows in self._each(step, dot):
+            given = {name.removesuffix("_dot"): array for name, array in change.given.items()}
+            rows.launch(step, rows.kernels.give, given, dots.impulse)
+
+    def act(self, step: StepContext, dot: Tangents, solid: int, name: str, total_dot: wp.array, *known: Named) -> None:
+        """Add to the tangent of the sum that `FreeFriction.act` adds to."""
+        for change, dots, own, _ in self._each(step, dot):
+            if solid in (ALL_WALLS, change.body.table.number):
+                self._rub(step, dot, dots, own, *known)
+                add(dots.found[f"{name}_dot"], total_dot)
+
+
+class FrictionAdjoint:
+    """The adjoint of the friction with free bodies, for reverse mode."""
+
+    def __init__(self, friction: FreeFriction):
+        self._friction = friction
+
+    @cached_property
+    def _own(self) -> dict[str, BodyFriction]:
+        """Make the adjoints of arrays when they are first asked for, as runs do without."""
+        return {name: BodyFriction(self._friction.layout, "_bar") for name in self._friction.own}
+
+    @cached_property
+    def _shares(self) -> dict[str, wp.array]:
+        """Make arrays of particles' shares of the adjoints of V and W."""
+        vector = self._friction.layout.precision.vector
+        return self._friction.layout.arrays("_bar", V=vector, W=vector)
+
+    @cached_property
+    def _sum(self) -> Any:
+        return self._friction.layout.sum_of(self._friction.layout.precision.vector)
+
+    def _each(self, step: StepContext, bar: Adjoints) -> Iterator[tuple[Changes, BodyFriction, BodyFriction, BodyRows]]:
+        for (body, own, rows), change in zip(
+            self._friction.each(step), (one for one in bar.bodies if one.body.table.sticks), strict=True
+        ):
+            yield change, self._own[body.table.name], own, rows
+
+    def begin(self, step: StepContext, bar: Adjoints) -> None:
+        """Set the adjoints of the bodies' arrays to 0."""
+        for _, bars, _, _ in self._each(step, bar):
+            for group in (bars.known, bars.found, bars.motion):
+                for array in group.values():
+                    array.zero_()
+
+    def take(self, step: StepContext, bar: Adjoints) -> None:
+        """Begin the solve from the adjoints of what the solution gave to bodies, which are velocities."""
+        for change, _, _, rows in self._each(step, bar):
+            rows.launch(step, rows.kernels.take, change.given)
+
+    def heed(self, step: StepContext, bar: Adjoints) -> None:
+        """Write what these velocities leave in the residual of the bodies' rows, given the loads by them."""
+        for _, _, _, rows in self._each(step, bar):
+            rows.launch(step, rows.kernels.heed, load=rows.load)
+
+    def push(self, step: StepContext, bar: Adjoints, acceleration_bar: wp.array, *known: Named) -> None:
+        """Apply the adjoint of `FreeFriction.push`, given that of the accelerations, and the solution of the rows."""
+        kernels, sizes = self._friction.kernels, {"time_step_bar": bar.parameters["time_step"]}
+        for _, bars, own, rows in self._each(step, bar):
+            solution = {"load_sum_bar": rows.arrays["first"]}
+            wp.copy(rows.arrays["r"], rows.arrays["y"])
+            rows.launch(step, rows.kernels.lift, total=bars.none_total)
+            rows.launch(step, rows.kernels.answer, own.impulse, sizes)
+            step.launch(kernels.rub.forward, own.found, *known, own.known, own.motion, self._friction.constants)
+            groups = bars.known, bars.found, *bar.named, own.known, own.found
+            step.launch(kernels.bear.adjoint, solution, *groups)
+            add(acceleration_bar, bars.found["rub_bar"])
+            self._rub(step, bar, bars, own, *known)
+
+    def act(self, step: StepContext, bar: Adjoints, solid: int, name: str, total_bar: wp.array, *known: Named) -> None:
+        """Apply the adjoint of `FreeFriction.act`."""
+        for change, bars, own, _ in self._each(step, bar):
+            if solid in (ALL_WALLS, change.body.table.number):
+                wp.copy(bars.found[f"{name}_bar"], total_bar)
+                self._rub(step, bar, bars, own, *known)
+
+    def _rub(self, step: StepContext, bar: Adjoints, bars: BodyFriction, own: BodyFriction, *known: Named) -> None:
+        groups = *known, bars.known, bars.found, *bar.named, own.known, own.motion, self._friction.constants
+        self._shared(step, self._friction.kernels.rub.adjoint, bars.motion, *groups)
+
+    def _shared(self, step: StepContext, kernel: Any, motion_bar: Named, *known: Named) -> None:
+        """Launch an adjoint kernel, and add the sums of particles' shares to the adjoints of a body's V and W."""
+        for array in self._shares.values():
+            array.zero_()
+        step.launch(kernel, self._shares, *known)
+        for name, share in self._shares.items():
+            add(self._sum(share), motion_bar[name])
+
+    def lean(self, step: StepContext, bar: Adjoints, A_bar: wp.array, *known: Named) -> None:
+        """Go back from the adjoint of A of the velocities at the end."""
+        for _, bars, own, _ in self._each(step, bar):
+            groups = *known, bars.known, *bar.named, own.known, own.motion
+            self._shared(step, self._friction.kernels.lean.adjoint, bars.motion, {"A_bar": A_bar}, *groups)
+
+    def gather(self, step: StepContext, bar: Adjoints, sums_bar: Named) -> None:
+        """Go back from the adjoints of M, A and R of the velocities at the start."""
+        kernels = self._friction.kernels
+        for change, bars, own, _ in self._each(step, bar):
+            groups = sums_bar, bars.known, *bar.named, own.known
+            step.launch(kernels.thicken.adjoint, *groups)
+            self._shared(step, kernels.lean.adjoint, change.before, *groups, change.body.before)
+
+    def finish(self, step: StepContext, bar: Adjoints, u_bar: wp.array) -> None:
+        """Go back from the adjoints of the bodies' velocities at the end and of H, Y, N and r, and from that of the
+        particles' velocities at the end to that of kicks."""
+        of = self._friction
+        of.kick_back(bar, u_bar)
+        for change, bars, own, _ in self._each(step, bar):
+            body = change.body
+            rates = {"density_bar": bar.parameters[body.table.weight], "time_step_bar": bar.parameters["time_step"]}
+            turned = {"turned_bar": bars.turned}
+            bars.turned.zero_()
+            of.launch(
+                step, of.move.adjoint, own, body, bars.motion, bars.momenta, begun(change), rates, turned, *bar.named
+            )
+            for total, given, pressed in zip(
+                bars.momenta.values(), change.given.values(), change.pressed.values(), strict=True
+            ):
+                add(total, given)
+                add(total, pressed)
+            bar.solids.add_whole(body.table.number, bars.none, bars.turned)
+            given = bar.solids.of(body.table.number)
+            known = bars.known, own.known, *bar.named, of.constants, *body.known(step)
+            step.launch(of.kernels.hold.adjoint, given, *known)

@@ -1,0 +1,287 @@
+"""Viscous friction between fluid and a free body without slip, by sums of each particle over the body's walls.
+
+A wall of the body is a neighbour at the point of its surface below particle i, as other walls without slip are
+(`cortado.sph.stress_forces`), and moves with the body there. With the weights s_b of its wall particles b, their y_b
+from the surface to the particle, and r from the body's middle c' to the particle, that point is at c' + r - y_b and has
+the velocity V + W x (r - y_b). So all that the body does to the particle follows from three sums,
+
+    H = sum_b s_b,   Y = sum_b s_b y_b,   N = sum_b s_b y_b y_b^T,
+
+and from z = v_i - V - W x r. With the matrix [W] of the cross product, M_i gets N, R_i gets tr N / mu_i, A_i gets
+z Y^T + [W] N, and the acceleration and its couple about the particle are
+
+    m_i a_i = -(T_i Y + C mu_i (H z + W x Y)),
+    m_i c_i = -(ax(T_i N) + C mu_i (Y x z + (tr N - N) W)),   ax(B) = (B_zy - B_yz, B_xz - B_zx, B_yx - B_xy).
+
+The body gets the force F = -sum_i m_i a_i and the torque -sum_i m_i (r x a_i - c_i) about c': minus half the derivative
+of what is dissipated by V and by W, as m_i a_i is that by v_i. So momentum and angular momentum are kept, and nothing
+is dissipated where body and fluid turn as a whole.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from cortado.device.modules import Kernels, by_name
+from cortado.device.precision import Precision, TypesByName
+from cortado.particles.moving_walls import matrix_of
+from cortado.particles.neighbourhood import Discretisation, pair_functions
+from cortado.particles.pair_sums import solid_sum
+from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
+from cortado.sph.free_solids import free_module
+from cortado.sph.held_bodies import hold_functions
+from cortado.sph.moment_functions import cross_terms_function, moment_functions
+from cortado.sph.stress_forces import contact_functions
+from cortado.sph.stress_kernels import fluidity_function, traction_function
+
+
+@cache
+def friction_functions(precision: Precision) -> SimpleNamespace:
+    """Make the Warp functions of the part ``lean`` of a body in A, of the acceleration and the couple ``rub``, and of
+    the force and torque on the body, six numbers, by those: ``bear``."""
+    real, vector, matrix, six = precision.real, precision.vector, matrix_of(precision), precision.six
+    typed = TypesByName(real, {vector: "v arm Y V W rub couple", matrix: "T N"})
+
+    @typed
+    def lean(v_i, arm_i, Y_i, N_i, V, W) -> matrix:
+        return wp.outer(v_i - V - wp.cross(W, arm_i), Y_i) + wp.skew(W) * N_i
+
+    @typed
+    def rub(v_i, m_i, T_i, eta_i, arm_i, H_i, Y_i, N_i, V, W, control) -> tuple[vector, vector]:
+        z, B, C = v_i - V - wp.cross(W, arm_i), T_i * N_i, control * eta_i
+        force = T_i * Y_i + C * (H_i * z + wp.cross(W, Y_i))
+        twist = vector(B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1])
+        twist += C * (wp.cross(Y_i, z) + wp.trace(N_i) * W - N_i * W)
+        return (real(-1.0) / m_i) * force, (real(-1.0) / m_i) * twist
+
+    @typed
+    def bear(m_i, arm_i, rub_i, couple_i) -> six:
+        f, t = -m_i * rub_i, m_i * (couple_i - wp.cross(arm_i, rub_i))
+        return six(f[0], f[1], f[2], t[0], t[1], t[2])
+
+    return SimpleNamespace(lean=lean, rub=rub, bear=bear)
+
+
+@cache
+def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
+    """Make the kernels of friction with a body in 2 or 3 dimensions. ``hold`` are those of the sums H, Y and N and of
+    r, ``thicken`` of the parts in M and R, ``lean``, ``rub`` and ``bear`` of `friction_functions`. ``pull`` adds to A
+    and T of some velocities, and ``push`` to B v of the implicit viscosity and to shares in the product with v, and
+    writes the load of the body, as solves do it."""
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    matrix, six, known = matrix_of(precision), precision.six, moment_functions(precision, dimension)
+    contact, cross_terms = contact_functions(discretisation), cross_terms_function(precision)
+    fall, fall_change, hold_weight, hold_gradient = (
+        contact.fall,
+        contact.fall_change,
+        contact.hold,
+        contact.hold_gradient,
+    )
+    fluidity, separation = fluidity_function(precision), pair_functions(discretisation).separation
+    modules = module, tangent_module, adjoint_module = discretisation.modules(f"free_friction_{dimension}d")
+    traction, whole = traction_function(precision, dimension, module), known.change
+    typed = TypesByName(
+        real, {vector: "x v foot turn arm Y V W after", matrix: "T M N", neighbourhood: "s", wp.int32: "solid"}
+    )
+    four = tuple[real, vector, vector, vector]
+
+    @solid_sum(discretisation)
+    @typed
+    def grip(x_ij, least, foot, solid, s) -> four:
+        w, y = hold_weight(x_ij, foot, least, s), fall(x_ij, foot)
+        return w, w * y, w * wp.cw_mul(y, y), w * cross_terms(y, y)
+
+    @solid_sum(discretisation)
+    @typed
+    def grip_tangent(x_ij, x_dot_ij, least, foot, turn_dot, solid, s) -> four:
+        w, y, rest = hold_weight(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
+        u, w_dot = (
+            fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y),
+            wp.dot(hold_gradient(x_ij, foot, least, s), rest),
+        )
+        others = w_dot * cross_terms(y, y) + w * (cross_terms(y, u) + cross_terms(u, y))
+        return w_dot, w_dot * y + w * u, wp.cw_mul(w_dot * y + real(2.0) * w * u, y), others
+
+    @solid_sum(discretisation)
+    @typed
+    def grip_back(x_ij, H_bar_i, Y_bar_i, N_bar_i, least, foot, solid, s) -> vector:
+        w, y = hold_weight(x_ij, foot, least, s), fall(x_ij, foot)
+        even = N_bar_i * y + wp.transpose(N_bar_i) * y
+        level = H_bar_i + wp.dot(Y_bar_i, y) + real(0.5) * wp.dot(y, even)
+        return level * hold_gradient(x_ij, foot, least, s) + w * fall_change(x_ij, Y_bar_i + even, foot)
+
+    numbers = ["solid", "least"]
+
+    @particle_kernel(module, "H Y N arm", [over(grip, "held led diagonal others")], numbers=numbers)
+    def hold(
+        solid: int,
+        held: real,
+        led: vector,
+        diagonal: vector,
+        others: vector,
+        x_i: vector,
+        after: vector,
+        s: neighbourhood,
+    ) -> tuple[real, vector, matrix, vector]:
+        return held, led, whole(diagonal, others), separation(x_i, after, s)
+
+    changes = over(grip_tangent, "held led diagonal others")
+
+    @particle_kernel(tangent_module, "H_dot Y_dot N_dot arm_dot", [changes], numbers=numbers)
+    def hold_tangent(
+        solid: int, held: real, led: vector, diagonal: vector, others: vector, x_dot_i: vector, after_dot: vector
+    ) -> tuple[real, vector, matrix, vector]:
+        return held, led, whole(diagonal, others), x_dot_i - after_dot
+
+    @particle_kernel(adjoint_module, "+x_bar +force_bar +torque_bar", [over(grip_back, "total")], numbers=numbers)
+    def hold_adjoint(
+        solid: int,
+        total: vector,
+        arm_i: vector,
+        Y_i: vector,
+        N_i: matrix,
+        Y_bar_i: vector,
+        N_bar_i: matrix,
+        arm_bar_i: vector,
+    ) -> tuple[vector, vector, vector]:
+        """Apply the adjoint of the sums and of r; turning the body turns Y and N."""
+        B = N_i * (N_bar_i + wp.transpose(N_bar_i))
+        turned = vector(B[1, 2] - B[2, 1], B[2, 0] - B[0, 2], B[0, 1] - B[1, 0])
+        return total + arm_bar_i, -total - arm_bar_i, wp.cross(Y_i, Y_bar_i) + turned - wp.cross(arm_i, total)
+
+    of = friction_functions(precision)
+    leaning, rubbing, bearing = (wp.func(one, module=module) for one in (of.lean, of.rub, of.bear))
+
+    @particle_kernel(module, "+A +T", numbers=["control"])
+    @typed
+    def pull(v_i, arm_i, Y_i, N_i, M_i, eta_i, V, W, control) -> tuple[matrix, matrix]:
+        change = leaning(v_i, arm_i, Y_i, N_i, V, W)
+        return change, traction(M_i, change, eta_i, control)
+
+    @particle_kernel(module, "+product +share load", numbers=["control"])
+    @typed
+    def push(time_step, v_i, m_i, T_i, eta_i, arm_i, H_i, Y_i, N_i, V, W, control) -> tuple[vector, real, six]:
+        a, c = rubbing(v_i, m_i, T_i, eta_i, arm_i, H_i, Y_i, N_i, V, W, control)
+        change = -time_step * a
+        return change, m_i * wp.dot(v_i, change), bearing(m_i, arm_i, a, c)
+
+    def thicken(N_i: matrix, mu_i: real) -> tuple[matrix, real]:
+        return N_i, wp.trace(N_i) * fluidity(mu_i)
+
+    def made(function: Any, results: list[str], **names: Any) -> Kernels:
+        return pointwise_kernels(precision, modules, lambda _: function, results, **names)
+
+    return SimpleNamespace(
+        hold=Kernels(hold, hold_tangent, hold_adjoint),
+        thicken=made(thicken, ["M:M", "R:R"]),
+        lean=made(of.lean, ["A:A"]),
+        rub=made(of.rub, ["rub", "couple"], numbers=["control"]),
+        bear=made(of.bear, ["load"], summed=["load"]),
+        pull=pull,
+        push=push,
+    )
+
+
+@cache
+def row_kernels(precision: Precision) -> SimpleNamespace:
+    """Make the kernels of a body's rows in a solve, with a thread for each scene, of momenta, six numbers each.
+    ``rise`` are the velocities by those in r, of a body that may be held (`cortado.sph.held_bodies`), and V and W those
+    by p.
+
+    `Rows` of `cortado.sph.moment_functions` need ``lift``, ``begin``, ``multiply``, ``descend`` and ``turn``. ``give``
+    adds the impulse by the solution to the momenta that a body gets. ``lengthen`` adds to the tangent of a load by that
+    of the time step. ``take`` begins from velocities, the adjoint of the impulse, of which ``heed`` writes what they
+    leave in r; ``answer`` adds those by the solution, and what they give to the adjoint of the time step."""
+    real, vector, matrix, six = precision.real, precision.vector, matrix_of(precision), precision.six
+    module, hold = free_module(precision), hold_functions(precision)
+    spin = hold.spin
+    kinds = {vector: "V W pushed twisted", matrix: "turns", wp.int32: "going", hold.kind: "hold"}
+    typed = TypesByName(real, {**kinds, six: "r rise p y product load impulse first"})
+
+    @wp.func
+    def both(V: vector, W: vector) -> six:
+        return six(V[0], V[1], V[2], W[0], W[1], W[2])
+
+    def kernel(function: Any) -> Any:
+        return wp.kernel(typed.arrays(function), module=module, enable_backward=False)
+
+    @kernel
+    def lift(r, density, volume: real, inertia: matrix, inverse: matrix, hold, turns, rise, total):
+        """Write velocities by the momenta r, and add the product of both to a total."""
+        b = wp.tid()
+        P, arm = vector(r[b][0], r[b][1], r[b][2]), turns[b] * hold.arm
+        L = vector(r[b][3], r[b][4], r[b][5]) - wp.cross(arm, P)
+        W = spin(turns[b], inertia, inverse, L, hold) / density[b]
+        found = both(wp.cw_mul(hold.moving, P) / (density[b] * volume) - wp.cross(W, arm), W)
+        rise[b] = found
+        total[b] = total[b] + wp.dot(r[b], found)
+
+    @kernel
+    def begin(r, rise, p, y, V, W):
+        b = wp.tid()
+        x = rise[b]
+        p[b] = r[b]
+        y[b] = six()
+        V[b] = vector(x[0], x[1], x[2])
+        W[b] = vector(x[3], x[4], x[5])
+
+    @kernel
+    def multiply(time_step, load, p, V, W, product, curvature):
+        b = wp.tid()
+        found = p[b] - time_step[b] * load[b]
+        product[b] = found
+        curvature[b] = curvature[b] + wp.dot(both(V[b], W[b]), found)
+
+    @kernel
+    def descend(going, size, curvature, p, product, y, r):
+        b = wp.tid()
+        if going[b] == 1:
+            step = size[b] / curvature[b]
+            y[b] = y[b] + step * p[b]
+            r[b] = r[b] - step * product[b]
+
+    @kernel
+    def turn(going, size, total, r, rise, p, V, W):
+        b = wp.tid()
+        if going[b] == 1:
+            part, x = total[b] / size[b], rise[b]
+            p[b] = r[b] + part * p[b]
+            V[b] = vector(x[0], x[1], x[2]) + part * V[b]
+            W[b] = vector(x[3], x[4], x[5]) + part * W[b]
+
+    @kernel
+    def give(time_step, y, impulse, pushed, twisted):
+        b = wp.tid()
+        x = time_step[b] * y[b]
+        impulse[b] = x
+        pushed[b] = pushed[b] + vector(x[0], x[1], x[2])
+        twisted[b] = twisted[b] + vector(x[3], x[4], x[5])
+
+    @kernel
+    def lengthen(time_step, time_step_dot, impulse, load):
+        b = wp.tid()
+        load[b] = load[b] + (time_step_dot[b] / (time_step[b] * time_step[b])) * impulse[b]
+
+    @kernel
+    def take(time_step, pushed_bar, twisted_bar, first, V, W):
+        """Write the velocities, and their negatives as V and W."""
+        b = wp.tid()
+        first[b] = time_step[b] * both(pushed_bar[b], twisted_bar[b])
+        V[b] = -time_step[b] * pushed_bar[b]
+        W[b] = -time_step[b] * twisted_bar[b]
+
+    @kernel
+    def heed(time_step, load, r):
+        b = wp.tid()
+        r[b] = -time_step[b] * load[b]
+
+    @kernel
+    def answer(time_step, impulse, rise, first, time_step_bar):
+        b = wp.tid()
+        found = first[b] + rise[b]
+        first[b] = found
+        time_step_bar[b] = time_step_bar[b] + wp.dot(found, impulse[b]) / (time_step[b] * time_step[b])
+
+    return by_name(lift, begin, multiply, descend, turn, give, lengthen, take, heed, answer)

@@ -1,0 +1,179 @@
+"""Fluid that rubs free bodies: momenta, a slow twin, closed forms, batches, and what is refused. `test_free_bodies.py`
+and `test_solid_loads.py` have their derivatives."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cortado import Problem, SceneError, Simulation
+from cortado.discretise.solid import Mass
+from cortado.losses import SolidPose
+from floating_bodies import stopping_cylinder
+from reference_projection import Projection
+from scenes import box
+from test_free_bodies import BALL, BRICK, RAFT, plane, rough, space
+from test_held_bodies import derivatives_agree, held
+from test_hinges import on_hinge
+from twins import stress_twin
+
+ROUGH = {**RAFT, "slip": "no"}
+SYRUP = [{"name": "water", "rest_density": 1000.0, "viscosity": 30.0}]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_rough_body_and_syrup_in_free_space_keep_their_momentum(dimension):
+    """Syrup hits a light body and clings to it."""
+    d, s = dimension, 0.05 if dimension == 2 else 0.08
+    syrup = box([-0.5] + [-0.25] * (d - 1), [-0.1] + [0.25] * (d - 1), phase="water", velocity=[1.0, 0.2, 0.0][:d])
+    body = box([-0.1, -0.4, -0.3][:d], [0.3, 0.1, 0.1][:d], name="raft", motion="free", density=40.0, slip="no")
+    tables = {"container": {"shape": "none"}, "forces": {"gravity": [0.0] * d}, "phase": SYRUP}
+    solver = {"kind": "projection", "time_step": 0.002}
+    scene = plane(body, dimension=d, discretisation={"spacing": s}, fluid=[syrup], solver=solver, **tables)
+    run = Simulation(scene, precision="float64").run(60, record_every=20)
+    solid = run.solids["raft"]
+    mass = 40.0 * Mass.of(scene.solid[0].own_solid()).volume
+    momentum = 1000.0 * s**dimension * run.velocities.sum(axis=1) + mass * solid.velocities
+    assert np.abs(momentum - momentum[0]).max() < 1e-12 * np.abs(momentum[0]).max()
+    assert solid.velocities[-1, 0] > 0.7 and run.diagnostics["viscous_iterations"].max() < 30
+
+
+def friction_of(simulation):
+    """The friction of its implicit viscous solve, and the accelerations by that alone."""
+    solver = simulation.solver
+    force = next(one for one in solver.forces if hasattr(one, "solve"))
+    found = solver.accelerations[-1].numpy() - solver.accelerations[-2].numpy()
+    order = solver.search.order.numpy()[: len(found)]
+    of_scene = np.empty_like(found)
+    of_scene[order] = found
+    return force.free, of_scene[:, : simulation.dimension]
+
+
+def test_the_solve_is_that_of_a_twin():
+    """Dense, of all particles and the body, after steps whose pressures count: forces on the body are those on wall
+    particles, at the surface below each particle."""
+    scene = plane({**ROUGH, "density": 60.0}, phase=SYRUP)
+    simulation = Simulation(scene, precision="float64")
+    state = simulation.run(3).last_state
+    simulation.run(1, state=state)
+    solver, h = simulation.solver, scene.solver.time_step
+    walls = {name: solver.search.walls[f"wall_{name}"].numpy() for name in ("positions", "weights", "solids")}
+    walls = walls["positions"][:, :2], walls["weights"] * (walls["solids"] == 0)  # the container slips freely
+    stress, twin = stress_twin(simulation, *walls, sticks=True), Projection.of(simulation)
+    x, n = state["positions"], len(state["positions"])
+    middle, held = solver.search.moving.named["after"].numpy()[0, 0, :2], twin.bodies[0]
+    mobility, twin = held.mobility[np.ix_([0, 1, 5], [0, 1, 5])], replace(twin, bodies=(replace(held, middle=middle),))
+    pushed = np.einsum("in,n->i", twin.body_rows(x)[0], state["pressure_impulse"])[[0, 1, 5]]
+    begun = np.array([*np.ravel(state["raft.velocity"])[:2], *np.ravel(state["raft.angular_velocity"])])
+    start = begun + [0.0, -9.81 * h, 0.0] + mobility @ pushed
+    u = state["velocities"] + h * np.array([0.0, -9.81]) + state["pressure_kick"]
+
+    def slope(y):
+        apart, _, g = twin.pairs(x, y)
+        square = (apart**2).sum(-1)
+        return (apart * g).sum(-1) / np.where(square == 0.0, 1.0, square) / stress.volume
+
+    slopes, wall_slopes = slope(x), slope(walls[0])
+
+    def forces(z):
+        """Of velocities of particles and of the body, forces on all of these."""
+        v, (a, b, w) = z[: 2 * n].reshape(n, 2), z[2 * n :]
+
+        def surface(places):
+            arms = places - middle
+            return np.stack([a - w * arms[..., 1], b + w * arms[..., 0]], axis=-1)
+
+        pull, places = stress.pulls(x, v, slopes, wall_slopes, np.full(n, 30.0), surface)
+        on_fluid, on_walls, arms = pull[:, :n].sum(0) - pull.sum(1), pull[:, n:], places - middle
+        torque = (arms[..., 0] * on_walls[..., 1] - arms[..., 1] * on_walls[..., 0]).sum()
+        return np.concatenate([on_fluid.ravel(), on_walls.sum((0, 1)), [torque]])
+
+    size = 2 * n + 3
+    matrix = np.array([forces(row) for row in np.eye(size)]).T
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-10 * np.abs(matrix).max())
+    inverse_mass = np.zeros((size, size))
+    inverse_mass[: 2 * n, : 2 * n] = np.eye(2 * n) / 1000.0
+    inverse_mass[2 * n :, 2 * n :] = mobility
+    z = np.linalg.solve(np.eye(size) - h * inverse_mass @ matrix, np.concatenate([u.ravel(), start]))
+    friction, found = friction_of(simulation)
+    rubbed = (z[: 2 * n] - u.ravel()).reshape(n, 2) / h
+    np.testing.assert_allclose(found, rubbed, atol=1e-9 * np.abs(rubbed).max())
+    impulse = friction.own["raft"].impulse["impulse"].numpy()[0][[0, 1, 5]]
+    wanted = h * forces(z)[2 * n :]
+    np.testing.assert_allclose(impulse, wanted, atol=1e-9 * np.abs(wanted).max())
+    np.testing.assert_allclose(friction.own["raft"].motion["V"].numpy()[0, :2], z[2 * n : 2 * n + 2], rtol=1e-9)
+
+
+@pytest.mark.parametrize("law", [None, {"kind": "power_law", "flow_index": 0.5, "least_shear_rate": 0.1}])
+def test_scenes_of_batches_have_the_bits_of_single_runs(law):
+    """And a derivative in float32 is near that in float64."""
+    phase, values = [{**SYRUP[0], "rheology": law}] if law else SYRUP, np.array([400.0, 700.0])
+    scene, loss = plane(ROUGH, {**BALL, "centre": [0.8, 0.5], "slip": "no"}, phase=phase), SolidPose("raft", [0.3, 0.2])
+    alone = [Problem(Simulation(scene), 4, loss).value_and_gradient({"raft.density": one}) for one in values]
+    both = Problem(Simulation(scene, batch=2), 4, loss).value_and_gradient({"raft.density": values})
+    assert [one[0] for one in alone] == both[0].tolist()
+    assert [one[1]["raft.density"] for one in alone] == both[1]["raft.density"].tolist()
+    exact = Problem(Simulation(scene, precision="float64"), 4, loss).value_and_gradient({"raft.density": 400.0})[1]
+    assert alone[0][1]["raft.density"] == pytest.approx(exact["raft.density"], rel=0.01)
+
+
+@pytest.mark.parametrize("density", [20.0, 1000.0, 5000.0])
+def test_bodies_of_any_density_rest_in_syrup(density):
+    """Light ones rise and heavy ones sink, both slowly and without a swing."""
+    ball = {**BALL, "centre": [0.3, 0.2], "density": density, "slip": "no"}
+    scene = plane(ball, phase=SYRUP, container=box([0.0, 0.0], [0.6, 1.0], slip="no"))
+    velocities = Simulation(scene).run(120, record_every=1).solids["ball"].velocities[:, 1]
+    assert np.abs(velocities).max() < 0.6 and np.abs(np.diff(velocities[60:], n=2)).max() < 0.01
+
+
+def test_a_turning_cylinder_stops_as_syrup_lets_it():
+    assert stopping_cylinder(16)["rate over the exact one"] == pytest.approx(1.0, abs=0.03)
+
+
+def test_an_explicit_solve_is_refused():
+    with pytest.raises(SceneError, match=r'viscous_solve is .explicit., but must be "implicit" or "automatic", as the'):
+        plane(ROUGH, forces={"viscous_solve": "explicit"})
+
+
+def test_bodies_that_slip_beside_those_that_do_not():
+    """Fluid that turns round a slippery one leaves it as it is."""
+    quiet = {"forces": {"gravity": [0.0, 0.0]}, "container": {"shape": "none"}, "phase": SYRUP}
+    wheels = [
+        {**BALL, "name": name, "centre": [x, 0.2], "slip": slip, "angular_velocity": 2.0}
+        for name, x, slip in (("a", 0.15, "no"), ("b", 0.45, "free"))
+    ]
+    run = Simulation(plane(*wheels, **quiet), precision="float64").run(10)
+    turning = {name: run.solids[name].angular_velocities[-1] for name in "ab"}
+    assert abs(turning["a"]) < 1.0 and turning["b"] == pytest.approx(2.0, rel=0.02)
+
+
+def test_it_goes_in_space_too():
+    scene = space({**BRICK, "slip": "no"}, phase=SYRUP)
+    solid = Simulation(scene).run(10).solids["raft"]
+    free = Simulation(space(BRICK, phase=SYRUP)).run(10).solids["raft"]
+    assert np.linalg.norm(solid.angular_velocities[-1]) < 0.8 * np.linalg.norm(free.angular_velocities[-1])
+
+
+HELD = {
+    "on a hinge": (lambda: on_hinge(plane, RAFT, {"position": [0.25, 0.45]}), 2),
+    "on a hinge in space": (
+        lambda: on_hinge(space, BRICK, {"position": [0.15, 0.35, 0.2], "axis": [0.3, 1.0, 0.2]}),
+        3,
+    ),
+    "that only heaves and turns": (lambda: plane(held(RAFT, "y", "rotation")), 2),
+    "that turns about two axes": (lambda: space(held(BRICK, "z", "rotation_x", "rotation_z")), 3),
+}
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_bodies_that_are_held_are_rubbed_with_derivatives(name):
+    (made, d), random = HELD[name], np.random.default_rng(3)
+    scene = rough(made())
+    body, flat = scene.solid[0], d == 2
+    loss = SolidPose("raft", [0.3, 0.2, 0.2][:d], 0.3 if flat else [0.3, 0.1, 0.2], length=0.2)
+    point = {"raft.position": body.middle(), "raft.density": np.array(500.0), "viscosity": np.array(30.0)}
+    point["raft.rotation"] = np.array(body.rotation[0] if flat else body.rotation)
+    point |= {"gravity": np.array([0.5, -9.81, 0.2][:d]), "time_step": np.array(0.001)}
+    sizes = {"density": 50.0, "position": 0.01, "time_step": 1e-5}
+    along = {n: sizes.get(n.split(".")[-1], 0.3) * random.normal(size=np.shape(v)) for n, v in point.items()}
+    derivatives_agree(Simulation(scene, precision="float64"), loss, point, along)
