@@ -319,3 +319,19 @@ def test_a_measured_flap_is_read_as_it_was_recorded(tmp_path):
 def test_a_course_made_by_hand_has_no_ramp():
     knots = Course(times=[0.0, 1.0], values=[[0.0], [2.0]]).knots
     assert knots.interpolation == "linear" and not knots.ramp and knots.at(np.array([0.5])).tolist() == [[1.0]]
+
+
+def test_gravity_of_one_value_begins_with_a_ramp():
+    one = {"times": [0.0], "values": [[0.0, -9.81]], "ramp": 0.02}
+    fall = {"fluid": [box([0.2, 0.3], [0.3, 0.4], phase="water")], "container": {"shape": "none"}}
+    made = plane(schedule={"gravity": one}, solver={"kind": "projection", "time_step": 1e-3}, **fall)
+    speed = -Simulation(made, precision="float64").run(40, record_every=1).velocities[:, :, 1].mean(axis=1)
+    half = 9.81 * 0.02 * 0.5  # the mean of the ramp is a half
+    np.testing.assert_allclose(speed[[20, 40]], [half, half + 9.81 * 0.02], rtol=1e-6)
+    assert speed[4] < 0.1 * 9.81 * 0.004
+
+
+@pytest.mark.parametrize("key", ["csv", "file"])
+def test_other_names_of_the_key_are_told(key):
+    with pytest.raises(SceneError, match=f"{key} is not a key of .* did you mean path"):
+        paddle(**{key: "p.csv"})

@@ -364,7 +364,7 @@ ALSO_CALLED = {
     **dict.fromkeys(("min", "from"), ("lower",)),
     **dict.fromkeys(("max", "to", "size"), ("upper",)),
     **{"type": ("kind", "shape"), "n": ("flow_index",), "cfl": ("courant",), "omega": ("angular_velocity",)},
-    **{"angle": ("rotation",), "csv": ("file",), "path": ("file",), "fps": ("frame_rate",)},
+    **{"angle": ("rotation",), "csv": ("path", "file"), "file": ("path",), "path": ("file",), "fps": ("frame_rate",)},
 }
 """Keys by the names that users of other programs have for them."""
 
