@@ -375,3 +375,31 @@ def test_solids_at_rest_carry_nothing_and_views_that_turn_have_no_images():
     for sensor in (WaveGauge([0.1, 0.0], on="sill", axes="body"), WallForce(on="sill")):
         with pytest.raises(InputError, match="has no images along periodic axes"):
             simulation.run(1, sensors={"mine": sensor})
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_readings_of_a_long_run_are_those_of_its_parts(kind):
+    """Bit for bit, over several chunks of steps and where a run goes on from a state."""
+    on, simulation = MADE[kind][1], simulated(kind, 2, "float32")
+    sensors = on_a_solid(2, on)
+    whole = simulation.run(45, sensors=sensors)
+    first = simulation.run(20, sensors=sensors)
+    rest = simulation.run(25, state=first.last_state, sensors=sensors)
+    for name in sensors:
+        parts = np.concatenate([first.sensors[name].values[:-1], rest.sensors[name].values[:-1]])
+        assert parts.tobytes() == whole.sensors[name].values[:-1].tobytes(), name
+
+
+@pytest.mark.parametrize("name", ["probe", "gauge in the body", "force"])
+def test_a_loss_of_a_riding_sensor_in_a_batch_is_that_of_each_scene(name):
+    starts = np.array([[0.2, 0.25], [0.23, 0.27]])
+    sensor, dt = on_a_solid(2, "raft")[name], simulated("free", 2).scene.solver.time_step
+    wanted = np.ones((2, len(sensor.columns(2))))
+    alone, together = (
+        cortado.Problem(simulated("free", 2, batch=batch), 4, Series(sensor, [0.0, 4 * dt], wanted, dt))
+        for batch in (None, 2)
+    )
+    each = [alone.value_and_gradient({"raft.position": start}) for start in starts]
+    values, gradient = together.value_and_gradient({"raft.position": starts})
+    np.testing.assert_allclose(values, [value for value, _ in each], rtol=1e-12)
+    np.testing.assert_allclose(gradient["raft.position"], [one["raft.position"] for _, one in each], rtol=1e-10)
