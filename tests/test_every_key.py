@@ -90,6 +90,10 @@ IN_THE_PLANE = [
         **{"centre_of_mass": [0.02, -0.02], "gyration_radius": 0.08},
     },
 ]
+PIN = {"name": "pin", "solid": "keel", "position": [1.1, 0.66], "stiffness": 3.0, "damping": 0.5, "rest_angle": 0.1}
+PIN |= {"times": [0.0, 0.1], "torques": [1.0, 2.0]}
+LINE = {"name": "line", "solid": "disc", "point": [0.5, 0.42], "anchor": [0.5, 0.7], "stiffness": 300.0}
+LINE |= {"rest_length": 0.25, "damping": 2.0, "slack": True}
 IN_SPACE = [
     {"name": "pole", "shape": "cylinder", "base": [0.2, 0.1, 0.3], "radius": 0.1, "height": 0.3, "slip": "no"},
     {"name": "cup", "shape": "cup", "base": [0.6, 0.1, 0.3], "radius": 0.1, "height": 0.3, "thickness": 0.1},
@@ -130,8 +134,9 @@ BASES = {
         fluid=[{"shape": "points", "file": DROPS, "phase": "water", "velocity": [0.6, 0.6]}],
         container={**ROOM, "upper": [1.6, 0.8], "colour": [0.3, 0.2, 0.1]},
         solid=IN_THE_PLANE,
-        hinge=[{"name": "pin", "solid": "keel", "position": [1.1, 0.66]}],
-        sensor=ON_THE_ROD,
+        hinge=[PIN],
+        spring=[LINE],
+        sensor=[*ON_THE_ROD, {"name": "i", "kind": "spring_force", "spring": "line"}],
         picture={"width": 80, "height": 64},
     ),
     "solids": lambda: scene(
@@ -169,6 +174,10 @@ ASIDE = {
     ("SolidTable", "name"): "what others call it",
     ("HingeTable", "name"): "what messages call it",
     ("HingeTable", "axis"): "in space alone: tests/test_hinges.py",
+    ("HingeTable", "torque"): "in place of torques: tests/test_springs.py",
+    ("SpringTable", "name"): "what sensors and parameters call it",
+    ("SpringTable", "preload"): "in place of rest_length: tests/test_springs.py",
+    ("SpringTable", "to"): "instead of the world: tests/test_springs.py",
     ("PackageTable", "kind"): "packages: tests/test_packages.py",
     ("PackageSolver", "kind"): "packages: tests/test_packages.py",
     ("PcisphSolver", "density_tolerance"): "only where more iterations are taken: tests/test_solver.py",

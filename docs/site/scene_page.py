@@ -48,6 +48,7 @@ LINKS = {
     "container": ("[table](#walls-container)", "What holds the fluid."),
     "solid": ("[tables](#solids-solid)", "What fluid flows around or is held by, besides the container."),
     "hinge": ("[tables](#hinges-hinge)", "Hinges, about which free bodies turn."),
+    "spring": ("[tables](#springs-spring)", "Springs, which pull free bodies."),
     "mixture": ("[table](#fluids-that-mix-mixture)", "How phases mix."),
     "forces": ("[table](#forces-forces)", "Which forces act."),
     "force": ("[tables](#forces-of-packages-force)", "Forces of installed packages, which act besides."),
@@ -328,6 +329,19 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         ),
     ),
     (
+        "## Springs: `[[spring]]`",
+        'They pull bodies with `motion = "free"` ([springs and mooring lines](solids.md#bodies-that-float)).',
+        (
+            (
+                "SpringTable",
+                "",
+                '[[solid]]\nname = "raft"\nshape = "box"\nlower = [0.6, 0.2, 0.1]\nupper = [0.9, 0.3, 0.4]\n'
+                'motion = "free"\ndensity = 300.0\n\n[[spring]]\nname = "line"\nsolid = "raft"\n'
+                "point = [0.9, 0.2, 0.25]\nanchor = [0.95, 0.0, 0.25]\nstiffness = 500.0\nslack = true",
+            ),
+        ),
+    ),
+    (
         "## Time steps: `[solver]`",
         "How the fluid is kept incompressible ([two ways](projection.md)). A time step beyond the limit of stability "
         'is warned of; with `time_step = "auto"` it is [chosen before each step](steps.md#steps-that-are-chosen). '
@@ -373,6 +387,14 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "### The load on a solid",
                 '[[solid]]\nname = "post"\nshape = "box"\nlower = [0.9, 0.0, 0.2]\nupper = [1.0, 0.6, 0.3]\n\n'
                 '[[sensor]]\nkind = "solid_load"\nname = "load"\nsolid = "post"',
+            ),
+            (
+                "SpringForceTable",
+                "### The force in a spring",
+                '[[solid]]\nname = "raft"\nshape = "box"\nlower = [0.6, 0.2, 0.1]\nupper = [0.9, 0.3, 0.4]\n'
+                'motion = "free"\ndensity = 300.0\n\n[[spring]]\nname = "line"\nsolid = "raft"\n'
+                "point = [0.9, 0.2, 0.25]\nanchor = [0.95, 0.0, 0.25]\nstiffness = 500.0\n\n"
+                '[[sensor]]\nkind = "spring_force"\nname = "pull"\nspring = "line"',
             ),
         ),
     ),

@@ -3,8 +3,9 @@
 from cortado.calls import face
 from cortado.runs.probes import FlowRate, PressureProbe, SolidLoad, WallForce
 from cortado.runs.sensor import Readings, Sensor
+from cortado.runs.spring_loads import SpringForce
 from cortado.runs.wave_gauge import WaveGauge
 
-__all__ = ["FlowRate", "PressureProbe", "Readings", "Sensor", "SolidLoad", "WallForce", "WaveGauge"]
+__all__ = ["FlowRate", "PressureProbe", "Readings", "Sensor", "SolidLoad", "SpringForce", "WallForce", "WaveGauge"]
 
 __dir__ = face(globals())

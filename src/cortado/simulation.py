@@ -105,7 +105,7 @@ class Simulation(Stepping):
         self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
         """What makes the solver, if it is not Cortado's own."""
         self._called, self._lanes = called(scene.solver, self._given[1]), checked_lanes(lanes)
-        self.known = known_of(self.forces, self._maker, scene.solid)
+        self.known = known_of(self.forces, self._maker, scene)
         """Its parameters."""
         self.device = device_named(device)
         self.precision = precision_named(precision)

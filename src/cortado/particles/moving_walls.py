@@ -60,6 +60,14 @@ def pose_arrays(members: int, solids: int, precision: Precision, device: Any) ->
     return made
 
 
+def resting_pose(layout: Layout) -> dict[str, wp.array]:
+    """Make the arrays (members,) of `pose_arrays` for what rests at the origin and is not turned."""
+    made = pose_arrays(layout.members, 1, layout.precision, layout.device)
+    for name in ("turns", "turns_before"):
+        made[name].fill_(matrix_of(layout.precision)(*np.eye(3).ravel()))
+    return {name: array[:, 0] for name, array in made.items()}
+
+
 @cache
 def matrix_of(precision: Precision) -> Any:
     """Return the Warp type of 3 x 3 matrices in a precision."""

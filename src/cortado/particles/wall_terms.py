@@ -46,8 +46,6 @@ NAMES = ("force", "torque", "force_before", "torque_before", "growth")
 """f, t, f_0, t_0 and g / sigma."""
 BARS = [f"{name}_bar" for name in ("after", "turned", "before", "turned_before", "scales")]
 """The adjoints, of poses and of the scale, that these are."""
-WHOLE = ("force", "torque", "growth")
-"""Shares of a solid that others than particles give."""
 LOOP = """\
 _x_i = at.x[i]
     _mirrors = _mirror_of(_x_i, i // s.particles, s)
@@ -215,7 +213,7 @@ class SolidShares:
         solids = range(0 if walls is None else walls.solids)
         self._arrays = [{name: wp.zeros(size, dtype=kinds[name], device=device) for name in NAMES} for _ in solids]
         self._sums = [{name: layout.sum_of(kinds[name]) for name in NAMES} for _ in solids]
-        whole = {name: (layout.members, kinds[name]) for name in WHOLE}
+        whole = {name: (layout.members, kinds[name]) for name in NAMES}
         self._whole = [zeros(whole, device) for _ in solids]
         """What was given by others than particles."""
 
@@ -250,10 +248,10 @@ class SolidShares:
         self._forget(solid)
         return dict(zip(BARS, found.values(), strict=True))
 
-    def add_whole(self, solid: int, *given: wp.array) -> None:
-        """Add f, t, and g where there is one, (members,), to the adjoints of one solid, apart from particles."""
-        for one, own in zip(given, self._whole[solid].values(), strict=False):
-            add(one, own)
+    def add_whole(self, solid: int, **given: wp.array) -> None:
+        """Add to some of the adjoints `BARS` (members,) of one solid, by name, apart from particles."""
+        for bar, one in given.items():
+            add(one, self._whole[solid][NAMES[BARS.index(bar)]])
 
     def clear(self) -> None:
         """Set the shares of all solids to 0."""

@@ -27,6 +27,7 @@ from cortado.runs.particle_sums import (
 )
 from cortado.runs.riding import Axes, Carrier, Ride, axes_of, named, ride_of, together
 from cortado.runs.sensor import Cut, Reading, SensedScene, Sensor, corner, direction, in_dimension, point, positive
+from cortado.runs.spring_loads import SpringForce
 from cortado.runs.wave_gauge import WaveGauge
 from cortado.scene.parameters import load_name
 from cortado.scene.scene import Scene
@@ -230,6 +231,7 @@ SENSORS: dict[str, Callable[..., Sensor]] = {
     "flow_rate": FlowRate,
     "wall_force": WallForce,
     "solid_load": SolidLoad,
+    "spring_force": SpringForce,
 }
 """Classes of sensors by their kinds."""
 

@@ -385,7 +385,7 @@ class SolidLoads:
         self._loads.twists_adjoint(step, self._bars["twist_bar"], bar, self._solid)
         if self._moving is not None:
             total = self._sums[1](self._bars["middle_bar"])
-            bar.of.solids.add_whole(self._solid, total, wp.zeros_like(total))
+            bar.of.solids.add_whole(self._solid, after_bar=total)
 
 
 def formulas(solver: ParticleSolver, circulation_factor: float) -> dict[str, QuantityFormula]:

@@ -20,6 +20,7 @@ from cortado.particles.state import Fields, Parameters, State, padded
 from cortado.rollout.rollout import Rollout
 from cortado.runs.particle_sums import in_the_scene
 from cortado.runs.quantity_formulas import SIX, Bars, QuantityFormula, formulas
+from cortado.runs.spring_loads import spring_loads
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.parameters import LOAD, QUANTITIES, check_quantity, is_load
 from cortado.scene.scene import Scene
@@ -126,7 +127,7 @@ class QuantityEvaluator:
         self.solids: tuple[SolidTable, ...] = scene.solid
         """As they begin."""
         self.container: Container = scene.container
-        self._formulas = formulas(solver, circulation_factor)
+        self._formulas = {**formulas(solver, circulation_factor), **spring_loads(solver)}
         self._counts: Counts = ()
         """Of the step that was solved last."""
         self._graphs: dict[tuple[int, Counts], CapturedGraph] = {}

@@ -19,9 +19,10 @@ from cortado.scene.links import check_hinges
 from cortado.scene.model import MixtureTable, SceneTables
 from cortado.scene.motions import free
 from cortado.scene.parameters import BY_NAME
-from cortado.scene.sensor_tables import FlowRateTable, PressureProbeTable, SolidLoadTable
+from cortado.scene.sensor_tables import FlowRateTable, PressureProbeTable, SolidLoadTable, SpringForceTable
 from cortado.scene.shape_tables import MeshShape, check_length
 from cortado.scene.solids import SolidTable
+from cortado.scene.springs import check_springs
 from cortado.scene.stability import chosen_limits
 from cortado.scene.tables import MISSING, FieldPath, field_error, field_name
 from cortado.words import point_in_words
@@ -195,6 +196,7 @@ def check_scene(scene: SceneTables) -> None:
     for index, solid in enumerate(scene.solid):
         check_solid(("solid", index), solid, spacing)
     check_hinges(scene.hinge, scene.solid, scene.dimension)
+    check_springs(scene.spring, scene.hinge, scene.solid)
     check_free(scene)
     _check_sensors(scene)
     for index, fluid in enumerate(scene.fluid):
@@ -244,7 +246,7 @@ def _check_phases(scene: SceneTables) -> None:
 
 
 def _check_sensors(scene: SceneTables) -> None:
-    names = [solid.name for solid in scene.solid]
+    names, springs = ([one.name for one in tables] for tables in (scene.solid, scene.spring))
     moving = [solid.name for solid in scene.solid if solid.moves]
     on_moving = f"the name of a solid that moves, of {shown(moving)}" if moving else "left out, as no solid moves"
     for index, sensor in enumerate(scene.sensor):
@@ -255,6 +257,10 @@ def _check_sensors(scene: SceneTables) -> None:
                 raise field_error((*path, "solid"), sensor.solid, wanted)
             if sensor.axes == "body" and sensor.solid not in moving:
                 raise field_error((*path, "axes"), sensor.axes, '"world", as the solid is at rest')
+        elif isinstance(sensor, SpringForceTable):
+            if sensor.spring not in springs:
+                wanted = f"the name of a spring, of {shown(springs)}" if springs else "of a scene with springs"
+                raise field_error((*path, "spring"), sensor.spring, wanted)
         elif not isinstance(sensor, FlowRateTable):
             if sensor.on is not None and sensor.on not in moving:
                 raise field_error((*path, "on"), sensor.on, on_moving)

@@ -2,15 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Annotated, Any, Self
 
 import numpy as np
 
 from cortado.arrays import unit
+from cortado.discretise.solid import Mass
 from cortado.errors import Words, shown
-from cortado.scene.courses import WAYS
+from cortado.scene.courses import WAYS, Knots
 from cortado.scene.solids import SolidTable
-from cortado.scene.tables import FieldPath, Length, Table, Text, Vector, field_error, quantity
+from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity
 
 Three = tuple[float, float, float]
 
@@ -27,6 +29,24 @@ class HingeTable(Table):
     axis: tuple[Annotated[float, quantity()], ...] | None = None
     """(3,) Direction of its axis in 3-D, of any length; left out, the body turns about it in every way. In 2-D there is
     none."""
+    stiffness: Annotated[float, quantity("N m/rad", ge=0.0)] | None = None
+    """Torque against each radian from the angle at rest [N m/rad]; in 2-D that of a metre across."""
+    rest_angle: Annotated[float, quantity("rad", ge=-3.0, le=3.0)] = 0.0
+    """Turn from how the scene begins at which that torque is 0 [rad]."""
+    damping: Annotated[float, quantity("N m s/rad", ge=0.0)] | None = None
+    """Torque against each radian a second of the turn [N m s/rad]."""
+    torque: Annotated[float, quantity("N m")] | None = None
+    """Torque with which a motor turns the body [N m]."""
+    times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
+    """(k,) Times of `torques`, from 0 on, each greater than the one before [s]; between them torques go in straight
+    lines."""
+    torques: tuple[Annotated[float, quantity("N m")], ...] | None = None
+    """(k,) Torques of a motor at these times, in place of `torque` [N m]."""
+
+    @property
+    def turns(self) -> bool:
+        """Return True where something turns the body about the hinge."""
+        return any(value is not None for value in (self.stiffness, self.damping, self.torque, self.times))
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if self.axis is not None:
@@ -35,7 +55,29 @@ class HingeTable(Table):
             self.check_components(("axis",), dimension, path)
             if not any(self.axis):
                 raise field_error((*path, "axis"), self.axis, "a vector that is not 0")
+        elif dimension == 3 and self.turns:
+            key = next(key for key in ("stiffness", "damping", "torque", "times") if getattr(self, key) is not None)
+            raise field_error((*path, key), Words("given"), "left out, as the hinge has no axis")
+        self._check_torques(path)
         return super().in_dimension(dimension, path)
+
+    @property
+    def course(self) -> Knots | None:
+        """Return the torque of the motor over time; None where it is steady."""
+        return None if self.times is None else Knots(np.array(self.times), np.array(self.torques))
+
+    def _check_torques(self, path: FieldPath) -> None:
+        times, torques = self.times or (), self.torques
+        if self.times is None and torques is None:
+            return
+        if len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
+            wanted = "at least two times, from 0 on, each greater than the one before"
+            raise field_error((*path, "times"), MISSING if self.times is None else times, wanted)
+        if torques is None or len(torques) != len(times):
+            found = MISSING if torques is None else Words(f"a list of {len(torques)}")
+            raise field_error((*path, "torques"), found, f"a list of {len(times)}, as are times")
+        if self.torque is not None:
+            raise field_error((*path, "torque"), self.torque, "left out, as there are torques")
 
 
 @dataclass(frozen=True)
@@ -72,6 +114,12 @@ def _three(vector: Any) -> Three:
     """Return a vector (d,) as three numbers."""
     x, y, z = (*map(float, vector), 0.0)[:3]
     return x, y, z
+
+
+def inertia_about(hold: Hold, mass: Mass) -> np.ndarray:
+    """Return the inertia (3, 3) of a mass about the hinge, or about its centre without one, in the body's frame."""
+    arm = np.array(hold.arm)
+    return np.asarray(mass.inertia + mass.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm)))
 
 
 def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dimension: int) -> None:

@@ -23,6 +23,7 @@ from cortado.scene.shape_tables import AnyContainer, NoContainer
 from cortado.scene.solid_shapes import AnySolid
 from cortado.scene.solids import solids_of
 from cortado.scene.solvers import AnySolver, what_suits
+from cortado.scene.springs import SpringTable
 from cortado.scene.tables import (
     Colour,
     Flag,
@@ -250,6 +251,8 @@ class SceneTables(Table):
     """Solids, which fluid flows around or is held by, besides the container."""
     hinge: tuple[HingeTable, ...] = ()
     """Hinges, about which free bodies turn."""
+    spring: tuple[SpringTable, ...] = ()
+    """Springs, which pull free bodies."""
     mixture: MixtureTable = MixtureTable()
     """How phases mix; the default if there is only one."""
     forces: Forces = Field(default=Forces(), validate_default=True)
@@ -324,7 +327,7 @@ class SceneTables(Table):
         given = table is not None and "dimension" in info.data
         return table.in_dimension(info.data["dimension"]) if given else table
 
-    @field_validator("sensor", "solid", "hinge")
+    @field_validator("sensor", "solid", "hinge", "spring")
     @classmethod
     def _resolve_named(cls, tables: Any, info: ValidationInfo) -> Any:
         for index, table in enumerate(tables):

@@ -122,6 +122,16 @@ class SolidLoadTable(SensorTable):
     """The axes of force and torque: "world", or "body", those that turn with the solid."""
 
 
+class SpringForceTable(SensorTable):
+    """A sensor of the force with which a spring pulls, and of its length."""
+
+    kind: Literal["spring_force"]
+    """Which sensor it is."""
+    spring: Text
+    """The name of the spring."""
+
+
 AnySensor = Annotated[
-    PressureProbeTable | WaveGaugeTable | FlowRateTable | WallForceTable | SolidLoadTable, Field(discriminator="kind")
+    PressureProbeTable | WaveGaugeTable | FlowRateTable | WallForceTable | SolidLoadTable | SpringForceTable,
+    Field(discriminator="kind"),
 ]

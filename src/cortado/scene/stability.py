@@ -13,6 +13,7 @@ from cortado.scene.parameter_values import Arrays, Tilt
 from cortado.scene.parameters import PARAMETERS
 from cortado.scene.solids import SolidTable, solids_of
 from cortado.scene.solvers import ProjectionSolver
+from cortado.scene.springs import spring_limit
 
 
 def greatest_fall(scene: SceneTables, gravity: Points) -> float:
@@ -192,6 +193,8 @@ def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTa
     own = {**_other_limits(scene, values), "viscosity": viscous}
     if (fastest := greatest_speed(solids, values)) > 0.0:
         own["the speed of solids"] = SOLID_STEP * scene.discretisation.spacing / fastest
+    if scene.spring or any(hinge.turns for hinge in scene.hinge):
+        own["springs"] = spring_limit(scene, values)
     return {name: own[name] for name in ("gravity", "depth", "viscosity", *own)}
 
 

@@ -3,7 +3,7 @@ names by their kinds, with the parameters that these bring; and what any solver 
 forces, phases, nozzle, and where particles may go.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from importlib import import_module
@@ -33,17 +33,19 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import NoContainer
 from cortado.scene.solids import SolidTable
 from cortado.scene.solvers import OWN, PackageSolver, SolverTable
+from cortado.scene.springs import ends_of, spring_parameters, turned_by
 from cortado.solvers.contacts import Contacts, Touching
 from cortado.solvers.obstacles import FINE, ON, FlatFaces, NamedSolid, Obstacle, Walled, flat_faces
 from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.solver import Solver
 from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, Diffusion, FreeEnergy
-from cortado.sph.free_solids import FreeSolids, FreeTable
+from cortado.sph.free_solids import FreeSolids, FreeSolidsPart, FreeTable, Push
 from cortado.sph.mixture import Phases
 from cortado.sph.moving_solids import MovingSolids
 from cortado.sph.own_force import Rheology
 from cortado.sph.parts import Force, Part, PartMaker, Setting
+from cortado.sph.springs import Springs
 from cortado.sph.stress_forces import LAWS
 
 
@@ -84,9 +86,9 @@ def checked_parameters(what: str, maker: Any, parameters: Any) -> Sequence[Param
     return parameters
 
 
-def known_of(forces: Sequence[ForceMaker], solver: Any = None, solids: Sequence[SolidTable] = ()) -> Known:
-    """Return the parameters of a simulation with these forces, this solver's maker and these solids; raise `InputError`
-    where two have one name, or replace the same force."""
+def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
+    """Return the parameters of a simulation with these forces, this solver's maker and the scene's solids and springs;
+    raise `InputError` where two have one name, or replace the same force."""
     taken: dict[str, ForceMaker] = {}
     for maker in forces:
         if (place := getattr(maker, "replaces", None)) is not None and taken.setdefault(place, maker) is not maker:
@@ -95,7 +97,8 @@ def known_of(forces: Sequence[ForceMaker], solver: Any = None, solids: Sequence[
             raise InputError(f"{found}, but only one can: leave out the other, in forces or as the phase's rheology.")
     own = [(parameter, "a solver") for parameter in getattr(solver, "parameters", ())]
     own += [(parameter, "a force") for maker in forces for parameter in maker.parameters]
-    return Known([*own, *((parameter, "a solid") for parameter in motion_parameters(solids))])
+    own += [(parameter, "a solid") for parameter in motion_parameters(scene.solid)]
+    return Known([*own, *((parameter, "a spring") for parameter in spring_parameters(scene))])
 
 
 def check_own(known: Known, source: Source) -> None:
@@ -209,7 +212,7 @@ def known_in(scene: Scene) -> Known:
     own = scene.force or any(phase.rheology for phase in scene.phase) or isinstance(scene.solver, PackageSolver)
     if not (own or moving(scene.solid)):
         return REGISTRY
-    return known_of(forces_named(scene), solver_named(scene.solver), scene.solid)
+    return known_of(forces_named(scene), solver_named(scene.solver), scene)
 
 
 FORCE_ATTRIBUTES = ("shares", "accelerate", "tangent", "adjoint")
@@ -355,7 +358,11 @@ def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch,
     if not tables:
         return None
     spacing, touching, periods = scene.discretisation.spacing, _touching(scene, discrete), discrete.periods
-    return FreeSolids(tables, scene.dimension, search, lambda part: Contacts(part, touching, spacing, periods, layout))
+    pushes: list[Callable[[FreeSolidsPart], Push]] = [lambda part: Contacts(part, touching, spacing, periods, layout)]
+    springs, turned = ends_of(scene.spring, moving(scene.solid)), turned_by(scene.hinge, moving(scene.solid))
+    if springs or turned:
+        pushes.append(lambda part: Springs(part, springs, turned, layout))
+    return FreeSolids(tables, scene.dimension, search, pushes)
 
 
 def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:

@@ -24,11 +24,12 @@ from cortado.device.launching import Named, bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_of
-from cortado.particles.moving_walls import matrix_of
+from cortado.particles.moving_walls import matrix_of, resting_pose
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout, Parameters, padded, zeros
 from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
-from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart, free_module
+from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart, given_to
+from cortado.sph.held_bodies import free_module
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 STIFFNESS = 0.04
@@ -205,15 +206,9 @@ class Contact:
     def poses(self, each: Sequence[Named]) -> Named:
         """Return the pose and scale of the other solid, and tangents, by the names that kernels have for them; ``each``
         are those of all solids that move."""
-        if self.touching.against >= 0:
-            return {f"other_{name}": array for name, array in each[self.touching.against].items()}
-        layout, vector = self.layout, self.layout.precision.vector
-        kinds = {"after": vector, "turns": matrix_of(layout.precision), "scales": layout.precision.real}
-        kinds |= {"after_dot": vector, "turned_dot": vector, "scales_dot": layout.precision.real}
-        still = zeros({f"other_{name}": (layout.members, kind) for name, kind in kinds.items()}, layout.device)
-        still["other_scales"].fill_(1.0)
-        still["other_turns"].fill_(kinds["turns"](*np.eye(3).ravel()))
-        return still
+        against = self.touching.against
+        other = resting_pose(self.layout) if against < 0 else each[against]
+        return {f"other_{name}": array for name, array in other.items()}
 
 
 class Totals:
@@ -283,18 +278,12 @@ class Contacts:
         return {name: parameters[body.table.weight] for name, body in zip(names, self.bodies(number), strict=True)}
 
     def given(self, number: int, each: Sequence[FreeBody | Changes]) -> Arrays:
-        """Return the momenta that both solids get, or their changes; ``pushed_bar`` of the other is
-        ``pushed_other_bar``."""
+        """Return the momenta that both solids get, or their changes."""
         touching = self.contacts[number].touching
-        other = each[touching.body if touching.other < 0 else touching.other].given
-        named = {name.replace("ed", "ed_other", 1): array for name, array in other.items()}
-        return {**each[touching.body].given, **named}
+        return given_to(each, touching.body, touching.other)
 
     def look(self, step: StepContext) -> None:
-        """Find the contacts of a step, and write the momenta that bodies get from them."""
-        for body in self.part.bodies:
-            for array in body.given.values():
-                array.zero_()
+        """Find the contacts of a step, and add the momenta that bodies get from them."""
         for number, (contact, shares) in enumerate(zip(self.contacts, self._shares, strict=True)):
             for array in contact.found.values():
                 array.zero_()
@@ -322,11 +311,8 @@ class ContactsTangent:
         self._shares = [Totals(contact, share_kinds(contacts.layout), "_dot") for contact in contacts.contacts]
 
     def look(self, step: StepContext, dot: Tangents) -> None:
-        """Write the tangents of the contacts, and of the momenta that bodies get from them in `Contacts.look`."""
+        """Add the tangents of the momenta that bodies get from contacts in `Contacts.look`."""
         contacts = self._contacts
-        for own in self._changes:
-            for array in own.given.values():
-                array.zero_()
         for number, shares in enumerate(self._shares):
             known = contacts.known(step, number)
             step.launch(contacts.kernels.push.tangent, shares.each, *known, threads=contacts.contacts[number].all)
@@ -355,7 +341,8 @@ class ContactsAdjoint:
             given = contacts.given(number, self._changes)
             step.launch(contacts.kernels.give.adjoint, given, *rates, *known, threads=contacts.layout.members)
             step.launch(contacts.kernels.push.adjoint, moved.each, *known, threads=contact.all)
-            force, torque, *others = moved.sums().values()
-            bar.solids.add_whole(contacts.bodies(number)[0].table.number, force, torque)
+            bars, own = moved.sums(), ("after_bar", "turned_bar")
+            bar.solids.add_whole(contacts.bodies(number)[0].table.number, **{name: bars[name] for name in own})
             if contact.touching.against >= 0:
-                bar.solids.add_whole(contact.touching.against, *others)
+                others = {name: bars[f"other_{name}"] for name in (*own, "scales_bar")}
+                bar.solids.add_whole(contact.touching.against, **others)

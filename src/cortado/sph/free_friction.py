@@ -22,8 +22,9 @@ from cortado.particles.mirrors import ALL_WALLS
 from cortado.particles.moving_walls import matrix_of
 from cortado.particles.state import Layout, zeros
 from cortado.scene.motions import free
-from cortado.sph.free_solids import Changes, FreeBody, move_kernels
+from cortado.sph.free_solids import Changes, FreeBody
 from cortado.sph.friction_kernels import friction_kernels, row_kernels
+from cortado.sph.held_bodies import move_kernels
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
 Arrays = dict[str, wp.array]
@@ -52,8 +53,8 @@ class BodyFriction:
         kinds = {f"{name}{suffix}": (layout.members, vector) for name in VELOCITIES}
         self.motion = zeros(kinds, layout.device)
         """V and W of the start with gravity and contact, and after the solve those of its end."""
-        self.turned, self.none = (wp.zeros(layout.members, dtype=vector, device=layout.device) for _ in range(2))
-        """The adjoint of a further turn, and 0."""
+        self.turned = wp.zeros(layout.members, dtype=vector, device=layout.device)
+        """The adjoint of a further turn."""
         self.none_total = wp.zeros(layout.members, dtype=real, device=layout.device)
         """A total that nobody reads."""
         self.momenta = {
@@ -399,7 +400,7 @@ class FrictionAdjoint:
             ):
                 add(total, given)
                 add(total, pressed)
-            bar.solids.add_whole(body.table.number, bars.none, bars.turned)
+            bar.solids.add_whole(body.table.number, turned_bar=bars.turned)
             given = bar.solids.of(body.table.number)
             known = bars.known, own.known, *bar.named, of.constants, *body.known(step)
             step.launch(of.kernels.hold.adjoint, given, *known)

@@ -23,7 +23,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.launching import Named
-from cortado.device.modules import Kernels, kernel_module
+from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import add
 from cortado.discretise.solid import Mass
@@ -32,17 +32,12 @@ from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Layout, State, StateField
-from cortado.scene.links import Hold
+from cortado.scene.links import Hold, inertia_about
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, rotation_name, velocity_name
 from cortado.scene.parameters import Axis
-from cortado.sph.held_bodies import hold_functions, hold_numbers, inertia_about_hinge
+from cortado.sph.held_bodies import free_module, hold_functions, hold_numbers
 from cortado.sph.moving_solids import rotations
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
-
-
-def free_module(precision: Precision) -> Any:
-    """Return the Warp module of kernels of free bodies that need no smoothing kernel."""
-    return kernel_module(f"free_bodies_derivative_{precision.name}")
 
 
 @cache
@@ -163,49 +158,6 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
     return begins, ends
 
 
-@cache
-def move_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of V, L and W of a body by gravity and by the sums of momenta that it gets, with a thread for
-    each scene, and of the velocity changes V - V_0 and W - W_0, ``faster`` and ``turned_faster``. Adjoints of the sums
-    are written."""
-    real, vector, matrix, hold = precision.real, precision.vector, matrix_of(precision), hold_functions(precision)
-    spin, vectors = hold.spin, "gravity V W L pulled twisted"
-
-    @TypesByName(real, {vector: vectors, matrix: "inertia inverse turns", hold.kind: "hold"})
-    def move(
-        time_step_i,
-        gravity_i,
-        density_i,
-        volume,
-        inertia,
-        inverse,
-        hold,
-        turns_i,
-        V_0_i,
-        W_0_i,
-        L_0_i,
-        pulled_sum_i,
-        twisted_sum_i,
-    ) -> tuple[vector, vector, vector, vector, vector]:
-        arm = turns_i * hold.arm
-        L = L_0_i + twisted_sum_i - wp.cross(arm, pulled_sum_i)
-        W = spin(turns_i, inertia, inverse, L, hold) / density_i
-        V = V_0_i + time_step_i * gravity_i + pulled_sum_i / (density_i * volume)
-        V = wp.cw_mul(hold.moving, V) - wp.cross(W, arm)
-        return V, L, W, V - V_0_i, W - W_0_i
-
-    return pointwise_kernels(
-        precision,
-        [free_module(precision)] * 3,
-        lambda _: move,
-        ["V", "L", "W", "faster", "turned_faster"],
-        numbers=["volume", "inertia", "inverse", "hold"],
-        written=["pulled_sum", "twisted_sum"],
-        told=["gravity"],
-        turned={"turns": "turned"},
-    )
-
-
 NAMES = {
     "position": position_name,
     "rotation": rotation_name,
@@ -236,7 +188,7 @@ class FreeTable:
     @property
     def inertia(self) -> np.ndarray:
         """Return the inertia (3, 3) about what the body turns about, its centre of mass or its hinge."""
-        return inertia_about_hinge(self.hold, self.mass)
+        return inertia_about(self.hold, self.mass)
 
     @property
     def bounds(self) -> dict[str, float]:
@@ -255,8 +207,8 @@ class FreeSolids:
     dimension: int
     search: NeighbourSearch
     """The search for neighbours that has the walls of the bodies."""
-    contacts: "Callable[[FreeSolidsPart], Touch]"
-    """Makes the object that finds what bodies touch."""
+    pushes: "Sequence[Callable[[FreeSolidsPart], Push]]"
+    """Make the objects that push bodies besides fluid and gravity: contacts, springs."""
 
     @property
     def walls(self) -> MovingWalls:
@@ -270,17 +222,24 @@ class FreeSolids:
         return FreeSolidsPart(self, layout)
 
 
-class Touch(Protocol):
-    """A search for what free bodies touch, once poses are known, which writes `FreeBody.given`."""
+class Push(Protocol):
+    """What pushes free bodies besides fluid and gravity, once poses are known: it adds to `FreeBody.given`."""
 
     def look(self, step: StepContext) -> None:
-        """Find what all bodies touch, and write the momenta that contact gives them."""
+        """Add the momenta that bodies get."""
 
     def tangent(self, changes: "Sequence[Changes]") -> Any:
-        """Return the tangent of this search, whose ``look(step, dot)`` writes `Changes.given`."""
+        """Return the tangent of this, whose ``look(step, dot)`` adds to `Changes.given`."""
 
     def adjoint(self, changes: "Sequence[Changes]") -> Any:
-        """Return the adjoint of this search, whose ``look(step, bar)`` goes on from `Changes.given`."""
+        """Return the adjoint of this, whose ``look(step, bar)`` goes on from `Changes.given`."""
+
+
+def given_to(each: "Sequence[FreeBody | Changes]", body: int, other: int) -> dict[str, wp.array]:
+    """Return the momenta that a body and another one get, or their changes: ``pushed_bar`` of the other one is
+    ``pushed_other_bar``. Where ``other`` is -1, what it gets is 0, and may be added to the body itself."""
+    others = each[body if other < 0 else other].given
+    return {**each[body].given, **{name.replace("ed", "ed_other", 1): array for name, array in others.items()}}
 
 
 class FreeBody:
@@ -309,7 +268,7 @@ class FreeBody:
         self.constants |= {"solid": table.number, "hold": hold_numbers(table.hold, layout.precision)}
         self.constants |= table.bounds
         self.given = {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in GIVEN}
-        """Momentum that it gets from what it touches, and from fluid that rubs it, and its moment."""
+        """Momentum that it gets from contacts, springs and fluid that rubs it, and its moment."""
         self.pressed = {name: wp.zeros_like(array) for name, array in self.given.items()}
         """Those that the pressures of the step before would give it; of bodies without slip alone."""
         self.before, self.moved = (
@@ -336,7 +295,7 @@ class FreeSolidsPart(Part):
         self.bodies = [FreeBody(table, poses[table.number], made_of.dimension, layout) for table in made_of.tables]
         self.fields = tuple(field for body in self.bodies for field in body.fields)
         self.begins, self.ends = free_kernels(layout.precision, made_of.dimension)
-        self.touch = made_of.contacts(self)
+        self.pushes = [push(self) for push in made_of.pushes]
 
     def begin(self, step: StepContext, state: State) -> None:
         for body in self.bodies:
@@ -345,7 +304,11 @@ class FreeSolidsPart(Part):
             step.launch(self.begins.forward, body.before, *body.known(step), threads=self.layout.members)
 
     def sort(self, step: StepContext, state: State) -> None:
-        self.touch.look(step)
+        for body in self.bodies:
+            for array in body.given.values():
+                array.zero_()
+        for push in self.pushes:
+            push.look(step)
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
         for body in self.bodies:
@@ -383,13 +346,17 @@ class FreeSolidsTangent(PartTangent):
     def __init__(self, part: FreeSolidsPart):
         self._part = part
         self.bodies = [Changes(body, part.layout, "_dot") for body in part.bodies]
-        self._touch = part.touch.tangent(self.bodies)
+        self._pushes = [push.tangent(self.bodies) for push in part.pushes]
 
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         self._launch(self._part.begins.tangent, step, dot, state_dot, begins=True)
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        self._touch.look(step, dot)
+        for own in self.bodies:
+            for array in own.given.values():
+                array.zero_()
+        for push in self._pushes:
+            push.look(step, dot)
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         self._launch(self._part.ends.tangent, step, dot, state_dot, begins=False)
@@ -411,7 +378,7 @@ class FreeSolidsAdjoint(PartAdjoint):
     def __init__(self, part: FreeSolidsPart):
         self._part = part
         self.bodies = [Changes(body, part.layout, "_bar") for body in part.bodies]
-        self._touch = part.touch.adjoint(self.bodies)
+        self._pushes = [push.adjoint(self.bodies) for push in reversed(part.pushes)]
 
     def end(self, step: StepContext, bar: Any, state_bar: State, moved_bar: State) -> State:
         part = self._part
@@ -422,7 +389,8 @@ class FreeSolidsAdjoint(PartAdjoint):
         return moved_bar
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        self._touch.look(step, bar)
+        for push in self._pushes:
+            push.look(step, bar)
 
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         part = self._part

@@ -30,8 +30,7 @@ from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
-from cortado.sph.free_solids import free_module
-from cortado.sph.held_bodies import hold_functions
+from cortado.sph.held_bodies import free_module, hold_functions
 from cortado.sph.moment_functions import cross_terms_function, moment_functions
 from cortado.sph.stress_forces import contact_functions
 from cortado.sph.stress_kernels import fluidity_function, traction_function

@@ -1,4 +1,5 @@
-"""How free bodies that are held go and turn: a body whose freedoms are few, and one on a hinge.
+"""How free bodies go and turn by the momenta that they get, also those that are held: a body whose freedoms are few,
+and one on a hinge.
 
 A body's velocities are V = D (V_0 + dt g + F / (rho K)) + W x s and W = G L. D is 0 along held axes. A hinge is at the
 arm a from the centre of mass in the body's frame, so that the centre is at s = - R a from the hinge, which stays where
@@ -14,12 +15,12 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import warp as wp
 
-from cortado.device.precision import Precision
-from cortado.discretise.solid import Mass
+from cortado.device.modules import Kernels, kernel_module
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.moving_walls import matrix_of
+from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.scene.links import Hold
 
 
@@ -49,12 +50,6 @@ def hold_numbers(hold: Hold, precision: Precision) -> Any:
         setattr(made, name, precision.vector(*getattr(hold, name)))
     made.turning = hold.turning
     return made
-
-
-def inertia_about_hinge(hold: Hold, mass: Mass) -> np.ndarray:
-    """Return the inertia (3, 3) of a mass about the hinge, or about its centre without one, in the body's frame."""
-    arm = np.array(hold.arm)
-    return np.asarray(mass.inertia + mass.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm)))
 
 
 @cache
@@ -104,3 +99,51 @@ def hold_functions(precision: Precision) -> SimpleNamespace:
         return found
 
     return SimpleNamespace(kind=hold, rate=rate, freed=freed, spin=spin, root=root)
+
+
+def free_module(precision: Precision) -> Any:
+    """Return the Warp module of kernels of free bodies that need no smoothing kernel."""
+    return kernel_module(f"free_bodies_derivative_{precision.name}")
+
+
+@cache
+def move_kernels(precision: Precision) -> Kernels:
+    """Make the kernels of V, L and W of a body by gravity and by the sums of momenta that it gets, with a thread for
+    each scene, and of the velocity changes V - V_0 and W - W_0, ``faster`` and ``turned_faster``. Adjoints of the sums
+    are written."""
+    real, vector, matrix, hold = precision.real, precision.vector, matrix_of(precision), hold_functions(precision)
+    spin, vectors = hold.spin, "gravity V W L pulled twisted"
+
+    @TypesByName(real, {vector: vectors, matrix: "inertia inverse turns", hold.kind: "hold"})
+    def move(
+        time_step_i,
+        gravity_i,
+        density_i,
+        volume,
+        inertia,
+        inverse,
+        hold,
+        turns_i,
+        V_0_i,
+        W_0_i,
+        L_0_i,
+        pulled_sum_i,
+        twisted_sum_i,
+    ) -> tuple[vector, vector, vector, vector, vector]:
+        arm = turns_i * hold.arm
+        L = L_0_i + twisted_sum_i - wp.cross(arm, pulled_sum_i)
+        W = spin(turns_i, inertia, inverse, L, hold) / density_i
+        V = V_0_i + time_step_i * gravity_i + pulled_sum_i / (density_i * volume)
+        V = wp.cw_mul(hold.moving, V) - wp.cross(W, arm)
+        return V, L, W, V - V_0_i, W - W_0_i
+
+    return pointwise_kernels(
+        precision,
+        [free_module(precision)] * 3,
+        lambda _: move,
+        ["V", "L", "W", "faster", "turned_faster"],
+        numbers=["volume", "inertia", "inverse", "hold"],
+        written=["pulled_sum", "twisted_sum"],
+        told=["gravity"],
+        turned={"turns": "turned"},
+    )

@@ -308,5 +308,5 @@ class BodiesAdjoint:
             given = bar.solids.of(held.body.table.number)
             context.launch(bodies.kernels.hold.adjoint, given, *known, edges)
             turned = self._turned[k]["turned_bar"]
-            bar.solids.add_whole(held.body.table.number, self._none["L_bar"], turned)
+            bar.solids.add_whole(held.body.table.number, turned_bar=turned)
             turned.zero_()

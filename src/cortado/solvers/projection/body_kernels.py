@@ -29,7 +29,7 @@ from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
 from cortado.solvers.projection.names import types_by_name
 from cortado.solvers.projection.wall_sums import normal_part
-from cortado.sph.free_solids import free_module, move_kernels
+from cortado.sph.held_bodies import free_module, move_kernels
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class MotionKernels:
     """Kernels that move rigid bodies by pressures and gravity, with their tangents and adjoints."""
 
     move: Kernels
-    """The kernels of `cortado.sph.free_solids.move_kernels`, by the sums of y gamma and y r x gamma."""
+    """The kernels of `cortado.sph.held_bodies.move_kernels`, by the sums of y gamma and y r x gamma."""
     carry: Kernels
     """The drift of walls by the velocity changes, particles' shares of whose adjoints are written."""
 

@@ -1,0 +1,105 @@
+"""Forces in springs as quantities of a state, with their tangents and adjoints, and their sensor."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from cortado.calls import fixed
+from cortado.device.launching import Named
+from cortado.device.modules import kernel_module
+from cortado.device.precision import Precision
+from cortado.errors import InputError, shown
+from cortado.runs.particle_sums import LoadSum, Summed
+from cortado.runs.quantity_formulas import SIX, Bars, QuantityFormula
+from cortado.runs.sensor import Reading, SensedScene
+from cortado.scene.parameters import load_name
+from cortado.scene.springs import Ends
+from cortado.solvers.particles import ParticleSolver
+from cortado.sph.parts import StepContext, Tangents
+from cortado.sph.springs import NUMBERS, PoseBars, Springs, numbers_of, springs_in
+
+
+@cache
+def six_kernels(precision: Precision) -> tuple[Any, Any]:
+    """Make the kernels of the first components of a load by a vector, and of that vector's adjoint by the load's."""
+    real, vector, module = precision.real, precision.vector, kernel_module(f"spring_load_{precision.name}")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def widen(reading: wp.array(dtype=vector), load: wp.array(dtype=SIX)):
+        i, no = wp.tid(), wp.float64(0.0)
+        load[i] = SIX(wp.float64(reading[i][0]), wp.float64(reading[i][1]), no, no, no, no)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def narrow(load_bar: wp.array(dtype=SIX), reading_bar: wp.array(dtype=vector)):
+        i = wp.tid()
+        reading_bar[i] = vector(real(load_bar[i][0]), real(load_bar[i][1]), real(0.0))
+
+    return widen, narrow
+
+
+class SpringLoads:
+    """The quantity of a spring's force and length at the start of a step, which are the first two numbers of a load."""
+
+    def __init__(self, springs: Springs, spring: Ends):
+        layout, self._springs, self._spring = springs.layout, springs, spring
+        self._threads, self._bars = layout.members, PoseBars(springs)
+        self._widen, self._narrow = six_kernels(layout.precision)
+        self._at = {name: wp.zeros(layout.members, **springs.vectors) for name in ("reading", "reading_bar")}
+        self._load = wp.zeros(layout.members, dtype=SIX, device=layout.device)
+
+    def _known(self, step: StepContext) -> tuple[Named, ...]:
+        return numbers_of(step.parameters, self._spring.name, NUMBERS), *self._springs.poses(self._spring)
+
+    def _found(self, step: StepContext, kernel: Any, found: str, *more: Named) -> wp.array:
+        out = {found: self._at["reading"]}
+        step.launch(kernel, out, *more, *self._known(step), threads=self._threads)
+        step.launch(self._widen, load=self._load, reading=self._at["reading"], threads=self._threads)
+        return self._load
+
+    def value(self, step: StepContext, p: Any) -> wp.array:
+        return self._found(step, self._springs.read.forward, "reading")
+
+    def tangent(self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any) -> wp.array:
+        sizes = {"time_step_dot": along.parameters["time_step"]}
+        dots = numbers_of(along.parameters, self._spring.name, NUMBERS, "_dot")
+        return self._found(step, self._springs.read.tangent, "reading_dot", sizes, dots)
+
+    def adjoint(self, step: StepContext, p: Any, own: wp.array, bar: Bars) -> None:
+        step.launch(self._narrow, load_bar=own, reading_bar=self._at["reading_bar"], threads=self._threads)
+        bars = numbers_of(bar.of.parameters, self._spring.name, NUMBERS, "_bar")
+        sizes = {"time_step_bar": bar.of.parameters["time_step"]}
+        known = (bars, sizes, self._bars.named, self._at, *self._known(step))
+        step.launch(self._springs.read.adjoint, *known, threads=self._threads)
+        self._bars.add(self._spring, bar.of)
+
+
+def spring_loads(solver: ParticleSolver) -> dict[str, QuantityFormula]:
+    """Make the formulas of the forces in a solver's springs, by their names."""
+    return {load_name(spring.name): SpringLoads(springs, spring) for springs, spring in springs_in(solver)}
+
+
+@fixed
+class SpringForce(Summed):
+    """A sensor of the force with which a spring pulls, less than 0 where it pushes, and of its length, as the state
+    has them; a damper's part is of how fast both ends go in the step that begins there."""
+
+    def __init__(self, spring: str):
+        """Take the name of a ``spring`` in the scene."""
+        if not isinstance(spring, str) or not spring:
+            raise InputError(f"spring is {shown(spring)}, but must be the name of a spring.")
+        self.spring = spring
+
+    def columns(self, dimension: int) -> dict[str, str]:
+        return {"force": "N" if dimension == 3 else "N/m", "length": "m"}
+
+    def summed(self, at: SensedScene) -> LoadSum:
+        return LoadSum(load_name(self.spring))
+
+    def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
+        return found[..., :2]
+
+    def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        return {load_name(self.spring): np.pad(bar, (0, 4 if at.dimension == 3 else 1))}

@@ -1,0 +1,272 @@
+"""Springs that pull free bodies, and what turns them about hinges, as momenta that a step gives to bodies.
+
+A spring leads from the point q = c + R p of a body to the point q' of another solid, or of the world. With its length l
+= |q' - q|, the unit vector n along it and its stiffness k, rest length l_0 and damping C, it pulls with
+
+    t = k (l - l_0) + C n . (w' - w),
+
+where w and w' are how fast both points go in the step if nothing but their present motion moves them. The body gets the
+momentum dt t n and its moment about the body's middle, the other solid the opposite. All is of where bodies are at the
+start of a step, with whose new velocities they then go on: symplectic Euler. Without damping a spring of the frequency
+omega has the period of arccos(1 - (omega dt)^2 / 2) / dt, within (omega dt)^2 / 24, an energy that swings and does not
+drift, and no bound of dt but 2 / omega.
+
+One that is slack only pulls: max(k (l - l_0) + s C n . (w' - w), 0), with s from 0 at l_0 to 1 at 1.01 l_0, and 0 below
+l_0. The derivative there is that of one side.
+
+About its hinge with the axis a, a body that is turned by the angle phi from how the scene begins gets the torque T -
+k (phi - phi_0) - C a . W, with the motor's torque T. At a half turn phi goes on from -pi.
+"""
+
+from collections.abc import Iterator, Sequence
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.launching import Named
+from cortado.device.modules import Kernels, kernel_module
+from cortado.device.precision import Precision, TypesByName
+from cortado.particles.moving_walls import matrix_of, resting_pose
+from cortado.particles.particle_kernels import pointwise_kernels
+from cortado.particles.state import Layout, Parameters, padded
+from cortado.scene.springs import Ends, Turned
+from cortado.sph.free_solids import Changes, FreeSolidsPart, given_to
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+TAUT = 0.01
+"""By which part of its rest length a slack spring is longer where it is damped in full."""
+OWN = ("before", "turns_before", "after", "turns")
+NUMBERS = ("stiffness", "rest_length", "damping")
+TURNING = ("stiffness", "rest_angle", "damping", "torque")
+
+
+@cache
+def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
+    """Make the kernels, with a thread for each scene, of the momenta that a spring gives; of its force and length, as
+    the first two components of a vector; and of the angular momentum that a hinge gives."""
+    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    taut, tiny, no, one = (wp.constant(real(value)) for value in (TAUT, precision.tiny, 0.0, 1.0))
+    places = "before after other_before other_after own anchor"
+    typed = TypesByName(real, {vector: places, matrix: "turns other_turns", bool: "slack is_free"})
+
+    @wp.func
+    def tension(k: real, rest: real, c: real, dt: real, d: vector, moved: vector, slack: bool) -> real:
+        """Return t for the way d between the ends, and by how much it changes in the step; ``tiny`` is for ends that
+        meet, where n is 0."""
+        length = wp.sqrt(wp.dot(d, d) + tiny)
+        longer, rate = length - rest, wp.dot(d, moved) / (length * dt)
+        found = k * longer + c * rate
+        if slack:
+            share = wp.clamp(longer / (taut * rest + tiny), no, one)
+            found = wp.max(k * longer + share * c * rate, no)
+        return found
+
+    @typed
+    def pull(
+        time_step_i,
+        stiffness_i,
+        rest_length_i,
+        damping_i,
+        before_i,
+        turns_before_i,
+        after_i,
+        turns_i,
+        other_before_i,
+        other_turns_before_i,
+        other_after_i,
+        other_turns_i,
+        own,
+        anchor,
+        cell,
+        slack,
+        is_free,
+    ) -> tuple[vector, vector, vector, vector]:
+        arm, other_arm = turns_before_i * own, other_turns_before_i * anchor
+        d = other_before_i + other_arm - before_i - arm
+        moved = other_after_i + other_turns_i * anchor - after_i - turns_i * own - d
+        t = tension(stiffness_i, rest_length_i, damping_i, time_step_i, d, moved, slack)
+        P = (time_step_i * t / (cell * wp.sqrt(wp.dot(d, d) + tiny))) * d
+        against = wp.where(is_free, -one, no)
+        return P, wp.cross(arm, P), against * P, against * wp.cross(other_arm, P)
+
+    @typed
+    def read(
+        time_step_i,
+        stiffness_i,
+        rest_length_i,
+        damping_i,
+        before_i,
+        turns_before_i,
+        after_i,
+        turns_i,
+        other_before_i,
+        other_turns_before_i,
+        other_after_i,
+        other_turns_i,
+        own,
+        anchor,
+        slack,
+    ) -> vector:
+        d = other_before_i + other_turns_before_i * anchor - before_i - turns_before_i * own
+        moved = other_after_i + other_turns_i * anchor - after_i - turns_i * own - d
+        t = tension(stiffness_i, rest_length_i, damping_i, time_step_i, d, moved, slack)
+        return vector(t, wp.sqrt(wp.dot(d, d) + tiny), no)
+
+    @TypesByName(real, {vector: "W axis", matrix: "turns begun"})
+    def twist(
+        time_step_i, stiffness_i, rest_angle_i, damping_i, torque_i, turns_before_i, W_i, axis, begun, cell
+    ) -> vector:
+        Q = turns_before_i * wp.transpose(begun)
+        across = vector(Q[2, 1] - Q[1, 2], Q[0, 2] - Q[2, 0], Q[1, 0] - Q[0, 1])
+        angle = wp.atan2(wp.dot(axis, across), Q[0, 0] + Q[1, 1] + Q[2, 2] - one)
+        torque = torque_i - stiffness_i * (angle - rest_angle_i) - damping_i * wp.dot(axis, W_i)
+        return (time_step_i * torque / cell) * axis
+
+    modules, poses = (
+        [kernel_module(f"springs_derivative_{precision.name}")] * 3,
+        [*OWN, *(f"other_{name}" for name in OWN)],
+    )
+    turned = {"turns": "turned", "turns_before": "turned_before"}
+    turned |= {f"other_{name}": f"other_{turn}" for name, turn in turned.items()}
+    ends = ["own", "anchor", "slack"]
+    given = [f"{name}:{name}" for name in ("pushed", "twisted", "pushed_other", "twisted_other")]
+    pulls = pointwise_kernels(
+        precision, modules, lambda _: pull, given, numbers=[*ends, "cell", "is_free"], written=poses, turned=turned
+    )
+    reads = pointwise_kernels(
+        precision, modules, lambda _: read, ["reading"], numbers=ends, written=poses, turned=turned
+    )
+    twists = pointwise_kernels(
+        precision,
+        modules,
+        lambda _: twist,
+        ["twisted:twisted"],
+        numbers=["axis", "begun", "cell"],
+        written=["turns_before"],
+        told=["torque"],
+        turned={"turns_before": "turned_before"},
+    )
+    return pulls, reads, twists
+
+
+class Springs:
+    """The springs and turned hinges of one solver, which push its free bodies."""
+
+    def __init__(self, part: FreeSolidsPart, springs: Sequence[Ends], turned: Sequence[Turned], layout: Layout):
+        self.part, self.springs, self.turned, self.layout = part, springs, turned, layout
+        self.pull, self.read, self.twist = spring_kernels(layout.precision)
+        self.vectors = {"dtype": layout.precision.vector, "device": layout.device}
+        self._rest = resting_pose(layout)
+
+    def poses(self, spring: Ends) -> tuple[Named, ...]:
+        """Return the poses of both solids with their tangents, and what is constant, by the names that kernels have."""
+        each, vector = self.part.made_of.walls.each, self.layout.precision.vector
+        other = self._rest if spring.against < 0 else each[spring.against]
+        named = {**each[self.number(spring.body)], **{f"other_{name}": array for name, array in other.items()}}
+        own, anchor = (vector(*padded(place[None])[0]) for place in (spring.point, spring.anchor))
+        return named, {"own": own, "anchor": anchor, "slack": spring.slack, "is_free": spring.other >= 0}
+
+    def number(self, body: int) -> int:
+        """Return the number of a free body among the solids that move."""
+        return self.part.bodies[body].table.number
+
+    def known(self, of: Turned) -> tuple[Named, ...]:
+        """Return what kernels know of a body that is turned about a hinge."""
+        axis, body = self.layout.precision.vector(*of.axis), self.part.bodies[of.body]
+        begun = matrix_of(self.layout.precision)(*of.begun.ravel())
+        return {"axis": axis, "begun": begun}, body.before, body.constants
+
+    def look(self, step: StepContext) -> None:
+        """Add the momenta that bodies get in a step."""
+        bodies, threads = self.part.bodies, self.layout.members
+        for spring in self.springs:
+            known = numbers_of(step.parameters, spring.name, NUMBERS), *self.poses(spring)
+            step.launch(self.pull.forward, given_to(bodies, spring.body, spring.other), *known, threads=threads)
+        for of in self.turned:
+            known = numbers_of(step.parameters, of.name, TURNING), *self.known(of)
+            step.launch(self.twist.forward, bodies[of.body].given, *known, threads=threads)
+
+    def tangent(self, changes: Sequence[Changes]) -> "SpringsTangent":
+        """Return forward mode of `look`."""
+        return SpringsTangent(self, changes)
+
+    def adjoint(self, changes: Sequence[Changes]) -> "SpringsAdjoint":
+        """Return reverse mode of `look`."""
+        return SpringsAdjoint(self, changes)
+
+
+def numbers_of(parameters: Parameters, name: str, ends: Sequence[str], suffix: str = "") -> Named:
+    """Return the parameters of a spring or a hinge by the names that kernels have for them."""
+    return {f"{end}{suffix}": parameters[f"{name}.{end}"] for end in ends}
+
+
+class SpringsTangent:
+    """The tangent of springs, for forward mode."""
+
+    def __init__(self, springs: Springs, changes: Sequence[Changes]):
+        self._springs, self._changes = springs, changes
+
+    def look(self, step: StepContext, dot: Tangents) -> None:
+        """Add the tangents of the momenta that bodies get."""
+        own, threads = self._springs, self._springs.layout.members
+        sizes = {"time_step_dot": dot.parameters["time_step"]}
+        for spring in own.springs:
+            known = numbers_of(step.parameters, spring.name, NUMBERS), *own.poses(spring)
+            dots = numbers_of(dot.parameters, spring.name, NUMBERS, "_dot"), sizes
+            given = given_to(self._changes, spring.body, spring.other)
+            step.launch(own.pull.tangent, given, *dots, *known, threads=threads)
+        for of in own.turned:
+            known = numbers_of(step.parameters, of.name, TURNING), *own.known(of)
+            change = self._changes[of.body]
+            rates = numbers_of(dot.parameters, of.name, TURNING, "_dot"), sizes, change.before
+            step.launch(own.twist.tangent, change.given, *rates, *known, threads=threads)
+
+
+class PoseBars:
+    """Adjoints of the poses of both ends of a spring, which go to those of the solids."""
+
+    def __init__(self, springs: Springs):
+        names = [f"{name}_bar" for name in ("before", "turned_before", "after", "turned")]
+        self._springs, self._names = springs, names
+        members, vectors = springs.layout.members, springs.vectors
+        self.named = {f"{way}{name}": wp.zeros(members, **vectors) for way in ("", "other_") for name in names}
+
+    def add(self, spring: Ends, bar: Adjoints) -> None:
+        """Add what a kernel has written to the adjoints of the solids' poses."""
+        for way, number in (("", self._springs.number(spring.body)), ("other_", spring.against)):
+            if number >= 0:
+                bar.solids.add_whole(number, **{name: self.named[f"{way}{name}"] for name in self._names})
+
+
+class SpringsAdjoint:
+    """The adjoint of springs, for reverse mode."""
+
+    def __init__(self, springs: Springs, changes: Sequence[Changes]):
+        self._springs, self._changes, self._poses = springs, changes, PoseBars(springs)
+        self._turned = {"turned_before_bar": wp.zeros(springs.layout.members, **springs.vectors)}
+
+    def look(self, step: StepContext, bar: Adjoints) -> None:
+        """Go on from the adjoints of the momenta that bodies get to those of their poses and of all numbers."""
+        own, threads = self._springs, self._springs.layout.members
+        sizes = {"time_step_bar": bar.parameters["time_step"]}
+        for spring in own.springs:
+            known = numbers_of(step.parameters, spring.name, NUMBERS), *own.poses(spring)
+            bars = numbers_of(bar.parameters, spring.name, NUMBERS, "_bar"), sizes, self._poses.named
+            given = given_to(self._changes, spring.body, spring.other)
+            step.launch(own.pull.adjoint, given, *bars, *known, threads=threads)
+            self._poses.add(spring, bar)
+        for of in own.turned:
+            known = numbers_of(step.parameters, of.name, TURNING), *own.known(of)
+            change = self._changes[of.body]
+            shares = numbers_of(bar.parameters, of.name, TURNING, "_bar"), sizes, change.before, self._turned
+            step.launch(own.twist.adjoint, change.given, *shares, *known, threads=threads)
+            bar.solids.add_whole(own.number(of.body), **self._turned)
+
+
+def springs_in(solver: Any) -> Iterator[tuple[Springs, Ends]]:
+    """Return the springs of a solver's parts, each with what computes it."""
+    for part in solver.parts:
+        for pushes in part.pushes if isinstance(part, FreeSolidsPart) else ():
+            if isinstance(pushes, Springs):
+                yield from ((pushes, spring) for spring in pushes.springs)
