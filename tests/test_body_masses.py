@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cortado import Problem, Simulation
 from cortado.discretise.solid import Mass
@@ -33,6 +34,35 @@ def test_a_body_is_the_same_by_its_density_and_by_its_mass(scene_of, table):
     for keys in ({}, told):
         one = scene_of(massive(table, table["density"] * even.volume, **keys))
         np.testing.assert_allclose(Simulation(one, precision="float64").run(20).positions[-1], wanted, atol=1e-13)
+
+
+@pytest.mark.parametrize(("scene_of", "table"), [(plane, RAFT), (space, BRICK)])
+def test_a_body_is_the_same_by_its_inertia(scene_of, table):
+    """As one or three numbers or a matrix, with a density or a mass."""
+    scene = scene_of(table)
+    even = Mass.of(scene.solid[0].shape_about()[0])
+    moments = 500.0 * np.diag(even.inertia)
+    wanted = Simulation(scene, precision="float64").run(20).positions[-1]
+    own = [float(moments[2])] if scene.dimension == 2 else moments.tolist()
+    for numbers in (own, own if scene.dimension == 2 else np.diag(moments).ravel().tolist()):
+        for one in ({**table, "inertia": numbers}, massive(table, 500.0 * even.volume, inertia=numbers)):
+            found = Simulation(scene_of(one), precision="float64").run(20).positions[-1]
+            np.testing.assert_allclose(found, wanted, atol=1e-13)
+
+
+def test_the_products_of_a_matrix_turn_a_body_about_other_axes():
+    """A body in nothing whose matrix is that of a turned one turns as that one does."""
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    moments, high = np.array([0.02, 0.03, 0.04]), [0.3, 2.0, 0.2]
+    body = {"name": "ball", "shape": "sphere", "motion": "free", "centre": high, "radius": 0.1, "mass": 3.0}
+    spins = []
+    for matrix, rotation in ((np.diag(moments), turn), (turn @ np.diag(moments) @ turn.T, np.eye(3))):
+        one = {**body, "inertia": matrix.ravel().tolist(), "angular_velocity": [5.0, 2.0, -3.0]}
+        one["rotation"] = Rotation.from_matrix(rotation).as_rotvec().tolist()
+        run = Simulation(space(one, container={"shape": "none"}), precision="float64").run(100)
+        spins.append(run.solids["ball"].angular_velocities)
+    np.testing.assert_allclose(spins[0], spins[1], atol=1e-11)
+    assert np.abs(spins[0][-1] - spins[0][0]).max() > 0.1
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -93,6 +123,9 @@ def test_a_picture_of_a_body_shows_its_shape_where_its_walls_are():
 
 WRONG = {
     "two masses": ({"density": 500.0, "mass": 20.0}, "left out, as there is a density"),
+    "two inertias": ({"mass": 20.0, "gyration_radius": 0.1, "inertia": 0.2}, "left out, as there is a gyration_radius"),
+    "three moments": ({"mass": 20.0, "inertia": [0.1, 0.1, 0.1]}, "one number in 2-D"),
+    "no moment": ({"mass": 20.0, "inertia": 0.0}, "greater than 0 about every axis"),
     "none": ({}, "a density in kg/m3, or a mass"),
     "no radius": ({"mass": 20.0, "centre_of_mass": [0.0, 0.1]}, "gyration_radius"),
     "three radii": ({"mass": 20.0, "gyration_radius": [0.1, 0.1, 0.1]}, "one number in 2-D"),
@@ -105,6 +138,19 @@ def test_masses_that_do_not_fit_together_are_refused(name):
     keys, wanted = WRONG[name]
     with pytest.raises(SceneError, match=wanted):
         plane({**box([0.2, 0.32], [0.45, 0.48], name="raft", motion="free"), **keys})
+
+
+@pytest.mark.parametrize(
+    ("numbers", "wanted"),
+    [
+        ([1.0, 2.0], "three numbers, or the nine of a matrix, in 3-D"),
+        ([1.0, 1.0, 3.0], "whose two least moments together are not less than the greatest"),
+        ([1.0, 0.1, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "the same numbers on both sides of its diagonal"),
+    ],
+)
+def test_an_inertia_of_no_body_is_refused(numbers, wanted):
+    with pytest.raises(SceneError, match=wanted):
+        space(massive(BRICK, 3.0, inertia=numbers))
 
 
 def test_only_a_free_body_has_a_mass():

@@ -242,7 +242,7 @@ def check_motion(solid: Any, dimension: int, path: FieldPath) -> None:
     given = [name for name in ("path", "times", *rows, *steady, "ramp") if getattr(solid, name) is not None]
     if solid.interpolation != "linear":
         given.append("interpolation")
-    for name in ("density", "mass", "centre_of_mass", "gyration_radius", "freedom"):
+    for name in ("density", "mass", "centre_of_mass", "gyration_radius", "inertia", "freedom"):
         if (value := getattr(solid, name)) is not None and solid.motion != "free":
             has = "can be held" if name == "freedom" else "has a mass"
             raise field_error((*path, name), value, f'left out, as only a body whose motion is "free" {has}')
@@ -252,6 +252,7 @@ def check_motion(solid: Any, dimension: int, path: FieldPath) -> None:
         return
     if solid.motion == "free":
         _check_free(solid, given, path)
+        _check_inertia(solid, dimension, path)
         _check_freedom(solid, dimension, path)
         return
     if solid.path is not None:
@@ -285,13 +286,34 @@ def _check_free(solid: Any, given: Sequence[str], path: FieldPath) -> None:
         raise field_error((*path, "density"), MISSING, 'a density in kg/m3, or a mass, as motion is "free"')
     if None not in (solid.mass, solid.density):
         raise field_error((*path, "mass"), solid.mass, "left out, as there is a density")
-    if solid.centre_of_mass is not None and solid.gyration_radius is None:
-        raise field_error((*path, "gyration_radius"), MISSING, "given, as there is a centre of mass")
+    if solid.inertia is not None and solid.gyration_radius is not None:
+        raise field_error((*path, "inertia"), Words("given"), "left out, as there is a gyration_radius")
+    if solid.centre_of_mass is not None and solid.gyration_radius is None and solid.inertia is None:
+        raise field_error((*path, "gyration_radius"), MISSING, "given, or an inertia, as there is a centre of mass")
     for name in (*given, "surface_velocity"):
         if name not in ("velocity", "angular_velocity") and getattr(solid, name) is not None:
             raise field_error((*path, name), Words("given"), 'left out, as motion is "free"')
     if solid.side == "inside":
         raise field_error((*path, "side"), solid.side, '"outside", as motion is "free"')
+
+
+def _check_inertia(solid: Any, dimension: int, path: FieldPath) -> None:
+    """Check that an inertia, if given, is that of a body that can be."""
+    numbers = solid.inertia
+    if numbers is None:
+        return
+    if len(numbers) not in ((1,) if dimension == 2 else (3, 9)):
+        wanted = "one number in 2-D" if dimension == 2 else "three numbers, or the nine of a matrix, in 3-D"
+        raise field_error((*path, "inertia"), Words(f"a list of {len(numbers)}"), wanted)
+    whole = np.array(numbers).reshape(3, 3) if len(numbers) == 9 else np.diag(numbers)
+    if not np.allclose(whole, whole.T, rtol=1e-9, atol=0.0):
+        raise field_error((*path, "inertia"), numbers, "a matrix with the same numbers on both sides of its diagonal")
+    moments = np.linalg.eigvalsh(whole)
+    if moments.min() <= 0.0:
+        raise field_error((*path, "inertia"), numbers, "greater than 0 about every axis")
+    if dimension == 3 and moments[:2].sum() < moments[2] * (1.0 - 1e-9):
+        wanted = "that of a body, whose two least moments together are not less than the greatest"
+        raise field_error((*path, "inertia"), numbers, wanted)
 
 
 def _check_freedom(solid: Any, dimension: int, path: FieldPath) -> None:

@@ -229,6 +229,11 @@ def mass_of_one(solid: SolidTable) -> Mass:
     its table says, is 1."""
     even = Mass.of(solid.shape_about()[0])
     size = even.volume if solid.mass is None else 1.0
+    if solid.inertia is not None:
+        numbers, inertia = np.array(solid.inertia) / (solid.mass or solid.density or 1.0), np.zeros((3, 3))
+        own = numbers.reshape(3, 3) if len(numbers) == 9 else np.diag(numbers)
+        inertia[3 - len(own) :, 3 - len(own) :] = own
+        return Mass(size, inertia)
     if solid.gyration_radius is None:
         return Mass(size, size / even.volume * even.inertia)
     radii = (0.0, 0.0, *solid.gyration_radius)[-3:]

@@ -16,6 +16,7 @@ from cortado.scene.shape_tables import Container, File
 from cortado.scene.tables import (
     Colour,
     FieldPath,
+    Inertia,
     Length,
     OneOf,
     Radii,
@@ -59,6 +60,9 @@ class SolidTable(Coloured):
     gyration_radius: Radii | None = None
     """(3,) Radii of gyration of a free body about its own axes through its centre of mass, in 2-D one number: roots of
     its moments of inertia over its mass [m]. If left out they are those of its shape."""
+    inertia: Inertia | None = None
+    """Moments of inertia of a free body about its centre of mass [kg m²], in place of its radii of gyration: in 2-D one
+    number, that of a metre of it; in 3-D three, about its own axes, or the nine of a matrix, row by row."""
     freedom: tuple[Annotated[str, OneOf(sorted({*WAYS[2], *WAYS[3]}))], ...] | None = None
     """Ways in which a free body can move, all if left out: of "x", "y" and "rotation", in 3-D of "x", "y", "z",
     "rotation_x", "rotation_y" and "rotation_z". Its velocity along the other axes of space, and the part of its angular

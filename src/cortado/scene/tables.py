@@ -149,6 +149,12 @@ Radii = Annotated[
     BeforeValidator(_in_a_list),
 ]
 
+Inertia = Annotated[
+    tuple[Annotated[float, quantity("kg m2")], ...],
+    Field(min_length=1, max_length=9, fail_fast=True),
+    BeforeValidator(_in_a_list),
+]
+
 
 def check_turn(path: FieldPath, value: tuple[float, ...] | None, dimension: int) -> None:
     """Check that a rotation or an angular velocity, if given, is a number in 2-D and a vector in 3-D."""
