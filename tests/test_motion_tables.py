@@ -305,8 +305,9 @@ def test_a_scene_file_finds_its_tables_beside_it(tmp_path):
 
 
 def test_a_measured_flap_is_read_as_it_was_recorded(tmp_path):
-    """The record of `validation/wave_flume.py` at its 50 Hz, on half of the samples and a spline between them."""
-    record = np.genfromtxt(Path(__file__).parent / "data" / "wave_flume_1062.csv", delimiter=",", names=True)
+    """The record of `examples/wave_flume` at its 50 Hz, on half of the samples and a spline between them."""
+    flume = Path(__file__).parents[1] / "examples" / "wave_flume"
+    record = np.genfromtxt(flume / "1062.csv", delimiter=",", names=True)
     times, stroke = record["time_s"], record["wavemaker_m"]
     file = written(tmp_path / "half.csv", times[::2], 1e3 * stroke[::2], head=HEAD)
     own = {"path": file, "interpolation": "spline", "ramp": 0.5}

@@ -1,0 +1,196 @@
+"""A measured wave flume: from the record of its flap to waves at its probes, and to the loads on a ship's section.
+
+    python examples/wave_flume/wave_flume.py                                                 # a minute on a laptop
+    python examples/wave_flume/wave_flume.py --deep 100 --long 13.63 --device cuda:0         # a minute on an H200
+    python examples/wave_flume/wave_flume.py RECORD.csv --gain 1.11 ...
+
+The flume is 13.63 m long and filled 1 m deep (Sundsdal, Greco, Hanssen and Lugni 2025, Ocean Engineering; CC0). A flap
+above a sill, hinged 0.1 m above the floor, makes waves, and a beach takes them away. A record is a CSV file with the
+columns `time_s`, `wavemaker_m`, the flap's displacement at the surface, positive away from the water, `probe_1_m` and
+so on. In one with `fy_n` and `fz_n` the section of a ship is held at 7 m, and these are the loads on it.
+
+Waves are compared with what was measured, and with linear theory of a flap that moves in any way (Dean and Dalrymple
+1991), over the same nine seconds. See docs/wave_flume.md.
+"""
+
+import argparse
+import warnings
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import warp as wp
+
+import cortado
+from cortado.sensors import SolidLoad, WaveGauge
+
+DEPTH, HINGE, FOOT, GRAVITY = 1.0, 0.1, 0.05, 9.81  # water, hinge, how far the flap reaches into its sill [m]; [m/s2]
+PROBES = {"probe_1_m": 3.0, "probe_2_m": 4.95, "probe_3_m": 5.2, "probe_4_m": 5.5, "probe_6_m": 8.5}  # [m]
+BEACH = 2.3  # length of the beach [m]
+BEGIN, END = 13.0, 22.0  # the time in which waves are compared [s]
+SECTION, BEAM, DRAUGHT, HIGH, BILGE, BREADTH = 7.0, 0.4, 0.2, 0.256, 0.0512, 0.586  # place and sizes of the section [m]
+
+
+def beach(x, v, t, k, start, length):
+    """The force of the beach, which takes velocities away, the further up the beach the more."""
+    way = wp.max((x[0] - start) / length, 0.0)
+    return -k * way * way * v
+
+
+def hull():
+    """The section of the ship: a polygon with round bilges, the keel at the bottom."""
+    arc = np.linspace(0.0, 0.5 * np.pi, 9)[:, None]
+    left = [0.5 * BEAM - BILGE, BILGE] + BILGE * np.concatenate([np.sin(arc), -np.cos(arc)], axis=1)
+    half = np.concatenate([left, [[0.5 * BEAM, HIGH]]])
+    return (np.concatenate([half, half[::-1] * [-1.0, 1.0]]) + [SECTION, DEPTH - DRAUGHT]).tolist()
+
+
+def flume(times, stroke, deep, long, holds_section):
+    """A flume with ``deep`` particles in its depth; ``stroke`` (times,) is that of the flap at the surface [m]."""
+    spacing, angle, arm = DEPTH / deep, -np.arctan2(stroke, DEPTH - HINGE), np.array([-0.1, 0.5 * (1.3 - HINGE - FOOT)])
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = np.stack([cos * arm[0] - sin * arm[1], sin * arm[0] + cos * arm[1]], axis=1)
+    flap = {"name": "flap", "shape": "box", "lower": [-0.2, HINGE - FOOT], "upper": [0.0, 1.3], "motion": "path"}
+    solids = [
+        {"name": "sill", "shape": "box", "lower": [-0.4, -5.0 * spacing], "upper": [0.0, HINGE]},
+        {**flap, "times": times.tolist(), "positions": [0.0, HINGE] + turned, "rotations": angle.tolist()},
+    ]
+    if holds_section:
+        still = {"motion": "path", "velocity": [0.0, 0.0]}
+        solids.append({"name": "section", "shape": "polygon", "corners": hull(), **still})
+    return cortado.Scene(
+        name="wave flume",
+        dimension=2,
+        discretisation={"spacing": spacing},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [long, DEPTH], "phase": "water"}],
+        container={"shape": "box", "lower": [-0.8, 0.0], "upper": [long, 2.0]},
+        solid=solids,
+        solver={"kind": "projection", "time_step": 0.1 * spacing},
+    )
+
+
+def theory(times, stroke, places, length=40.0, modes=4000):
+    """The surface (times, places) [m] by linear theory in a long channel, mode by mode: E'' + w^2 E = S stroke''."""
+    k = np.arange(modes) * np.pi / length
+    w, y = np.sqrt(GRAVITY * k * np.tanh(k * DEPTH)), np.linspace(HINGE, DEPTH, 1001)
+    profile = np.exp(np.multiply.outer(k, y - DEPTH)) + np.exp(-np.multiply.outer(k, y + DEPTH))
+    profile /= (1.0 + np.exp(-2.0 * k * DEPTH))[:, None]
+    source = np.trapezoid((y - HINGE) / (DEPTH - HINGE) * profile, y, axis=1)
+    step, speed = times[1] - times[0], np.gradient(stroke, times)
+    cos, sin = np.cos(w * step), np.sin(w * step) / np.where(w > 0.0, w, 1.0)
+    level, rate, shapes = np.zeros(modes), np.zeros(modes), np.cos(np.multiply.outer(places, k))
+    found = np.zeros((len(times), len(places)))
+    for n in range(len(times) - 1):
+        push = 0.25 * step * (speed[n] + speed[n + 1]) * source
+        level = level + push
+        level, rate = cos * level + sin * rate, cos * rate - w * w * sin * level
+        level = level + push
+        found[n + 1] = (level[0] + 2.0 * shapes[:, 1:] @ level[1:]) / length
+    return found
+
+
+def period(times, stroke):
+    """The period [s] at which the record of the flap has most of its amplitude."""
+    late = times >= 8.0
+    tried = np.linspace(0.6, 2.5, 1901)
+    return tried[np.argmax([abs(swing(times[late], stroke[late], one)) for one in tried])]
+
+
+def swing(times, values, long):
+    """The complex amplitude of a series at a period ``long`` [s], beside its mean and its second harmonic."""
+    turn = 2.0 * np.pi * times / long
+    waves = [np.cos(turn), np.sin(turn), np.cos(2.0 * turn), np.sin(2.0 * turn), np.ones_like(turn)]
+    a, b, *_ = np.linalg.lstsq(np.stack(waves, axis=1), values, rcond=None)[0]
+    return a - 1j * b
+
+
+def gain(measured, found, block, draws=400):
+    """The factor between two surfaces (times, probes), and its bars (two standard deviations): one of noise alone, and
+    one of what the model lacks, by drawing residuals again in blocks of so many times."""
+    factor = (measured * found).sum() / (found**2).sum()
+    left, random = measured - factor * found, np.random.default_rng(0)
+    noise = 2.0 * left.std() / np.sqrt((found**2).sum())
+    starts = random.integers(0, len(left) - block, size=(draws, -(-len(left) // block)))
+    drawn = np.stack([np.concatenate([left[s : s + block] for s in row])[: len(left)] for row in starts])
+    return factor, noise, 2.0 * ((drawn * found).sum((1, 2)) / (found**2).sum()).std()
+
+
+def arguments():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    default = Path(__file__).parent / "1062.csv"
+    parser.add_argument("record", type=Path, nargs="?", default=default, help="a CSV file")
+    parser.add_argument("--deep", type=int, default=20, help="particles in the depth")
+    parser.add_argument("--long", type=float, default=8.0, help="length of the flume [m]")
+    parser.add_argument("--begin", type=float, default=BEGIN, help="from when on waves are compared [s]")
+    parser.add_argument("--end", type=float, default=END, help="when the run ends [s]")
+    parser.add_argument("--gain", type=float, default=1.0, help="the flap moves by so many times its record")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--film", action="store_true", help="write wave_flume.mp4 too")
+    return parser.parse_args()
+
+
+def main():
+    """Run the flume, print what its probes say, and draw it."""
+    asked = arguments()
+    record = np.genfromtxt(asked.record, delimiter=",", names=True)
+    times, stroke = record["time_s"], -asked.gain * record["wavemaker_m"]
+    probes = {name: place for name, place in PROBES.items() if place < asked.long - BEACH}
+    measured, is_held = np.stack([record[name] for name in probes], axis=1), "fz_n" in record.dtype.names
+
+    step = 0.1 / asked.deep
+    force = cortado.forces.Body(beach, k=6.0, start=asked.long - BEACH, length=BEACH)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", cortado.CortadoWarning)  # the limit "solids" is of water that falls: none does
+        scene = flume(times, stroke, asked.deep, asked.long, is_held)
+        simulation = cortado.Simulation(scene, device=asked.device, forces=[force])
+        sensors = {name: WaveGauge([place, 0.0], radius=2.0 / asked.deep) for name, place in probes.items()}
+        sensors |= {"load": SolidLoad("section")} if is_held else {}
+        steps, often = round(asked.end / step), round(0.1 / step) if asked.film else round(asked.end / step)
+        run = simulation.run(steps, record_every=often, sensors=sensors)
+    here = np.stack([np.interp(times, run.sensors[n].times, run.sensors[n]["height"]) - DEPTH for n in probes], axis=1)
+    fine = np.arange(0.0, asked.end + 1e-3, 4e-3)
+    exact = theory(fine, np.interp(fine, times, stroke), np.array(list(probes.values())))
+    linear = np.stack([np.interp(times, fine, one) for one in exact.T], axis=1)
+
+    long, late = period(times, stroke), (times >= asked.begin) & (times <= asked.end)
+    other, name = (measured, "measured") if is_held else (linear, "theory")  # which has no section
+    print(f"{len(simulation.positions):,} particles, waves of {long:.3f} s, from {asked.begin:g} to {asked.end:g} s")
+    print(f"probe [m]  measured [mm]  linear theory [mm]  here [mm]  here / {name}  phase after {name} [deg]")
+    for n, place in enumerate(probes.values()):
+        own, true = (swing(times[late], each[late, n], long) for each in (here, other))
+        tall = [2e3 * abs(swing(times[late], each[late, n], long)) for each in (measured, linear, here)]
+        print(f"{place:9.2f}  {tall[0]:13.1f}  {tall[1]:18.1f}  {tall[2]:9.1f}", end="")
+        print(f"{abs(own / true):{9 + len(name)}.3f}{np.degrees(np.angle(true / own)):{20 + len(name)}.1f}")
+    near = [n for n, place in enumerate(probes.values()) if place < 6.0]
+    factor, noise, bar = gain(measured[late][:, near], here[late][:, near], round(long / 0.02))
+    same = np.corrcoef(measured[late][:, near].ravel(), here[late][:, near].ravel())[0, 1]
+    print(f"what was measured is {factor:.3f} of this, within {bar:.3f} (of noise {noise:.3f}); correlation {same:.3f}")
+    for axis, column in {"force_x": "fy_n", "force_y": "fz_n"}.items() if is_held else ():
+        load = BREADTH * np.interp(times, run.sensors["load"].times, run.sensors["load"][axis])
+        own, true = (swing(times[late], each[late], long) for each in (load, record[column]))
+        print(f"{axis}: {abs(own):.1f} N, {abs(true):.1f} N measured,", end=" ")
+        print(f"{np.degrees(np.angle(true / own)):.0f} degrees after what was measured")
+    draw(times, measured, here, linear, probes, asked.end)
+    if asked.film:
+        run.film("wave_flume.mp4", device=asked.device, lines=240)
+    assert same > 0.8, "the waves are not those that were measured"
+
+
+def draw(times, measured, here, linear, probes, end):
+    """Draw the surface at the probes over time."""
+    figure, rows = plt.subplots(len(probes), sharex=True, sharey=True, figsize=(9.0, 1.5 * len(probes) + 0.5))
+    for row, place, *three in zip(np.atleast_1d(rows), probes.values(), measured.T, linear.T, here.T, strict=True):
+        row.plot(times, 1e3 * three[0], color="0.65", linewidth=3.0, label="measured")
+        row.plot(times, 1e3 * three[1], color="tab:orange", linewidth=1.0, label="linear theory")
+        row.plot(times, 1e3 * three[2], color="tab:blue", linewidth=1.2, label="here")
+        row.set(ylabel=f"{place:g} m", xlim=(3.0, end))
+    row.set_xlabel("time [s]")
+    figure.legend(*row.get_legend_handles_labels(), loc="upper center", ncols=3)
+    figure.supylabel("surface at probes [mm]")
+    figure.tight_layout(rect=(0.0, 0.0, 1.0, 0.95))
+    figure.savefig("wave_flume.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main()
