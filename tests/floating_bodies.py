@@ -191,3 +191,36 @@ def settling_disc(across: int, step: float, duration: float, device: str = "cpu"
         "speed over the exact one": float(-late.mean() / exact),
         "swing": float(np.abs(late - course).max() / exact),
     }
+
+
+def passing(times: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """When something that swings goes through 0 upwards."""
+    k = np.nonzero((heights[:-1] < 0.0) & (heights[1:] >= 0.0))[0]
+    return times[k] - heights[k] * (times[k + 1] - times[k]) / (heights[k + 1] - heights[k])
+
+
+def heaving_water(half: float, draft: float, depth: float, width: float, h: float = 0.01) -> float:
+    """The mass of water that goes along with a box, ``half`` of which is so wide, that heaves in the middle of a tank,
+    by potential flow on cells of the size h: the surfaces beside the box move as pistons, by as much water as it moves
+    aside."""
+    from scipy.sparse import lil_matrix
+    from scipy.sparse.linalg import spsolve
+
+    columns, rows, under, below = (round(length / h) for length in (0.5 * width, depth, half, depth - draft))
+    numbers = -np.ones((columns, rows), dtype=int)
+    wet = np.ones((columns, rows), dtype=bool)
+    wet[:under, below:] = False
+    numbers[wet] = np.arange(wet.sum())
+    flows, matrix = np.zeros(wet.sum()), lil_matrix((wet.sum(), wet.sum()))
+    for i, j in np.argwhere(wet):
+        k = numbers[i, j]
+        for a, b in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
+            if 0 <= a < columns and 0 <= b < rows and wet[a, b]:
+                matrix[k, k] -= 1.0
+                matrix[k, numbers[a, b]] += 1.0
+            elif b > j:
+                flows[k] = -h * (1.0 if i < under else -half / (0.5 * width - half))
+    wanted = flows.copy()
+    matrix[0], wanted[0] = 0.0, 0.0
+    matrix[0, 0] = 1.0
+    return 2.0 * 1000.0 * float(-(flows * spsolve(matrix.tocsr(), wanted)).sum())

@@ -6,7 +6,7 @@ import pytest
 from cortado import Problem, SceneError, Simulation
 from cortado.losses import CentreOfMass, SolidPose
 from finite_differences import both_modes, decades, distance
-from floating_bodies import disc_in_a_round_tank
+from floating_bodies import disc_in_a_round_tank, heaving_water, passing
 from test_free_bodies import BRICK, RAFT, plane, space
 
 STILL = {"velocity": None, "angular_velocity": None}
@@ -52,6 +52,24 @@ def test_a_body_in_nothing_moves_in_its_free_ways_alone(scene_of, table, freedom
 def test_a_disc_that_may_only_rise_has_its_added_mass(tmp_path):
     faster = disc_in_a_round_tank(200.0, str(tmp_path / "rings.npy"), 0.03, 6, freedom=["y"])
     assert np.abs(faster[1:] - 1.0).max() < 0.1
+
+
+def test_a_box_that_may_only_heave_has_its_period():
+    """That of its mass and the water that goes along, in a tank that is not much wider, where its surface sinks as the
+    box rises."""
+    wide, draft, depth, width = 0.6, 0.2, 0.5, 1.0
+    lower = depth - draft + 0.05
+    raft = {"shape": "box", "lower": [0.5 * (width - wide), lower], "upper": [0.5 * (width + wide), lower + 0.4]}
+    raft |= {"name": "raft", "motion": "free", "density": 500.0, "freedom": ["y"]}
+    water = {"shape": "box", "lower": [0.0, 0.0], "upper": [width, depth], "phase": "water"}
+    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [width, 1.2]}
+    scene = plane(raft, fluid=[water], container=room, discretisation={"spacing": 0.025})
+    run = Simulation(scene.replaced("phase[0].viscosity=0.001"), precision="float64").run(3000, record_every=5)
+    heights = run.solids["raft"].positions[:, 1]
+    mass = 1000.0 * wide * draft + heaving_water(0.5 * wide, draft, depth, width)
+    rate = np.sqrt(9810.0 * wide * (1.0 + wide / (width - wide)) / mass)
+    through = passing(run.times, heights - heights[len(heights) // 4 :].mean())
+    assert np.diff(through).mean() == pytest.approx(2.0 * np.pi / rate, rel=0.03)
 
 
 def test_a_box_that_may_not_move_is_a_solid_at_rest_to_the_fluid():

@@ -7,6 +7,7 @@ from scipy.special import ellipk
 
 from cortado import SceneError, Simulation
 from cortado.losses import SolidPose
+from floating_bodies import passing
 from scenes import box
 from test_free_bodies import BRICK, RAFT, plane, space
 from test_held_bodies import derivatives_agree
@@ -37,12 +38,6 @@ def swing(scene, steps):
     solid, d = run.solids["rod"], scene.dimension
     angles, spins = (a if d == 2 else a[:, 2] for a in (solid.rotations, solid.angular_velocities))
     return run.times, angles, spins, solid.positions
-
-
-def passing(times, angles):
-    """When a pendulum goes through the middle to the right."""
-    k = np.nonzero((angles[:-1] < 0.0) & (angles[1:] >= 0.0))[0]
-    return times[k] - angles[k] * (times[k + 1] - times[k]) / (angles[k + 1] - angles[k])
 
 
 INERTIA = (SIZE[0] ** 2 + SIZE[1] ** 2) / 12.0 + ARM**2

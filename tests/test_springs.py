@@ -9,10 +9,10 @@ from cortado import InputError, Problem, SceneError, Simulation
 from cortado.losses import Series, SolidPose
 from cortado.scene.stability import stability_limits
 from cortado.sensors import SpringForce
+from floating_bodies import passing
 from scenes import box
 from test_free_bodies import BRICK, RAFT, plane, space
 from test_held_bodies import derivatives_agree
-from test_hinges import passing
 
 RATE = np.sqrt(30.0)
 """Frequency of a block on its spring [rad/s]."""
