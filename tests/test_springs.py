@@ -173,6 +173,11 @@ def test_the_force_in_a_spring_has_derivatives(case):
     derivatives_agree(Simulation(scene, precision="float64"), loss, point, along)
 
 
+def test_large_changes_of_dampers_leave_them_dampers():
+    known = Simulation(moored(*TAUT[0])).known
+    assert [float(known["line.damping"].change(None, np.array(at))) for at in (5.0, 0.0)] == [5.0, 300.0]
+
+
 def test_steps_beyond_the_limit_of_springs_are_told_and_go_wrong():
     """Of a spring in nothing the limit is exact, 2 / omega, and without a load on the middle it is on the safe side."""
     limit, mass = stability_limits(hung(), {})["springs"], DENSITY * SIDE**2

@@ -121,11 +121,11 @@ def spring_parameters(scene: Any) -> list[Parameter]:
 def _number(
     name: str, of: str, end: str, unit: str, what: str, value: float, values: Range, change: float
 ) -> Parameter:
-    """Return the parameter of one number of a spring or a hinge."""
+    """Return the parameter of one number of a spring or a hinge; where it is 0, or may be less, ``change`` is large."""
     own = np.asarray(value, dtype=np.float64)
 
     def changed(source: Source, at: NDArray[Any]) -> NDArray[np.float64]:
-        return np.full(np.shape(at), change)
+        return np.where((np.asarray(at) == 0.0) | (values is Range.ANY), change, np.abs(at))
 
     return Parameter(
         f"{name}.{end}", unit, f"{what} {of}", Axis.SCALAR, lambda source: own, range=values, change=changed
