@@ -163,10 +163,10 @@ def stopping_cylinder(across: int, density: float = 8000.0, viscosity: float = 3
 
 
 def settling_disc(across: int, step: float, duration: float, device: str = "cpu") -> dict[str, float]:
-    """A disc without slip, so many particles across and of the density of steel, that sinks in syrup midway
+    """A disc without slip, so many particles across and three times as heavy as syrup, that sinks in it midway
     between two walls three times its diameter apart: its speed in the last quarter of a ``duration`` [s] over that of
     Faxen (1946), and by how much of that it swings about its course there."""
-    radius, viscosity, density, wide, high = 0.05, 200.0, 7850.0, 0.3, 0.9
+    radius, viscosity, density, wide, high = 0.05, 100.0, 3000.0, 0.3, 0.6
     disc = {"name": "disc", "shape": "sphere", "centre": [0.5 * wide, 0.6 * high], "radius": radius, "slip": "no"}
     spacing = 2.0 * radius / across
     scene = Scene(

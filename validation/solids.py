@@ -19,7 +19,7 @@ from loads import LOADS
 
 from cortado import Scene, Simulation
 from cortado.errors import CortadoWarning
-from floating_bodies import added_mass, disc_in_a_round_tank, floating_box
+from floating_bodies import added_mass, disc_in_a_round_tank, floating_box, settling_disc, stopping_cylinder
 from held_water import MESHES, cup_turned, meshes, stirred
 from piston_waves import piston
 
@@ -101,6 +101,9 @@ def cases(device: str) -> dict[str, Callable[[], object]]:
         "cup-turned, 8,000 particles": lambda: cup_turned(100, 6000),
         "piston, kd = 1.5, 20 deep": lambda: piston(20, 1.5, 0.03, device),
         "piston, kd = 1.5, 60 deep": lambda: piston(60, 1.5, 0.03, device),
+        **{f"stopping-cylinder, {across} across": partial(stopping_cylinder, across) for across in (8, 12, 24)},
+        "settling-disc, 12 across, steps of 1 ms": partial(settling_disc, 12, 0.001, 0.15, device),
+        "settling-disc, 12 across, steps of 0.5 ms": partial(settling_disc, 12, 0.0005, 0.15, device),
         "floating-box, 16 particles long": lambda: floating_box(16),
         "floating-box, 32 particles long": lambda: floating_box(32),
         "added-mass, a sphere 8 across, 20 deep, 4 iterations": lambda: added_mass(8, 20, 100, 4),

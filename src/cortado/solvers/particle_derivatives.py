@@ -24,10 +24,9 @@ class ParticleTangent:
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
         self._parts = [part.new_tangent() for part in solver.parts]
         bodies = [own for part in self._parts if isinstance(part, FreeSolidsTangent) for own in part.bodies]
-        self.carried_dot = Carried(solver.carried_fields, solver.layout)
-        kick = self.carried_dot[solver.kick_name] if solver.kick_name else None
-        self.dot = Tangents(fields, solver.new_fractions(), parameters_dot, bodies, kick)
+        self.dot = Tangents(fields, solver.new_fractions(), parameters_dot, bodies)
         """Of the sorted particles, once `sort` has been called, and of the parameters."""
+        self.carried_dot = Carried(solver.carried_fields, solver.layout)
         self.density = solver.density.new_tangent()
         self._accelerations_dot = [solver.vectors() for _ in range(len(solver.forces) + 1)]
         finalize(self, solver.launch.forget)
@@ -93,7 +92,6 @@ class ParticleAdjoint:
             Shares(names, layout),
             SolidShares(solver.search.moving, layout),
             [own for part in self._parts if isinstance(part, FreeSolidsAdjoint) for own in part.bodies],
-            solver.vectors() if any(body.table.sticks for body in solver.free) else None,
         )
         """Adjoints; those of the parameters are complete after `collect`."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
@@ -108,8 +106,6 @@ class ParticleAdjoint:
         self.bar.shares.clear()
         self.bar.parameters.clear()
         self.bar.solids.clear()
-        if self.bar.kick is not None:
-            self.bar.kick.zero_()
 
     def collect(self) -> Parameters:
         """Return the adjoints of the parameters, summed over all steps since `begin`."""

@@ -72,8 +72,6 @@ class ParticleSolver(Staying):
 
     carried_fields: tuple[StateField, ...] = ()
     """Fields of particles that the solver itself carries from step to step."""
-    kick_name = ""
-    """Name of the carried field of velocities that pressures gave to particles; empty where none is."""
     topic = "density"
     """Topic of the Warp modules that have the kernels of the density."""
     density_power = 2
@@ -102,7 +100,6 @@ class ParticleSolver(Staying):
         """Number of substeps of diffusion in each step."""
         self.carried = Carried(self.carried_fields, layout, requires_grad)
         """Sorted, as they were at the start of the step."""
-        self.kick = self.carried[self.kick_name] if self.kick_name else None
         of_parts = (field for part in self.parts for field in part.fields)
         self.state_fields = (POSITIONS, VELOCITIES, *of_parts, *self.carried_fields)
         """The fields of a state."""
@@ -208,7 +205,7 @@ class ParticleSolver(Staying):
         if self._context is None or self._context.parameters is not parameters:
             order, step, particles = self.search.order, self.step_number, self.layout.particles
             own = (self.launch, particles, self._neighbourhood, order, step, self.lattice.cell)
-            self._context = StepContext(*own, self.fields, self.fractions, parameters, self.free, self.kick)
+            self._context = StepContext(*own, self.fields, self.fractions, parameters, self.free)
         return self._context
 
     def sort(self, state: State, parameters: Parameters) -> StepContext:

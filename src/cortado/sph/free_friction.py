@@ -8,6 +8,11 @@ momenta M of a body, a force F(u, U) on it and the velocities U of the start of 
 are further rows of the operator B (`cortado.sph.viscous_stress`), which is symmetric in the product weighted with the
 masses of particles and M. J comes to the momenta that contact gives, before pressures do. So a light body neither
 swings nor needs smaller steps.
+
+What friction resists are velocities before pressures have come to them, which hold fluid and bodies against gravity. So
+gravity is left out of u, and U has what the pressures of the step before gave. A u with the kicks of these pressures
+would do better where they are right, but pressures that viscosity smooths away are not: with 2 iterations a disc in
+syrup gets ever faster where nu dt is more than 5 s^2.
 """
 
 from collections.abc import Iterator
@@ -23,7 +28,7 @@ from cortado.particles.moving_walls import matrix_of
 from cortado.particles.state import Layout, zeros
 from cortado.scene.motions import free
 from cortado.sph.free_solids import Changes, FreeBody
-from cortado.sph.friction_kernels import friction_kernels, row_kernels
+from cortado.sph.friction_kernels import friction_kernels, lift_kernels, row_kernels
 from cortado.sph.held_bodies import move_kernels
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
@@ -124,7 +129,10 @@ class FreeFriction:
         self.kernels: Any = None
         if names:
             self.kernels = friction_kernels(setting.discretisation, scene.dimension)
-            self.move = move_kernels(layout.precision)
+            self.move, self.lifts = move_kernels(layout.precision), lift_kernels(layout.precision)
+        vector = layout.precision.vector
+        self.lift = {"lift": wp.zeros(layout.members, dtype=vector, device=layout.device)}
+        """-dt g."""
 
         self.dots, self.bars = FrictionTangent(self), FrictionAdjoint(self)
 
@@ -135,7 +143,9 @@ class FreeFriction:
                 yield body, self.own[body.table.name], self._rows[body.table.name]
 
     def begin(self, step: StepContext) -> None:
-        """Write H, Y, N and r of a step."""
+        """Write H, Y, N and r of a step, and the lift, which is that of this step also after it."""
+        if self.rows:
+            step.launch(self.lifts.forward, self.lift, threads=self.layout.members)
         for body, own, rows in self.each(step):
             rows.known = body.known(step)
             step.launch(self.kernels.hold.forward, own.known, self.constants, *rows.known)
@@ -146,15 +156,10 @@ class FreeFriction:
             step.launch(self.kernels.thicken.forward, own.known, sums)
             step.launch(self.kernels.lean.forward, own.known, sums, body.before)
 
-    def kick(self, step: StepContext | Tangents, u: wp.array) -> None:
-        """Add to velocities u, or their tangents, the kicks by the pressures of the step before."""
+    def hang(self, step: StepContext, u: wp.array) -> None:
+        """Take the gravity of the step from velocities u of particles, as pressures hold these against it."""
         if self.rows:
-            add(step.kick, u)
-
-    def kick_back(self, bar: Adjoints, u_bar: wp.array) -> None:
-        """Apply the adjoint of `kick`."""
-        if self.rows:
-            add(u_bar, bar.kick)
+            step.launch(self.kernels.hang.forward, self.lift, u=u)
 
     def start(self, step: StepContext) -> None:
         """Write the velocities of bodies by gravity, by the momenta that they have got so far, and by the pressures of
@@ -235,6 +240,18 @@ class FrictionTangent:
         of = self._friction
         for change, dots, _, _ in self._each(step, dot):
             step.launch(of.kernels.hold.tangent, dots.known, *dot.named, of.constants, *change.body.known(step))
+
+    def hang(self, step: StepContext, dot: Tangents, u_dot: wp.array) -> None:
+        """Apply the tangent of `FreeFriction.hang`."""
+        of = self._friction
+        if of.rows:
+            known = self._lift, of.lift, *dot.named
+            step.launch(of.lifts.tangent, *known, threads=of.layout.members)
+            step.launch(of.kernels.hang.tangent, *known, u_dot=u_dot)
+
+    @cached_property
+    def _lift(self) -> Arrays:
+        return {"lift_dot": wp.zeros_like(self._friction.lift["lift"])}
 
     def gather(self, step: StepContext, dot: Tangents, sums: Named) -> None:
         """Add to the tangents of M, A and R of the velocities at the start."""
@@ -384,9 +401,14 @@ class FrictionAdjoint:
 
     def finish(self, step: StepContext, bar: Adjoints, u_bar: wp.array) -> None:
         """Go back from the adjoints of the bodies' velocities at the end and of H, Y, N and r, and from that of the
-        particles' velocities at the end to that of kicks."""
+        particles' velocities at the end to that of gravity."""
         of = self._friction
-        of.kick_back(bar, u_bar)
+        if of.rows:
+            share, sizes = self._shares["V_bar"], {"time_step_bar": bar.parameters["time_step"]}
+            share.zero_()
+            step.launch(of.kernels.hang.adjoint, *bar.named, of.lift, u_bar=u_bar, lift_bar=share)
+            total = {"lift_bar": self._sum(share)}
+            step.launch(of.lifts.adjoint, total, sizes, *bar.named, of.lift, threads=of.layout.members)
         for change, bars, own, _ in self._each(step, bar):
             body = change.body
             rates = {"density_bar": bar.parameters[body.table.weight], "time_step_bar": bar.parameters["time_step"]}

@@ -24,6 +24,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.launching import bundle
 from cortado.device.modules import Kernels, by_name
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.moving_walls import matrix_of
@@ -66,9 +67,9 @@ def friction_functions(precision: Precision) -> SimpleNamespace:
 @cache
 def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
     """Make the kernels of friction with a body in 2 or 3 dimensions. ``hold`` are those of the sums H, Y and N and of
-    r, ``thicken`` of the parts in M and R, ``lean``, ``rub`` and ``bear`` of `friction_functions`. ``pull`` adds to A
-    and T of some velocities, and ``push`` to B v of the implicit viscosity and to shares in the product with v, and
-    writes the load of the body, as solves do it."""
+    r, ``hang`` of a ``lift`` that is added to velocities u, ``thicken`` of the parts in M and R, ``lean``, ``rub`` and
+    ``bear`` of `friction_functions`. ``pull`` adds to A and T of some velocities, and ``push`` to B v of the implicit
+    viscosity and to shares in the product with v, and writes the load of the body, as solves do it."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     matrix, six, known = matrix_of(precision), precision.six, moment_functions(precision, dimension)
     contact, cross_terms = contact_functions(discretisation), cross_terms_function(precision)
@@ -153,21 +154,39 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     of = friction_functions(precision)
     leaning, rubbing, bearing = (wp.func(one, module=module) for one in (of.lean, of.rub, of.bear))
 
-    @particle_kernel(module, "+A +T", numbers=["control"])
-    @typed
-    def pull(v_i, arm_i, Y_i, N_i, M_i, eta_i, V, W, control) -> tuple[matrix, matrix]:
-        change = leaning(v_i, arm_i, Y_i, N_i, V, W)
-        return change, traction(M_i, change, eta_i, control)
+    around = bundle(H=real, Y=vector, N=matrix, arm=vector)
+    arrays = TypesByName(real, {vector: "v V W product", matrix: "A M T", around: "body", six: "load"})
 
-    @particle_kernel(module, "+product +share load", numbers=["control"])
-    @typed
-    def push(time_step, v_i, m_i, T_i, eta_i, arm_i, H_i, Y_i, N_i, V, W, control) -> tuple[vector, real, six]:
-        a, c = rubbing(v_i, m_i, T_i, eta_i, arm_i, H_i, Y_i, N_i, V, W, control)
-        change = -time_step * a
-        return change, m_i * wp.dot(v_i, change), bearing(m_i, arm_i, a, c)
+    @wp.kernel(module=module, enable_backward=False)
+    @arrays.arrays
+    def pull(particles: int, control: real, v, M, eta, body, V, W, A, T):
+        """Leave out particles that the body does not rub."""
+        i, member = wp.tid(), wp.tid() // particles
+        if body.H[i] == real(0.0):
+            return
+        change = leaning(v[i], body.arm[i], body.Y[i], body.N[i], V[member], W[member])
+        A[i] = A[i] + change
+        T[i] = T[i] + traction(M[i], change, eta[i], control)
+
+    @wp.kernel(module=module, enable_backward=False)
+    @arrays.arrays
+    def push(particles: int, control: real, time_step, v, m, T, eta, body, V, W, product, share, load):
+        i, member = wp.tid(), wp.tid() // particles
+        if body.H[i] == real(0.0):
+            load[i] = six()
+            return
+        H, Y, N, arm = body.H[i], body.Y[i], body.N[i], body.arm[i]
+        a, c = rubbing(v[i], m[i], T[i], eta[i], arm, H, Y, N, V[member], W[member], control)
+        change = -time_step[member] * a
+        product[i] = product[i] + change
+        share[i] = share[i] + m[i] * wp.dot(v[i], change)
+        load[i] = bearing(m[i], arm, a, c)
 
     def thicken(N_i: matrix, mu_i: real) -> tuple[matrix, real]:
         return N_i, wp.trace(N_i) * fluidity(mu_i)
+
+    def hang(lift: vector) -> vector:
+        return lift
 
     def made(function: Any, results: list[str], **names: Any) -> Kernels:
         return pointwise_kernels(precision, modules, lambda _: function, results, **names)
@@ -178,9 +197,22 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
         lean=made(of.lean, ["A:A"]),
         rub=made(of.rub, ["rub", "couple"], numbers=["control"]),
         bear=made(of.bear, ["load"], summed=["load"]),
+        hang=made(hang, ["u:u"]),
         pull=pull,
         push=push,
     )
+
+
+@cache
+def lift_kernels(precision: Precision) -> Kernels:
+    """Make the kernels of the velocity by which gravity changes in a step, with its sign turned, with a thread for each
+    scene."""
+    real, vector = precision.real, precision.vector
+
+    def lift(time_step_i: real, gravity_i: vector) -> vector:
+        return -time_step_i * gravity_i
+
+    return pointwise_kernels(precision, [free_module(precision)] * 3, lambda _: lift, ["lift"], told=["gravity"])
 
 
 @cache

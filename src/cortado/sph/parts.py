@@ -59,8 +59,6 @@ class StepContext:
     parameters: Parameters
     bodies: Sequence[Any] = ()
     """The free bodies of the solver, each a `cortado.sph.free_solids.FreeBody`."""
-    kick: Any = None
-    """(n,) Velocities that the pressures of the step before gave to particles; None of a solver that carries none."""
 
     @cached_property
     def _known(self) -> tuple[Named, ...]:
@@ -93,8 +91,6 @@ class Tangents:
     parameters: Parameters
     bodies: Sequence[Any] = ()
     """Tangents of free bodies in the step, each a `cortado.sph.free_solids.Changes`."""
-    kick: Any = None
-    """Tangent of the `StepContext.kick`."""
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
@@ -142,8 +138,6 @@ class Adjoints:
     """Adjoints of the poses of solids that move."""
     bodies: Sequence[Any] = ()
     """Adjoints of free bodies in the step, each a `cortado.sph.free_solids.Changes`."""
-    kick: Any = None
-    """What friction with free bodies adds to the adjoint of the `StepContext.kick`; None without any."""
 
     @cached_property
     def named(self) -> tuple[Named, ...]:

@@ -342,7 +342,7 @@ class ImplicitViscousStress(ViscousStress):
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         self._measure(step)
         step.launch(self._implicit.predict, acceleration=before, u=self._u)
-        self.free.kick(step, self._u)
+        self.free.hang(step, self._u)
         known = self._known()
         self.free.start(step)
         step.launch(self._pull, *known, v=self._u)
@@ -358,7 +358,7 @@ class ImplicitViscousStress(ViscousStress):
     def _find_end(self, step: StepContext) -> None:
         """Write the velocities u = v + dt a' at the end of the step, and their velocity sum A and stress T."""
         step.launch(self._implicit.predict, acceleration=self._after, u=self._u)
-        self.free.kick(step, self._u)
+        self.free.hang(step, self._u)
         step.launch(self._pull, *self._known(), v=self._u)
         self.free.pull(step, *self._known(), v=self._u)
 
@@ -366,7 +366,7 @@ class ImplicitViscousStress(ViscousStress):
         self._find_end(step)
         u_dot, along = self._y, {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}
         step.launch(self._implicit.predict, along, acceleration=self._after, u=u_dot)
-        self.free.kick(dot, u_dot)
+        self.free.dots.hang(step, dot, u_dot)
         self.free.dots.start(step, dot)
         change = self._stress_along(step, dot, self._end_along(u_dot))
         now = {"v": self._u, "v_dot": u_dot, "acceleration_in_dot": before, "acceleration_dot": self._r}
@@ -388,7 +388,7 @@ class ImplicitViscousStress(ViscousStress):
         by_time, u_dot = {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}, self._y
         step.launch(self._implicit.predict, by_time, acceleration=self._after, u=self._r)
         step.launch(self._implicit.predict, v=self._r, acceleration=self._after_dot, u=u_dot)
-        self.free.kick(dot, u_dot)
+        self.free.dots.hang(step, dot, u_dot)
         self.free.dots.start(step, dot)
         return {**self._stress_along(step, dot, self._end_along(u_dot)), "v_dot": u_dot}
 

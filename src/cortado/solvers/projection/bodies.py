@@ -284,9 +284,10 @@ class BodiesAdjoint:
     ) -> None:
         """Apply the adjoint of what `Bodies.begin` finds of bodies without slip, given the pressures of the step before
         and their adjoints, after `finish`."""
-        self.begin()
         for k, held in enumerate(self._bodies.held):
             if held.body.table.sticks:
+                for array in self._held[k].known.values():
+                    array.zero_()
                 known, pressed = self._known(context, bar, k), self._changes[k].pressed.values()
                 sums = dict(zip(self._sums_bar, pressed, strict=True))
                 context.launch(self._bodies.kernels.pull.adjoint, sums, *known, y=pressures[0], y_bar=pressures[1])

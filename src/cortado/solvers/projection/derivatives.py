@@ -231,9 +231,7 @@ class ProjectionAdjoint(ParticleAdjoint):
             self._bodies.finish(context, self.bar, solver.around, self._around)
         context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
         self.predict(context, within)
-        if self._bodies is not None and self.bar.kick is not None:
-            add(self.bar.kick, self._kick_before_bar)
-            self.bar.kick.zero_()
+        if self._bodies is not None:
             pressures = solver.carried[IMPULSE], self._k_before_bar
             self._bodies.release(context, self.bar, solver.around, self._around, pressures)
         self.mix(context, state_bar)

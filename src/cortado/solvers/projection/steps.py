@@ -181,7 +181,6 @@ class ProjectionSteps(ParticleSolver):
     density: Surroundings
     density_power = 0
     carried_fields = (StateField(IMPULSE, "Pa s", Entry.NUMBER), StateField(KICK, "m/s", Entry.VECTOR))
-    kick_name = KICK
 
     def __init__(
         self,
@@ -209,7 +208,7 @@ class ProjectionSteps(ParticleSolver):
         """u, A and the divergence of u, y and k before each iteration; the last has u and y = k of all."""
         self.repaired = [self.layout.arrays(**self._repair_kinds)]
         """x_k, lambda and n - 1 before each repair, and which part of its way a particle has gone to x_k."""
-        self.x_star, self.v_star, self.new_kick, self.x_moved, self.delta = (self.vectors() for _ in range(5))
+        self.x_star, self.v_star, self.kick, self.x_moved, self.delta = (self.vectors() for _ in range(5))
         self.following = following_kernels(self.discretisation, system.walled.dimension) if follow else None
         """Those of velocities that follow the shift and the repairs; None where they do not."""
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
@@ -361,7 +360,7 @@ class ProjectionSteps(ParticleSolver):
 
     def press(self, context: StepContext, at: dict[str, wp.array]) -> None:
         """Write the velocities that the y of an iterate leaves, with its pull y L."""
-        own = {"y": at["y"], "u": at["u"], "T": self.pull, "kick": self.new_kick}
+        own = {"y": at["y"], "u": at["u"], "T": self.pull, "kick": self.kick}
         context.launch(self.kernels.velocity.velocity.forward, self.around, own, v_star=self.v_star)
 
     def settle(self, context: StepContext, last: int) -> None:
@@ -399,5 +398,5 @@ class ProjectionSteps(ParticleSolver):
         if self.following is not None:
             moved, v_end = {"x_now": x_now, "v_new": v_end, "v_end": self.delta}, self.delta  # which is moved by now
             context.launch(self.following.forward, self.around, moved, A=self.last_gradient(iterations))
-        self.unsort(context, x_now, v_end, new_state, **{IMPULSE: end["k"], KICK: self.new_kick})
+        self.unsort(context, x_now, v_end, new_state, **{IMPULSE: end["k"], KICK: self.kick})
         return v_end
