@@ -11,8 +11,8 @@ swings nor needs smaller steps.
 
 What friction resists are velocities before pressures have come to them, which hold fluid and bodies against gravity. So
 gravity is left out of u, and U has what the pressures of the step before gave. A u with the kicks of these pressures
-would do better where they are right, but pressures that viscosity smooths away are not: with 2 iterations a disc in
-syrup gets ever faster where nu dt is more than 5 s^2.
+would do better where they are right. But of pressures that viscosity smooths away iterations take up less in a step, so
+that a disc 24 particles across, at nu dt = 11 s^2, got ever faster.
 """
 
 from collections.abc import Iterator
