@@ -92,8 +92,8 @@ IN_THE_PLANE = [
 ]
 PIN = {"name": "pin", "solid": "keel", "position": [1.1, 0.66], "stiffness": 3.0, "damping": 0.5, "rest_angle": 0.1}
 PIN |= {"times": [0.0, 0.1], "torques": [1.0, 2.0]}
-LINE = {"name": "line", "solid": "disc", "point": [0.5, 0.42], "anchor": [0.5, 0.7], "stiffness": 300.0}
-LINE |= {"rest_length": 0.25, "damping": 2.0, "slack": True}
+LINE = {"name": "line", "solid": "disc", "point": [0.5, 0.42], "anchor": [0.5, 0.14], "stiffness": 300.0}
+LINE |= {"rest_length": 0.279, "damping": 2.0, "slack": True}
 IN_SPACE = [
     {"name": "pole", "shape": "cylinder", "base": [0.2, 0.1, 0.3], "radius": 0.1, "height": 0.3, "slip": "no"},
     {"name": "cup", "shape": "cup", "base": [0.6, 0.1, 0.3], "radius": 0.1, "height": 0.3, "thickness": 0.1},

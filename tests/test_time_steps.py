@@ -465,7 +465,7 @@ def wedge(gap, **tables):
 
 
 def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter():
-    simulation = Simulation(wedge(0.015))
+    simulation = Simulation(wedge(0.012))
     whole = simulation.run(65)
     sizes = sizes_of(whole)
     again = np.flatnonzero(sizes[1:] < 0.3 * sizes[:-1]) + 1
@@ -473,7 +473,7 @@ def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter():
     before = int(again[0])
     rest = simulation.run(65 - before, state=whole[: before + 1].last_state)  # of which the first step is taken again
     assert rest.positions.tobytes() == whole.positions[before:].tobytes()
-    pair = Simulation(wedge(0.015), batch=2).run(65, {"viscosity": np.array([0.001, 0.1])})
+    pair = Simulation(wedge(0.012), batch=2).run(65, {"viscosity": np.array([0.001, 0.1])})
     assert pair[0].positions.tobytes() == whole.positions.tobytes()
     assert whole.diagnostics["greatest_density_errors"].max() < 0.3
 
