@@ -7,7 +7,8 @@
 The flume is 13.63 m long and filled 1 m deep (Sundsdal, Greco, Hanssen and Lugni 2025, Ocean Engineering; CC0). A flap
 above a sill, hinged 0.1 m above the floor, makes waves, and a beach takes them away. A record is a CSV file with the
 columns `time_s`, `wavemaker_m`, the flap's displacement at the surface, positive away from the water, `probe_1_m` and
-so on. In one with `fy_n` and `fz_n` the section of a ship is held at 7 m, and these are the loads on it.
+so on. In one with `fy_n` and `fz_n` the section of a ship is held at 7 m, and these are the loads on it. In one with
+`sway_m`, `heave_m` and `roll_rad` it moves, on springs that hold it across, and these are its motions.
 
 Waves are compared with what was measured, and with linear theory of a flap that moves in any way (Dean and Dalrymple
 1991), over the same nine seconds. See docs/wave_flume.md.
@@ -27,8 +28,11 @@ from cortado.sensors import SolidLoad, WaveGauge
 DEPTH, HINGE, FOOT, GRAVITY = 1.0, 0.1, 0.05, 9.81  # water, hinge, how far the flap reaches into its sill [m]; [m/s2]
 PROBES = {"probe_1_m": 3.0, "probe_2_m": 4.95, "probe_3_m": 5.2, "probe_4_m": 5.5, "probe_6_m": 8.5}  # [m]
 BEACH = 2.3  # length of the beach [m]
+LOADS, MOTIONS = {"force_x": "fy_n", "force_y": "fz_n"}, ("sway_m", "heave_m", "roll_rad")
 BEGIN, END = 13.0, 22.0  # the time in which waves are compared [s]
 SECTION, BEAM, DRAUGHT, HIGH, BILGE, BREADTH = 7.0, 0.4, 0.2, 0.256, 0.0512, 0.586  # place and sizes of the section [m]
+MASS, GRAVITY_CENTRE, GYRATION = 46.8, 0.108, 0.144  # of the section [kg], above its keel and radius [m]
+STIFFNESS, DAMPING, LINE = 60.0, 8.7, 20.0  # of what holds it [N/m], [N s/m]; lines so long that they stay level [m]
 
 
 def beach(x, v, t, k, start, length):
@@ -45,19 +49,30 @@ def hull():
     return (np.concatenate([half, half[::-1] * [-1.0, 1.0]]) + [SECTION, DEPTH - DRAUGHT]).tolist()
 
 
-def flume(times, stroke, deep, long, holds_section):
+def section(moves):
+    """The section of the ship and the springs that hold it, for each metre of breadth."""
+    own = {"name": "section", "shape": "polygon", "corners": hull()}
+    if not moves:
+        return {**own, "motion": "path", "velocity": [0.0, 0.0]}, []
+    centre, (x, y) = [SECTION, DEPTH - DRAUGHT + GRAVITY_CENTRE], np.array(hull()).T
+    area = x * np.roll(y, -1) - np.roll(x, -1) * y
+    middle = [(area * (a + np.roll(a, -1))).sum() / (3.0 * area.sum()) for a in (x, y)]
+    own |= {"motion": "free", "mass": MASS / BREADTH, "gyration_radius": GYRATION}
+    own |= {"centre_of_mass": [a - b for a, b in zip(centre, middle, strict=True)]}
+    holds = {"solid": "section", "point": centre, "damping": DAMPING / BREADTH}
+    across = {**holds, "name": "across", "anchor": [SECTION + LINE, centre[1]], "stiffness": STIFFNESS / BREADTH}
+    return own, [across, {**holds, "name": "up", "anchor": [SECTION, centre[1] + LINE], "stiffness": 1e-3}]
+
+
+def flume(times, stroke, deep, long, has_section, moves):
     """A flume with ``deep`` particles in its depth; ``stroke`` (times,) is that of the flap at the surface [m]."""
     spacing, angle, arm = DEPTH / deep, -np.arctan2(stroke, DEPTH - HINGE), np.array([-0.1, 0.5 * (1.3 - HINGE - FOOT)])
     cos, sin = np.cos(angle), np.sin(angle)
     turned = np.stack([cos * arm[0] - sin * arm[1], sin * arm[0] + cos * arm[1]], axis=1)
     flap = {"name": "flap", "shape": "box", "lower": [-0.2, HINGE - FOOT], "upper": [0.0, 1.3], "motion": "path"}
-    solids = [
-        {"name": "sill", "shape": "box", "lower": [-0.4, -5.0 * spacing], "upper": [0.0, HINGE]},
-        {**flap, "times": times.tolist(), "positions": [0.0, HINGE] + turned, "rotations": angle.tolist()},
-    ]
-    if holds_section:
-        still = {"motion": "path", "velocity": [0.0, 0.0]}
-        solids.append({"name": "section", "shape": "polygon", "corners": hull(), **still})
+    sill = {"name": "sill", "shape": "box", "lower": [-0.4, -5.0 * spacing], "upper": [0.0, HINGE]}
+    flap |= {"times": times.tolist(), "positions": ([0.0, HINGE] + turned).tolist(), "rotations": angle.tolist()}
+    ship, springs = section(moves) if has_section else (None, [])
     return cortado.Scene(
         name="wave flume",
         dimension=2,
@@ -65,7 +80,8 @@ def flume(times, stroke, deep, long, holds_section):
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [long, DEPTH], "phase": "water"}],
         container={"shape": "box", "lower": [-0.8, 0.0], "upper": [long, 2.0]},
-        solid=solids,
+        solid=[sill, flap, *([ship] if has_section else [])],
+        spring=springs,
         solver={"kind": "projection", "time_step": 0.1 * spacing},
     )
 
@@ -127,7 +143,10 @@ def arguments():
     parser.add_argument("--gain", type=float, default=1.0, help="the flap moves by so many times its record")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--film", action="store_true", help="write wave_flume.mp4 too")
-    return parser.parse_args()
+    asked = parser.parse_args()
+    if asked.end - asked.begin < 4.0:
+        parser.error(f"--begin is {asked.begin:g} s and --end {asked.end:g} s, but 4 s or more must be between them.")
+    return asked
 
 
 def main():
@@ -136,17 +155,18 @@ def main():
     record = np.genfromtxt(asked.record, delimiter=",", names=True)
     times, stroke = record["time_s"], -asked.gain * record["wavemaker_m"]
     probes = {name: place for name, place in PROBES.items() if place < asked.long - BEACH}
-    measured, is_held = np.stack([record[name] for name in probes], axis=1), "fz_n" in record.dtype.names
+    measured, names = np.stack([record[name] for name in probes], axis=1), record.dtype.names
+    is_held, moves = "fz_n" in names, "heave_m" in names
 
     step = 0.1 / asked.deep
     force = cortado.forces.Body(beach, k=6.0, start=asked.long - BEACH, length=BEACH)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", cortado.CortadoWarning)  # the limit "solids" is of water that falls: none does
-        scene = flume(times, stroke, asked.deep, asked.long, is_held)
+        scene = flume(times, stroke, asked.deep, asked.long, is_held or moves, moves)
         simulation = cortado.Simulation(scene, device=asked.device, forces=[force])
         sensors = {name: WaveGauge([place, 0.0], radius=2.0 / asked.deep) for name, place in probes.items()}
         sensors |= {"load": SolidLoad("section")} if is_held else {}
-        steps, often = round(asked.end / step), round(0.1 / step) if asked.film else round(asked.end / step)
+        steps, often = round(asked.end / step), max(round(0.04 / step), 1) if asked.film or moves else 10**9
         run = simulation.run(steps, record_every=often, sensors=sensors)
     here = np.stack([np.interp(times, run.sensors[n].times, run.sensors[n]["height"]) - DEPTH for n in probes], axis=1)
     fine = np.arange(0.0, asked.end + 1e-3, 4e-3)
@@ -154,7 +174,7 @@ def main():
     linear = np.stack([np.interp(times, fine, one) for one in exact.T], axis=1)
 
     long, late = period(times, stroke), (times >= asked.begin) & (times <= asked.end)
-    other, name = (measured, "measured") if is_held else (linear, "theory")  # which has no section
+    other, name = (measured, "measured") if is_held or moves else (linear, "theory")  # which has no section
     print(f"{len(simulation.positions):,} particles, waves of {long:.3f} s, from {asked.begin:g} to {asked.end:g} s")
     print(f"probe [m]  measured [mm]  linear theory [mm]  here [mm]  here / {name}  phase after {name} [deg]")
     for n, place in enumerate(probes.values()):
@@ -166,10 +186,20 @@ def main():
     factor, noise, bar = gain(measured[late][:, near], here[late][:, near], round(long / 0.02))
     same = np.corrcoef(measured[late][:, near].ravel(), here[late][:, near].ravel())[0, 1]
     print(f"what was measured is {factor:.3f} of this, within {bar:.3f} (of noise {noise:.3f}); correlation {same:.3f}")
-    for axis, column in {"force_x": "fy_n", "force_y": "fz_n"}.items() if is_held else ():
-        load = BREADTH * np.interp(times, run.sensors["load"].times, run.sensors["load"][axis])
-        own, true = (swing(times[late], each[late], long) for each in (load, record[column]))
-        print(f"{axis}: {abs(own):.1f} N, {abs(true):.1f} N measured,", end=" ")
+    series = {}
+    if is_held:
+        load = run.sensors["load"]
+        series = {f"{column} [N]": (column, load.times, BREADTH * load[axis]) for axis, column in LOADS.items()}
+    elif moves:
+        ship = run.solids["section"]
+        moved = [*(ship.positions - ship.positions[0]).T, -ship.rotations]
+        series = {name: (name, run.times, one) for name, one in zip(MOTIONS, moved, strict=True)}
+    for name, (column, at, values) in series.items():
+        own, true = (
+            swing(times[late], np.interp(times, at, values)[late], long),
+            swing(times[late], record[column][late], long),
+        )
+        print(f"{name}: {abs(own):.4g} here, {abs(true):.4g} measured,", end=" ")
         print(f"{np.degrees(np.angle(true / own)):.0f} degrees after what was measured")
     draw(times, measured, here, linear, probes, asked.end)
     if asked.film:
