@@ -203,7 +203,7 @@ def main():
         print(f"{np.degrees(np.angle(true / own)):.0f} degrees after what was measured")
     draw(times, measured, here, linear, probes, asked.end)
     if asked.film:
-        run.film("wave_flume.mp4", device=asked.device, lines=240)
+        run.film("wave_flume.mp4", device=asked.device, width=1280, height=240, film_frames=150)
     assert same > 0.8, "the waves are not those that were measured"
 
 
