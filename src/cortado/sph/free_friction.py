@@ -218,22 +218,32 @@ class FreeFriction:
                 add(own.found[name], total)
 
 
-class FrictionTangent:
-    """The tangent of the friction with free bodies, for forward mode."""
+class FrictionChanges:
+    """The changes of the friction with free bodies by a derivative, with a ``suffix`` of names."""
+
+    suffix: str
 
     def __init__(self, friction: FreeFriction):
         self._friction = friction
 
     @cached_property
     def _own(self) -> dict[str, BodyFriction]:
-        """Make the tangents of arrays when they are first asked for, as runs do without."""
-        return {name: BodyFriction(self._friction.layout, "_dot") for name in self._friction.own}
+        """Make the tangents or adjoints of arrays when they are first asked for, as runs do without."""
+        return {name: BodyFriction(self._friction.layout, self.suffix) for name in self._friction.own}
 
-    def _each(self, step: StepContext, dot: Tangents) -> Iterator[tuple[Changes, BodyFriction, BodyFriction, BodyRows]]:
-        for (body, own, rows), change in zip(
-            self._friction.each(step), (one for one in dot.bodies if one.body.table.sticks), strict=True
-        ):
+    def _each(
+        self, step: StepContext, of: Tangents | Adjoints
+    ) -> Iterator[tuple[Changes, BodyFriction, BodyFriction, BodyRows]]:
+        """Yield the bodies that rub: their changes, those of their arrays, their arrays, and their rows."""
+        changes = (one for one in of.bodies if one.body.table.sticks)
+        for (body, own, rows), change in zip(self._friction.each(step), changes, strict=True):
             yield change, self._own[body.table.name], own, rows
+
+
+class FrictionTangent(FrictionChanges):
+    """The tangent of the friction with free bodies, for forward mode."""
+
+    suffix = "_dot"
 
     def begin(self, step: StepContext, dot: Tangents) -> None:
         """Write the tangents of H, Y, N and r."""
@@ -308,16 +318,10 @@ class FrictionTangent:
                 add(dots.found[f"{name}_dot"], total_dot)
 
 
-class FrictionAdjoint:
+class FrictionAdjoint(FrictionChanges):
     """The adjoint of the friction with free bodies, for reverse mode."""
 
-    def __init__(self, friction: FreeFriction):
-        self._friction = friction
-
-    @cached_property
-    def _own(self) -> dict[str, BodyFriction]:
-        """Make the adjoints of arrays when they are first asked for, as runs do without."""
-        return {name: BodyFriction(self._friction.layout, "_bar") for name in self._friction.own}
+    suffix = "_bar"
 
     @cached_property
     def _shares(self) -> dict[str, wp.array]:
@@ -328,12 +332,6 @@ class FrictionAdjoint:
     @cached_property
     def _sum(self) -> Any:
         return self._friction.layout.sum_of(self._friction.layout.precision.vector)
-
-    def _each(self, step: StepContext, bar: Adjoints) -> Iterator[tuple[Changes, BodyFriction, BodyFriction, BodyRows]]:
-        for (body, own, rows), change in zip(
-            self._friction.each(step), (one for one in bar.bodies if one.body.table.sticks), strict=True
-        ):
-            yield change, self._own[body.table.name], own, rows
 
     def begin(self, step: StepContext, bar: Adjoints) -> None:
         """Set the adjoints of the bodies' arrays to 0."""
