@@ -32,6 +32,17 @@ def derivatives_agree(simulation, loss, point, along, steps=6, least=1e-6):
     assert distance(problem.value, point, along, tangent, decades(3.0, 7.0), enough=least) < least
 
 
+def same_bits_where_a_run_goes_on_and_in_batches(scene, parameter, values):
+    """A run that goes on from a state, and scenes of a batch with these values of a parameter, are as single runs."""
+    simulation = Simulation(scene)
+    whole, first = simulation.run(12).last_state, simulation.run(5).last_state
+    rest = simulation.run(7, state=first).last_state
+    assert all(np.array_equal(whole[name], rest[name]) for name in rest.fields)
+    for value, run in zip(values, Simulation(scene, batch=len(values)).run(12, {parameter: values}), strict=True):
+        alone = simulation.run(12, {parameter: value}).last_state
+        assert all(np.array_equal(alone[name], run.last_state[name]) for name in alone.fields)
+
+
 @pytest.mark.parametrize(("scene_of", "table", "freedom"), WAYS)
 def test_a_body_in_nothing_moves_in_its_free_ways_alone(scene_of, table, freedom):
     d = 2 if scene_of is plane else 3
@@ -97,16 +108,9 @@ def test_held_bodies_have_derivatives(scene_of, table, freedom):
 
 
 def test_runs_of_held_bodies_go_on_and_are_those_of_batches_to_the_bit():
-    scene = space(held(BRICK, "x", "y", "rotation_y"))
-    simulation = Simulation(scene)
-    whole, first = simulation.run(12).last_state, simulation.run(5).last_state
-    rest = simulation.run(7, state=first).last_state
-    assert all(np.array_equal(whole[name], rest[name]) for name in rest.fields)
-    densities = [300.0, 600.0]
-    runs = Simulation(scene, batch=2).run(12, {"raft.density": densities})
-    for density, run in zip(densities, runs, strict=True):
-        alone = simulation.run(12, {"raft.density": density}).last_state
-        assert all(np.array_equal(alone[name], run.last_state[name]) for name in alone.fields)
+    same_bits_where_a_run_goes_on_and_in_batches(
+        space(held(BRICK, "x", "y", "rotation_y")), "raft.density", [300.0, 600.0]
+    )
 
 
 WRONG = {

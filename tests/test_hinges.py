@@ -10,7 +10,7 @@ from cortado.losses import SolidPose
 from floating_bodies import passing
 from scenes import box
 from test_free_bodies import BRICK, RAFT, plane, space
-from test_held_bodies import derivatives_agree
+from test_held_bodies import derivatives_agree, same_bits_where_a_run_goes_on_and_in_batches
 
 ARM, SIZE = 0.3, np.array([0.1, 0.6, 0.2])
 """From the hinge to the middle of a rod, and its sides [m]."""
@@ -103,16 +103,8 @@ def test_bodies_on_hinges_have_derivatives(scene_of, table, hinge):
 
 
 def test_runs_of_bodies_on_hinges_go_on_and_are_those_of_batches_to_the_bit():
-    scene = on_hinge(space, BRICK, WAYS[1][2])
-    simulation = Simulation(scene)
-    whole, first = simulation.run(12).last_state, simulation.run(5).last_state
-    rest = simulation.run(7, state=first).last_state
-    assert all(np.array_equal(whole[name], rest[name]) for name in rest.fields)
     spins = [[0.2, 0.1, 1.0], [0.4, 0.2, 2.0]]
-    runs = Simulation(scene, batch=2).run(12, {"raft.angular_velocity": spins})
-    for spin, run in zip(spins, runs, strict=True):
-        alone = simulation.run(12, {"raft.angular_velocity": spin}).last_state
-        assert all(np.array_equal(alone[name], run.last_state[name]) for name in alone.fields)
+    same_bits_where_a_run_goes_on_and_in_batches(on_hinge(space, BRICK, WAYS[1][2]), "raft.angular_velocity", spins)
 
 
 WRONG = {

@@ -12,7 +12,7 @@ from cortado.sensors import SpringForce
 from floating_bodies import passing
 from scenes import box, thrown
 from test_free_bodies import BRICK, RAFT, plane, space
-from test_held_bodies import derivatives_agree
+from test_held_bodies import derivatives_agree, same_bits_where_a_run_goes_on_and_in_batches
 
 RATE = np.sqrt(30.0)
 """Frequency of a block on its spring [rad/s]."""
@@ -247,16 +247,7 @@ def test_what_turns_a_body_about_its_hinge_has_derivatives(d):
 
 
 def test_runs_with_springs_go_on_and_are_those_of_batches_to_the_bit():
-    scene = moored(*TAUT[5])
-    simulation = Simulation(scene)
-    whole, first = simulation.run(12).last_state, simulation.run(5).last_state
-    rest = simulation.run(7, state=first).last_state
-    assert all(np.array_equal(whole[name], rest[name]) for name in rest.fields)
-    stiffness = [1000.0, 4000.0]
-    runs = Simulation(scene, batch=2).run(12, {"line.stiffness": stiffness})
-    for one, run in zip(stiffness, runs, strict=True):
-        alone = simulation.run(12, {"line.stiffness": one}).last_state
-        assert all(np.array_equal(alone[name], run.last_state[name]) for name in alone.fields)
+    same_bits_where_a_run_goes_on_and_in_batches(moored(*TAUT[5]), "line.stiffness", [1000.0, 4000.0])
 
 
 def test_gradients_of_springs_in_float32_are_those_in_float64():
