@@ -26,6 +26,7 @@ def test_the_version_stands_in_one_place():
     assert PROJECT["project"]["dynamic"] == ["version"] and "version" not in PROJECT["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
     assert citation["version"] == cortado.__version__ and citation["license"] == PROJECT["project"]["license"]
+    assert f"## {cortado.__version__}, of " in (ROOT / "CHANGELOG.md").read_text("utf-8")
 
 
 def test_wheels_are_for_the_pythons_that_are_promised():

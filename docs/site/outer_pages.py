@@ -12,6 +12,7 @@ OUTER = {
     "contributing": "CONTRIBUTING.md",
     "changelog": "CHANGELOG.md",
     "release": "RELEASE.md",
+    "notice": "NOTICE.md",
     "validation": "validation/README.md",
     "benchmarks": "benchmarks/README.md",
     "experiments": "experiments/README.md",

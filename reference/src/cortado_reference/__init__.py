@@ -9,7 +9,7 @@ from cortado_reference.histories import Gradient, History
 from cortado_reference.losses import FinalPositions, Loss
 from cortado_reference.simulation import METHODS, Simulation, Terms
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "METHODS",
