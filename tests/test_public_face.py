@@ -29,11 +29,13 @@ ROOT = Path(__file__).parents[1]
 NAMED = {
     name
     for path in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").glob("*.py"))
+    if path.parent.name != "records"
     for name in re.findall(r"\bcortado(?:\.[A-Za-z_]\w*)+", path.read_text(encoding="utf-8"))
 } - {"cortado.sph.drag"} | {f"cortado.{name}" for name in cortado.__all__}
 if find_spec("torch") is None:
     NAMED = {name for name in NAMED if not name.startswith("cortado.torch")}
-"""Dotted names in the documents, and those of the package; not the module that docs/adding_parts.md adds."""
+"""Dotted names in the documents, and those of the package; not the module that docs/adding_parts.md adds, and none of
+records, where some are gone."""
 
 
 def by_import(name):
