@@ -14,6 +14,7 @@ import matplotlib.pyplot
 import numpy as np
 import outer_pages
 import pytest
+import rows
 import scene_page
 import task_page
 import trimesh
@@ -227,6 +228,20 @@ def test_every_table_has_an_example_and_every_key_is_explained(module, models):
     for name, table in tables.items():
         assert [key for key in table["properties"] if f"\n| `{key}` |" not in text] == [], name
     assert not re.findall(r"\| \.? \|\n", text), "a key without a meaning"
+
+
+def test_a_key_of_several_tables_stands_once():
+    """And each table has all of its keys, those that it shares or its own."""
+    tables, text = Scene.model_json_schema()["$defs"], scene_page.page()
+    for heading, _, models in scene_page.PARTS:
+        section = re.search(rf"^{re.escape(heading)}\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)[1]
+        lines = [line for line in section.splitlines() if line.startswith("| `")]
+        assert len(lines) == len(set(lines)), heading
+        shared, *own = re.split(r"^### .*\n", section, flags=re.MULTILINE)
+        for name, part in zip([name for name, below, _ in models if below], own, strict=True):
+            for key, row in rows.rows_of(tables[name], {}).items():
+                wanted = f"| `{key}` |" if key in rows.TAGS else " | ".join(["", *row]).strip().rstrip(".")
+                assert wanted.replace("`|", "`\\|") in shared + part, (name, key)
 
 
 def parts(text: str) -> list[tuple[str, str]]:

@@ -2,39 +2,92 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from cortado.scene.tables import GREATEST
 
 Schema = Mapping[str, Any]
+Row = tuple[str, str, str, str]
+"""Of a key its name, what it is, its value if it is left out, and its meaning."""
 WORDS = {"number": "number", "integer": "whole number", "boolean": "`true` or `false`", "string": "text"}
-HEAD = "| key | what it is | unit | range | if left out | meaning |\n|---|---|---|---|---|---|\n"
+HEAD = "| key | what it is | if left out | meaning |\n|---|---|---|---|\n"
+TAGS = ("shape", "kind")
+"""Keys that say which of several tables one is."""
 
 
 def rows(schema: Schema, links: Mapping[str, tuple[str, str]] | None = None) -> str:
-    """A row for each key of a table.
+    """A table with a row for each key.
 
     Args:
         schema: that of the table, part of `model_json_schema()`.
         links: for keys that are tables themselves, where the page describes them, and what they are.
     """
-    needed = schema.get("required", [])
-    links = links or {}
-    found = [_row(key, field, key in [*needed, "shape"], links.get(key)) for key, field in schema["properties"].items()]
-    return HEAD + "".join(found)
+    return shown(rows_of(schema, links or {}).values())
 
 
-def _row(key: str, field: Schema, needed: bool, link: tuple[str, str] | None) -> str:
+def rows_of(schema: Schema, links: Mapping[str, tuple[str, str]]) -> dict[str, Row]:
+    """The row of each key, by its name."""
+    needed = [*schema.get("required", []), "shape"]
+    return {key: _row(key, field, key in needed, links.get(key)) for key, field in schema["properties"].items()}
+
+
+def shown(found: Iterable[Row]) -> str:
+    """Rows as a table in Markdown; nothing where there is none."""
+    lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |\n" for row in found]
+    return HEAD + "".join(lines) if lines else ""
+
+
+def split(schemas: Iterable[Schema]) -> tuple[list[Row], list[list[Row]]]:
+    """The rows that several tables have alike, each once, and of every table the others.
+
+    A row that some of the tables lack says which have it. The key that tells the tables apart is one row.
+    """
+    tables = [rows_of(schema, {}) for schema in schemas]
+    tags = [key for key in TAGS if key in tables[0]]
+    names = [" ".join(table[tag][1] for tag in tags) for table in tables]
+    common, held = [_tag_row([table.pop(tag) for table in tables]) for tag in tags], set[Row]()
+    for row in dict.fromkeys(row for table in tables for row in table.values()):
+        having = [name for name, table in zip(names, tables, strict=True) if row in table.values()]
+        if len(having) > 1:
+            held.add(row)
+            common.append((*row[:3], _of_some(row[3], having, names)))
+    return common, [[row for row in table.values() if row not in held] for table in tables]
+
+
+def _tag_row(found: Sequence[Row]) -> Row:
+    """The rows of the key that tells tables apart as one; a default is one where a single table has it."""
+    defaults = {default for _, _, default, _ in found} - {"*needed*"}
+    names = listed([name for _, name, _, _ in found])
+    return found[0][0], names, defaults.pop() if len(defaults) == 1 else "*needed*", "Which of them it is."
+
+
+def _of_some(meaning: str, having: Sequence[str], names: Sequence[str]) -> str:
+    """A meaning with the names of the tables that have the key, or of the fewer ones that lack it."""
+    lacking = [name for name in names if name not in having]
+    if not lacking:
+        return meaning
+    fewer, word = (having, "With") if len(having) <= len(lacking) else (lacking, "Not with")
+    return f"{meaning} {word} {listed(fewer)}."
+
+
+def listed(names: Sequence[str]) -> str:
+    """One or the other of some names, in words."""
+    return " or ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)
+
+
+def _row(key: str, field: Schema, needed: bool, link: tuple[str, str] | None) -> Row:
     value = field["anyOf"][0] if "anyOf" in field else field
     number = value.get("items", value)
     number = number.get("items", number)  # of a list of lists
     unit = {"-": ""}.get(number.get("unit", ""), number.get("unit", ""))
     words = [one["const"] for one in field.get("anyOf", ()) if "const" in one and one is not value]
-    kinds = " or ".join([_kind(value), *(f'`"{word}"`' for word in words)]) if link is None else ""
-    kind, meaning = link or (kinds, _meaning(key, field, unit))
-    cells = (f"`{key}`", kind, unit, _range(number), _default(field, needed), meaning)
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
+    if link:
+        return f"`{key}`", link[0], _default(field, needed), link[1]
+    between = _range(number)
+    measure = (f" [{unit}]" if unit else "") + (f", {between}" if between else "")
+    kinds = (", or " if between else " or ").join([f"{_kind(value)}{measure}", *(f'`"{word}"`' for word in words)])
+    return f"`{key}`", kinds, _default(field, needed), _meaning(key, field, unit)
 
 
 def _kind(value: Schema) -> str:
@@ -42,7 +95,7 @@ def _kind(value: Schema) -> str:
         case {"const": one}:
             return f'`"{one}"`'
         case {"enum": names}:
-            return " or ".join(f'`"{name}"`' for name in names)
+            return listed([f'`"{name}"`' for name in names])
         case {"type": "array", "components": names}:
             return f"{len(names)} {_plural(value['items'])}"
         case {"type": "array", "items": items, "maxItems": _}:
@@ -52,7 +105,7 @@ def _kind(value: Schema) -> str:
         case {"type": "array", "items": {"items": items}}:
             return f"list of lists of {_plural(items)}"
         case {"type": "array", "items": {"enum": _}}:
-            return "list of names of parameters"
+            return "list of names"
         case {"type": "array", "items": items}:
             return f"list of {_plural(items)}"
         case {"type": "object"}:
@@ -96,7 +149,7 @@ def _meaning(key: str, field: Schema, unit: str) -> str:
         words = "Which shape it is."
     words = re.sub(r"^\((\w+, )*\w+,?\) ?", "", words)
     words = re.sub(r"^\[[^\]]+\] | \[[^\]]+\](?=[.;,]|$)", "", words) if unit else words
-    words = words[:1].upper() + words[1:]
+    words = words if re.match(r"[a-z]\b", words) else words[:1].upper() + words[1:]  # a symbol stays as it is
     return words if words.endswith(".") else f"{words}."
 
 

@@ -7,7 +7,7 @@ together with `WHOLE` is a valid scene; `tests/test_docs.py` loads them.
 from pathlib import Path
 from typing import Any
 
-from rows import rows, toml
+from rows import rows, shown, split, toml
 
 from cortado.scene.scene import Scene
 
@@ -68,35 +68,32 @@ def _with_law(rheology: str) -> str:
 
 BEGINNING = """# The scene file
 
-A scene file says what a simulation starts from: which fluids there are, where they are, what holds them, which forces
-act, and how long a time step is. It is written in [TOML](https://toml.io). All units are SI. This is a whole file:
+This page is for whoever writes a scene and looks up a key: its type, unit, bounds, default and meaning. A scene says
+what a simulation starts from, in [TOML](https://toml.io) and SI units. This is a whole file:
 
 {whole}
     cortado run scene.toml --steps 200 --out runs/block
 
-In Python the same keys are arguments, with a list of tables for `[[phase]]` and `[[fluid]]`:
+In Python the same keys are arguments, with lists of tables for `[[phase]]` and `[[fluid]]`:
 `cortado.Scene(dimension=3, discretisation={{"spacing": 0.05}}, phase=[{{...}}], fluid=[{{...}}], solver={{...}})`.
-A scene does not change once it is made: `scene.replaced("solver.time_step=0.001", "phase.water.viscosity=0.1")` is the
-same scene with other values.
+A scene does not change once it is made. `scene.replaced("solver.time_step=0.001", "phase.water.viscosity=0.1")` is
+another one.
 
-d stands for the number of dimensions, 2 or 3. Defaults of vectors are for 3-D: in 2-D the last component is left out. A
-key whose last but one column says *needed* has to be there; all others may be left out. A key that does not exist, a
-number out of its range or a missing key is refused in a sentence that names the file and the key.
-
-Each example below is a part of a file. Swap it for the table of the same name in the file above to get a complete
-file.
+d stands for the number of dimensions, 2 or 3. Defaults of vectors are for 3-D: in 2-D the last component is left out.
+Keys that are *needed* have to be there, and all others may be left out. A sentence that names the file and the key
+refuses what is wrong. Each example replaces the table of the same name in the file above.
 
 ## At the top of the file
 
 {top}
-A file may also hold the tables `[problem]` and `[optimise]`, which make it a [task](task_file.md).
+The tables `[problem]` and `[optimise]` make a scene a [task](task_file.md).
 """
 
 PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     (
         "## Particles: `[discretisation]`",
-        "Fluid is cut into particles that start on a regular lattice. A smaller spacing shows smaller waves and takes "
-        "more time: half of it means eight times as many particles in 3-D, and time steps about half as long.",
+        "Fluid is cut into particles that start on a regular lattice. Half the spacing shows smaller waves. It takes "
+        "eight times as many particles in 3-D, and steps half as long ([how to choose it](cookbook.md)).",
         (("DiscretisationTable", "", '[discretisation]\nspacing = 0.05\nsupport = 3.0\nkernel = "wendland_c4"'),),
     ),
     (
@@ -112,8 +109,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     ),
     (
         "## Bodies of fluid: `[[fluid]]`",
-        "What is filled with fluid at the start. There may be several, which must not overlap. `shape` decides which "
-        "other keys a body has.",
+        "What is filled with fluid at the start. Several bodies must not overlap.",
         (
             (
                 "BoxFluid",
@@ -154,8 +150,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     (
         "## A jet: `[emitter]`",
         "A column of particles waits behind an opening and comes out of it with one speed. With an emitter a scene may "
-        "leave out `[[fluid]]`: its container is then filled by the emitter alone. Where the opening is may "
-        "change over time: the parameter `nozzle_path`.",
+        "leave out `[[fluid]]`. The parameter `nozzle_path` moves the opening.",
         (
             (
                 "EmitterTable",
@@ -167,8 +162,8 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     ),
     (
         "## Walls: `[container]`",
-        "What holds the fluid. Walls are at rest; a container that is tilted is simulated by gravity that leans, the "
-        "parameter `tilt`. Without this table fluid is in free space.",
+        "What holds the fluid, at rest. Gravity that leans, the parameter `tilt`, tilts it. Without this table fluid "
+        "is in free space.",
         (
             (
                 "BoxContainer",
@@ -187,7 +182,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     (
         "## Viscosity that depends on the shear rate: `rheology`",
         'A law in a phase, in a scene with one phase and the viscous force "stress" ([thick fluids](viscosity.md)). '
-        "`kind` decides which other keys it has; each number is a parameter, such as `carreau.flow_index`.",
+        "Each number is a parameter, such as `carreau.flow_index`.",
         (
             ("PowerLaw", "### A power law", _with_law('{ kind = "power_law", flow_index = 0.6 }')),
             (
@@ -206,8 +201,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     (
         "## Solids: `[[solid]]`",
         "What fluid flows around or is held by, besides the container: pillars, ramps, baffles, cups, tanks that lean, "
-        "pistons, rotors, belts, meshes from files ([how they work](solids.md)). `shape` decides which other keys a "
-        "solid has.",
+        "pistons, rotors, belts, meshes from files ([how they work](solids.md)).",
         (
             (
                 "BoxSolid",
@@ -281,9 +275,9 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     ),
     (
         "## Changes over time: `[schedule]`",
-        "What changes while a scene runs, as values at some times, with straight lines or a spline between them. So a "
-        "box is shaken and a cup is tilted: walls stay where they are, and gravity changes ([runs](runs.md)). Values "
-        "may be in [a file](solids.md#paths-from-files).",
+        "What changes while a scene runs, as values at some times, in the table or in "
+        "[a file](solids.md#paths-from-files). So a box is shaken and a cup is tilted: walls stay, and gravity changes "
+        "([runs](runs.md)).",
         (
             ("Schedule", "", "[schedule.gravity]\ntimes = [0.0, 0.1]\nvalues = [[0.0, -9.81, 0.0], [3.0, -9.81, 0.0]]"),
             (
@@ -308,11 +302,10 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     ),
     (
         "## Forces of packages: `[[force]]`",
-        "Forces that installed packages register, each with the key `kind`, the name that its package gives it. Its "
-        "other keys are those of the force, which judges them: `k = 2.0`. They act besides those of `[forces]`, in the "
-        "order of the file. [A force, a solver of your own](own_parts.md#a-package-that-scene-files-name) says how a "
-        "package registers one. Their parameters, such as `drag.k`, are differentiated and searched for as others are; "
-        "two forces of one kind need names of their own.",
+        "Forces that installed packages register ([how](own_parts.md#a-package-that-scene-files-name)). `kind` is the "
+        "name that its package gives a force, and its other keys, such as `k = 2.0`, are those of the force. They act "
+        "besides those of `[forces]`, in the order of the file. Their parameters, such as `drag.k`, are differentiated "
+        "and searched for as others are. Two forces of one kind need names of their own.",
         (),
     ),
     (
@@ -344,9 +337,8 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     (
         "## Time steps: `[solver]`",
         "How the fluid is kept incompressible ([two ways](projection.md)). A time step beyond the limit of stability "
-        'is warned of; with `time_step = "auto"` it is [chosen before each step](steps.md#steps-that-are-chosen). '
-        "A scene that names no `kind` has the projection. With the name of a solver that an installed package "
-        "registers as `kind`, the table has the first four keys below and those of that solver.",
+        'is warned of; "auto" [chooses each step](steps.md#steps-that-are-chosen). '
+        "If `kind` names the solver of an installed package, the table has the shared keys and those of that solver.",
         (
             ("ProjectionSolver", "### The projection", "[solver]\ntime_step = 0.002\niterations = 4"),
             (
@@ -359,8 +351,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     ),
     (
         "## Sensors: `[[sensor]]`",
-        "What `cortado run` reads of the fluid in every step and writes to `sensors.csv` ([sensors](sensors.md)). "
-        "`kind` decides which other keys a sensor has.",
+        "What `cortado run` reads of the fluid in every step and writes to `sensors.csv` ([sensors](sensors.md)).",
         (
             (
                 "PressureProbeTable",
@@ -452,19 +443,29 @@ def examples() -> dict[str, str]:
     return {model: example for _, _, tables in PARTS for model, _, example in tables}
 
 
+COMMON = "Shared keys:"
+NEXT = "*Next*: [a scene of your own](own_scene.md), [the cookbook](cookbook.md), [the task file](task_file.md)."
+
+
 def page() -> str:
-    """The whole page."""
+    """The whole page, in which keys that several tables of a section have stand once, before these tables."""
     schema: dict[str, Any] = Scene.model_json_schema()
-    text = BEGINNING.format(whole=toml(WHOLE), top=rows(schema, LINKS))
+    parts = [BEGINNING.format(whole=toml(WHOLE), top=rows(schema, LINKS)).rstrip("\n")]
     for heading, words, tables in PARTS:
-        text += f"\n{heading}\n\n" + (f"{words}\n\n" if words else "")
+        parts += [heading, words]
+        headed = [schema["$defs"][model] for model, below, _ in tables if below]
+        common, own = split(headed) if headed else ([], [])
         for model, below, example in tables:
             table = schema["$defs"][model]
-            words = table.get("description", "").replace("``", "`")
-            above = [part for part in (below, words) if below and part]
-            text += "\n\n".join([*above, f"{rows(table)}\n{toml(example)}\n"])
-        text = text.rstrip("\n") + "\n"
-    return text
+            if not below:
+                parts += [rows(table), toml(example)]
+                continue
+            if common:
+                parts += [COMMON, shown(common)]
+                common = []
+            said = "" if model.startswith("Course_") else table.get("description", "")  # [schedule] says it
+            parts += [below, said.replace("``", "`"), shown(own.pop(0)), toml(example)]
+    return "\n\n".join(part.rstrip("\n") for part in [*parts, NEXT] if part) + "\n"
 
 
 if __name__ == "__main__":
