@@ -1,0 +1,160 @@
+"""What pages say is so today: their options, files and keys are there, and their defaults are those of the code."""
+
+import inspect
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import cortado
+from cortado.cli import main
+from cortado.cli.arguments import STEPS
+from cortado.scene.appearance import Picture
+from cortado.scene.scene import Scene
+from cortado.scene.solvers import COURANT
+
+ROOT = Path(__file__).parents[1]
+OUTER = ("README.md", "CONTRIBUTING.md", "RELEASE.md", "NOTICE.md", "validation/README.md")
+FILES = [path for path in sorted((ROOT / "docs").rglob("*.md")) if "records" not in path.parts]
+TODAY = {path.relative_to(ROOT).as_posix(): path.read_text("utf-8") for path in [*FILES, *(ROOT / n for n in OUTER)]}
+"""All pages but records, which may name what is gone."""
+PROGRAM = re.compile(r"^    python (\S.*)$|`python (\S[^`]*)`", re.MULTILINE)
+PROGRAMS = sorted({(a or b).partition("  #")[0] for text in TODAY.values() for a, b in PROGRAM.findall(text)})
+OF_OTHERS = {"build", "cibuildwheel", "pip", "twine", "venv", "pytest"}
+OPTIONS_OF_OTHERS = {
+    "--editable",
+    "--exclude-editable",
+    "--ignore-requires-python",
+    "--no-deps",
+    "--platform",
+    "--strict",
+}
+COMMANDS = (
+    "compare",
+    "completion",
+    "convergence",
+    "dataset",
+    "describe",
+    "examples",
+    "export",
+    "fit",
+    "gradients check",
+)
+COMMANDS += ("new", "optimise", "picture", "run", "schema", "sweep", "view")
+
+
+def sources(place: Path) -> str:
+    """The text of a program: of a file, or of all files of a package."""
+    files = [place] if place.is_file() else sorted(place.rglob("*.py"))
+    return "".join(file.read_text("utf-8") for file in files)
+
+
+def has(text: str, option: str) -> bool:
+    """Whether a program reads an option, from its text: argparse names it, and tyro makes it of an argument's name."""
+    name = option.removeprefix("--").replace("-", "_")
+    return f'"{option}"' in text or re.search(rf"\b{name.removeprefix('no_')}: ", text) is not None
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_a_program_that_a_page_names_is_there_with_its_options(program):
+    words = shlex.split(program)
+    module = words[1] if words[0] == "-m" else ""
+    if module.partition(".")[0] in OF_OTHERS:
+        return
+    place = ROOT / (module.replace(".", "/") if module else words[0])
+    place = place.with_suffix(".py") if module and not place.exists() else place
+    assert place.exists(), place
+    text = sources(place) + (sources(ROOT / "benchmarks") if module.startswith("benchmarks") else "")
+    assert [word for word in words if word.startswith("--") and not has(text, word)] == []
+    files = [word for word in words[1:] if re.fullmatch(r"[\w/.-]+/[\w.-]+\.(toml|csv|jsonl|py)", word)]
+    assert [file for file in files if not file.startswith("runs/") and not (ROOT / file).exists()] == []
+
+
+def test_an_option_that_a_page_names_is_there(capsys):
+    """Of a command of Cortado's, of a program of the repository, or of a program of others that is named here."""
+    for command in COMMANDS:
+        with pytest.raises(SystemExit):
+            main([*command.split(), "--help"])
+    known = {*re.findall(r"--[a-z][\w-]*", capsys.readouterr().out), "--version", "--help", *OPTIONS_OF_OTHERS}
+    text = "".join(
+        sources(ROOT / folder) for folder in ("benchmarks", "validation", "experiments", "tests", "docs/site")
+    )
+    text += sources(ROOT / "examples")
+    named = {
+        (option, page) for page, words in TODAY.items() for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", words)
+    }
+    assert len(named) > 100
+    assert sorted((option, page) for option, page in named if option not in known and not has(text, option)) == []
+
+
+def test_a_key_that_a_page_sets_is_one():
+    """Its last name is that of a key of a scene, a task or a data set, or of a parameter."""
+    found = {key for text in TODAY.values() for key in re.findall(r"--(?:set|zip) ([\w.]+)=", text)}
+    read = "".join(sources(ROOT / f"src/cortado/{name}") for name in ("scene", "optimisation", "pictures"))
+    assert len(found) > 15
+    assert [key for key in sorted(found) if not re.search(rf"\b{key.rpartition('.')[2]}\b", read)] == []
+
+
+def scene(**tables) -> Scene:
+    water = {"name": "water", "rest_density": 1000.0, "viscosity": 0.001}
+    whole = {"dimension": 2, "discretisation": {"spacing": 0.05}, "phase": [water], "solver": {"time_step": 0.001}}
+    fluid = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 0.5], "phase": "water"}
+    return Scene(**{**whole, "fluid": [fluid], "container": BOX, **tables})
+
+
+BOX = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}
+PLAIN, OLD = scene(), scene(solver={"kind": "pcisph", "time_step": 0.001})
+PERIODIC = scene(container={**BOX, "upper": [0.5, 0.5], "periodic": [True, True]})
+FACTS = {
+    "`solver.kind`": (PLAIN.solver.kind,),
+    "`solver.iterations`, `solver.repairs`": (PLAIN.solver.iterations, PLAIN.solver.repairs),
+    "`discretisation.kernel`, `discretisation.support` with the projection": (
+        PLAIN.discretisation.kernel,
+        PLAIN.discretisation.support,
+    ),
+    "the same with PCISPH": (OLD.discretisation.kernel, OLD.discretisation.support),
+    "`discretisation.jitter` where all axes are periodic, and beside another axis": (
+        PERIODIC.discretisation.jitter,
+        PLAIN.discretisation.jitter,
+    ),
+    "`forces.viscosity`, `forces.viscous_solve`": (PLAIN.forces.viscosity, PLAIN.forces.viscous_solve),
+    "`slip` of walls and solids": (PLAIN.container.slip,),
+    '`solver.courant` with `time_step = "auto"`': (COURANT,),
+    "`picture.width`, `picture.height`": (Picture().width, Picture().height),
+    "`precision` of `Simulation` and of commands": (
+        inspect.signature(cortado.Simulation).parameters["precision"].default,
+    ),
+    "`--steps` of `cortado run`": (STEPS,),
+}
+"""The defaults that pages quote, by the words of the cookbook's table, as the code has them."""
+SAID = {
+    r"\bThe (\w+), the default, makes the velocity": PLAIN.solver.kind,
+    r"default solver, the (\w+)": PLAIN.solver.kind,
+    r"names no kernel has (\w+) with a support of": PLAIN.discretisation.kernel,
+    r"Wendland C2 with a support of ([\d.]+\d)": PLAIN.discretisation.support,
+    r"names no kernel has \w+ with a support of ([\d.]+\d)": PLAIN.discretisation.support,
+    r"courant \(([\d.]+) if left out": COURANT,
+    r"takes 400 steps, (\d+) if nothing": STEPS,
+    r"default, (\w+), is as viscous as asked": PLAIN.forces.viscosity,
+    r"viscous_solve = (\w+) in \[forces\], the default": PLAIN.forces.viscous_solve,
+    r"(\d+) if left out\s+height = ": Picture().width,
+    r"default is slip = (\w+), as that of other solids": PLAIN.container.slip,
+    r"A problem in (\w+), the default of Simulation": "float32",
+}
+"""What pages say of defaults in passing; the group is the value."""
+
+
+def test_the_table_of_defaults_is_that_of_the_code():
+    table = TODAY["docs/cookbook.md"].partition("## What you get if you say nothing")[2].partition("\n## ")[0]
+    found = dict(re.findall(r"^\| (`.*?|the .*?) \| (`.*`) \|$", table, re.MULTILINE))
+    assert found == {words: ", ".join(f"`{value}`" for value in values) for words, values in FACTS.items()}
+
+
+def test_pages_agree_on_defaults():
+    """Whatever pages still say of them; most of these sentences have to be there, so that the patterns find something."""
+    link = re.compile(r'\[(?!forces)([^\]]*)\]\([^)]*\)|[*`"#]')
+    pages = [" ".join(link.sub(r"\1", text).split()) for text in TODAY.values()]
+    found = {words: {said for page in pages for said in re.findall(words, page)} for words in SAID}
+    assert {words: said for words, said in found.items() if not said <= {str(SAID[words])}} == {}
+    assert sum(map(bool, found.values())) >= 8
