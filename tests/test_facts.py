@@ -152,7 +152,7 @@ def test_the_table_of_defaults_is_that_of_the_code():
 
 
 def test_pages_agree_on_defaults():
-    """Whatever pages still say of them; most of these sentences have to be there, so that the patterns find something."""
+    """Most of these sentences have to be there, so that the patterns find something."""
     link = re.compile(r'\[(?!forces)([^\]]*)\]\([^)]*\)|[*`"#]')
     pages = [" ".join(link.sub(r"\1", text).split()) for text in TODAY.values()]
     found = {words: {said for page in pages for said in re.findall(words, page)} for words in SAID}
