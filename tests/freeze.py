@@ -110,8 +110,8 @@ def own() -> Iterator[tuple[str, Make, Table]]:
     for law, keys in (laws | {"carreau": {**thinning, "relaxation_time": 0.5}}).items():
         mud = {"name": "water", "rest_density": 1300.0, "viscosity": 2.0, "rheology": {"kind": law, **keys}}
         yield law, partial(plane, phase=[mud], container=held, forces=pull, solver=projection), {}
-    for estimator in (gradients.AdjointViscosity(), gradients.ImplicitPressure()):
-        yield f"gradient {type(estimator).__name__}", partial(plane, solver=projection), {"estimator": estimator}
+    viscous = gradients.AdjointViscosity()
+    yield "gradient AdjointViscosity", partial(plane, solver=projection), {"estimator": viscous}
     yield "gradient Tape", plane, {"estimator": gradients.Tape()}
     tension = {**pull, "surface_tension": 0.5}
     yield "pcisph tension", partial(plane, forces={**tension, "viscosity": "pairwise"}), {}

@@ -54,7 +54,6 @@ KEPT = {
     },
     "test_solids": {"test_a_mesh_holds_water[torus]", "test_a_paddle_stirs_and_nothing_enters_it"},
     "test_image_loss": {"test_the_whole_chain_from_gravity_to_the_picture[True]"},
-    "test_implicit_pressure": {"test_at_the_fixed_point_it_is_the_exact_gradient[few]"},
     "test_energy_budget": {"test_water_at_rest_has_the_pressure_of_its_depth"},
     "test_packages": {"test_they_are_there_in_processes_of_their_own"},
     "test_plants": {"test_plants_of_one_scene_are_found"},

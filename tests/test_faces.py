@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from cortado import Problem, Simulation
-from cortado.gradients import ImplicitPressure
 from cortado.losses import CentreOfMass
 from cortado.sensors import SolidLoad, WallForce
 from reference_projection import Projection
@@ -159,12 +158,3 @@ def test_in_float32_the_gradient_is_near_that_of_float64():
     single, double = (Problem(one, 12, CentreOfMass([0.5, 0.3])).value_and_gradient(given)[1] for one in made)
     for name, wanted in double.items():
         assert np.linalg.norm(single[name] - wanted) < 1e-2 * np.linalg.norm(wanted), name
-
-
-def test_the_pressure_as_a_fixed_point_has_the_same_gradient():
-    scene = flume().replaced("solver.iterations=8")
-    problem = Problem(Simulation(scene, precision="float64"), 12, CentreOfMass([0.5, 0.3]))
-    point, _ = point_of(scene, 12)
-    gradients = (problem.value_and_gradient(point, gradient=one)[1] for one in (None, ImplicitPressure()))
-    exact, fixed = (gradient["flap.position"] for gradient in gradients)
-    assert exact @ fixed > 0.999 * np.linalg.norm(exact) * np.linalg.norm(fixed)

@@ -134,7 +134,6 @@ def test_any_number_of_lanes_computes_the_same(name, lanes):
     ("name", "estimator"),
     [
         *((name, gradients.AdjointViscosity()) for name in ("fixed", "two fluids")),
-        *((name, gradients.ImplicitPressure()) for name in ("projection", "projection in the plane")),
         *((name, gradients.AdjointViscosity()) for name in ("projection", "projection in the plane")),
     ],
 )

@@ -65,7 +65,6 @@ FORCES = {"forces of one's own": [forces.Body(swirl, rate=2.0), forces.Pair(spri
 ESTIMATORS = {
     "exact": gradients.Exact(),
     "adjoint viscosity": gradients.AdjointViscosity(5.0),
-    "implicit pressure": gradients.ImplicitPressure(),
 }
 CORES_AND_PARTS = ((2, 2), (2, 8), (5, 5))
 """All of them in the first case, and one of them in each of the others, in turn: how launches are cut does not depend
@@ -102,10 +101,6 @@ def results(name) -> dict[str, bytes]:
     found = {"value": problem.value(point), "tangent": problem.tangent(point, directions)}
     found["iterations"] = problem.iterations()
     for label, estimator in ESTIMATORS.items():
-        is_pcisph = simulation.scene.solver.kind == "pcisph"
-        is_free = any(solid.motion == "free" for solid in simulation.scene.solid)
-        if label == "implicit pressure" and (is_pcisph or is_free):
-            continue
         _, gradient = problem.value_and_gradient(point, estimator)
         found |= {f"{label}, {name}": array for name, array in gradient.items()}
     seen = Problem(simulation, STEPS, Seen(simulation))

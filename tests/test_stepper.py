@@ -288,13 +288,11 @@ def test_segments_chained_by_vjp_have_the_bits_of_one_run(name, precision):
 
 @pytest.mark.parametrize(
     "estimator",
-    [gradients.AdjointViscosity(), gradients.ImplicitPressure(), gradients.AdjointViscosity(base=gradients.Tape())],
-    ids=["viscosity", "implicit pressure", "viscosity of a tape"],
+    [gradients.AdjointViscosity(), gradients.AdjointViscosity(base=gradients.Tape())],
+    ids=["viscosity", "viscosity of a tape"],
 )
 def test_segments_go_back_by_an_estimator_as_one_run_does(estimator):
-    solver = {"kind": "projection", "time_step": 0.005} if estimator == gradients.ImplicitPressure() else {}
-    made = plane(solver=solver) if solver else plane()
-    simulation = Simulation(made, precision="float64")
+    simulation = Simulation(plane(), precision="float64")
     start = {"initial_velocities": simulation.velocities + np.random.default_rng(2).normal(0, 0.3, (64, 2))}
     wanted = Problem(simulation, 20, Weighted()).value_and_gradient({"viscosity": 0.1, **start}, estimator)[1]
     stepper, state, residuals = simulation.stepper(5), simulation.state(start), []

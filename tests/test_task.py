@@ -150,7 +150,6 @@ SEVERAL = ["optimise.gradient.samples=4", "optimise.gradient.spread.gravity=0.5"
 STILL = "optimise.gradient.position_noise=0"
 ESTIMATORS = {
     "exact": ([], gradients.Exact()),
-    "a fixed point": (['optimise.gradient.name="implicit_pressure"'], gradients.ImplicitPressure()),
     "smoothing": (SMOOTHING, gradients.AdjointViscosity()),
     "with a coefficient": ([*SMOOTHING, "optimise.gradient.coefficient=3.0"], gradients.AdjointViscosity(3.0)),
     "averaged": ([*SMOOTHING, *SEVERAL], gradients.EnsembleMean({"gravity": 0.5}, 4)),

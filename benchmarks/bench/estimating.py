@@ -12,7 +12,7 @@ from benchmarks.bench.scene import dam_break
 from benchmarks.bench.watching import tank
 from cortado import Problem, Simulation, gradients, losses
 
-ESTIMATORS = gradients.Exact(), gradients.AdjointViscosity(), gradients.ImplicitPressure()
+ESTIMATORS = gradients.Exact(), gradients.AdjointViscosity()
 
 
 def bench_estimating(depth: int, particles: int, steps: int, repeats: int, device: str, as_json: bool) -> str:

@@ -20,7 +20,7 @@ from cortado.gradients.estimator import (
     checked_estimate,
     checked_estimator,
 )
-from cortado.gradients.reverse_mode import AdjointNorms, AdjointViscosity, Exact, ImplicitPressure, Tape
+from cortado.gradients.reverse_mode import AdjointNorms, AdjointViscosity, Exact, Tape
 from cortado.rollout.rollout import OBSERVED, Observer
 from cortado.scene.parameter_values import Values
 
@@ -36,7 +36,6 @@ __all__ = [
     "ForwardPass",
     "GradientEstimator",
     "Guided",
-    "ImplicitPressure",
     "RandomizedSmoothing",
     "Tape",
     "estimate",

@@ -1,5 +1,5 @@
-"""Estimators that go back through a run step by step: exact, by a tape, with implicit pressures, or with filters of the
-adjoint of a state between two steps, an eddy viscosity and a limit; norms of adjoints.
+"""Estimators that go back through a run step by step: exact, by a tape, or with filters of the adjoint of a
+state between two steps, an eddy viscosity and a limit; norms of adjoints.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from cortado.particles.pair_sums import fluid_sum
 from cortado.particles.state import Parameters, State
 from cortado.rollout.rollout import AdjointStep, BackwardStep, Observer, Rollout
 from cortado.scene.parameter_values import Arrays
-from cortado.solvers.solver import Counts, ResumingAdjoint, Solver
+from cortado.solvers.solver import Counts, Solver
 
 STRONGEST = 0.6
 """Greatest strength s of the viscosity, at which waves of two spacings are damped and keep their sign."""
@@ -239,59 +239,6 @@ class _TapeStep:
 
     def parameters(self) -> Parameters:
         return self._own.gradients()
-
-
-@dataclass(frozen=True)
-class ImplicitPressure(AdjointEstimator):
-    """A gradient estimator: the adjoint of the projection with its pressure as a fixed point, instead of iteration by
-    iteration.
-
-    Formula: an iteration k' = Phi(k, u) of the pressure k from the inputs u, velocities and positions, has the fixed
-    point k = Phi(k, u). So the adjoint is u^ = Phi_u^T l with (1 - Phi_k^T) l = k^, which conjugate gradients solve.
-
-    Bias: none at the fixed point. After a few iterations the pressure is not there yet, and the gradient is that of a
-    fluid with the same pressure that would be. The first guess of a step, the pressure of the last, has no adjoint. The
-    gradient with respect to the rest density of a single phase, which the pressure cancels, is of no use then.
-    Cost: it does not depend on the iterations of the solver, neither the memory nor the work.
-
-    Only for scenes with the solver ``"projection"``. Source: implicit differentiation of fixed points (Christianson
-    1994, Optimization Methods and Software 3).
-    """
-
-    tolerance: float = 0.1
-    """Ratio of the residual to the first, in the norm of its diagonal, at which the solve ends; at least 0, where all
-    `iterations` are done."""
-    iterations: int = 100
-    """Greatest number of iterations for each step."""
-
-    batches = True
-
-    def __post_init__(self) -> None:
-        tolerance = as_number(self.tolerance)
-        if tolerance is None or not 0.0 <= tolerance < 1.0:
-            raise InputError(f"tolerance is {shown(self.tolerance)}, but must be a number from 0 to below 1.")
-        if not is_whole(self.iterations) or self.iterations < 1:
-            raise InputError(f"iterations is {shown(self.iterations)}, but must be a whole number of at least 1.")
-
-    def derivative(self, rollout: Rollout) -> BackwardStep:
-        own = rollout.steps, float(self.tolerance), int(self.iterations)
-        return _ResumingStep(rollout, rollout.solver.implicit_adjoint(*own))
-
-
-class _ResumingStep(AdjointStep):
-    """An exact backward step that repeats the forward step from what is known of its result."""
-
-    def __init__(self, rollout: Rollout, adjoint: ResumingAdjoint):
-        super().__init__(rollout, adjoint)
-        self._resuming = adjoint
-
-    def begin(self) -> None:
-        super().begin()
-        self._resuming.arrive(self.rollout.last_state())
-
-    def step(self, state: State, counts: Counts, bar: State) -> None:
-        self._resuming.replay(state, self._parameters, counts)
-        self._resuming.step(counts, bar, self._parameters)
 
 
 EXACT = Exact()

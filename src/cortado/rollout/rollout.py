@@ -363,10 +363,6 @@ class Rollout(Staying):
         derivative.step(counts, dot, self.parameters)
         self.solver.write_state(counts, self.parameters, self._buffer)
 
-    def last_state(self) -> State:
-        """Return the last state of the last forward run, recomputed from a checkpoint where it was not kept."""
-        return self._checkpoints.state(self.steps, self._replayed)
-
     def _require(self, what: str, evaluation: int) -> None:
         """Raise `InputError` unless a forward run was of the present evaluation."""
         if evaluation != self.evaluation:

@@ -27,7 +27,7 @@ from cortado.scene.discrete_scene import Lattice
 from cortado.solvers.containment import Containment
 from cortado.solvers.loop import IterationLog, Loop, convergence_kernels
 from cortado.solvers.obstacles import FlatFaces, NamedSolid, Walled
-from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint, StepTangent
+from cortado.solvers.solver import Counts, StepAdjoint, StepTangent
 from cortado.sph.density import Density, WallAction, WallSums, wall_slope_term
 from cortado.sph.free_solids import FreeSolidsPart
 from cortado.sph.integration import integration_kernels
@@ -293,9 +293,6 @@ class ParticleSolver(Staying):
 
     def adjoint(self, steps: int) -> StepAdjoint:
         self._lacks("reverse mode", "try gradients.Tape, or gradients.RandomizedSmoothing, which only runs forward")
-
-    def implicit_adjoint(self, steps: int, tolerance: float, iterations: int) -> ResumingAdjoint:
-        self._lacks("implicit adjoint of its pressure", "try gradients.Exact")
 
     def differentiable(self) -> Self:
         self._lacks("tape", "try gradients.RandomizedSmoothing, which only runs forward")

@@ -63,16 +63,6 @@ class StepAdjoint(Protocol):
         """Return the adjoints of the parameters, summed over all steps since `begin`."""
 
 
-class ResumingAdjoint(StepAdjoint, Protocol):
-    """An adjoint of steps that takes the pressure of a step from the state that the step led to."""
-
-    def arrive(self, state: State) -> None:
-        """Take the state after the step that is to be replayed next."""
-
-    def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
-        """Replay a step as `Solver.replay` does, without the pressure iterations; the step before comes next."""
-
-
 class PressureTangent(StepTangent, Protocol):
     """The tangent of a solver with pressures, through which quantities and sensors can be differentiated."""
 
@@ -110,8 +100,8 @@ class PressureAdjoint(StepAdjoint, Protocol):
 
 class Solver(Protocol):
     """The solver of a scene, or of a batch of scenes, on one device, which rollouts share. Of its methods `make_room`
-    and `reset` alone wait for the device and read from it. `tangent`, `adjoint`, `implicit_adjoint` and
-    `differentiable` raise `InputError`, one sentence, where a solver has no such derivative.
+    and `reset` alone wait for the device and read from it. `tangent`, `adjoint` and `differentiable`
+    raise `InputError`, one sentence, where a solver has no such derivative.
     """
 
     discretisation: Discretisation
@@ -163,10 +153,6 @@ class Solver(Protocol):
 
     def adjoint(self, steps: int) -> StepAdjoint:
         """Return the adjoint of the steps of a run of ``steps`` steps (reverse mode)."""
-
-    def implicit_adjoint(self, steps: int, tolerance: float, iterations: int) -> ResumingAdjoint:
-        """Return the adjoint of steps with the pressure as a fixed point of its iterations, for `ImplicitPressure`. Its
-        system is solved until the residual has fallen to ``tolerance`` of the first, in ``iterations`` at most."""
 
     def differentiable(self) -> Self:
         """Return a copy of this solver with arrays that Warp's tape can differentiate."""

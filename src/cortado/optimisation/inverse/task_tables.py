@@ -28,7 +28,6 @@ from cortado.gradients import (
     EnsembleMean,
     Exact,
     GradientEstimator,
-    ImplicitPressure,
 )
 from cortado.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.datasets import DatasetTables
@@ -50,7 +49,6 @@ DISTANCES: dict[str, ImageLoss] = {"squared_difference": SquaredDifference(), "p
 ESTIMATORS: dict[str, AdjointEstimator] = {
     "exact": Exact(),
     "adjoint_viscosity": AdjointViscosity(),
-    "implicit_pressure": ImplicitPressure(),
 }
 
 
@@ -282,8 +280,7 @@ class GradientTable(Table):
     """[optimise.gradient]: which gradient the search follows, see docs/gradients.md."""
 
     name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
-    """Name of the estimator; "adjoint_viscosity" is for long splashes, "implicit_pressure" for the solver
-    "projection" with many iterations."""
+    """Name of the estimator; "adjoint_viscosity" is for long splashes."""
     coefficient: Annotated[float, quantity(ge=0.0)] | None = None
     """C of `AdjointViscosity`, whose strength is C times what the fluid strains in a step; if left out, 2."""
     samples: Annotated[int, count(1, 10_000)] = 1

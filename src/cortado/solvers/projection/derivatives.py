@@ -167,7 +167,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         state_bar.clear()
         self._begin(state_bar, parameters)
         context, known = solver.context(parameters), self.bar.named
-        pressed, k = pressed_kernels(solver.layout.precision).adjoint, self._last(counts)["k"]
+        pressed, k = pressed_kernels(solver.layout.precision).adjoint, solver.iterates[counts[0]]["k"]
         context.launch(pressed, *known, impulse=k, p_bar=within.p, impulse_bar=self._k_bar)
         if within.stress is not None:
             self._q_bar.zero_()
@@ -176,14 +176,6 @@ class ProjectionAdjoint(ParticleAdjoint):
             context.launch(pressed, *known, impulse=q, p_bar=within.stress, impulse_bar=at["q_bar"])
             solver.mean_stress.adjoint(context, self.bar, (solver.around, self._around), at)
         self._go_back(counts, state_bar, parameters, within)
-
-    def _last(self, counts: Counts) -> dict[str, wp.array]:
-        """Return the iterate of the replayed step after all pressure iterations."""
-        return self._solver.iterates[counts[0]]
-
-    def _last_gradient(self, counts: Counts) -> wp.array:
-        """Return the velocity gradient sums A of the replayed step's last pressure iteration."""
-        return self._solver.last_gradient(counts[0])
 
     def _begin(self, state_bar: State, parameters: Parameters) -> None:
         """Go back from the adjoint of a step's result to those of the last positions, velocities and k."""
@@ -212,14 +204,15 @@ class ProjectionAdjoint(ParticleAdjoint):
         that follow, repairs, shift, iterations, first k, prediction with all forces, sorting."""
         solver, kernels, context = self._solver, self._solver.kernels, self._solver.context(parameters)
         known = (*self.bar.named, self._around, solver.around)
-        flow = {"A": self._last_gradient(counts), "A_bar": self._A_bar}
-        v_new = {"v_new": self._last(counts)["u"], "v_new_bar": self._u_bar}
+        last = solver.iterates[counts[0]]
+        flow = {"A": solver.last_gradient(counts[0]), "A_bar": self._A_bar}
+        v_new = {"v_new": last["u"], "v_new_bar": self._u_bar}
         if solver.following is not None:
             ends = {"x_now": solver.repaired[counts[1]]["x_now"], "x_now_bar": self._x_now_bar}
             context.launch(solver.following.adjoint, *known, flow, v_new, ends)
         self._mend(context, known, counts[1])
         context.launch(kernels.moving.adjoint, *known, v_new, delta=solver.delta, delta_bar=self._x_moved_bar)
-        pull = {"k": self._last(counts)["k"], "k_bar": self._k_bar}
+        pull = {"k": last["k"], "k_bar": self._k_bar}
         context.launch(kernels.shift.adjoint, *known, solver.spaced, flow, pull, delta_bar=self._x_moved_bar)
         self._project(context, known, counts[0])
         before = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
@@ -264,7 +257,7 @@ class ProjectionAdjoint(ParticleAdjoint):
             self._bodies.settle(context, self.bar, solver.iterates[iterations]["y"], self._y_bar)
         self._coarse.begin()
         for k in reversed(range(iterations)):
-            self._press(context, known, solver.iterates[k + 1], self._y_bar)
+            self._press(context, known, solver.iterates[k + 1])
             self._back(context, known, solver.corrected[k], solver.momentum(k), moves=k == iterations - 1)
             solver.coarse.where_due(k, partial(self._correct, context, known, k))
         self._coarse.finish(context, known, solver.around["coarse"])
@@ -280,13 +273,13 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._diverge(context, known, solver.kernels.pressure.update.adjoint[1], at, steps)
         add(self._f, self._u_bar)
 
-    def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], y_bar: wp.array) -> None:
+    def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array]) -> None:
         """Apply the adjoint of the velocities that the pressure y leaves, to those of v* and of y."""
         solver, velocity = self._solver, self._solver.kernels.velocity
         found = {"u": at["u"], "u_bar": self._u_bar, "kick_bar": self._kick_bar, "v_star": solver.v_star}
         steps = {"f": self._f, "T": self._pull, "y": at["y"]}
         context.launch(velocity.own_adjoint, *known, found, steps)
-        context.launch(velocity.velocity.adjoint, *known, steps, y_bar=y_bar)
+        context.launch(velocity.velocity.adjoint, *known, steps, y_bar=self._y_bar)
         self._faces.add(context, self.bar, context.fields.named(), solver.around, u=self._f, spread=at["y"])
 
     def _back(

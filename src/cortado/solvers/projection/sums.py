@@ -2,8 +2,7 @@
 one, v* - D^T y / m, see `cortado.solvers.projection.pressure`; g_ij = V grad W_ij.
 
 The force of pressures and the divergence of velocities are each other's transpose, and do most of the work, forward
-and back. A = sum_j v_ij g_ij^T has kernels of its own for the fixed point of the projection, where no iteration has
-found it.
+and back.
 """
 
 from dataclasses import dataclass
@@ -332,32 +331,4 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
 
     return VelocityKernels(
         Kernels(velocity, velocity_tangent, velocity_adjoint), pull_tangent, own_adjoint, time_adjoint
-    )
-
-
-@cache
-def velocity_gradient_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of A = sum v_ij g_ij^T in 2 or 3 dimensions; the adjoint needs g, the sum of g_ij."""
-    precision, modules = discretisation.precision, discretisation.modules(f"projection_{dimension}d")
-    vector, matrix, sums = precision.vector, matrix_type(precision), projection_sums(discretisation)
-    typed = types_by_name(precision)
-
-    def gradient(name: str, module: Any, result: str, total: Any) -> Any:
-        @particle_kernel(module, result, [over(total, "row_x row_y row_z", v="v_flow", v_dot="v_flow_dot")], name=name)
-        def velocity_gradient(row_x: vector, row_y: vector, row_z: vector) -> matrix:
-            return wp.matrix_from_rows(row_x, row_y, row_z)
-
-        return velocity_gradient
-
-    back = over(sums.velocity_gradient.adjoint, "v_part x_part", v="v_flow")
-
-    @particle_kernel(modules[2], "+x_bar +v_flow_bar", [back])
-    @typed
-    def velocity_gradient_adjoint(v_part, x_part, g_i, A_bar_i) -> tuple[vector, vector]:
-        return x_part, v_part + A_bar_i * g_i
-
-    return Kernels(
-        gradient("velocity_gradient", modules[0], "A", sums.velocity_gradient.forward),
-        gradient("velocity_gradient_tangent", modules[1], "A_dot", sums.velocity_gradient.tangent),
-        velocity_gradient_adjoint,
     )
