@@ -106,8 +106,8 @@ def cases(device: str) -> dict[str, Callable[[], object]]:
         "settling-disc, 12 across, steps of 0.5 ms": partial(settling_disc, 12, 0.0005, 0.15, device),
         "floating-box, 16 particles long": lambda: floating_box(16),
         "floating-box, 32 particles long": lambda: floating_box(32),
-        "added-mass, a sphere 8 across, 20 deep, 4 iterations": lambda: added_mass(8, 20, 100, 4),
-        "added-mass, a sphere 8 across, 20 deep, 4 iterations, 10 steps": lambda: added_mass(8, 20, 100, 4, steps=10),
+        "added-mass, a sphere 8 across, 20 deep, 2 iterations": lambda: added_mass(8, 20, 100, 2),
+        "added-mass, a sphere 8 across, 20 deep, 2 iterations, 10 steps": lambda: added_mass(8, 20, 100, 2, steps=10),
         "added-mass, a sphere 8 across, 20 deep, 16 iterations": lambda: added_mass(8, 20, 100, 16),
         "added-mass, a sphere 8 across, 20 deep, 32 iterations": lambda: added_mass(8, 20, 200, 32),
         **{
