@@ -1,4 +1,4 @@
-"""Slow twin of a step of the projection: all pairs, NumPy, straight from the equations of `docs/projection.md`."""
+"""Slow twin of a step of the projection: all pairs, NumPy, straight from the equations of `docs/projection_step.md`."""
 
 import itertools
 from dataclasses import dataclass, replace

@@ -1,5 +1,5 @@
 """How near is the projection to flows that are known? ``python validation/projection.py [--device cuda] [--only jet]``
-prints a line for each case of `docs/projection.md` and more, some of which take minutes on one core."""
+prints a line for each case of `validation/README.md` and more, some of which take minutes on one core."""
 
 import argparse
 import sys

@@ -146,7 +146,7 @@ def creep_sentence(scene: SceneTables) -> str | None:
 
 
 FAULT = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear"
-"""The fault of the pairwise viscosity, as measured in waves of shear (`docs/discretisation.md`)."""
+"""The fault of the pairwise viscosity, as measured in waves of shear (`docs/records/validation_viscosity.md`)."""
 
 
 def viscosity_sentence(scene: SceneTables, where: str) -> str | None:

@@ -153,7 +153,7 @@ class CurvatureTension:
 
 RELAXED = {2: 1.1, 3: 1.25}
 """By dimension: the tension of a surface that has flown over that of a cut lattice, measured in drops: see
-docs/discretisation.md."""
+docs/records/surface_tension.md."""
 LEAST_SUPPORT = {"pairs": 1.8, "curvature": 2.5}
 """In spacings: below, drops fall apart in pairs, and curvatures are too noisy."""
 LEAST_VISCOSITY = 0.05
