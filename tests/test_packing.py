@@ -151,6 +151,20 @@ def test_small_bodies_have_the_particles_that_fit():
         assert np.isfinite(found).all()
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_round_solid_in_a_tank_leaves_layers_along_its_walls_whole(dimension):
+    """There was a hole along the last wall before: all particles of flat faces counted as if they were round."""
+    upper, middle = [3.0, 1.0, 0.4][:dimension], [0.9, 0.53, 0.2][:dimension]
+    ball = {"name": "ball", "shape": "sphere", "centre": middle, "radius": 0.16}
+    tank = {"shape": "box", "lower": [0.0] * dimension, "upper": upper}
+    found = discretise(bodies(dimension, [tank], {**tank, "upper": [upper[0], 1.2, *upper[2:]]}, solid=[ball]))
+    layers = np.bincount((found.fluid.positions[:, 0] / SPACING).astype(int), minlength=60)
+    assert len(layers) == 60 and (layers[30:] == 20 * 8 ** (dimension - 2)).all()
+    surface = {2: 2.0 * np.pi * 0.16, 3: 4.0 * np.pi * 0.16**2}[dimension]
+    lacking = np.prod(upper) - surface * 0.16 / dimension - layers.sum() * SPACING**dimension
+    assert abs(lacking) < 0.15 * surface * SPACING
+
+
 def test_distances_from_a_region():
     points = np.array([[0.0, 0.2, 0.0], [0.0, 0.9, 0.0], [0.6, 0.5, 0.0], [0.0, -0.1, 0.45]])
     cylinder = Region.cylinder(np.zeros(3), 0.5, 0.8, 1)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.room import Region, Room
-from cortado.discretise.shapes import EXCESS, Points, apart, grid, pairs_within
+from cortado.discretise.shapes import EXCESS, Points, Which, apart, grid, pairs_within
 from cortado.errors import InputError
 from cortado.scene.emitter_table import EmitterSample
 from cortado.scene.fluids import ALIGNED, Fluid, PointsFluid, RegionFluid
@@ -22,8 +22,11 @@ from cortado.scene.scene import Scene
 FINER = 4
 """Number of parts of a cell at the surface along each axis, to measure a volume."""
 LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
-"""Particles that a round body lacks, over those in its outermost spacing, and over all of its own: particles off the
-lattice see each other as denser than as many on it, by 4 % with the Wendland kernels and a support of 2 spacings."""
+"""Particles that a round body lacks, over those in its outermost spacing near cells that are cut, and over all of its
+own: particles off the lattice see each other as denser than as many on it, by 4 % with the Wendland kernels and a
+support of 2 spacings."""
+BESIDE = 2
+"""In cells: the greatest distance along each axis from a cell that is cut at which particles may be left out."""
 FAR = 4.0
 """In spacings: the greatest depth in a body that is told from others."""
 DIGITS = 6
@@ -56,10 +59,12 @@ class CutBody:
         """Return the part (n,) of the cell around each of the points (n, d) [m] that is within the body."""
         return np.clip(0.5 - self.distance(points, 0.5 * self.spacing) / self.spacing, 0.0, 1.0)
 
-    def volume(self, depth: float = 0.0) -> float:
-        """Return the volume [m^d] of the part that is more than a depth [m] below the surface."""
+    def volume(self, depth: float = 0.0, beside_cuts: bool = False) -> float:
+        """Return the volume [m^d] of the part that is more than a depth [m] below the surface, of all cells or of those
+        beside cells that are cut."""
         dimension, fine = self.room.dimension, self.spacing / FINER
         cells, reach = self.fluid.block(self.spacing).grown(1).points(), depth + self.spacing
+        cells = cells[self._beside_cuts(cells)] if beside_cuts else cells
         distances = self.distance(cells, reach) + depth
         cut = cells[np.abs(distances) < 0.5 * self.spacing * np.sqrt(dimension)]
         whole = np.count_nonzero(distances < 0.0) - np.count_nonzero(self.distance(cut, reach) + depth < 0.0)
@@ -82,18 +87,30 @@ class CutBody:
     @cached_property
     def count(self) -> int:
         """Return the number of its particles."""
-        volume = self._held
-        lacking = min(LOOSENESS * (volume - self.volume(self.spacing)), MOST_LOOSENESS * volume)
+        volume, outermost = self._held, self.volume(0.0, True) - self.volume(self.spacing, True)
+        lacking = min(LOOSENESS * outermost, MOST_LOOSENESS * volume)
         return round((volume - lacking) / self.spacing**self.room.dimension)
 
     def particles(self) -> Points:
-        """Return the places (n, d) [m] where its particles begin: on the lattice, and where surfaces cut its cells the
-        deepest points, `count` of them."""
+        """Return the places (n, d) [m] where its particles begin: on the lattice, and beside cells that surfaces cut
+        the deepest points, `count` in all."""
         if not self._cuts_cells():
             return self.fluid.particles_in(self.room, self.spacing)
         points = self.fluid.lattice(self.spacing, self.spacing)
         depths = np.round(self.distance(points, FAR * self.spacing) / self.spacing, DIGITS)
+        depths = np.where(self._beside_cuts(points), depths, np.copysign(np.inf, depths))
         return points[np.sort(np.argsort(depths, kind="stable")[: self.count])]
+
+    def _beside_cuts(self, points: Points) -> Which:
+        """Test (n,) which points (n, d) [m] are within `BESIDE` cells of one that a surface cuts. Flat faces between
+        cells cut none, so that layers along them stay whole."""
+        from scipy.spatial import cKDTree
+
+        lattice = self.fluid.block(self.spacing)
+        cells = lattice.grown(1).points()
+        is_cut = np.abs(self.distance(cells, self.spacing)) < (0.5 - ALIGNED) * lattice.spacings.min()
+        reach = (BESIDE + 0.5) * lattice.spacings.max()
+        return np.asarray(cKDTree(cells[is_cut]).query(points, p=np.inf, distance_upper_bound=reach)[0] < reach)
 
     def _cuts_cells(self) -> bool:
         """Return True where a surface goes through cells: that of the body, or that of a solid."""
