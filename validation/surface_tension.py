@@ -1,5 +1,5 @@
-"""How does a drop oscillate? ``python validation/surface_tension.py`` prints a table (`docs/records/surface_tension.md`):
-drops in the plane, drawn out by 8 %, against the linear problem with viscosity, and drops in space.
+"""How does a drop oscillate? ``python validation/surface_tension.py`` prints the table of
+`docs/records/surface_tension.md`: drops in the plane, drawn out by 8 %, against the linear problem, and in space.
 
 Numbers are over the exact ones: frequency and damping of the mode 2, the derivative of the frequency with respect to
 the surface tension by the tangent of two periods, and the pressure in the second half over (d - 1) sigma / R. The rest
