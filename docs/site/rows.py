@@ -38,12 +38,14 @@ def shown(found: Iterable[Row]) -> str:
     return HEAD + "".join(lines) if lines else ""
 
 
-def split(schemas: Iterable[Schema]) -> tuple[list[Row], list[list[Row]]]:
+def split(
+    schemas: Iterable[Schema], links: Mapping[str, tuple[str, str]] | None = None
+) -> tuple[list[Row], list[list[Row]]]:
     """The rows that several tables have alike, each once, and of every table the others.
 
     A row that some of the tables lack says which have it. The key that tells the tables apart is one row.
     """
-    tables = [rows_of(schema, {}) for schema in schemas]
+    tables = [rows_of(schema, links or {}) for schema in schemas]
     tags = [key for key in TAGS if key in tables[0]]
     names = [" ".join(table[tag][1] for tag in tags) for table in tables]
     common, held = [_tag_row([table.pop(tag) for table in tables]) for tag in tags], set[Row]()

@@ -6,7 +6,7 @@ table has an example, which below the scene of `scene_page` is a valid task; `te
 
 from pathlib import Path
 
-from rows import rows, toml
+from rows import rows, shown, split, toml
 
 from cortado.optimisation.inverse.task_tables import FitTables, TaskTables
 
@@ -56,17 +56,16 @@ LINKS = {
 
 BEGINNING = f"""# The task file
 
-A task is an inverse problem: which parameters lead to a given end? It is a [scene](scene_file.md) with two more tables:
+This page is for whoever writes a task and looks up a key. A task is a [scene](scene_file.md) with two more tables:
 `[problem]` says what is to be reached, `[optimise]` how it is searched, or `[fit]` what is fitted to measured data.
-[Tasks](tasks.md) explains them, and has
-examples. Below the scene of the page before, these tables make a task that finds gravity:
+[Tasks](tasks.md) explains them. Below the scene of the page before, these tables make a task that finds gravity:
 
 {toml(WHOLE)}
     cortado optimise task.toml --out runs/task
 
-Parameters, wherever a table names some, are those of [this list](parameters.md), and those of
-[solids that move](solids.md#where-solids-are-as-parameters), such as `target.paddle.displacement`. A key whose last but
-one column says *needed* has to be there. Each example below replaces the table of the same name.
+Tables name [parameters](parameters.md), and those of [solids that
+move](solids.md#where-solids-are-as-parameters), such as `target.paddle.displacement`. Keys that are *needed* have to be
+there. Each example below replaces the table of the same name.
 """
 
 PARTS = [
@@ -147,14 +146,22 @@ def examples() -> dict[str, str]:
 
 
 def page() -> str:
-    """The whole page."""
+    """The whole page, in which keys that several things measured have stand once, before them."""
     tables = {**TaskTables.model_json_schema()["$defs"], **FitTables.model_json_schema()["$defs"]}
     sections = [
         f"\n{heading}\n\n{words}\n\n{rows(tables[model], LINKS)}\n{toml(example)}"
-        for heading, model, words, example in [*PARTS, *FIT_PARTS]
+        for heading, model, words, example in [*PARTS, FIT_PARTS[-1]]
     ]
-    fit = f"{MEASURED}{toml(WHOLE_FIT)}\n    cortado fit task.toml --out runs/fit\n"
-    return "".join([BEGINNING, *sections[: len(PARTS)], fit, *sections[len(PARTS) :]])
+    common, own = split([tables[model] for _, model, _, _ in FIT_PARTS[:-1]], LINKS)
+    measured = [
+        f"\n{heading}\n\n{words}\n\n{shown(found)}\n{toml(example)}"
+        for (heading, _, words, example), found in zip(FIT_PARTS[:-1], own, strict=True)
+    ]
+    fit = f"{MEASURED}{toml(WHOLE_FIT)}\n    cortado fit task.toml --out runs/fit\n\nShared keys:\n\n{shown(common)}"
+    return "".join([BEGINNING, *sections[:-1], fit, *measured, sections[-1], NEXT])
+
+
+NEXT = "\n*Next*: [tasks](tasks.md), [fits of experiments](fits.md), [the scene file](scene_file.md).\n"
 
 
 if __name__ == "__main__":
