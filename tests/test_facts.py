@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+import scene_page
 
 import cortado
 from cortado.cli import main
@@ -143,6 +144,15 @@ SAID = {
     r"A problem in (\w+), the default of Simulation": "float32",
 }
 """What pages say of defaults in passing; the group is the value."""
+
+
+def test_defaults_that_depend_on_the_solver_are_those_of_scenes():
+    given = scene(discretisation={"spacing": 0.05, "kernel": "cubic_spline"}).discretisation.support
+    support = f"`{PLAIN.discretisation.support}` with the projection if `kernel` is left out too, else `{given}`"
+    kernel = f'`"{PLAIN.discretisation.kernel}"` with the projection if `support` is left out too, else'
+    wide = scene(discretisation={"spacing": 0.05, "support": 3.0}).discretisation.kernel
+    assert {"support": support, "kernel": f'{kernel} `"{wide}"`'} == scene_page.DEFAULTS
+    assert all(default in TODAY["docs/scene_file.md"] for default in scene_page.DEFAULTS.values())
 
 
 def test_the_table_of_defaults_is_that_of_the_code():

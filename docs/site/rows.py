@@ -16,14 +16,22 @@ TAGS = ("shape", "kind")
 """Keys that say which of several tables one is."""
 
 
-def rows(schema: Schema, links: Mapping[str, tuple[str, str]] | None = None) -> str:
+def rows(
+    schema: Schema,
+    links: Mapping[str, tuple[str, str]] | None = None,
+    defaults: Mapping[str, str] | None = None,
+) -> str:
     """A table with a row for each key.
 
     Args:
         schema: that of the table, part of `model_json_schema()`.
         links: for keys that are tables themselves, where the page describes them, and what they are.
+        defaults: of keys whose default depends on others what it is, in words.
     """
-    return shown(rows_of(schema, links or {}).values())
+    found, defaults = rows_of(schema, links or {}), defaults or {}
+    return shown(
+        (name, kind, defaults.get(key, default), meaning) for key, (name, kind, default, meaning) in found.items()
+    )
 
 
 def rows_of(schema: Schema, links: Mapping[str, tuple[str, str]]) -> dict[str, Row]:

@@ -61,6 +61,13 @@ LINKS = {
 """Of keys that are tables what they are, with the heading that describes them, and their meaning."""
 
 
+DEFAULTS = {
+    "support": "`2.6` with the projection if `kernel` is left out too, else `2.0`",
+    "kernel": '`"wendland_c2"` with the projection if `support` is left out too, else `"cubic_spline"`',
+}
+"""Of keys of `[discretisation]`, which the solver decides; `tests/test_facts.py` holds them against scenes."""
+
+
 def _with_law(rheology: str) -> str:
     """A phase with a law of viscosity."""
     return f'[[phase]]\nname = "water"\nrest_density = 1000.0\nviscosity = 0.05\nrheology = {rheology}'
@@ -458,7 +465,7 @@ def page() -> str:
         for model, below, example in tables:
             table = schema["$defs"][model]
             if not below:
-                parts += [rows(table), toml(example)]
+                parts += [rows(table, defaults=DEFAULTS if model == "DiscretisationTable" else None), toml(example)]
                 continue
             if common:
                 parts += [COMMON, shown(common)]
