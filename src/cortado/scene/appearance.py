@@ -313,8 +313,8 @@ class Picture(Table):
     field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=120.0)] = 28.0
     """The angle that the width of the picture spans [degrees], in 3-D."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
-    """The part of the light, from 0 to 1, that goes through fluid a tenth as thick as the container is long; if left
-    out 0.9 with one phase, and 0 with several or with another colour than theirs."""
+    """The part of the light, from 0 to 1, that goes through fluid a tenth as thick as the container is long. If
+    left out 0.9 with one phase, and 0 with several or with another colour than theirs."""
     floor: Flag = True
     """Whether there is a floor, in 3-D."""
     light: Annotated[str, OneOf(LIGHTS)] = "studio"

@@ -51,12 +51,12 @@ class EmitterTable(FluidBody):
     flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", gt=0.0)]
     """Volume, in 2-D area, that comes out in a second [m3/s (m2/s in 2-D)]."""
     duration: Annotated[float, quantity("s", gt=0.0)] | None = None
-    """For how long fluid comes out [s], of particles in reserve that join the end of the column. If left out, commands
-    such as `cortado run` have enough for the run, and `Simulation` has what is in the column: see `Scene.lasting`."""
+    """For how long fluid comes out [s]. If left out, commands such as `cortado run` have enough for the run, and
+    `Simulation` has what is in the column (`Scene.lasting`)."""
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """How far a particle is from its place in the lattice of its layer at most, along each axis of the opening and in
-    spacings, at random but the same in every run. With the solver "projection" it is 0.05 if it is not given: a stream
-    that is drawn out keeps to the columns of a lattice, and is too wide."""
+    """How far a particle is from its place in the lattice of its layer at most, along each axis of the opening and
+    in spacings, the same in every run. With the solver "projection" 0.05 if left out, as a stream on a lattice is
+    too wide."""
 
     @field_validator("direction")
     @classmethod

@@ -101,8 +101,8 @@ class Yielding(RheologyTable):
     yield_stress: Annotated[float, quantity("Pa", ge=0.0)]
     """Below it the fluid hardly flows [Pa]."""
     regularisation: Annotated[float, quantity("s", gt=0.0)] | None = None
-    """m of Papanastasiou (1987) [s]: at rest the viscosity is finite, yield_stress m more, so that fluid which does not
-    yield creeps, at its depth / m at most; the longer of 40 s and 100 viscosity / yield_stress if left out."""
+    """m of Papanastasiou (1987) [s]: at rest the viscosity is finite, yield_stress m more. Fluid that does not
+    yield creeps, at its depth / m at most. The longer of 40 s and 100 viscosity / yield_stress if left out."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
         growth = self.regularisation
@@ -169,10 +169,9 @@ class DiscretisationTable(Table):
     is given."""
 
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """How far a particle of a body is from its first place at most, along each axis and in spacings, at random but the
-    same in every run: a fluid on a lattice is stiffer than one without order, and its derivatives at rest have corners.
-    With the solver "projection" it is 0.05 if not given where all axes are periodic. Points of files stay where they
-    are, and an emitter has a jitter of its own."""
+    """How far a particle of a body is from its first place at most, along each axis and in spacings, the same in every
+    run. With the solver "projection" 0.05 if left out where all axes are periodic: a fluid on a lattice is stiffer than
+    one without order. Points of files stay where they are."""
 
     @property
     def support_radius(self) -> float:
@@ -208,14 +207,13 @@ class FixedForces(Table):
     gravity: Vector[Annotated[float, quantity("m/s2")]] = (0.0, -9.81, 0.0)
     """(d,) Acceleration that acts on all fluid [m/s2]; with schedule.gravity, the first row there, if given."""
     viscosity: Literal["stress", "pairwise", "none"] = "stress"
-    """Form of the viscous force. "stress": a stress that has the asked viscosity within 1 %, with 40 particles across a
-    wave of shear, in every direction, and makes no force where fluid turns as a whole. "pairwise", with the
-    solver "pcisph" alone: Monaghan's (2005), whose fluid is 0.6 to 1.4 times as viscous as asked for, by the direction
-    of the shear, and flows 1.6 to 1.9 times as fast between plates as it should."""
+    """Form of the viscous force. "stress" has the asked viscosity within 1 %, with 40 particles across a wave of
+    shear, and makes no force where fluid turns as a whole. "pairwise", with the solver "pcisph" alone, is
+    Monaghan's (2005): 0.6 to 1.4 times as viscous as asked for, by the direction of the shear."""
     viscous_solve: Literal["automatic", "explicit", "implicit"] = "automatic"
-    """When the viscous stress acts. "explicit": as velocities are at the start of a step, which limits the time step;
-    "implicit": as they are at its end, for any time step, which takes a system of equations; "automatic": implicit
-    where the time step is too long for the other."""
+    """When the viscous stress acts. "explicit": at the start of a step, which limits the time step. "implicit": at
+    its end, for any time step, by a system of equations. "automatic": implicit where the time step is too long for
+    the other."""
     pressure: Flag = True
     """Whether the fluid resists compression."""
 

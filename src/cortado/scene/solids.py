@@ -47,9 +47,8 @@ class SolidTable(Coloured):
     """How it is turned about its middle [rad], not at all if left out: in 3-D a rotation vector, in 2-D one number,
     counterclockwise."""
     motion: Literal["fixed", "path", "free"] = "fixed"
-    """Whether it stays where it is; moves as it is told, by `times` with `positions`, `rotations` or both, by the file
-    `path`, or with a steady `velocity`, `angular_velocity` or both; or is a rigid body, which fluid and gravity
-    move."""
+    """How it moves. "fixed": not at all. "path": by `times` with `positions` or `rotations`, by the file `path`, or
+    with a steady `velocity` or `angular_velocity`. "free": as a rigid body, which fluid and gravity move."""
     density: Annotated[float, quantity("kg/m3", gt=0.0)] | None = None
     """Density of a free body: its mass over its volume [kg/m³]."""
     mass: Annotated[float, quantity("kg", gt=0.0)] | None = None
@@ -61,12 +60,11 @@ class SolidTable(Coloured):
     """(3,) Radii of gyration of a free body about its own axes through its centre of mass, in 2-D one number: roots of
     its moments of inertia over its mass [m]. If left out they are those of its shape."""
     inertia: Inertia | None = None
-    """Moments of inertia of a free body about its centre of mass [kg m²], in place of its radii of gyration: in 2-D one
-    number, that of a metre of it; in 3-D three, about its own axes, or the nine of a matrix, row by row."""
+    """Moments of inertia of a free body about its centre of mass [kg m²], in place of its radii of gyration. In 2-D
+    one number, that of a metre of it. In 3-D three, about its own axes, or the nine of a matrix, row by row."""
     freedom: tuple[Annotated[str, OneOf(sorted({*WAYS[2], *WAYS[3]}))], ...] | None = None
     """Ways in which a free body can move, all if left out: of "x", "y" and "rotation", in 3-D of "x", "y", "z",
-    "rotation_x", "rotation_y" and "rotation_z". Its velocity along the other axes of space, and the part of its angular
-    velocity along them, are 0."""
+    "rotation_x", "rotation_y" and "rotation_z", along the axes of space."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of the path, from 0 on, each greater than the one before [s]; after the last it rests."""
     positions: tuple[tuple[Length, ...], ...] | None = None

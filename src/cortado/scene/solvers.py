@@ -29,8 +29,8 @@ class SolverTable(Table):
     time_step: Annotated[float | Literal["auto"], OrWord(quantity("s", gt=0.0), "auto")]
     """Length of a step [s]; with "auto" each step has a length of its own, chosen before it."""
     courant: Annotated[float, quantity(gt=0.0, le=1.0)] | None = None
-    """The Courant number of a time step that is chosen: how far the fastest particle moves in a step at most, in
-    smoothing lengths, of which the support radius has two; 0.2 if left out."""
+    """Courant number of a time step that is chosen: how far the fastest particle moves in it at most, in smoothing
+    lengths, half of the support radius each; 0.2 if left out."""
     greatest_time_step: Annotated[float, quantity("s", gt=0.0)] | None = None
     """Upper bound of a time step that is chosen [s]; needed where nothing else bounds it, without gravity."""
 
