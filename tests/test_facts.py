@@ -26,6 +26,7 @@ OF_OTHERS = {"build", "cibuildwheel", "pip", "twine", "venv", "pytest"}
 OPTIONS_OF_OTHERS = {
     "--editable",
     "--exclude-editable",
+    "--find-links",
     "--ignore-requires-python",
     "--no-deps",
     "--platform",
