@@ -322,16 +322,16 @@ class Picture(Table):
     background: Colour | None = None
     """(3,) red, green and blue, linear, each from 0 to 1; that of the light if left out"""
     colour: Annotated[str, OneOf(COLOURS)] = "phase"
-    """What colours particles: "phase", their own colours; a quantity, "density", "pressure", "speed", "vorticity" or
-    "wall_force", or "age", the time since they left an emitter or since the start; of both with a scale beside it."""
+    """What colours particles: "phase", their own colours, a quantity with its scale, or "age", the time since they
+    left an emitter or since the start."""
     shaded: Flag = True
     """Whether light and shadow fall on the fluid; without them its colours are those of the scale."""
     film_frames: Annotated[int, count(0, 1_000_000)] | None = None
     """Frames of a film, evenly chosen from those that were recorded; 25 in each of its seconds if left out, and no film
     if 0. A search records as many for its films, 121 if left out."""
     film_speed: Annotated[float, quantity(gt=0.0)] | None = None
-    """Seconds of the run in a second of its film: 1 is real time, 0.25 a quarter of it. If left out real time, or
-    slower or faster where the film would be shorter than 4 s or longer than 10 s."""
+    """Seconds of the run in a second of its film: 1 is real time. If left out real time, or what makes the film 4 to
+    10 s long."""
 
     @property
     def sun_and_sky(self) -> Light:

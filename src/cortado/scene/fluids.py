@@ -240,8 +240,8 @@ class PointsFluid(Fluid):
 
     shape: Literal["points"] = "points"
     file: File
-    """Its name: an array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file, of which the first step is read; beside
-    the scene file, and absolute once read."""
+    """An array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file, of which the first step is read. A relative name
+    begins at the scene file."""
 
     def points(self) -> Points:
         """Read the positions (n, d) [m] from the file; raise `InputError`."""

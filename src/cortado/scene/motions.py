@@ -33,12 +33,12 @@ class Course(Table):
     """(k, components) in the parameter's unit"""
     file: File | None = None
     """A CSV file in the place of `times` and `values`, with a column time [s] and one with a unit for each component:
-    x, y and z; tilt, in 3-D tilt_x and tilt_z. It is beside the scene file, and absolute once read."""
+    x, y and z; tilt, in 3-D tilt_x and tilt_z. A relative name begins at the scene file."""
     interpolation: Interpolation = "linear"
     """Between the times: straight lines, or a cubic spline, which is level at both ends."""
     ramp: Ramp | None = None
-    """How long the values, or the way from the first place, are multiplied by a number that grows smoothly (C2) from 0
-    at the start to 1 [s]; not if left out."""
+    """Time after which values, or the way from the first place, are whole [s]; until then they are multiplied by a
+    number that grows smoothly (C2) from 0 to 1."""
     _dimension: int = PrivateAttr(0)
 
     @model_validator(mode="after")

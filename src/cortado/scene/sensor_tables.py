@@ -62,8 +62,8 @@ class WaveGaugeTable(SensorTable):
     on: Text | None = None
     """The name of a solid that moves, which carries the column from where it is as the scene begins."""
     axes: Axes = "world"
-    """Along which axes a column on a solid stands: "body", it turns with the solid and has the height that is read in
-    the solid, as that begins; "world", it stands upright, and the height is that in the scene."""
+    """Along which axes a column on a solid stands. "body": it turns with the solid, and its height is that in the
+    solid, as that begins. "world": it stands upright, and its height is that in the scene."""
 
 
 class FlowRateTable(SensorTable):

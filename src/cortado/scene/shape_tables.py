@@ -143,7 +143,7 @@ class MeshShape(Table):
 
     shape: Literal["mesh"] = "mesh"
     file: File
-    """Its name: STL, OBJ, PLY, glTF or GLB; beside the scene file, and absolute once read."""
+    """Name of an STL, OBJ, PLY, glTF or GLB file. A relative one begins at the scene file."""
     scale: Annotated[float, quantity(gt=0.0)] = 1.0
     """Factor of its lengths, such as 0.001 where they are millimetres."""
 

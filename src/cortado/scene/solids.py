@@ -74,14 +74,14 @@ class SolidTable(Coloured):
     0 [rad]."""
     path: File | None = None
     """A CSV file in the place of `times`, with columns such as time [s], x [mm], y [mm] and rotation [deg], in 3-D
-    rotation_x [deg] and so on. Only how they differ from their first line counts; a column that is not there stays 0.
-    It is beside the scene file, and absolute once read."""
+    rotation_x [deg] and so on. Only differences from the first line count, and a column that is not there stays 0. A
+    relative name begins at the scene file."""
     interpolation: Interpolation = "linear"
     """How it gets from one of the times to the next: in straight lines, or along a cubic spline, whose velocity and
     acceleration are continuous, and which is at rest at both ends."""
     ramp: Ramp | None = None
-    """Displacement and turn of the path are multiplied by a number that grows smoothly (C2) from 0 at the start to 1
-    after this time [s]; not if left out."""
+    """Time after which the path is whole [s]; until then it is multiplied by a number that grows smoothly (C2) from 0
+    to 1."""
     velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
     """(d,) Velocity of the middle, if it is steady; of a free body at the start [m/s]."""
     angular_velocity: Turning | None = None
