@@ -1,6 +1,6 @@
 """A measured wave flume: from the record of its flap to waves at its probes, and to the loads on a ship's section.
 
-    python examples/wave_flume/wave_flume.py                                                 # a minute on a laptop
+    python examples/wave_flume/wave_flume.py                                                 # minutes on a laptop
     python examples/wave_flume/wave_flume.py --deep 100 --long 13.63 --device cuda:0         # a minute on an H200
     python examples/wave_flume/wave_flume.py RECORD.csv --gain 1.11 ...
 
