@@ -129,6 +129,26 @@ def test_links_lead_to_files():
     assert not missing
 
 
+def anchors(text: str) -> set[str]:
+    """Return where links to headings of a page may lead."""
+    prose = re.sub(r"^(```+|~~~+).*?^\1$", "", text, flags=re.MULTILINE | re.DOTALL)
+    headings = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
+    shown = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).lower() for heading in headings)
+    return {re.sub(r"[^\w\- ]", "", heading).replace(" ", "-") for heading in shown}
+
+
+def test_links_lead_to_headings():
+    paths = [path for name in ("docs", "validation", "benchmarks") for path in (ROOT / name).rglob("*.md")]
+    found = []
+    for path in [*ROOT.glob("*.md"), *paths]:
+        for file, anchor in re.findall(r"\]\(([^)\s#]*)#([^)\s]+)\)", path.read_text(encoding="utf-8")):
+            target = path.parent / file if file else path
+            if "://" not in file and target.suffix == ".md":
+                found.append((path.name, file, anchor, anchor in anchors(target.read_text(encoding="utf-8"))))
+    assert len(found) > 100
+    assert [link[:3] for link in found if not link[3]] == []
+
+
 def test_there_is_code_and_names_and_paths_in_files_are_there():
     assert CODE["runs.md"]
     assert len(TUTORIALS) == 8 and len(COMMANDS) > 15
