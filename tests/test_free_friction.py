@@ -9,15 +9,17 @@ import pytest
 from cortado import Problem, SceneError, Simulation
 from cortado.discretise.solid import Mass
 from cortado.losses import SolidPose
-from floating_bodies import stopping_cylinder
+from cortado.scene.stability import stability_limits
+from floating_bodies import settling_disc, stopping_cylinder
 from reference_projection import Projection
-from scenes import box
+from scenes import bodies, box
 from test_free_bodies import BALL, BRICK, RAFT, plane, rough, space
 from test_held_bodies import derivatives_agree, held
 from test_hinges import on_hinge
 from twins import stress_twin
 
 ROUGH = {**RAFT, "slip": "no"}
+PROJECTION = {"kind": "projection", "time_step": 0.001}
 SYRUP = [{"name": "water", "rest_density": 1000.0, "viscosity": 30.0}]
 
 
@@ -128,6 +130,21 @@ def test_bodies_of_any_density_rest_in_syrup(density):
 
 def test_a_turning_cylinder_stops_as_syrup_lets_it():
     assert stopping_cylinder(16)["rate over the exact one"] == pytest.approx(1.0, abs=0.03)
+
+
+def test_a_disc_sinks_in_the_longest_step_as_syrup_lets_it():
+    """Faxen (1946). In steps four times as long it is 25 % too fast."""
+    found = settling_disc(8, 0.25 * 0.0125**2 / 0.1, 0.08)
+    assert found["speed over the exact one"] == pytest.approx(1.0, abs=0.08) and found["swing"] < 0.02
+
+
+def test_steps_are_bounded_by_friction_where_bodies_do_not_slip():
+    for slip in ("no", "free"):
+        disc = {"name": "disc", "shape": "sphere", "centre": [0.5, 0.5], "radius": 0.2, "slip": slip}
+        disc |= {"motion": "free", "density": 2000.0}
+        scene = bodies(2, [box([0.0, 0.0], [1.0, 1.0])], viscosity=100.0, solid=[disc], solver=PROJECTION)
+        limits = stability_limits(scene)
+        assert limits.get("friction") == (pytest.approx(0.25 * 0.05**2 / 0.1) if slip == "no" else None)
 
 
 def test_an_explicit_solve_is_refused():

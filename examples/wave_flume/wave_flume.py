@@ -7,8 +7,8 @@
 The flume is 13.63 m long and filled 1 m deep (Sundsdal, Greco, Hanssen and Lugni 2025, Ocean Engineering; CC0). A flap
 above a sill, hinged 0.1 m above the floor, makes waves, and a beach takes them away. A record is a CSV file with the
 columns `time_s`, `wavemaker_m`, the flap's displacement at the surface, positive away from the water, `probe_1_m` and
-so on. In one with `fy_n` and `fz_n` the section of a ship is held at 7 m, and these are the loads on it. In one with
-`sway_m`, `heave_m` and `roll_rad` it moves, on springs that hold it across, and these are its motions.
+so on. In one with `fy_n`, `fz_n` and `mx_nm` the section of a ship is held at 7 m, and these are the loads on it. In
+one with `sway_m`, `heave_m` and `roll_rad` it moves, on springs that hold it across, and these are its motions.
 
 Waves are compared with what was measured, and with linear theory of a flap that moves in any way (Dean and Dalrymple
 1991), over the same nine seconds. See docs/wave_flume.md.
@@ -28,10 +28,10 @@ from cortado.sensors import SolidLoad, WaveGauge
 DEPTH, HINGE, FOOT, GRAVITY = 1.0, 0.1, 0.05, 9.81  # water, hinge, how far the flap reaches into its sill [m]; [m/s2]
 PROBES = {"probe_1_m": 3.0, "probe_2_m": 4.95, "probe_3_m": 5.2, "probe_4_m": 5.5, "probe_6_m": 8.5}  # [m]
 BEACH = 2.3  # length of the beach [m]
-LOADS, MOTIONS = {"force_x": "fy_n", "force_y": "fz_n"}, ("sway_m", "heave_m", "roll_rad")
+LOADS, MOTIONS = ("fy_n", "fz_n", "mx_nm"), ("sway_m", "heave_m", "roll_rad")
 BEGIN, END = 13.0, 22.0  # the time in which waves are compared [s]
 SECTION, BEAM, DRAUGHT, HIGH, BILGE, BREADTH = 7.0, 0.4, 0.2, 0.256, 0.0512, 0.586  # place and sizes of the section [m]
-MASS, GRAVITY_CENTRE, GYRATION = 46.8, 0.108, 0.144  # of the section [kg], above its keel and radius [m]
+GRAVITY_CENTRE, GYRATION, GAUGE = 0.108, 0.144, 0.33  # height over the keel, radius, height of the load cell [m]
 STIFFNESS, DAMPING, LINE = 60.0, 8.7, 20.0  # of what holds it [N/m], [N s/m]; lines so long that they stay level [m]
 
 
@@ -49,15 +49,21 @@ def hull():
     return (np.concatenate([half, half[::-1] * [-1.0, 1.0]]) + [SECTION, DEPTH - DRAUGHT]).tolist()
 
 
+def middle_of(corners):
+    """The centroid of a polygon."""
+    x, y = np.array(corners).T
+    area = x * np.roll(y, -1) - np.roll(x, -1) * y
+    return [(area * (a + np.roll(a, -1))).sum() / (3.0 * area.sum()) for a in (x, y)]
+
+
 def section(moves):
     """The section of the ship and the springs that hold it, for each metre of breadth."""
     own = {"name": "section", "shape": "polygon", "corners": hull()}
     if not moves:
         return {**own, "motion": "path", "velocity": [0.0, 0.0]}, []
-    centre, (x, y) = [SECTION, DEPTH - DRAUGHT + GRAVITY_CENTRE], np.array(hull()).T
-    area = x * np.roll(y, -1) - np.roll(x, -1) * y
-    middle = [(area * (a + np.roll(a, -1))).sum() / (3.0 * area.sum()) for a in (x, y)]
-    own |= {"motion": "free", "mass": MASS / BREADTH, "gyration_radius": GYRATION}
+    centre, middle = [SECTION, DEPTH - DRAUGHT + GRAVITY_CENTRE], middle_of(hull())
+    mass = 1000.0 * (BEAM * DRAUGHT - (2.0 - 0.5 * np.pi) * BILGE**2)  # of the water that it displaces
+    own |= {"motion": "free", "mass": mass, "gyration_radius": GYRATION}
     own |= {"centre_of_mass": [a - b for a, b in zip(centre, middle, strict=True)]}
     holds = {"solid": "section", "point": centre, "damping": DAMPING / BREADTH}
     across = {**holds, "name": "across", "anchor": [SECTION + LINE, centre[1]], "stiffness": STIFFNESS / BREADTH}
@@ -186,39 +192,44 @@ def main():
     factor, noise, bar = gain(measured[late][:, near], here[late][:, near], round(long / 0.02))
     same = np.corrcoef(measured[late][:, near].ravel(), here[late][:, near].ravel())[0, 1]
     print(f"what was measured is {factor:.3f} of this, within {bar:.3f} (of noise {noise:.3f}); correlation {same:.3f}")
-    series = {}
-    if is_held:
-        load = run.sensors["load"]
-        series = {f"{column} [N]": (column, load.times, BREADTH * load[axis]) for axis, column in LOADS.items()}
-    elif moves:
-        ship = run.solids["section"]
-        moved = [*(ship.positions - ship.positions[0]).T, -ship.rotations]
-        series = {name: (name, run.times, one) for name, one in zip(MOTIONS, moved, strict=True)}
-    for name, (column, at, values) in series.items():
-        own, true = (
-            swing(times[late], np.interp(times, at, values)[late], long),
-            swing(times[late], record[column][late], long),
-        )
-        print(f"{name}: {abs(own):.4g} here, {abs(true):.4g} measured,", end=" ")
-        print(f"{np.degrees(np.angle(true / own)):.0f} degrees after what was measured")
-    draw(times, measured, here, linear, probes, asked.end)
+    section = {name: np.interp(times, *one) for name, one in on_section(run, is_held, moves).items()}
+    for name, found in section.items():
+        own, true = (swing(times[late], each[late], long) for each in (found, record[name]))
+        print(f"{name}: {abs(own):.4g} here, {abs(true):.4g} measured, {abs(own / true):.3f} times;", end=" ")
+        print(f"{np.degrees(np.angle(true / own)):.0f} degrees after, mean {found[late].mean():.3g} here, ", end="")
+        print(f"{record[name][late].mean():.3g} measured")
+    surface = 1e3 * np.stack([measured.T, here.T, linear.T], axis=1)
+    rows = {f"{place:g} m [mm]": each for place, each in zip(probes.values(), surface, strict=True)}
+    draw(times, rows | {name: (record[name], found) for name, found in section.items()}, asked.end)
     if asked.film:
         run.film("wave_flume.mp4", device=asked.device, width=1280, height=240, film_frames=150)
     assert same > 0.8, "the waves are not those that were measured"
 
 
-def draw(times, measured, here, linear, probes, end):
-    """Draw the surface at the probes over time."""
-    figure, rows = plt.subplots(len(probes), sharex=True, sharey=True, figsize=(9.0, 1.5 * len(probes) + 0.5))
-    for row, place, *three in zip(np.atleast_1d(rows), probes.values(), measured.T, linear.T, here.T, strict=True):
-        row.plot(times, 1e3 * three[0], color="0.65", linewidth=3.0, label="measured")
-        row.plot(times, 1e3 * three[1], color="tab:orange", linewidth=1.0, label="linear theory")
-        row.plot(times, 1e3 * three[2], color="tab:blue", linewidth=1.2, label="here")
-        row.set(ylabel=f"{place:g} m", xlim=(3.0, end))
-    row.set_xlabel("time [s]")
-    figure.legend(*row.get_legend_handles_labels(), loc="upper center", ncols=3)
-    figure.supylabel("surface at probes [mm]")
-    figure.tight_layout(rect=(0.0, 0.0, 1.0, 0.95))
+def on_section(run, is_held, moves):
+    """The times and values of the loads on the section, or of its motions, by the names that records have for them."""
+    if moves:
+        ship = run.solids["section"]
+        moved = *(ship.positions - ship.positions[0]).T, ship.rotations
+        return {name: (run.times, one) for name, one in zip(MOTIONS, moved, strict=True)}
+    if not is_held:
+        return {}
+    load, above = run.sensors["load"], DEPTH - DRAUGHT + GAUGE - middle_of(hull())[1]
+    loads = load["force_x"], load["force_y"], load["torque"] + above * load["force_x"]
+    return {name: (load.times, BREADTH * one) for name, one in zip(LOADS, loads, strict=True)}
+
+
+def draw(times, series, end):
+    """Draw what was measured, what is here, and at probes linear theory, over time: a row each, by its name."""
+    styles = ("measured", "0.65", 3.0, 1), ("here", "tab:blue", 1.2, 3), ("linear theory", "tab:orange", 1.0, 2)
+    figure, axes = plt.subplots(len(series), sharex=True, squeeze=False, figsize=(9.0, 1.4 * len(series) + 0.7))
+    for row, (name, each) in zip(axes[:, 0], series.items(), strict=True):
+        for one, (label, colour, width, order) in zip(each, styles[: len(each)], strict=True):
+            row.plot(times[times <= end], one[times <= end], color=colour, linewidth=width, label=label, zorder=order)
+        row.set(ylabel=name, xlim=(3.0, end))
+    axes[-1, 0].set_xlabel("time [s]")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="upper center", ncols=3)
+    figure.tight_layout(rect=(0.0, 0.0, 1.0, 1.0 - 0.4 / figure.get_figheight()))
     figure.savefig("wave_flume.png", dpi=150)
 
 
