@@ -169,3 +169,26 @@ def test_pages_agree_on_defaults():
     found = {words: {said for page in pages for said in re.findall(words, page)} for words in SAID}
     assert {words: said for words, said in found.items() if not said <= {str(SAID[words])}} == {}
     assert sum(map(bool, found.values())) >= 8
+
+
+MOST = 35
+"""Words of a sentence, at most."""
+NOT_PROSE = re.compile(r"^---\n.*?\n---\n|^(```+).*?^\1$|^ {4}\S.*$|<!--.*?-->|\$\$.*?\$\$", re.MULTILINE | re.DOTALL)
+INLINE = re.compile(r"`[^`]*`|\$[^$]*\$|!?\[([^\]]*)\]\([^)]*\)")
+
+
+def sentences(text: str) -> list[str]:
+    """Those of a page, of its lists and of cells of its tables; code and formulas count as one word each."""
+    found = []
+    for block in re.split(r"\n\s*\n", NOT_PROSE.sub("\n\n", text)):
+        rows = [cell for line in block.splitlines() for cell in line.split("|")] if block.lstrip()[:1] == "|" else None
+        for part in rows or re.split(r"\n(?=\s*(?:[-*]|\d+\.) )", block):
+            words = " ".join(INLINE.sub(lambda one: one[1] or "X", part).split())
+            found += re.split(r"(?<=[.!?:])\s+(?=[A-Z*\[\"(])", words)
+    return found
+
+
+@pytest.mark.parametrize("page", TODAY)
+def test_sentences_are_short(page):
+    found = [(len(re.findall(r"\S*\w\S*", one)), one) for one in sentences(TODAY[page])]
+    assert [(count, one) for count, one in found if count > MOST] == []
