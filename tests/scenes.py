@@ -180,18 +180,20 @@ def thrown(simulation):
 
 
 class Weighed:
-    """A linear loss of positions, velocities and fractions, with random weights."""
+    """A linear loss of positions, velocities, fractions, and how solids lie and move, with random weights."""
 
     def __init__(self, simulation: Simulation, seed: int = 8):
-        random, shape = np.random.default_rng(seed), simulation.positions.shape
-        self.weights = [random.standard_normal(each) for each in (shape, shape, simulation.mass_fractions.shape)]
+        random, state = np.random.default_rng(seed), simulation.state()
+        solids = {solid.name for solid in simulation.scene.solid}
+        names = ["positions", "velocities", "mass_fractions"]
+        names += [name for name in state.fields if name.split(".")[0] in solids]
+        self.weights = {name: random.standard_normal(state[name].shape) for name in names}
 
     def value(self, end: Any) -> float:
-        fields = (end.positions, end.velocities, end.mass_fractions)
-        return sum(float((w * field).sum()) for w, field in zip(self.weights, fields, strict=True))
+        return sum(float((weights * end[name]).sum()) for name, weights in self.weights.items())
 
-    def adjoint(self, end: Any) -> tuple[np.ndarray, ...]:
-        return tuple(self.weights)
+    def adjoint(self, end: Any) -> dict[str, np.ndarray]:
+        return self.weights
 
 
 def aimed(simulation: Simulation, steps: int) -> Problem:

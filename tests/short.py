@@ -2,7 +2,7 @@
 
 Of a test with several parameters it runs so many cases that every value of each parameter is in one of them, not all
 combinations; and of cases in `tests/seconds.csv` those in `KEPT` alone. They take at least 3 s, or need kernels that
-few others need, so that they take long on a new clone (`tests/cold.py`). The table is written from pytest's report:
+few others need, so that they take long on a new clone. Rows of the first are written from pytest's report:
 
     pytest --short --junitxml=suite.xml; python tests/short.py suite.xml
 """
@@ -33,6 +33,9 @@ KEPT = {
         "test_reverse_forward_tape_and_differences_agree[two layers]",
         "test_reverse_forward_tape_and_differences_agree[a nozzle over a pool]",
         "test_reverse_forward_tape_and_differences_agree[surface tension]",
+        "test_reverse_forward_tape_and_differences_agree[a body]",
+        "test_reverse_forward_tape_and_differences_agree[a body on a spring, to a ball]",
+        "test_reverse_forward_tape_and_differences_agree[a rubbed body]",
         "test_reverse_forward_tape_and_differences_agree[implicit viscosity, no slip]",
         "test_reverse_forward_tape_and_differences_agree[projection, plane]",
         "test_reverse_forward_tape_and_differences_agree[projection, velocities follow]",
@@ -43,7 +46,6 @@ KEPT = {
     },
     "test_free_bodies": {
         "test_a_body_and_fluid_in_free_space_keep_their_momentum[2]",
-        "test_derivatives_of_bodies[plane]",
     },
     "test_freeze": {
         "test_texts_are_the_same",

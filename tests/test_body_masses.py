@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cortado import Problem, Simulation
+from cortado import Simulation
 from cortado.discretise.solid import Mass
 from cortado.errors import SceneError
 from cortado.pictures.shown_solids import shown_solids
 from cortado.runs.frames import posed
-from finite_differences import both_modes, decades, distance
 from scenes import box
 from test_free_bodies import BRICK, RAFT, plane, space
-from test_quantities import Weighted
 
 KEEL = {"centre_of_mass": [0.02, -0.04], "gyration_radius": 0.09}
 KEELS = {"centre_of_mass": [0.01, -0.03, 0.02], "gyration_radius": [0.07, 0.09, 0.08]}
@@ -96,17 +94,6 @@ def test_a_low_load_rights_a_box_and_a_high_one_capsizes_it(load, sign):
     )
     run = Simulation(scene, precision="float64").run(100)
     assert sign * run.solids["raft"].angular_velocities[-1] > 0.01
-
-
-@pytest.mark.parametrize(("scene_of", "table", "keys"), [(plane, RAFT, KEEL), (space, BRICK, KEELS)])
-def test_mass_has_derivatives(scene_of, table, keys):
-    scene = scene_of(massive(table, 20.0 if scene_of is plane else 3.0, **keys))
-    simulation = Simulation(scene, precision="float64")
-    weights = np.random.default_rng(1).uniform(size=simulation.quantity("speed").shape)
-    problem = Problem(simulation, 6, Weighted("speed", weights))
-    point = {"raft.mass": np.array(scene.solid[0].mass)}
-    tangent = both_modes(problem, point, {"raft.mass": 1.0})[1]
-    assert distance(problem.value, point, {"raft.mass": 1.0}, tangent, decades(2.0, 6.0), enough=1e-7) < 1e-6
 
 
 def test_a_picture_of_a_body_shows_its_shape_where_its_walls_are():

@@ -175,7 +175,7 @@ def test_gradients_equal_those_of_the_twin(estimator, dimension):
     slow = twin_of(dimension)
     loss = Weighed(slow.simulation)
     _, found = Problem(slow.simulation, STEPS, loss).value_and_gradient(slow.point, estimator)
-    last = np.concatenate([w.ravel() for w in loss.weights[:2]])
+    last = np.concatenate([w.ravel() for w in (loss.weights["positions"], loss.weights["velocities"])])
     wanted, exact = slow.adjoint(last, estimator), slow.adjoint(last, gradients.Exact())
     gradient = np.concatenate([found[name].ravel() for name in slow.point])
     np.testing.assert_allclose(gradient, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
@@ -335,7 +335,7 @@ def test_every_adjoint_of_a_state_can_be_observed():
     found = problem.estimate(point, gradients.AdjointViscosity(), observe)
     assert list(seen) == [7, 6, 5, 4, 3, 2, 1, 0]
     for k, field in enumerate(("positions", "velocities")):
-        np.testing.assert_array_equal(seen[7][field], problem.loss.weights[k])
+        np.testing.assert_array_equal(seen[7][field], problem.loss.weights[field])
         np.testing.assert_array_equal(seen[0][field], found.gradient[f"initial_{field}"])
         wanted = [np.linalg.norm(seen[step][field]) for step in range(8)]
         np.testing.assert_allclose(norms.numpy()[:, k], wanted, rtol=1e-13)

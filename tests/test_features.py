@@ -19,8 +19,13 @@ from finite_differences import central_difference, decades, plateau
 from own_forces import Breeze
 from remembering_force import Memory
 from scenes import MIXING, Weighed, box, jet, plane, plane_of_three, pour, scene, splash, two_layers
+from test_body_masses import KEEL, KEELS, massive
 from test_faces import flume
-from test_free_bodies import touching
+from test_free_bodies import BRICK, RAFT, SHEAR_THINNING, rough, touching, touching_across, touching_in_space
+from test_free_bodies import plane as afloat
+from test_free_bodies import space as afloat_in_space
+from test_held_bodies import held
+from test_hinges import on_hinge
 from test_implicit_viscosity import cube, syrups, thick
 from test_moving_solids import ROTOR
 from test_moving_solids import plane as beside
@@ -29,6 +34,7 @@ from test_own_functions import FORCES
 from test_projection import C2, CASES, SOLVER, begun
 from test_rheology import KINDS
 from test_rheology import thick as yielding
+from test_springs import ACROSS, TAUT, TURNED_BY, moored
 
 STEPS = 6
 
@@ -74,6 +80,38 @@ BESIDE_A_ROTOR = {
     "implicit": {"forces": {"viscous_solve": "implicit"}},
     "pairwise": {"forces": {"viscosity": "pairwise"}, "solver": PCISPH},
 }
+PIN, AXLE = {"position": [0.22, 0.5]}, {"position": [0.12, 0.36, 0.1], "axis": [0.2, 0.1, 1.0]}
+RUBBED_AXLE = {"position": [0.15, 0.35, 0.2], "axis": [0.3, 1.0, 0.2]}
+BODIES = {
+    "a body": lambda: afloat(RAFT, container=box([0.0, 0.0], [1.0, 1.0], slip="no")),
+    "a body in space": lambda: afloat_in_space(BRICK),
+    "bodies that touch": touching,
+    "bodies that touch across a period": touching_across,
+    "bodies that touch in space": touching_in_space,
+    "a body with a mass": lambda: afloat(massive(RAFT, 20.0, **KEEL)),
+    "a body with a mass in space": lambda: afloat_in_space(massive(BRICK, 3.0, **KEELS)),
+    "a body that does not turn": lambda: afloat(held(RAFT, "x", "y")),
+    "a body that does not heave": lambda: afloat(held(RAFT, "x", "rotation")),
+    "a body that turns about one axis": lambda: afloat_in_space(held(BRICK, "x", "y", "rotation_y")),
+    "a body that turns about two axes": lambda: afloat_in_space(held(BRICK, "z", "rotation_x", "rotation_z")),
+    "a body on a hinge": lambda: on_hinge(afloat, RAFT, PIN),
+    "a body on a ball joint": lambda: on_hinge(afloat_in_space, BRICK, {"position": [0.12, 0.36, 0.1]}),
+    "a body on a hinge with a spring": lambda: on_hinge(afloat, RAFT, {**PIN, **TURNED_BY}),
+    "a body on a hinge with a spring in space": lambda: on_hinge(afloat_in_space, BRICK, {**AXLE, **TURNED_BY}),
+    **{f"a body on a spring, {name}": lambda own=own: moored(afloat, RAFT, own) for name, own in TAUT.items()},
+    **{f"one in space, {name}": lambda own=own: moored(afloat_in_space, BRICK, own) for name, own in ACROSS.items()},
+    "a rubbed body": lambda: rough(afloat(RAFT)),
+    "a rubbed body in a fluid with a law": lambda: rough(afloat(RAFT), **SHEAR_THINNING),
+    "a rubbed body in space": lambda: rough(afloat_in_space(BRICK)),
+    "rubbed bodies that touch": lambda: rough(touching()),
+    "rubbed bodies that touch across a period": lambda: rough(touching_across()),
+    "a rubbed body on a hinge": lambda: rough(on_hinge(afloat, RAFT, {"position": [0.25, 0.45]})),
+    "a rubbed body on a hinge in space": lambda: rough(on_hinge(afloat_in_space, BRICK, RUBBED_AXLE)),
+    "a rubbed body that only heaves and turns": lambda: rough(afloat(held(RAFT, "y", "rotation"))),
+    "a rubbed body that turns about two axes": lambda: rough(
+        afloat_in_space(held(BRICK, "z", "rotation_x", "rotation_z"))
+    ),
+}
 FEATURES = {
     "the cubic spline": Feature(splash),
     "Wendland C2": Feature(lambda: scene(discretisation=SPLINES["wendland_c2"])),
@@ -91,7 +129,7 @@ FEATURES = {
     },
     "beside a paddle": Feature(in_space, has_tape=False),
     "a face that mirrors": Feature(flume, has_tape=False),
-    "bodies that touch": Feature(touching, has_tape=False),
+    **{name: Feature(make, has_tape=False) for name, make in BODIES.items()},
     "two layers": Feature(two_layers),
     "three fluids": Feature(plane_of_three),
     "miscible fluids": Feature(lambda: two_layers(mixture=MISCIBLE)),
@@ -209,7 +247,7 @@ def test_float32_is_near_float64(name):
 
 def own_rows(point: dict[str, Any]) -> dict[str, Any]:
     """Gravity and numbers of a point for two scenes, but those that may have rows or that diffusion is cut by."""
-    others = ("mobility", "interface_width", "gust.k", "spring.damping")
+    others = ("mobility", "interface_width", "gust.k", "spring.damping", ".torque")
     names = [key for key, one in point.items() if np.ndim(one) == 0 and not key.endswith((".turn", *others))]
     numbers = {key: point[key] * np.array([1.0, 0.98]) for key in names}
     return {**numbers, "gravity": np.stack([point["gravity"], 0.8 * point["gravity"]])[:, None]}

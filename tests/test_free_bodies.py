@@ -1,4 +1,5 @@
-"""Rigid bodies that fluid moves: momenta, floating, contact, derivatives, states, and what is refused."""
+"""Rigid bodies that fluid moves: momenta, floating, contact, states, and what is refused. `test_features.py` has
+derivatives, batches and runs that go on."""
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from cortado.losses import CentreOfMass, SolidPose
 from cortado.runs.frames import posed
 from cortado.scene.solid_shapes import AnySolid
 from cortado.solvers.contacts import STIFFNESS
-from finite_differences import central_difference
 from floating_bodies import disc_in_a_round_tank, floating_box
 from reference_projection import Projection
 from scenes import box, pool, thrown
@@ -33,25 +33,6 @@ def plane(*solids, **tables):
 def space(*solids, **tables):
     fluid, container = box([0.0, 0.0, 0.0], [0.4, 0.3, 0.4], phase="water"), box([0.0, 0.0, 0.0], [0.5, 0.6, 0.4])
     return plane(*solids, **{"dimension": 3, "fluid": [fluid], "container": container, **tables})
-
-
-def begun(scene):
-    """What the bodies of a scene begin with, as parameters."""
-    found = {}
-    for table in scene.solid:
-        flat = scene.dimension == 2
-        turned = table.rotation or (0.0,) * (2 * scene.dimension - 3)
-        found[f"{table.name}.position"] = np.array(table.middle())
-        found[f"{table.name}.rotation"] = np.array(turned[0] if flat else turned)
-        if table.motion == "free":
-            found[f"{table.name}.velocity"] = np.array(table.velocity)
-            found[f"{table.name}.density"] = np.array(table.density)
-            if table.angular_velocity is not None:
-                turning = table.angular_velocity
-                found[f"{table.name}.angular_velocity"] = np.array(turning[0] if flat else turning)
-        else:
-            found[f"{table.name}.scale"] = np.array(1.02)
-    return found
 
 
 def touching():
@@ -247,59 +228,13 @@ def test_bodies_touch_across_a_period():
     assert all(body.positions[:, 1].min() > 0.04 for body in (solid, hit))
 
 
-@pytest.mark.parametrize(
-    ("made", "loss"),
-    [
-        (lambda: plane(RAFT, container=box([0.0, 0.0], [1.0, 1.0], slip="no")), CentreOfMass([0.5, 0.3])),
-        (lambda: space(BRICK), SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
-        (touching, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
-        (touching_across, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
-        (touching_in_space, SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
-        (lambda: rough(plane(RAFT)), SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
-        (lambda: rough(plane(RAFT), **SHEAR_THINNING), CentreOfMass([0.5, 0.3])),
-        (lambda: rough(space(BRICK)), SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
-        (lambda: rough(touching_across()), SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
-    ],
-    ids=[
-        *("plane", "space", "touching", "touching across a period", "touching in space", "rough"),
-        *("rough, with a law of viscosity", "rough, in space", "rough, touching across a period"),
-    ],
-)
-def test_derivatives_of_bodies(made, loss):
-    """Reverse and forward mode to round-off, and differences, of all that a body begins with, of its density, and of
-    how large what it touches is."""
-    scene = made()
-    problem, random = Problem(Simulation(scene, precision="float64"), 6, loss), np.random.default_rng(3)
-    values = {**begun(scene), "gravity": np.array([0.5, -9.81, 0.2][: scene.dimension])}
-    values |= {name: np.array(getattr(scene.phase[0], name)) for name in ("viscosity", "rest_density")}
-    scales = {"density": 50.0, "position": 0.01, "scale": 0.1, "rest_density": 50.0}
-    along = {n: scales.get(n.split(".")[-1], 0.3) * random.normal(size=np.shape(v)) for n, v in values.items()}
-    _, gradient = problem.value_and_gradient(values)
-    for name, change in along.items():
-        forward = problem.tangent(values, {name: change})
-        assert (gradient[name] * change).sum() == pytest.approx(forward, rel=1e-10)
-    forward = problem.tangent(values, along)
-    differences = [central_difference(problem.value, values, along, h) for h in (1e-5, 1e-6, 1e-7)]
-    assert min(abs(one / forward - 1.0) for one in differences) < 1e-6
-
-
-def test_the_time_step_has_a_derivative_beside_bodies():
-    scene = rough(space(BRICK))
-    problem = Problem(Simulation(scene, precision="float64"), 6, SolidPose("raft", [0.3, 0.2, 0.2]))
-    _, gradient = problem.value_and_gradient({"time_step": 0.001})
-    value = [problem.value({"time_step": 0.001 + h}) for h in (-1e-8, 1e-8)]
-    assert gradient["time_step"] == pytest.approx(problem.tangent({"time_step": 0.001}, {"time_step": 1.0}), rel=1e-10)
-    assert gradient["time_step"] == pytest.approx((value[1] - value[0]) / 2e-8, rel=1e-5)
-
-
-@pytest.mark.parametrize("made", [touching, touching_in_space, lambda: rough(touching())])
-def test_a_run_goes_on_from_a_state_and_from_a_file_with_the_same_bits(made, tmp_path):
+@pytest.mark.parametrize("made", [touching, touching_in_space])
+def test_a_run_goes_on_from_a_file_with_the_same_bits(made, tmp_path):
     simulation = Simulation(made())
     whole, first = simulation.run(20).last_state, simulation.run(8)
     first.save(tmp_path / "first.vtkhdf")
-    for state in (first.last_state, Trajectory.load(tmp_path / "first.vtkhdf").last_state):
-        rest = simulation.run(12, state=state).last_state
-        assert all(np.array_equal(whole[name], rest[name]) for name in rest.fields)
+    rest = simulation.run(12, state=Trajectory.load(tmp_path / "first.vtkhdf").last_state).last_state
+    assert all(np.array_equal(whole[name], rest[name]) for name in rest.fields)
     with pytest.raises(InputError, match=r"parameter raft\.velocity is given, but must be left out with a state"):
         simulation.run(1, controls={"raft.velocity": np.zeros(simulation.dimension)}, state=first.last_state)
 

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from cortado import Problem, SceneError, Simulation
-from cortado.losses import CentreOfMass, SolidPose
-from finite_differences import both_modes, decades, distance
+from cortado import SceneError, Simulation
 from floating_bodies import disc_in_a_round_tank, heaving_water, passing
 from test_free_bodies import BRICK, RAFT, plane, space
 
@@ -21,26 +19,6 @@ def held(table, *freedom):
     speeds = [speed * (way in freedom) for way, speed in zip("xyz", table["velocity"], strict=False)]
     spins = [spin * (way in freedom) for way, spin in zip(turns, np.atleast_1d(table["angular_velocity"]), strict=True)]
     return {**table, "freedom": list(freedom), "velocity": speeds, "angular_velocity": spins[0] if flat else spins}
-
-
-def derivatives_agree(simulation, loss, point, along, steps=6, least=1e-6):
-    """Reverse and forward mode, and both with differences."""
-    problem = Problem(simulation, steps, loss)
-    for name, change in along.items():
-        both_modes(problem, point, {name: change})
-    tangent = both_modes(problem, point, along)[1]
-    assert distance(problem.value, point, along, tangent, decades(3.0, 7.0), enough=least) < least
-
-
-def same_bits_where_a_run_goes_on_and_in_batches(scene, parameter, values):
-    """A run that goes on from a state, and scenes of a batch with these values of a parameter, are as single runs."""
-    simulation = Simulation(scene)
-    whole, first = simulation.run(12).last_state, simulation.run(5).last_state
-    rest = simulation.run(7, state=first).last_state
-    assert all(np.array_equal(whole[name], rest[name]) for name in rest.fields)
-    for value, run in zip(values, Simulation(scene, batch=len(values)).run(12, {parameter: values}), strict=True):
-        alone = simulation.run(12, {parameter: value}).last_state
-        assert all(np.array_equal(alone[name], run.last_state[name]) for name in alone.fields)
 
 
 @pytest.mark.parametrize(("scene_of", "table", "freedom"), WAYS)
@@ -90,27 +68,6 @@ def test_a_box_that_may_not_move_is_a_solid_at_rest_to_the_fluid():
     other = plane({**boxed, "motion": "path", "velocity": [0.0, 0.0]})
     runs = [Simulation(scene, precision="float64").run(30) for scene in (one, other)]
     assert np.abs(runs[0].positions[-1] - runs[1].positions[-1]).max() < 1e-3
-
-
-@pytest.mark.parametrize(("scene_of", "table", "freedom"), WAYS)
-def test_held_bodies_have_derivatives(scene_of, table, freedom):
-    scene, d, random = scene_of(held(table, *freedom)), 2 if scene_of is plane else 3, np.random.default_rng(3)
-    body, flat = scene.solid[0], scene_of is plane
-    loss = CentreOfMass([0.5, 0.3]) if flat else SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)
-    values = {"position": body.middle(), "rotation": body.rotation, "velocity": body.velocity}
-    values |= {"angular_velocity": body.angular_velocity}
-    point = {f"raft.{name}": np.array(value) for name, value in values.items()}
-    point |= {"gravity": np.array([0.5, -9.81, 0.2][:d]), "raft.density": np.array(500.0)}
-    point = {n: value[0] if flat and np.shape(value) == (1,) else value for n, value in point.items()}
-    sizes = {"density": 50.0, "position": 0.01}
-    along = {n: sizes.get(n.split(".")[-1], 0.3) * random.normal(size=np.shape(v)) for n, v in point.items()}
-    derivatives_agree(Simulation(scene, precision="float64"), loss, point, along)
-
-
-def test_runs_of_held_bodies_go_on_and_are_those_of_batches_to_the_bit():
-    same_bits_where_a_run_goes_on_and_in_batches(
-        space(held(BRICK, "x", "y", "rotation_y")), "raft.density", [300.0, 600.0]
-    )
 
 
 WRONG = {

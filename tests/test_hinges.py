@@ -1,4 +1,4 @@
-"""Free bodies on hinges: pendulums, derivatives, and what is refused."""
+"""Free bodies on hinges: pendulums, and what is refused."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipk
 
 from cortado import SceneError, Simulation
-from cortado.losses import SolidPose
 from floating_bodies import passing
 from scenes import box
 from test_free_bodies import BRICK, RAFT, plane, space
-from test_held_bodies import derivatives_agree, same_bits_where_a_run_goes_on_and_in_batches
 
 ARM, SIZE = 0.3, np.array([0.1, 0.6, 0.2])
 """From the hinge to the middle of a rod, and its sides [m]."""
@@ -79,32 +77,6 @@ def test_a_hinge_with_a_leaning_axis_holds_a_rod_to_its_plane():
     assert np.abs((arms - arms[0]) @ axis).max() < 1e-12
     turns = run.solids["rod"].angular_velocities
     assert np.abs(np.cross(turns, axis)).max() < 1e-12 and np.abs(turns).max() > 1.0
-
-
-WAYS = [
-    (plane, RAFT, {"position": [0.22, 0.5]}),
-    (space, BRICK, {"position": [0.12, 0.36, 0.1], "axis": [0.2, 0.1, 1.0]}),
-    (space, BRICK, {"position": [0.12, 0.36, 0.1]}),
-]
-
-
-@pytest.mark.parametrize(("scene_of", "table", "hinge"), WAYS)
-def test_bodies_on_hinges_have_derivatives(scene_of, table, hinge):
-    scene, flat = on_hinge(scene_of, table, hinge), scene_of is plane
-    random, d = np.random.default_rng(3), 2 if flat else 3
-    loss = SolidPose("raft", [0.3, 0.2, 0.2][:d], 0.3 if flat else [0.3, 0.1, 0.2], length=0.2)
-    body, turn = scene.solid[0], 0.3 * np.ones(()) if flat else np.array([0.3, -0.2, 0.4])
-    point = {"raft.position": body.middle(), "raft.angular_velocity": turn, "raft.density": np.array(500.0)}
-    point["raft.rotation"] = np.array(body.rotation[0] if flat else body.rotation)
-    point |= {"gravity": np.array([0.5, -9.81, 0.2][:d]), "time_step": np.array(0.001)}
-    sizes = {"density": 50.0, "position": 0.01, "time_step": 1e-4}
-    along = {n: sizes.get(n.split(".")[-1], 0.3) * random.normal(size=np.shape(v)) for n, v in point.items()}
-    derivatives_agree(Simulation(scene, precision="float64"), loss, point, along)
-
-
-def test_runs_of_bodies_on_hinges_go_on_and_are_those_of_batches_to_the_bit():
-    spins = [[0.2, 0.1, 1.0], [0.4, 0.2, 2.0]]
-    same_bits_where_a_run_goes_on_and_in_batches(on_hinge(space, BRICK, WAYS[1][2]), "raft.angular_velocity", spins)
 
 
 WRONG = {
