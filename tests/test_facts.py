@@ -1,5 +1,6 @@
 """What pages say is so today: their options, files and keys are there, and their defaults are those of the code."""
 
+import importlib
 import inspect
 import re
 import shlex
@@ -96,6 +97,30 @@ def test_a_key_that_a_page_sets_is_one():
     read = "".join(sources(ROOT / f"src/cortado/{name}") for name in ("scene", "optimisation", "pictures"))
     assert len(found) > 15
     assert [key for key in sorted(found) if not re.search(rf"\b{key.rpartition('.')[2]}\b", read)] == []
+
+
+MODULES = (
+    "environments",
+    "errors",
+    "executors",
+    "forces",
+    "gradients",
+    "image_losses",
+    "losses",
+    "measured",
+    "optimisers",
+)
+MODULES += ("optimisation.transforms", "pictures", "render", "sensors")
+
+
+def test_a_class_that_a_page_names_is_there():
+    """Such as `gradients.Exact`, with or without `cortado.` before it."""
+    short = {name.rpartition(".")[2]: name for name in MODULES}
+    named = re.compile(rf"(?<![\w/])(?:cortado\.)?({'|'.join(short)})\.([A-Z]\w*)")
+    found = {(module, name, page) for page, text in TODAY.items() for module, name in named.findall(text)}
+    assert len({module for module, _, _ in found}) > 8
+    there = {module: dir(importlib.import_module(f"cortado.{short[module]}")) for module, _, _ in found}
+    assert sorted((page, module, name) for module, name, page in found if name not in there[module]) == []
 
 
 def scene(**tables) -> Scene:
