@@ -99,6 +99,18 @@ IN_SPACE = [
     {"name": "cup", "shape": "cup", "base": [0.6, 0.1, 0.3], "radius": 0.1, "height": 0.3, "thickness": 0.1},
     {"name": "block", "shape": "mesh", "file": BLOCK, "scale": 0.2, "position": [1.0, 0.3, 0.3], "material": "steel"},
 ]
+DRAINS = [
+    {
+        "shape": "sink",
+        "name": "a",
+        "position": [0.2, 0.0],
+        "radius": 0.06,
+        "times": [0.0, 1.0],
+        "flow_rates": [0.3, 0.1],
+    },
+    {"shape": "box", "name": "b", "lower": [0.3, 0.3], "upper": [0.36, 0.36]},
+    {"shape": "plane", "name": "c", "position": [0.0, 0.201], "direction": [-1.0, 1.0]},
+]
 BASES = {
     "pcisph": lambda: jet(
         phase=[{**WATER, "rheology": LAW, "colour": [0.1, 0.2, 0.3]}],
@@ -139,6 +151,7 @@ BASES = {
         sensor=[*ON_THE_ROD, {"name": "i", "kind": "spring_force", "spring": "line"}],
         picture={"width": 80, "height": 64},
     ),
+    "drains": lambda: plane(drain=DRAINS, solver={"kind": "projection", "time_step": 0.001}),
     "solids": lambda: scene(
         discretisation=COARSE,
         fluid=[{"shape": "points", "file": AROUND, "phase": "water", "velocity": [0.0, 0.0, 1.0]}],
@@ -169,6 +182,10 @@ BASES = {
     ),
 }
 ASIDE = {
+    ("BoxDrain", "name"): "what the balance calls it",
+    ("PlaneDrain", "name"): "what the balance calls it",
+    ("SinkDrain", "name"): "what parameters call it",
+    ("SinkDrain", "flow_rate"): "in place of flow_rates: tests/test_drains.py",
     ("Picture", "colour"): "what is computed colours: tests/test_films.py",
     ("SceneTables", "name"): "titles",
     ("SolidTable", "name"): "what others call it",

@@ -45,6 +45,7 @@ LINKS = {
     "phase": ("[tables](#materials-phase)", "The materials: in this order the components of mass fractions."),
     "fluid": ("[tables](#bodies-of-fluid-fluid)", "The bodies of fluid; particles come in this order."),
     "emitter": ("[table](#a-jet-emitter)", "An opening out of which fluid comes; its particles come after all others."),
+    "drain": ("[tables](#drains-drain)", "What takes particles out of the fluid."),
     "container": ("[table](#walls-container)", "What holds the fluid."),
     "solid": ("[tables](#solids-solid)", "What fluid flows around or is held by, besides the container."),
     "hinge": ("[tables](#hinges-hinge)", "Hinges, about which free bodies turn."),
@@ -164,6 +165,27 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "",
                 '[emitter]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\ndirection = [0.0, -1.0, 0.0]\nradius = 0.1\n'
                 "length = 0.2\nflow_rate = 0.02",
+            ),
+        ),
+    ),
+    (
+        "## Drains: `[[drain]]`",
+        "They take particles out of the fluid ([taps and drains](taps_and_drains.md)).",
+        (
+            (
+                "SinkDrain",
+                "### A sink",
+                '[[drain]]\nshape = "sink"\nname = "hole"\nposition = [0.8, 0.0, 0.25]\nflow_rate = 0.02',
+            ),
+            (
+                "BoxDrain",
+                "### A box",
+                '[[drain]]\nshape = "box"\nname = "overflow"\nlower = [0.9, 0.5, 0.0]\nupper = [1.0, 0.6, 0.5]',
+            ),
+            (
+                "PlaneDrain",
+                "### A plane, or a level",
+                '[[drain]]\nshape = "plane"\nname = "outflow"\nposition = [0.9, 0.0, 0.0]\ndirection = [1.0, 0.0, 0.0]',
             ),
         ),
     ),

@@ -241,7 +241,7 @@ class Exported:
 
     def _frame(self, frame: Frame, recorded: int, solids: SolidMotions, number: int) -> ExportedFrame:
         """Make a frame of a state near a recorded one, with the solids where they are in a frame of their motion."""
-        shown = those(is_out(self.scene, frame.others.get("emitted"), len(frame.positions)))
+        shown = those(is_out(self.scene, frame.others, len(frame.positions)))
         within = self.scene.domain.wrapped(frame.positions[shown])
         positions, velocities = in_space(np.float64(within)), in_space(np.float64(frame.velocities[shown]))
         colours = colours_of(self.scene, frame.mass_fractions, len(frame.positions))

@@ -6,7 +6,7 @@ One run as pictures show it is what is in the picture, and each of its frames as
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -248,9 +248,8 @@ class ShownRun:
 
     @cached_property
     def _out(self) -> list[NDArray[np.bool_]]:
-        """Return masks (frames, n) of the particles that have left the emitter."""
-        emitted = (frame.others.get("emitted") for frame in self.trajectory)
-        return [is_out(self.scene, one, self.trajectory.particles) for one in emitted]
+        """Return masks (frames, n) of the particles in the fluid."""
+        return [is_out(self.scene, frame.others, self.trajectory.particles) for frame in self.trajectory]
 
     def _pose(self, k: int) -> Scene | None:
         return posed(self.scene, self._motions, k) if self._motions else None
@@ -271,26 +270,27 @@ class ShownRun:
         return Moment(k / max(len(self.trajectory) - 1, 1), float(self.times[k]), up, places)
 
 
-def is_out(scene: Scene, emitted: NDArray | None, particles: int) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles that have left the emitter, given the length ``emitted`` (1,) [m] of
-    `Frame.others`; all of them without an emitter. Where there is no other fluid, the layer that comes first is out
-    from the start."""
+def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the particles that have left the emitter and are in no drain, given the ``emitted`` [m] and
+    ``drained`` of `Frame.others`. Where there is no other fluid, the layer that comes first is out from the start."""
     found = np.ones(particles, dtype=bool)
-    if scene.emitter is not None and emitted is not None:
+    if scene.emitter is not None and "emitted" in others:
         upstream = scene.emitter.sample(scene.discretisation.spacing).upstream
         least = upstream.min() if len(upstream) == particles else 0.0
-        found[particles - len(upstream) :] = upstream <= max(float(np.ravel(emitted)[0]), least)
-    return found
+        found[particles - len(upstream) :] = upstream <= max(float(np.ravel(others["emitted"])[0]), least)
+    return found & (np.ravel(others["drained"]) == 0.0) if "drained" in others else found
 
 
 def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """Return places (frames, n, d) [m] of particles in pictures; those that wait in an emitter are at its opening."""
-    out = np.array([is_out(scene, frame.others.get("emitted"), trajectory.particles) for frame in trajectory])
-    return (
-        trajectory.positions
-        if out.all()
-        else np.where(out[..., None], trajectory.positions, trajectory.others["outlet"])
-    )
+    """Return places (frames, n, d) [m] of particles in pictures; those that wait in an emitter are at its opening, and
+    those that a drain took in its middle."""
+    places, others = trajectory.positions, trajectory.others
+    if scene.emitter is not None and "outlet" in others:
+        out = [is_out(scene, {"emitted": frame.others["emitted"]}, trajectory.particles) for frame in trajectory]
+        places = places if np.all(out) else np.where(np.array(out)[..., None], places, others["outlet"])
+    for number, drain in enumerate(scene.drain, 1):
+        places = np.where((others["drained"] == number)[..., None], drain.middle(scene.dimension), places)
+    return places
 
 
 def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:

@@ -294,8 +294,10 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
         raise InputError(f"{wrong}, but must be from 0 to 1 and add up to 1.")
     _check_densities(fields[DENSITY], fields["mass_fractions"], np.array(origin.rest_density))
     held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
-    free, spacing = positions[: simulation.free_particles], scene.discretisation.spacing
-    for particle in outside(scene.resting_room, free, spacing)[:1] if held else ():  # solids that move are elsewhere
+    drained, spacing = fields.get("drained", np.zeros(len(positions))), scene.discretisation.spacing
+    free = np.flatnonzero(drained[: simulation.free_particles] == 0.0)
+    for index in outside(scene.resting_room, positions[free], spacing)[:1] if held else ():  # moving ones are elsewhere
+        particle = free[index]
         place = place_in_words(positions[particle])
         raise InputError(
             f"state positions has particle {particle} at {place}, outside the container of this scene or in a solid."

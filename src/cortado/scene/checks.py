@@ -13,6 +13,7 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.solid import Solid
 from cortado.errors import InputError, Words, shown
+from cortado.scene.drain_tables import check_drains
 from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
 from cortado.scene.links import check_hinges
@@ -198,6 +199,7 @@ def check_scene(scene: SceneTables) -> None:
     check_hinges(scene.hinge, scene.solid, scene.dimension)
     check_springs(scene.spring, scene.hinge, scene.solid)
     check_free(scene)
+    check_drains(scene)
     _check_sensors(scene)
     for index, fluid in enumerate(scene.fluid):
         _check_inside(scene, index, fluid)

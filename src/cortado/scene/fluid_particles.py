@@ -250,13 +250,41 @@ def fluid_particles(scene: Scene) -> FluidSample:
 def reserve_offset(scene: Scene) -> Points:
     """Return the shift (d,) [m] from their place in line at which particles in reserve wait: along every axis without a
     period beyond all else, upstream of the opening."""
-    assert scene.emitter is not None
-    spacing, direction = scene.discretisation.spacing, np.array(scene.emitter.direction)
+    lower, upper = _ends(scene)
+    size = float((upper - lower).max())
+    return 2.0 * (size + scene.discretisation.support_radius) * _aside(scene)
+
+
+def drained_places(scene: Scene, count: int) -> Points:
+    """Return places (count, d) [m] for particles that drains took: beyond all else, away from particles in reserve, and
+    too far from one another to touch. Along periods there are as many as these have room for."""
+    (lower, upper), (begin, lengths) = _ends(scene), scene.periods
+    away, pitch = (
+        2.0 * (float((upper - lower).max()) + scene.discretisation.support_radius),
+        2.0 * scene.discretisation.support_radius,
+    )
+    free = lengths == 0.0
+    slots = np.maximum(np.floor(lengths / pitch), 1.0)
+    slots[free] = np.ceil((count / slots[~free].prod()) ** (1.0 / max(free.sum(), 1)))
+    number = np.stack(np.unravel_index(np.arange(count), slots.astype(int)), axis=1)
+    start = np.where(_aside(scene) > 0.0, lower - away, upper + away)
+    return np.where(free, start - _aside(scene) * pitch * number, begin + pitch * (number + 0.5))
+
+
+def _ends(scene: Scene) -> tuple[Points, Points]:
+    """Return the corners (d,) of a box around container, fluid, solids and the opening of an emitter [m]."""
+    spacing = scene.discretisation.spacing
     boxes = [fluid.extent(spacing) for fluid in scene.fluid] + [solid.body().extent() for solid in scene.solid]
-    ends = np.array([[scene.emitter.outlet] * 2, scene.container.extent() or [scene.emitter.outlet] * 2, *boxes])
-    size = float(np.ptp(ends.reshape(-1, scene.dimension), axis=0).max())
-    aside = np.where(direction > 0.0, -1.0, 1.0) * (scene.periods[1] == 0.0)
-    return 2.0 * (size + scene.discretisation.support_radius) * aside
+    boxes += [(np.array(scene.emitter.outlet),) * 2] if scene.emitter is not None else []
+    boxes += [ends] if (ends := scene.container.extent()) is not None else []
+    corners = np.array(boxes).reshape(-1, scene.dimension)
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+def _aside(scene: Scene) -> Points:
+    """Return where particles in reserve wait: 1 or -1 along each axis, 0 along a period."""
+    direction = np.zeros(scene.dimension) if scene.emitter is None else np.array(scene.emitter.direction)
+    return np.where(direction > 0.0, -1.0, 1.0) * (scene.periods[1] == 0.0)
 
 
 def _why_none(body: CutBody | None, spacing: float) -> str:

@@ -12,6 +12,7 @@ from pydantic import Field, ValidationInfo, create_model, field_validator, model
 from cortado.discretise.room import Domain, Region, Room
 from cortado.discretise.shapes import Points
 from cortado.scene.appearance import LIQUIDS, Coloured, Picture, Render
+from cortado.scene.drain_tables import AnyDrain
 from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.fluids import AnyFluid, turned
 from cortado.scene.links import HingeTable
@@ -243,6 +244,8 @@ class SceneTables(Table):
     """The bodies of fluid; particles come in this order. With an emitter there may be none."""
     emitter: EmitterTable | None = None
     """An emitter, out of which fluid comes; its particles come after those of all fluids."""
+    drain: tuple[AnyDrain, ...] = ()
+    """Drains, which take particles out of the fluid."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)
     """What holds the fluid."""
     solid: tuple[AnySolid, ...] = ()
@@ -325,7 +328,7 @@ class SceneTables(Table):
         given = table is not None and "dimension" in info.data
         return table.in_dimension(info.data["dimension"]) if given else table
 
-    @field_validator("sensor", "solid", "hinge", "spring")
+    @field_validator("sensor", "solid", "hinge", "spring", "drain")
     @classmethod
     def _resolve_named(cls, tables: Any, info: ValidationInfo) -> Any:
         for index, table in enumerate(tables):

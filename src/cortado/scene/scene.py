@@ -103,10 +103,10 @@ class Scene(SceneTables):
 
     def computed_json(self) -> str:
         """Return as JSON the part of the scene on which results depend. It has no [picture], [[sensor]] and materials,
-        nor an empty [[force]], [[solid]], [[hinge]] or [[spring]], a jitter of 0, keys of chosen time steps where they
-        are fixed, and options of the projection that are off."""
+        nor an empty [[force]], [[solid]], [[hinge]], [[spring]] or [[drain]], a jitter of 0, keys of chosen time steps
+        where they are fixed, and options of the projection that are off."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
-        aside |= {name: True for name in ("force", "solid", "hinge", "spring") if not getattr(self, name)}
+        aside |= {name: True for name in ("force", "solid", "hinge", "spring", "drain") if not getattr(self, name)}
         jittered = {"discretisation": self.discretisation.jitter, "emitter": self.emitter and self.emitter.jitter}
         aside |= {name: {"jitter"} for name, jitter in jittered.items() if not jitter}
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}

@@ -7,6 +7,7 @@ import numpy as np
 
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import pairwise_rate, smoothing_kernel, stress_rate
+from cortado.scene.drain_tables import sink_limit
 from cortado.scene.model import SceneTables
 from cortado.scene.motions import free, greatest_speed, moving, position_name, rotation_name, scale_name, told
 from cortado.scene.parameter_values import Arrays, Tilt
@@ -178,8 +179,8 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     Friction: 0.25 s^2 / nu where free bodies do not slip, as pressure and friction act one after the other: beyond it
     they move too fast. nu is the greatest viscosity over the smallest density.
 
-    Solids that move go no further than a fifth of a spacing in a step. Optional forces have limits of their own, in
-    the registry of parameters.
+    Solids that move go no further than a fifth of a spacing in a step, and fluid that a sink takes no further than 0.4.
+    Optional forces have limits of their own, in the registry of parameters.
 
     ``values``: parameters by name that replace the scene's and its schedule's; of a gravity that changes the strongest
     counts.
@@ -202,6 +203,8 @@ def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTa
         own["springs"] = spring_limit(scene, values)
     if any(body.sticks for body in free(scene.solid)) and (greatest := _kinematic(scene, values)) > 0.0:
         own["friction"] = FRICTION_STEP * scene.discretisation.spacing**2 / greatest
+    if (longest := sink_limit(scene, values)) < inf:
+        own["drains"] = longest
     return {name: own[name] for name in ("gravity", "depth", "viscosity", *own)}
 
 

@@ -24,6 +24,7 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout, padded
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
+from cortado.scene.drain_tables import drain_parameters
 from cortado.scene.fluid_particles import reserve_offset
 from cortado.scene.links import Hold
 from cortado.scene.motions import mass_of_one, motion_parameters, moving, solid_frames, wall_numbers, weight_name
@@ -35,9 +36,11 @@ from cortado.scene.solids import SolidTable
 from cortado.scene.solvers import OWN, PackageSolver, SolverTable
 from cortado.scene.springs import ends_of, spring_parameters, turned_by
 from cortado.solvers.contacts import Contacts, Touching
+from cortado.solvers.drained import drained_of
 from cortado.solvers.obstacles import FINE, ON, FlatFaces, NamedSolid, Obstacle, Walled, flat_faces
 from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.solver import Solver
+from cortado.sph.drains import Drains
 from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, Diffusion, FreeEnergy
 from cortado.sph.free_solids import FreeSolids, FreeSolidsPart, FreeTable, Push
@@ -98,6 +101,7 @@ def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
     own = [(parameter, "a solver") for parameter in getattr(solver, "parameters", ())]
     own += [(parameter, "a force") for maker in forces for parameter in maker.parameters]
     own += [(parameter, "a solid") for parameter in motion_parameters(scene.solid)]
+    own += [(parameter, "a drain") for parameter in drain_parameters(scene)]
     return Known([*own, *((parameter, "a spring") for parameter in spring_parameters(scene))])
 
 
@@ -210,7 +214,7 @@ def known_in(scene: Scene) -> Known:
     """Return the parameters of a scene, with those of parts of packages and of moving solids; raise `InputError` where
     two have one name."""
     own = scene.force or any(phase.rheology for phase in scene.phase) or isinstance(scene.solver, PackageSolver)
-    if not (own or moving(scene.solid)):
+    if not (own or scene.drain or moving(scene.solid)):
         return REGISTRY
     return known_of(forces_named(scene), solver_named(scene.solver), scene)
 
@@ -232,6 +236,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     scene, discrete, precision, device = setting.scene, setting.discrete, setting.precision, setting.device
     layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, setting.batch, setting.known)
     lanes, moves = lanes_for(layout.particles, device, setting.lanes), bool(moving(scene.solid))
+    drains = drained_of(scene, discrete, precision)
     shared = Discretisation(discrete.kernel, precision, lanes, any(discrete.periods), moves)
     mirrors = mirrors_of(scene)
     most = MOST_FACES if layout.all_particles <= most_imaged(moving=True) else 0
@@ -245,10 +250,13 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
             layout,
             discrete.lattice,
             search,
-            _forces(scene, discrete, discretisation, layout, setting.forces),
+            [
+                *_forces(scene, discrete, discretisation, layout, setting.forces),
+                *([] if drains is None else [Drains(drains, layout, discretisation.taped)]),
+            ],
             [*discrete.periods, *[0.0] * (3 - scene.dimension)],
             _parts(scene, discrete, discretisation, setting.free_energy, search, layout),
-            discrete.fluid.emitted.start,
+            discrete.fluid.emitted.start if drains is None else 0,
             _walled(scene, discrete),
             mirrors,
             faces,

@@ -196,9 +196,9 @@ def lost_kernel(precision: Precision) -> Any:
 
         Lost is what is not finite, too far away, of a mixture without a volume, or what went through a wall. It was
         inside before the step and is outside after it, or it is in a solid then. Over the rim of an open cup fluid may
-        go, and what a nozzle leads, so that it is not where it would be without one, passes walls with it. Such are
-        only among the particles from ``first_waiting`` on, in scene order. ``x`` is the new state in that order; the
-        others are sorted, and ``x_free`` and ``v_free`` are the new state without the nozzle.
+        go, and what a nozzle leads or a drain took, so that it is not where it would be otherwise, passes walls with
+        it. Such are only among the particles from ``first_waiting`` on, in scene order. ``x`` is the new state in that
+        order; the others are sorted, and ``x_free`` and ``v_free`` are the new state without nozzle and drains.
         """
         i = wp.tid()
         member = i // particles
@@ -254,8 +254,8 @@ class Containment:
     def __init__(
         self, walled: Walled, layout: Layout, launch: KernelLauncher, first_waiting: int, moving: MovingWalls | None
     ):
-        """Prepare the search: ``first_waiting`` is the first particle, in the scene's order, that may wait in a nozzle,
-        and ``moving`` has the poses of moving solids."""
+        """Prepare the search: ``first_waiting`` is the first particle, in the scene's order, that may wait in a nozzle
+        or be taken by a drain, and ``moving`` has the poses of moving solids."""
         self.walled, self._precision, self._launch = walled, layout.precision, launch
         self._kernel = lost_kernel(layout.precision)
         members, device = layout.members, layout.device

@@ -24,9 +24,10 @@ class ParticleTangent:
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
         self._parts = [part.new_tangent() for part in solver.parts]
         bodies = [own for part in self._parts if isinstance(part, FreeSolidsTangent) for own in part.bodies]
-        self.dot = Tangents(fields, solver.new_fractions(), parameters_dot, bodies)
-        """Of the sorted particles, once `sort` has been called, and of the parameters."""
         self.carried_dot = Carried(solver.carried_fields, solver.layout)
+        kick = solver.kick_of(self.carried_dot)
+        self.dot = Tangents(fields, solver.new_fractions(), parameters_dot, bodies, kick)
+        """Of the sorted particles, once `sort` has been called, and of the parameters."""
         self.density = solver.density.new_tangent()
         self._accelerations_dot = [solver.vectors() for _ in range(len(solver.forces) + 1)]
         finalize(self, solver.launch.forget)

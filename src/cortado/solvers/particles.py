@@ -50,7 +50,7 @@ class ParticleSystem:
     parts: Sequence[PartMaker]
     """Makers of the parts that are no forces."""
     waiting: int
-    """Number of the first particle of a scene that may wait in a nozzle."""
+    """Number of the first particle of a scene that may wait in a nozzle, or be taken by a drain."""
     walled: Walled
     mirrors: tuple[Points, Points]
     """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite where none
@@ -134,6 +134,11 @@ class ParticleSolver(Staying):
         None where none does."""
         return None
 
+    def kick_of(self, carried: Carried) -> wp.array | None:
+        """Return what pressure added to velocities in the step before, or its tangent or adjoint, of what a step
+        carries; None where it is not carried."""
+        return None
+
     def vectors(self) -> wp.array:
         """Make an array (n,) of zero vectors for a step or its derivative to work in."""
         return self._array(self.discretisation.precision.vector)
@@ -205,7 +210,9 @@ class ParticleSolver(Staying):
         if self._context is None or self._context.parameters is not parameters:
             order, step, particles = self.search.order, self.step_number, self.layout.particles
             own = (self.launch, particles, self._neighbourhood, order, step, self.lattice.cell)
-            self._context = StepContext(*own, self.fields, self.fractions, parameters, self.free)
+            self._context = StepContext(
+                *own, self.fields, self.fractions, parameters, self.free, self.kick_of(self.carried)
+            )
         return self._context
 
     def sort(self, state: State, parameters: Parameters) -> StepContext:

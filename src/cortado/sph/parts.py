@@ -59,6 +59,9 @@ class StepContext:
     parameters: Parameters
     bodies: Sequence[Any] = ()
     """The free bodies of the solver, each a `cortado.sph.free_solids.FreeBody`."""
+    kick: wp.array | None = None
+    """(n,) vectors: what pressure added to velocities of sorted particles in the step before [m/s]; None of a solver
+    whose steps do not begin with it."""
 
     @cached_property
     def _known(self) -> tuple[Named, ...]:
@@ -91,6 +94,7 @@ class Tangents:
     parameters: Parameters
     bodies: Sequence[Any] = ()
     """Tangents of free bodies in the step, each a `cortado.sph.free_solids.Changes`."""
+    kick: wp.array | None = None
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
@@ -138,6 +142,7 @@ class Adjoints:
     """Adjoints of the poses of solids that move."""
     bodies: Sequence[Any] = ()
     """Adjoints of free bodies in the step, each a `cortado.sph.free_solids.Changes`."""
+    kick: wp.array | None = None
 
     @cached_property
     def named(self) -> tuple[Named, ...]:

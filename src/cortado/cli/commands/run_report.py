@@ -24,6 +24,7 @@ from cortado.pictures.run_pictures import density_errors, readings, run_pictures
 from cortado.pictures.shown_solids import solid_outline
 from cortado.rollout.outcome import divergence_sentence, dry_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
+from cortado.runs.balance import Balance
 from cortado.runs.frames import Pace, common_rate, posed, solid_motions
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensor import Readings, summary
@@ -35,7 +36,8 @@ from cortado.solvers.particles import ParticleSolver
 
 @dataclass(frozen=True)
 class Energy:
-    """The energies of all particles but those that wait in an emitter [J], in 2-D of a layer one metre thick."""
+    """The energies of all particles but those that wait in an emitter or that drains took [J], in 2-D of a layer one
+    metre thick."""
 
     kinetic: float
     potential: float
@@ -93,6 +95,10 @@ class RunSummary:
         if isinstance(solver, ParticleSolver):
             found = solver.densities(last, rollout.parameters, taken - 1)[_out(simulation, last)]
             self.densities = float(found.min()), float(found.max())
+        self.balance = (
+            Balance.of(simulation.scene, *map(_others, (rollout.initial, last))) if simulation.scene.drain else None
+        )
+        """Of particles; None without drains."""
         self.spilt = _spilt(simulation, last)
         """Particles beside or below an open cup at the end."""
         self.particles = simulation.free_particles
@@ -115,11 +121,13 @@ class RunSummary:
         least, greatest = self.densities or (None, None)
         sensors = {"sensors": summary(self.readings)} if self.readings else {}
         masses = {"given": self.masses.given, "asked": self.masses.asked}
+        balance = {} if self.balance is None else {"balance": self.balance.for_machines()}
         return {
             "energy": energies,
             "mass": masses,
             "density": {"least": least, "greatest": greatest},
             "spilt": self.spilt,
+            **balance,
             **sensors,
         }
 
@@ -138,6 +146,7 @@ class RunSummary:
             (f"time that {self._computed_in_words} steps took", f"{self.seconds:.3g}", "s"),
             *energies,
             *((f"fluid at the start: {words}", "", "") for words in self.masses.off.values()),
+            *([] if self.balance is None else self.balance.rows()),
             *([("particles that left the cup over its rim", self.spilt, "")] if self.spilt else []),
             *((f"{which} density at the end", f"{density:.4g}", "kg/m³") for which, density in densities),
             *(
@@ -163,25 +172,32 @@ class RunSummary:
             text += f"; density {self.densities[0]:.4g} to {self.densities[1]:.4g} kg/m3"
         if self.spilt:
             text += f". Over the rim of the cup went {self.spilt} of {self.particles} particles"
+        if self.balance is not None:
+            text += f". {self.balance}"
         if self.masses.off:
             text += f". The fluid began with {' and '.join(self.masses.off.values())}"
         return f"{text}."
 
 
 def _out(simulation: Simulation, state: State) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles that have left the emitter; waiting ones are prescribed, even within
-    walls."""
-    emitted = state["emitted"].numpy() if simulation.scene.emitter else None
-    return is_out(simulation.scene, emitted, len(simulation.positions))
+    """Return a mask (n,) of the particles in the fluid; those that wait in an emitter are prescribed, even within
+    walls, and those that drains took rest elsewhere."""
+    return is_out(simulation.scene, _others(state), len(simulation.positions))
+
+
+def _others(state: State) -> dict[str, NDArray[Any]]:
+    """Return the fields of a state that say which particles are in the fluid."""
+    return {name: state[name].numpy() for name in ("emitted", "drained") if name in state.names}
 
 
 def _spilt(simulation: Simulation, state: State) -> int:
     """Return how many particles that did not begin in an emitter are outside of a cup without a lid."""
-    scene, container = simulation.scene, simulation.scene.container
+    scene, container, free = simulation.scene, simulation.scene.container, simulation.free_particles
     if not np.isfinite(container.region(simulation.dimension).rim):
         return 0
-    positions = state.numpy(simulation.dimension, only=["positions"])["positions"][: simulation.free_particles]
-    return int((~container.contains(positions, TOLERANCE * scene.discretisation.spacing)).sum())
+    positions = state.numpy(simulation.dimension, only=["positions"])["positions"]
+    outside = ~container.contains(positions[:free], TOLERANCE * scene.discretisation.spacing)
+    return int((outside & _out(simulation, state)[:free]).sum())
 
 
 def simulated(rollout: Rollout) -> float:

@@ -263,8 +263,9 @@ def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -
 def _state(made: Setup, run: Run, step: int) -> State:
     state = run[step]
     colours = colours_of(made.task.scene, state.mass_fractions, len(state.positions), state.colours)
-    emitted = state.state["emitted"].numpy() if "emitted" in state.state.names else None
-    out = those(is_out(made.task.scene, emitted, len(colours)))
+    names = {"emitted", "drained"} & set(state.state.names)
+    others = {name: state.state[name].numpy() for name in names}
+    out = those(is_out(made.task.scene, others, len(colours)))
     fractions = None if state.mass_fractions is None else state.mass_fractions[out]
     return State(state.positions[out], colours[out], fractions=fractions)
 

@@ -1,6 +1,7 @@
 """The tangent of a replayed step of the projection, and its transpose, the adjoint; every sum is a gather."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import warp as wp
@@ -146,6 +147,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._around = self.density.around
         self._x_now_bar, self._x_moved_bar, self._u_bar, self._f = (solver.vectors() for _ in range(4))
         self._kick_bar, self._kick_before_bar = (solver.vectors() for _ in range(2))
+        self.bar = replace(self.bar, kick=self._kick_before_bar)
         self._A_bar = wp.zeros_like(solver.iterates[0]["A"])
         self._faces = FaceShares(solver.discretisation, solver.layout, len(solver.system.faces.solids))
         six = solver.pull.dtype

@@ -61,7 +61,7 @@ from cortado.solvers.solver import Counts
 from cortado.sph.free_solids import FreeSolidsPart
 from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type, symmetric
-from cortado.sph.parts import StepContext
+from cortado.sph.parts import Carried, StepContext
 
 RATE = 20.0
 """Factor of dt |grad v| in the rate r of the shift."""
@@ -228,6 +228,9 @@ class ProjectionSteps(ParticleSolver):
     def new_density(self) -> Surroundings:
         own = self.discretisation, self.layout, self.topic, self.system.walled.dimension
         return Surroundings(*own, self.constants, len(self.system.faces.solids))
+
+    def kick_of(self, carried: Carried) -> wp.array:
+        return carried[KICK]
 
     @property
     def around(self) -> dict[str, wp.array]:

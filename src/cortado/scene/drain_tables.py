@@ -1,0 +1,227 @@
+"""Drains, which take particles out of the fluid: their tables, and the parameters of those that suck."""
+
+from dataclasses import replace
+from itertools import pairwise
+from math import inf
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from cortado.discretise.room import Room
+from cortado.discretise.shapes import Points
+from cortado.errors import Words
+from cortado.scene.courses import Knots
+from cortado.scene.parameters import Axis, Parameter, Range
+from cortado.scene.shape_tables import check_order
+from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity
+
+PRESCRIBED, BLENDED = 3.0, 3.0
+"""In spacings: how thick the shell around a sink is in which fluid flows as it says, and that in which it comes to."""
+
+
+class BoxDrain(Table):
+    """A box that takes every particle which comes into it."""
+
+    shape: Literal["box"]
+    """Which drain it is."""
+    name: Text
+    """Name of the drain."""
+    lower: Vector[Length] | None = None
+    """(d,) lower corner of the box [m]; without an end there if left out."""
+    upper: Vector[Length] | None = None
+    """(d,) upper corner of the box [m]; without an end there if left out."""
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        if self.lower is not None and self.upper is not None:
+            check_order(self.lower, self.upper)
+        return self
+
+    def ends(self, dimension: int) -> Points:
+        """Return the corners (2, d) [m], infinite where there is no end."""
+        none = np.full(dimension, np.inf)
+        return np.array([-none if self.lower is None else self.lower, none if self.upper is None else self.upper])
+
+    def middle(self, dimension: int) -> Points:
+        """Return the middle (d,) of the box [m], its end where it has one, and 0 where it has none."""
+        ends = self.ends(dimension)
+        return np.where(np.isfinite(ends), ends, np.where(np.isfinite(ends[::-1]), ends[::-1], 0.0)).mean(axis=0)
+
+
+class PlaneDrain(Table):
+    """A plane that takes every particle which comes beyond it; one that points upwards is a level."""
+
+    shape: Literal["plane"]
+    """Which drain it is."""
+    name: Text
+    """Name of the drain."""
+    position: Vector[Length]
+    """(d,) a point of the plane [m]."""
+    direction: Vector[Annotated[float, quantity()]]
+    """(d,) where beyond is; its length does not matter."""
+
+    @model_validator(mode="after")
+    def _check_direction(self) -> Self:
+        if not any(self.direction):
+            raise field_error(("direction",), self.direction, "a vector that is not zero")
+        return self
+
+    def middle(self, dimension: int) -> Points:
+        """Return the position (d,) [m]."""
+        return np.array(self.position)
+
+
+class SinkDrain(Table):
+    """A sink, to which fluid flows from all sides with a given flow rate."""
+
+    shape: Literal["sink"]
+    """Which drain it is."""
+    name: Text
+    """Name of the drain, with which those of its parameters begin."""
+    position: Vector[Length]
+    """(d,) its middle [m], in the fluid or on a wall."""
+    radius: Annotated[float, quantity("m", gt=0.0)] | None = None
+    """Distance from the middle at which particles are taken [m]; two and a half spacings if left out. In a shell of
+    three spacings around it fluid flows as the flow rate says, and comes to that in another three."""
+    flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)] | None = None
+    """Volume, in 2-D area, that it takes in a second [m3/s (m2/s in 2-D)]."""
+    times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
+    """(k,) Times of `flow_rates`, from 0 on, each greater than the one before [s]; between them flow rates go in
+    straight lines."""
+    flow_rates: tuple[Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)], ...] | None = None
+    """(k,) Flow rates at these times, in place of `flow_rate` [m3/s (m2/s in 2-D)]."""
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        times, rates = self.times or (), self.flow_rates
+        if self.times is None and rates is None:
+            if self.flow_rate is None:
+                raise field_error((*path, "flow_rate"), MISSING, "given, or times with flow_rates")
+        elif len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
+            wanted = "at least two times, from 0 on, each greater than the one before"
+            raise field_error((*path, "times"), MISSING if self.times is None else times, wanted)
+        elif rates is None or len(rates) != len(times):
+            found = MISSING if rates is None else Words(f"a list of {len(rates)}")
+            raise field_error((*path, "flow_rates"), found, f"a list of {len(times)}, as are times")
+        elif self.flow_rate is not None:
+            raise field_error((*path, "flow_rate"), self.flow_rate, "left out, as there are flow_rates")
+        return super().in_dimension(dimension, path)
+
+    def middle(self, dimension: int) -> Points:
+        """Return the position (d,) [m]."""
+        return np.array(self.position)
+
+    @property
+    def course(self) -> Knots | None:
+        """Return the flow rate over time; None where it is steady."""
+        return None if self.times is None else Knots(np.array(self.times), np.array(self.flow_rates))
+
+    @property
+    def greatest(self) -> float:
+        """Return the greatest flow rate [m3/s (m2/s in 2-D)]."""
+        return max(self.flow_rates or (self.flow_rate or 0.0,))
+
+    def inner(self, spacing: float) -> float:
+        """Return the distance at which particles are taken [m]."""
+        return 2.5 * spacing if self.radius is None else self.radius
+
+
+AnyDrain = Annotated[BoxDrain | PlaneDrain | SinkDrain, Field(discriminator="shape")]
+
+
+def check_drains(scene: Any) -> None:
+    """Check that drains are where fluid can come to, and that sinks have a solver which they work with."""
+    (ends, lengths), spacing = (scene.container.extent(), scene.periods[1]), scene.discretisation.spacing
+    if scene.drain and (lengths > 0.0).all():
+        wanted = "left out, as no axis is without a period, along which what it takes could be put aside"
+        raise field_error(("drain",), Words("given"), wanted)
+    for index, drain in enumerate(scene.drain):
+        path = "drain", index
+        if isinstance(drain, SinkDrain):
+            if scene.solver.kind != "projection":
+                wanted = '"box" or "plane", as the solver is not "projection"'
+                raise field_error((*path, "shape"), drain.shape, wanted)
+            place, shell = np.array(drain.position), drain.inner(spacing) + PRESCRIBED * spacing
+            within = scene.container.contains(place[None], 1e-6 * spacing).all()
+            if not within or open_sphere(scene.resting_room, place, shell) == 0.0:
+                raise field_error((*path, "position"), drain.position, "in the container, where fluid can come to")
+        elif ends is not None:
+            _check_reached(drain, np.array(ends), path)
+
+
+def _check_reached(drain: BoxDrain | PlaneDrain, ends: Points, path: FieldPath) -> None:
+    """Check that a part of a drain is within the corners (2, d) of a container [m]."""
+    key, found = ("position", drain.position) if isinstance(drain, PlaneDrain) else ("lower", drain.lower)
+    if isinstance(drain, PlaneDrain):
+        way = np.array(drain.direction)
+        reached = (np.where(way > 0.0, ends[1], ends[0]) - drain.position) @ way > 0.0
+    else:
+        lower, upper = drain.ends(ends.shape[1])
+        reached = ((lower < ends[1]) & (upper > ends[0])).all()
+        key, found = ("lower", found) if (lower >= ends[1]).any() else ("upper", drain.upper)
+    if not reached:
+        raise field_error((*path, key), found, "where a part of the drain is in the container")
+
+
+def sink_limit(scene: Any, values: Any) -> float:
+    """Return the longest step [s] in which no fluid goes further than 0.4 spacings where sinks take it."""
+    longest, spacing = inf, scene.discretisation.spacing
+    for drain in scene.drain:
+        if isinstance(drain, SinkDrain):
+            flow = float(np.max(values.get(f"{drain.name}.flow_rate", drain.greatest)))
+            sphere = open_sphere(scene.resting_room, np.array(drain.position), drain.inner(spacing))
+            if flow > 0.0:
+                area = max(sphere, 1e-3) * drain.inner(spacing) ** (scene.dimension - 1)
+                longest = min(longest, 0.4 * spacing * area / flow)
+    return longest
+
+
+def drain_parameters(scene: Any) -> list[Parameter]:
+    """Return the parameters of a scene's sinks."""
+    found = []
+    for drain in scene.drain:
+        if isinstance(drain, SinkDrain):
+            found += _of_sink(drain, "m³/s" if scene.dimension == 3 else "m²/s", scene.discretisation.spacing)
+    return found
+
+
+def _of_sink(sink: SinkDrain, unit: str, spacing: float) -> list[Parameter]:
+    course, place = sink.course, np.array(sink.position)
+    begun = float(sink.flow_rate or 0.0 if course is None else course.values[0])
+    flow = Parameter(
+        f"{sink.name}.flow_rate",
+        unit,
+        f"volume that the drain {sink.name} takes in a second of each step",
+        Axis.STEP,
+        lambda source: np.array(begun),
+        range=Range.NOT_NEGATIVE,
+        change=lambda source, value: np.full(np.shape(value), max(sink.greatest, float(np.max(value)))),
+    )
+    position = Parameter(
+        f"{sink.name}.position",
+        "m",
+        f"middle of the drain {sink.name}",
+        Axis.SCALAR,
+        lambda source: place,
+        components=lambda dimension, phases: dimension,
+        change=lambda source, value: spacing,
+    )
+    return [replace(flow, course=course), position]
+
+
+DIRECTIONS = 1024
+"""Number of directions in which it is looked for walls around a sink."""
+
+
+def open_sphere(room: Room, place: Points, radius: float) -> float:
+    """Return the part of the unit sphere, in 2-D of the unit circle, around a place (d,) [m] that is not behind walls
+    at a radius [m], as an angle [rad] or solid angle [sr]."""
+    k = np.arange(DIRECTIONS) + 0.5
+    if len(place) == 2:
+        turn = 2.0 * np.pi * k / DIRECTIONS
+        ways, whole = np.stack([np.cos(turn), np.sin(turn)], axis=1), 2.0 * np.pi
+    else:
+        z, turn = 1.0 - 2.0 * k / DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
+        across = np.sqrt(1.0 - z * z)
+        ways, whole = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1), 4.0 * np.pi
+    return whole * float(room.contains(place + radius * ways, 0.0).mean())

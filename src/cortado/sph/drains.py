@@ -1,0 +1,438 @@
+"""Drains: particles that come into one are taken out of the fluid, and fluid flows to a sink as its flow rate says.
+
+A particle that is in a drain as a step begins is taken: from the end of the step on it rests at a place of its own, far
+from all others, with ``drained`` = 1, 2, ..., the number of the drain. Of the choice there is no derivative, and what
+was taken has none.
+
+A sink makes fluid around it flow to its middle c, with y = x - c, r = |y| and the flow rate Q:
+
+    v* = (1 - phi) (v + dt a) + phi (u - lambda w),   u = -Q y / (S r^d),
+
+instead of v + dt a, in d dimensions, where S is the part of the unit sphere, or circle, that walls leave open. phi goes
+smoothly from 0 at r_2 to 1 at r_1; within r_0 < r_1 particles are taken. So a particle that is taken has neighbours
+whose motion is given. w is what the pressure added to the velocity in the step before: without it fluid would be
+pressed through the shell from r_0 to r_1, behind which there is none. lambda < 1 lets w forget.
+
+Fluid in the shell is thinner than elsewhere, so that Q is not all that goes: in its place stands (1 + E / M) Q with the
+whole number E of particles that the sink is behind, at most M / 4 either way, and M particles within r_1. E changes by
+one at a time, and has no derivative.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.launching import Named
+from cortado.device.modules import Kernels, kernel_module
+from cortado.device.precision import Precision, TypesByName
+from cortado.device.reduction import TreeReduction
+from cortado.discretise.shapes import Points
+from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels
+from cortado.particles.state import (
+    POSITIONS,
+    VELOCITIES,
+    Entry,
+    Layout,
+    Parameters,
+    State,
+    StateField,
+    padded,
+    to_device,
+)
+from cortado.scene.parameters import Axis
+from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
+
+MEMORY = 0.98
+"""lambda: which part of what pressure did in the step before a sink works against."""
+BOX, PLANE, BALL = 0, 1, 2
+MOST = 0.25
+"""The greatest part of M that a sink is behind."""
+DRAINED = StateField("drained", "", Entry.NUMBER)
+"""The number of the drain that took a particle, from 1 on; 0 of one in the fluid."""
+
+
+def behind(name: str) -> StateField:
+    """Return the field of how many particles a sink is behind, which is no whole number."""
+    return StateField(f"{name}.behind", "", Entry.DOUBLE, Axis.SCALAR)
+
+
+@dataclass(frozen=True)
+class Mouth:
+    """Where a drain takes particles."""
+
+    name: str
+    shape: int
+    """`BOX`, `PLANE` or `BALL`."""
+    middle: Points
+    """(d,) [m]"""
+    ends: Points
+    """(2, d) corners of a box from its middle [m], which may be infinite; the direction of a plane, twice."""
+    radius: float = 0.0
+    """[m]"""
+
+
+@dataclass(frozen=True)
+class Pull:
+    """How fluid flows to a sink."""
+
+    name: str
+    shell: tuple[float, float]
+    """r_1 and r_2 [m]"""
+    sphere: float
+    """S"""
+    holds: float
+    """M"""
+
+
+@dataclass(frozen=True)
+class Drained:
+    """The drains of a scene, the places where particles rest that they took, and those that may wait in a nozzle."""
+
+    mouths: Sequence[Mouth]
+    pulls: Mapping[str, Pull]
+    """Of those that suck, by their names."""
+    places: Points
+    """(n, d) [m]"""
+    upstream: Points
+    """(n,) distance from the opening of an emitter [m]; 0 of a particle that is none of its."""
+    periods: Points
+    """(d,) [m], 0 along an axis that is not periodic"""
+
+
+@cache
+def mouth_type(precision: Precision) -> Any:
+    """Make the Warp struct of where a drain takes particles."""
+    real, vector = precision.real, precision.vector
+
+    class MouthOf:
+        shape: wp.int32
+        number: real
+        lower: vector
+        """The direction of a plane."""
+        upper: vector
+        radius: real
+        period: vector
+        """[m], 0 along an axis that is not periodic."""
+        frequency: vector
+        """1 / period [1 / m], or 0."""
+
+    MouthOf.__name__ = MouthOf.__qualname__ = f"MouthOf_{precision.name}"
+    return wp.struct(MouthOf)
+
+
+@cache
+def nearest_function(precision: Precision, module: Any) -> Any:
+    """Make the Warp function of the nearest periodic image of a distance."""
+    vector = precision.vector
+
+    @wp.func
+    def nearest(y: vector, period: vector, frequency: vector) -> vector:
+        turns = wp.cw_mul(y, frequency)
+        return y - wp.cw_mul(vector(wp.round(turns[0]), wp.round(turns[1]), wp.round(turns[2])), period)
+
+    return nearest
+
+
+@cache
+def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Kernels]:
+    """Make the kernel that finds the particles which a drain takes, and those that park them, all in scene order."""
+    real, vector, mouth_of = precision.real, precision.vector, mouth_type(precision)
+    module = kernel_module(f"drains_{'taped_' * taped}{precision.name}", taped)
+    derivatives = kernel_module(f"drains_derivative_{precision.name}")
+    nearest = nearest_function(precision, module)
+    typed = TypesByName(real, {mouth_of: "mouth", vector: "middle x v", wp.float64: "emitted"})
+
+    @wp.func
+    def contains(x: vector, middle: vector, m: mouth_of) -> bool:
+        y = nearest(x - middle, m.period, m.frequency)
+        if m.shape == wp.static(PLANE):
+            return wp.dot(y, m.lower) >= real(0.0)
+        if m.shape == wp.static(BALL):
+            return wp.length(y) < m.radius
+        below = y[0] < m.lower[0] or y[1] < m.lower[1] or y[2] < m.lower[2]
+        return not below and y[0] <= m.upper[0] and y[1] <= m.upper[1] and y[2] <= m.upper[2]
+
+    @particle_kernel(module, "taken fresh", numbers=["mouth", "particles"])
+    @typed
+    def take(
+        i: int,
+        member: int,
+        particles: int,
+        mouth,
+        middle,
+        emitted,
+        upstream: wp.array(dtype=real),
+        x_i,
+        taken_i,
+    ) -> tuple[real, real]:
+        found, fresh = taken_i, real(0.0)
+        waits = wp.float64(upstream[i - member * particles]) > emitted
+        if found == real(0.0) and not waits and contains(x_i, middle, mouth):
+            found = mouth.number
+            fresh = real(1.0)
+        return found, fresh
+
+    @particle_kernel(module, "x v", numbers=["particles"])
+    @typed
+    def park(
+        i: int, member: int, particles: int, places: wp.array(dtype=vector), taken_i, x_free_i, v_free_i
+    ) -> tuple[vector, vector]:
+        place, at_rest = places[i - member * particles], vector()
+        return wp.where(taken_i > real(0.0), place, x_free_i), wp.where(taken_i > real(0.0), at_rest, v_free_i)
+
+    def held(results: str) -> Any:
+        @particle_kernel(derivatives, results, name=f"park_{results.split('_')[-1]}")
+        @typed
+        def hold(taken_i, x_of_i, v_of_i) -> tuple[vector, vector]:
+            no = vector()
+            return wp.where(taken_i > real(0.0), no, x_of_i), wp.where(taken_i > real(0.0), no, v_of_i)
+
+        return hold
+
+    return take, Kernels(park, held("x_dot v_dot"), held("x_free_bar v_free_bar"))
+
+
+def _period(periods: Points, precision: Precision) -> dict[str, Any]:
+    """Return the vectors of a period and of its inverse, which is 0 along axes without one."""
+    lengths = padded(periods[None])[0]
+    frequency = np.divide(1.0, lengths, out=np.zeros(3), where=lengths > 0.0)
+    return {"period": precision.vector(*lengths), "frequency": precision.vector(*frequency)}
+
+
+def _mouth(one: Mouth, number: int, periods: Points, precision: Precision) -> Any:
+    found = mouth_type(precision)()
+    found.shape, found.number, found.radius = one.shape, float(number + 1), one.radius
+    found.lower, found.upper = (precision.vector(*padded(end[None])[0]) for end in one.ends)
+    for name, vector in _period(periods, precision).items():
+        setattr(found, name, vector)
+    return found
+
+
+@cache
+def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Kernels, Kernels]:
+    """Make the kernel that counts how many particles a sink is behind; the kernels of the acceleration by a sink, after
+    that by all other forces; and those that read its flow rate in a step, and add to the adjoint of that. The first and
+    the last have a thread for each scene."""
+    real, vector = precision.real, precision.vector
+    modules = [kernel_module(f"sinks_{'taped_' * taped}{precision.name}", taped)]
+    modules += [kernel_module(f"sinks_derivative_{precision.name}")] * 2
+    memory, tiny, no, one = (wp.constant(real(value)) for value in (MEMORY, precision.tiny, 0.0, 1.0))
+    typed = TypesByName(real, {vector: "position x v kick acceleration_in period frequency"})
+
+    def make(module: Any) -> Any:
+        nearest = nearest_function(precision, module)
+
+        @typed
+        def drive(
+            time_step,
+            flow,
+            position,
+            x_i,
+            v_i,
+            kick_i,
+            acceleration_in_i,
+            inner,
+            outer,
+            sphere,
+            power,
+            period,
+            frequency,
+        ) -> vector:
+            y = nearest(x_i - position, period, frequency)
+            r = wp.sqrt(wp.dot(y, y) + tiny)
+            t = wp.clamp((outer - r) / (outer - inner), no, one)
+            phi = t * t * t * (real(10.0) - t * (real(15.0) - real(6.0) * t))
+            goal = -flow / (sphere * wp.pow(wp.max(r, real(0.1) * inner), power)) * y - memory * kick_i
+            return acceleration_in_i + phi * ((goal - v_i) / time_step - acceleration_in_i)
+
+        return drive
+
+    numbers = ["inner", "outer", "sphere", "power", "period", "frequency"]
+    drives = pointwise_kernels(
+        precision, modules, make, ["acceleration"], {"acceleration": "acceleration_in"}, numbers=numbers
+    )
+    rows = wp.array2d(dtype=real)
+    of_scene = TypesByName(real, {wp.int32: "step", rows: "table", wp.float64: "behind"})
+    most = wp.constant(wp.float64(MOST))
+
+    @wp.kernel(module=modules[0], enable_backward=False)
+    @of_scene.arrays
+    def fall_behind(step, table: rows, time_step, taken_sum, cell: real, holds: real, behind, gain):
+        """Count what a sink is to take in the step and what it took; ``gain`` is 1 + E / M before."""
+        m = wp.tid()
+        held = wp.float64(holds)
+        gain[m] = real(wp.float64(1.0) + wp.round(behind[m]) / held)
+        due = behind[m] + wp.float64(table[m, step[m]]) * wp.float64(time_step[m]) / wp.float64(cell)
+        behind[m] = wp.clamp(due - wp.float64(taken_sum[m]), -most * held, most * held)
+
+    @wp.kernel(module=modules[0])
+    @of_scene.arrays
+    def read(step, table: rows, gain, flow):
+        flow[wp.tid()] = gain[wp.tid()] * table[wp.tid(), step[wp.tid()]]
+
+    @wp.kernel(module=modules[1], enable_backward=False)
+    @of_scene.arrays
+    def add_to(step, table: rows, gain, total):
+        m = wp.tid()
+        table[m, step[m]] = table[m, step[m]] + gain[m] * total[m]
+
+    return fall_behind, drives, Kernels(read, read, add_to)
+
+
+class Drains(Part):
+    """The part of a step that takes particles out, in one solver, and the force with which sinks make fluid flow to
+    them, after all others."""
+
+    batches = is_last = True
+
+    def __init__(self, of: Drained, layout: Layout, taped: bool):
+        self.layout, precision, device, real = layout, layout.precision, layout.device, layout.precision.real
+        self.free = layout.state((POSITIONS, VELOCITIES), taped)
+        """Room for the end of a step if no particle were taken."""
+        self.take, self.parks = drain_kernels(precision, taped)
+        self.fall_behind, self.drive, self.flows = pull_kernels(precision, taped)
+        self.shares = tuple(f"{name}.position" for name in of.pulls)
+        self.fields = (DRAINED, *map(behind, of.pulls))
+        self.taken = layout.arrays(taken=real, fresh=real)
+        """(n,) by which drain each particle is taken in the step, or was before; and 1 for one taken by the last."""
+        self.places = to_device(of.places, precision, device)
+        self._upstream = wp.array(of.upstream, dtype=real, device=device)
+        self._none = wp.zeros(layout.members, dtype=wp.float64, device=device)
+        self._mouths = [
+            (one, _mouth(one, k, of.periods, precision), self._middle(one)) for k, one in enumerate(of.mouths)
+        ]
+        self._pulls = {name: self._pull(pull, of.periods) for name, pull in of.pulls.items()}
+        members = {"dtype": real, "device": device}
+        self._flow = {end: wp.zeros(layout.members, **members) for end in ("flow", "flow_dot")}
+        self._gains = {name: wp.zeros(layout.members, **members) for name in of.pulls}
+        self._behind = {name: wp.zeros(layout.members, dtype=wp.float64, device=device) for name in of.pulls}
+        self._between = [layout.arrays(a=precision.vector)["a"] for _ in of.pulls][1:]
+        self._still = layout.arrays(kick=precision.vector)["kick"]
+        self._found: list[tuple[str, wp.array, wp.array]] = []
+        """Each sink with the accelerations before and after it in the last step."""
+
+    @cached_property
+    def _bars(self) -> dict[str, wp.array]:
+        vector, real = self.layout.precision.vector, self.layout.precision.real
+        return self.layout.arrays("_bar", acceleration_in=vector, kick=vector, flow=real)
+
+    @cached_property
+    def _sum(self) -> TreeReduction:
+        return self.layout.sum_of(self.layout.precision.real)
+
+    def _middle(self, one: Mouth) -> Any:
+        """Return the name of the parameter that a mouth's middle is, or its places in all scenes."""
+        if one.shape == BALL:
+            return f"{one.name}.position"
+        return to_device(np.tile(one.middle, (self.layout.members, 1)), self.layout.precision, self.layout.device)
+
+    def _pull(self, pull: Pull, periods: Points) -> dict[str, Any]:
+        """Return the numbers of a sink by the names that kernels have for them."""
+        own = {"inner": pull.shell[0], "outer": pull.shell[1], "sphere": pull.sphere, "holds": pull.holds}
+        return {**own, "power": float(len(periods)), **_period(periods, self.layout.precision)}
+
+    def begin(self, step: StepContext, state: State) -> None:
+        """Find the particles that are taken, by where they are as the step begins."""
+        wp.copy(self.taken["taken"], state["drained"])
+        emitted = state["emitted"] if "emitted" in state.names else self._none
+        at = {"x": state.positions, "upstream": self._upstream, "emitted": emitted}
+        for one, mouth, middle in self._mouths:
+            place = step.parameters[middle] if isinstance(middle, str) else middle
+            step.launch(self.take, at, self.taken, mouth=mouth, middle=place)
+            if one.name in self._pulls:
+                wp.copy(self._behind[one.name], state[behind(one.name).name])
+                counted = {"taken_sum": self._sum(self.taken["fresh"]), "behind": self._behind[one.name]}
+                step.launch(self.fall_behind, counted, self._of(step.parameters, one.name), threads=self.layout.members)
+
+    def _of(self, parameters: Parameters, name: str) -> dict[str, Any]:
+        """Return what kernels know of a sink; ``table`` is its flow rate, or the tangent or adjoint of that."""
+        return {**self._pulls[name], "gain": self._gains[name], "table": parameters[f"{name}.flow_rate"]}
+
+    def target(self, moved: State) -> State:
+        return self.free
+
+    def end(self, step: StepContext, state: State, moved: State) -> None:
+        free = {"x_free": self.free.positions, "v_free": self.free.velocities, "places": self.places}
+        step.launch(self.parks.forward, self.taken, free, x=moved.positions, v=moved.velocities)
+        wp.copy(state["drained"], self.taken["taken"])
+        for name, count in self._behind.items():
+            wp.copy(state[behind(name).name], count)
+
+    def new_tangent(self) -> "DrainsTangent":
+        return DrainsTangent(self)
+
+    def new_adjoint(self) -> "DrainsAdjoint":
+        return DrainsAdjoint(self)
+
+    def _known(self, step: StepContext, name: str) -> tuple[Named, ...]:
+        of = self._of(step.parameters, name)
+        step.launch(self.flows.forward, of, flow=self._flow["flow"], threads=self.layout.members)
+        kick = self._still if step.kick is None else step.kick
+        return of, self._flow, {"kick": kick, "position": step.parameters[f"{name}.position"]}
+
+    def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
+        if not self._pulls:
+            wp.copy(after, before)
+            return
+        ends = [before, *self._between, after]
+        self._found = list(zip(self._pulls, ends[:-1], ends[1:], strict=True))
+        for name, start, end in self._found:
+            step.launch(self.drive.forward, *self._known(step, name), acceleration_in=start, acceleration=end)
+
+    def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
+        if not self._pulls:
+            wp.copy(after, before)
+            return
+        dots = [before, *self._dots, after]
+        for (name, start, _), start_dot, end_dot in zip(self._found, dots[:-1], dots[1:], strict=True):
+            known, rates = self._known(step, name), self._of(dot.parameters, name)
+            step.launch(self.flows.tangent, rates, flow=self._flow["flow_dot"], threads=self.layout.members)
+            along = {"kick_dot": self._still if dot.kick is None else dot.kick}
+            along["position_dot"] = dot.parameters[f"{name}.position"]
+            ends = {"acceleration_in": start, "acceleration_in_dot": start_dot, "acceleration_dot": end_dot}
+            step.launch(self.drive.tangent, ends, along, *known, *dot.named)
+
+    @cached_property
+    def _dots(self) -> list[wp.array]:
+        return [wp.zeros_like(a) for a in self._between]
+
+    def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array:
+        passed, flow_bar = self._bars["acceleration_in_bar"], self._bars["flow_bar"]
+        wp.copy(passed, acceleration_bar)
+        own = {**self._bars, "kick_bar": self._bars["kick_bar"] if bar.kick is None else bar.kick}
+        for name, start, _ in reversed(self._found):
+            known = self._known(step, name)
+            flow_bar.zero_()
+            ends = {"acceleration_in": start, "position_bar": bar.shares[f"{name}.position"]}
+            step.launch(self.drive.adjoint, ends, own, *known, *bar.named)
+            rates = self._of(bar.parameters, name)
+            step.launch(self.flows.adjoint, rates, total=self._sum(flow_bar), threads=self.layout.members)
+        return passed
+
+
+class DrainsTangent(PartTangent):
+    """The tangent of particles that drains take: it is 0."""
+
+    def __init__(self, of: Drains):
+        self._of = of
+
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        both = {"x_dot": state_dot.positions, "v_dot": state_dot.velocities}
+        step.launch(self._of.parks.tangent, both, self._of.taken, x_of=both["x_dot"], v_of=both["v_dot"])
+
+
+class DrainsAdjoint(PartAdjoint):
+    """The adjoint of particles that drains take: they pass nothing on."""
+
+    def __init__(self, of: Drains):
+        self._of, self._free = of, of.free.like()
+
+    def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
+        free = {"x_free_bar": self._free.positions, "v_free_bar": self._free.velocities}
+        moved = {"x_of": moved_bar.positions, "v_of": moved_bar.velocities}
+        step.launch(self._of.parks.adjoint, free, moved, self._of.taken)
+        return self._free

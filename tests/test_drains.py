@@ -1,0 +1,177 @@
+"""Drains: what they take is out of everybody's reach and counted to a particle, sinks take their flow rate, and every
+gradient is right."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cortado import Problem, Scene, SceneError, Simulation
+from cortado.runs.balance import Balance
+from cortado.scene.drain_tables import open_sphere
+from finite_differences import both_modes, decades, distance
+from scenes import Weighed, jet, plane, scene, thrown
+from test_held_bodies import same_bits_where_a_run_goes_on_and_in_batches
+
+STEPS = 8
+SPACING = 0.025
+HOLE = {"shape": "sink", "name": "hole"}
+SOLVER = {"kind": "projection", "time_step": 0.002}
+
+
+def emptied(d, **keys):
+    """A block of fluid beside a wall, with a sink off the floor and two other drains above."""
+    sink = {**HOLE, "position": [0.22, 0.02, 0.13][:d], "radius": 0.05, "flow_rate": [0.05, 0.01][d - 2]}
+    box = {"shape": "box", "name": "over", "lower": [0.3, 0.36, 0.0][:d]}
+    return (plane if d == 2 else scene)(drain=[sink, box], solver=SOLVER, **keys)
+
+
+def tank(depth=0.5, time_step=1e-3, **keys):
+    """A tank of one metre in the plane, with water up to a depth."""
+    water = {"shape": "box", "phase": "water", "lower": [0.0, 0.0], "upper": [1.0, depth]}
+    tables = {
+        "dimension": 2,
+        "discretisation": {"spacing": SPACING},
+        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 1e-3}],
+        "fluid": [water],
+        "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, depth + 0.5]},
+        "solver": {"kind": "projection", "time_step": time_step},
+    }
+    return Scene.from_json(json.dumps({**tables, **keys}))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_every_number_of_a_sink_has_its_derivatives(d):
+    simulation = Simulation(emptied(d), precision="float64")
+    problem, own = Problem(simulation, STEPS, Weighed(simulation)), simulation.parameters()
+    point = {name: own[name] for name in ("hole.position", "gravity", "time_step")} | thrown(simulation)
+    point["hole.flow_rate"] = np.linspace(0.5, 1.0, STEPS) * own["hole.flow_rate"]
+    taken = (problem.run(point).others["drained"] > 0).sum(axis=1)
+    assert taken[0] == 0 < taken[-1]
+    random, sizes = np.random.default_rng(4), {"time_step": 1e-4, "gravity": 1.0}
+    for name, value in point.items():
+        along = {name: sizes.get(name, 0.01) * random.standard_normal(np.shape(value))}
+        tangent = both_modes(problem, point, along)[1]
+        assert distance(problem.value, point, along, tangent, decades(2.0, 7.0), enough=1e-7) < 1e-6
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_runs_with_drains_go_on_and_are_batched_with_the_same_bits(d):
+    same_bits_where_a_run_goes_on_and_in_batches(
+        emptied(d), "hole.position", np.array([[0.2, 0.1, 0.1], [0.1, 0.0, 0.1]])[:, :d]
+    )
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("kind", ["projection", "pcisph"])
+def test_what_a_box_took_is_out_of_reach_and_what_is_left_goes_on_as_if_it_were_not_there(kind, precision):
+    """Of two blocks that fall beside one another, far apart, a box takes one, layer after layer."""
+    solver = {"kind": kind, "time_step": 0.002}
+    solver |= {"minimum_iterations": 4, "maximum_iterations": 4} if kind == "pcisph" else {}
+    blocks = [{"shape": "box", "phase": "water", "lower": [x, 0.3], "upper": [x + 0.2, 0.5]} for x in (0.0, 0.8)]
+    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}
+    box = {"shape": "box", "name": "right", "lower": [0.6, 0.0], "upper": [1.0, 0.2]}
+    both = plane(fluid=blocks, container=room, drain=[box], solver=solver)
+    alone = plane(fluid=blocks[:1], container=room, solver=solver)
+    run, other = (Simulation(one, precision=precision).run(150, record_every=10) for one in (both, alone))
+    drained, left = run.others["drained"], len(other.positions[0])
+    assert (np.diff((drained > 0).sum(axis=1)) >= 0).all() and (drained[-1, left:] == 1).all()
+    assert (drained[:, :left] == 0).all() and 0 < (drained > 0).sum(axis=1)[9] < len(drained[0]) - left
+    tolerance = 1e-12 if precision == "float64" else 1e-4
+    np.testing.assert_allclose(run.positions[:, :left], other.positions, rtol=0, atol=tolerance)
+    taken = run.positions[-1, left:]
+    assert (run.velocities[-1, left:] == 0.0).all() and (np.abs(taken - 0.5) > 1.0).any(axis=1).all()
+    apart = np.linalg.norm(taken[:, None] - taken, axis=-1) + 9.0 * np.eye(len(taken))
+    assert apart.min() > 1.5 * both.discretisation.support_radius
+
+
+def test_a_plane_takes_what_is_beyond_it_and_waiting_particles_are_left_alone():
+    """The column of the jet reaches above the plane; what has come out of it and splashes up does not."""
+    level = {"shape": "plane", "name": "level", "position": [0.0, 0.4], "direction": [0.0, 1.0]}
+    poured = jet(drain=[level], solver=SOLVER)
+    simulation = Simulation(poured)
+    run = simulation.run(60)
+    assert simulation.positions[:, 1].max() > 0.5 and (run.others["drained"] == 0).all()
+    low = {**level, "position": [0.0, 0.12]}
+    run = Simulation(jet(drain=[low], solver=SOLVER)).run(3)
+    before = run.positions[0, : simulation.free_particles, 1]
+    assert np.array_equal(run.others["drained"][1][: len(before)] == 1, before > 0.12)
+
+
+@pytest.mark.parametrize("depth", [0.5, 1.5])
+def test_a_sink_takes_its_flow_rate(depth):
+    """Within a few particles, also of those that it begins with; pressure does not drive fluid through it."""
+    sink = {**HOLE, "position": [0.5, 0.0], "flow_rate": 0.05}
+    run = Simulation(tank(depth, drain=[sink])).run(1000, record_every=100)
+    out = (run.others["drained"] > 0).sum(axis=1)
+    assert np.abs(out - 0.05 * run.times / SPACING**2)[5:].max() < 10.0
+    away = np.linalg.norm(run.positions - [0.5, 0.0], axis=-1) > 8.5 * SPACING
+    assert np.linalg.norm(run.velocities, axis=-1)[away].max() < 0.5
+
+
+def test_a_level_stays_where_it_is_with_a_tap_and_a_drain():
+    """For ten seconds, in which more comes and goes than the tank holds, within a particle."""
+    tap = {"phase": "water", "outlet": [0.2, 0.55], "radius": 0.05, "flow_rate": 0.05}
+    sink = {**HOLE, "position": [0.8, 0.0], "flow_rate": 0.05}
+    filled = tank(0.4, emitter=tap, drain=[sink])
+    simulation = Simulation(filled.lasting(10.0))
+    run = simulation.run(10_000, record_every=500)
+    for frame in run:
+        balance = Balance.of(simulation.scene, run[0].others, frame.others)
+        assert balance.last == balance.first + balance.came - balance.went["hole"]
+        assert abs(balance.last - balance.first) * SPACING**2 < 0.5 * SPACING
+    assert balance.came == pytest.approx(800, abs=1) and balance.went["hole"] == pytest.approx(800, abs=8)
+
+
+def test_a_flow_rate_over_time_opens_and_shuts_a_sink():
+    course = {"times": [0.0, 0.3, 0.301, 1.0], "flow_rates": [0.1, 0.1, 0.0, 0.0]}
+    run = Simulation(tank(drain=[{**HOLE, "position": [0.5, 0.0], **course}])).run(600, record_every=50)
+    out = (run.others["drained"] > 0).sum(axis=1)
+    assert out[6] - out[1] > 30 and out[-1] - out[7] <= 2
+    top = np.sort(run.positions[-1][run.others["drained"][-1] == 0][:, 1])[-40:]
+    assert top.mean() == pytest.approx(0.5 - 0.5 * SPACING - out[-1] * SPACING**2, abs=SPACING)
+
+
+def test_the_balance_is_right_to_a_particle():
+    hole = {**HOLE, "position": [0.3, 0.0], "flow_rate": 0.3, "radius": 0.06}
+    lid = {"shape": "box", "name": "lid", "lower": [0.0, 0.35]}
+    poured = jet(drain=[hole, lid], solver=SOLVER)
+    simulation = Simulation(poured.lasting(steps=100))
+    run = simulation.run(100)
+    balance = Balance.of(simulation.scene, run[0].others, run[-1].others)
+    assert balance.first + balance.came - sum(balance.went.values()) == balance.last
+    assert balance.first == simulation.free_particles and balance.came > 20 and balance.went["hole"] > 20
+
+
+def test_walls_around_a_sink_are_taken_out_of_its_sphere():
+    room = tank().resting_room
+    for place, part in (([0.5, 0.25], 1.0), ([0.5, 0.0], 0.5), ([0.0, 0.0], 0.25)):
+        assert open_sphere(room, np.array(place), 0.1) == pytest.approx(2.0 * np.pi * part, rel=3e-3)
+    space = scene().resting_room
+    assert open_sphere(space, np.zeros(3), 0.1) == pytest.approx(0.5 * np.pi, rel=1e-2)
+
+
+WRONG = [
+    ([{**HOLE, "position": [2.0, 0.0], "flow_rate": 0.1}], "drain[0].position", "in the container"),
+    ([{**HOLE, "position": [0.5, 0.0], "flow_rate": -0.1}], "drain[0].flow_rate", "at least 0"),
+    ([{**HOLE, "position": [0.5, 0.0]}], "drain[0].flow_rate", "missing"),
+    ([{**HOLE, "position": [0.5, 0.0], "times": [0.0, 1.0]}], "drain[0].flow_rates", "missing"),
+    ([{**HOLE, "position": [0.5, 0.0], "times": [0.5, 1.0], "flow_rates": [0.1, 0.1]}], "drain[0].times", "from 0 on"),
+    ([{"shape": "box", "name": "a", "lower": [2.0, 0.0]}], "drain[0].lower", "in the container"),
+    ([{"shape": "box", "name": "a", "upper": [-1.0, 0.0]}], "drain[0].upper", "in the container"),
+    ([{"shape": "box", "name": "a"}, {"shape": "box", "name": "a"}], "drain[1].name", "another name"),
+    ([{"shape": "plane", "name": "a", "position": [0.0, 2.0], "direction": [0.0, 1.0]}], "drain[0].position", "part"),
+    ([{"shape": "plane", "name": "a", "position": [0.0, 0.2], "direction": [0.0, 0.0]}], "drain[0].direction", "zero"),
+]
+
+
+@pytest.mark.parametrize(("drains", "key", "words"), WRONG)
+def test_a_wrong_drain_is_told_in_a_sentence(drains, key, words):
+    with pytest.raises(SceneError) as error:
+        tank(drain=drains)
+    assert str(error.value).startswith(key) and words in str(error.value)
+
+
+def test_a_sink_needs_the_projection():
+    with pytest.raises(SceneError, match="projection"):
+        tank(drain=[{**HOLE, "position": [0.5, 0.0], "flow_rate": 0.1}], solver={"kind": "pcisph", "time_step": 1e-3})
