@@ -217,3 +217,13 @@ def sentences(text: str) -> list[str]:
 def test_sentences_are_short(page):
     found = [(len(re.findall(r"\S*\w\S*", one)), one) for one in sentences(TODAY[page])]
     assert [(count, one) for count, one in found if count > MOST] == []
+
+
+def test_pages_are_no_longer_than_readers_bear():
+    """A page has at most 3,500 words, code included, the README 700, and all pages for users 60,000 besides code; the
+    reference of scenes is generated."""
+    words = {page: len(text.split()) for page, text in TODAY.items()}
+    long = {page: count for page, count in words.items() if count > (700 if page == "README.md" else 3500)}
+    assert set(long) <= {"docs/scene_file.md"}
+    pages = [NOT_PROSE.sub("", text) for page, text in TODAY.items() if page.startswith("docs/")]
+    assert sum(len(re.findall(r"\S*\w\S*", page)) for page in pages) <= 60_000
