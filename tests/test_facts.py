@@ -198,7 +198,9 @@ def test_pages_agree_on_defaults():
 
 MOST = 35
 """Words of a sentence, at most."""
-NOT_PROSE = re.compile(r"^---\n.*?\n---\n|^(```+).*?^\1$|^ {4}\S.*$|<!--.*?-->|\$\$.*?\$\$", re.MULTILINE | re.DOTALL)
+NOT_PROSE = re.compile(
+    r"\A---\n.*?\n---\n|^(```+).*?^\1$|^ {4}\S[^\n]*$|<!--.*?-->|\$\$.*?\$\$", re.MULTILINE | re.DOTALL
+)
 INLINE = re.compile(r"`[^`]*`|\$[^$]*\$|!?\[([^\]]*)\]\([^)]*\)")
 
 
