@@ -156,16 +156,6 @@ def test_a_certificate_and_an_estimator_beside_a_rotor():
     assert exact @ viscous > 0.99 * np.linalg.norm(exact) * np.linalg.norm(viscous)
 
 
-def test_a_run_goes_on_from_a_state_with_the_same_bits():
-    simulation = Simulation(plane(ROTOR), precision="float64")
-    whole = simulation.run(60)
-    state = simulation.step(simulation.state(), {}, steps=25)
-    rest = simulation.run(35, state=state)
-    np.testing.assert_array_equal(rest.positions[-1], whole.positions[-1])
-    np.testing.assert_array_equal(rest.solids["rotor"].positions, whole.solids["rotor"].positions[25:])
-    np.testing.assert_array_equal(whole[::10].solids["rotor"].rotations, whole.solids["rotor"].rotations[::10])
-
-
 def test_steps_that_are_chosen_know_how_fast_solids_are():
     fast = {**ROTOR, "angular_velocity": 60.0, "velocity": None}
     scene = plane(fast)

@@ -1,4 +1,5 @@
-"""Sensors that ride on solids, beside closed forms, and their derivatives by the motion of these."""
+"""Sensors that ride on solids, beside closed forms, and their derivatives by the motion of these. What they read on a
+device, and in batches, is in tests/test_step_reader.py."""
 
 import numpy as np
 import pytest
@@ -8,9 +9,7 @@ import cortado
 from bad_scenes import one_sentence
 from cortado.errors import InputError
 from cortado.losses import Series
-from cortado.losses.distances import SensorMatch
 from cortado.runs.riding import Carrier
-from cortado.runs.sensor import value_of
 from cortado.scene.motions import matrix
 from cortado.sensors import PressureProbe, SolidLoad, WallForce, WaveGauge
 from finite_differences import both_modes, distance
@@ -58,16 +57,23 @@ def riding(dimension, on):
     }
 
 
-@pytest.mark.parametrize("on", ["solid 0", "solid 1"], ids=["path", "free"])
-@pytest.mark.parametrize("kind", riding(2, "solid 0"))
+KINDS = [(kind, on) for kind in riding(2, "solid 0") for on in ("solid 0", "solid 1")] + [
+    ("gauge that stays", "solid 0")
+]
+
+
+@pytest.mark.parametrize(("kind", "on"), KINDS)
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_what_a_riding_sensor_makes_of_its_adjoint_is_its_derivative(dimension, kind, on):
+def test_what_a_sensor_beside_solids_makes_of_its_adjoint_is_its_derivative(dimension, kind, on):
     """With respect to the fields and quantities that it reads and to the poses of solids, taken as free."""
     make, point, axes = fields(dimension)
-    sensor, random = riding(dimension, on)[kind], np.random.default_rng(2)
+    stays = WaveGauge([0.93, 0.0, 0.97][:dimension], up=[0.1, 1.0, 0.0][:dimension])
+    sensor, random = {**riding(dimension, on), "gauge that stays": stays}[kind], np.random.default_rng(2)
     bar = random.normal(size=len(sensor.value(make(point))))
     bars = sensor.adjoint(make(point), bar)
     assert f"{on}.position" in bars or "load" in kind
+    if sensor is stays:
+        assert set(bars) == {name for name in point if not name.endswith(("pressure", "wall_force", "load"))}
     spun = 1e-6 * random.normal(size=3) * (1.0 if dimension == 3 else [0.0, 0.0, 1.0])
     along = {name: 1e-6 * random.normal(size=value.shape) for name, value in point.items() if "turn_" not in name}
     along |= {f"solid 1.turn_{x}": np.cross(spun, axes[:, k])[None, :dimension] for k, x in enumerate("xyz")}
@@ -169,33 +175,7 @@ def test_the_certificate_finds_the_gradient_of_a_riding_sensor_right_in_float32(
     assert cortado.certify(problem, {"tank.displacement": point["tank.displacement"]}).right
 
 
-# ---- on the device -----------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("kind", MADE)
-@pytest.mark.parametrize(("dimension", "precision"), [(2, "float64"), (3, "float64"), (2, "float32")])
-def test_a_run_reads_on_its_device_what_losses_read_of_its_states(kind, dimension, precision):
-    simulation, steps = simulated(kind, dimension, precision), 7
-    sensors = on_a_solid(dimension, MADE[kind][1])
-    run = simulation.run(steps, record_every=1, sensors=sensors)
-    for name, sensor in sensors.items():
-        problem = cortado.Problem(simulation, 4, SensorMatch(sensor, 0.0))
-        wanted = value_of(sensor, problem.end({}))
-        size = np.abs(run.sensors[name].values).max()
-        np.testing.assert_allclose(run.sensors[name].values[4], wanted, atol=1e-11 * size, err_msg=name)
-        assert np.ptp(run.sensors[name].values, axis=0).max() > 1e-4 * size
-
-
-@pytest.mark.parametrize("kind", MADE)
-def test_readings_of_a_batch_are_those_of_each_scene(kind):
-    on, starts = MADE[kind][1], np.array([[0.2, 0.25], [0.23, 0.27]])
-    sensors, name = on_a_solid(2, on), f"{on}.position"
-    together = simulated(kind, 2, batch=2).run(5, {name: starts}, sensors=sensors)
-    for b, start in enumerate(starts):
-        alone = simulated(kind, 2).run(5, {name: start}, sensors=sensors)
-        for one in sensors:
-            assert together[b].sensors[one].values.tobytes() == alone.sensors[one].values.tobytes(), one
-    assert together[0].sensors["probe"].values[-1] != together[1].sensors["probe"].values[-1]
-
-
+# ---- runs and batches --------------------------------------------------------------------------------------------
 # ---- closed forms ------------------------------------------------------------------------------------------------
 def carried(start, rate, times, full=True, **sensors):
     """Readings in a tank that begins at a rate [m/s] with its water, gets faster by ``start`` [m/s2] all the time, and

@@ -121,43 +121,6 @@ def turned(dimension):
     return plate, boat
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_the_derivative_of_a_gauge_follows_solids_that_move(dimension):
-    """With respect to the places of particles, and to the pose and the scale of a solid."""
-
-    basin, random, angles = Basin(dimension, turned(dimension)), np.random.default_rng(4), 2 * dimension - 3
-
-    class Fields(dict):
-        dimension, solids, lattice, container = basin.dimension, basin.solids, basin.lattice, basin.container
-
-    point = {"positions": basin["positions"]}
-    for table in basin.solids:
-        begun = np.array(table.rotation)
-        point[f"{table.name}.position"] = table.middle()[None]
-        point[f"{table.name}.rotation"] = begun if dimension == 2 else begun[None]
-    point["solid 0.turn"] = np.full(angles, 0.1) if dimension == 2 else np.full((1, 3), 0.1)
-    point["solid 0.scale"] = np.array([1.1])
-    axes = np.linalg.qr(np.eye(3) + 0.1 * random.normal(size=(3, 3)))[0] if dimension == 3 else np.eye(3)
-    axes = axes * np.sign(np.diag(axes))
-    point |= {f"solid 1.turn_{x}": (axes - np.eye(3))[:, k][None, :dimension] for k, x in enumerate("xyz")}
-    gauge, at = WaveGauge([0.93, 0.0, 0.97][:dimension], up=[0.1, 1.0, 0.0][:dimension]), Fields(point)
-    bars = gauge.adjoint(at, np.array([2.0]))
-    assert set(bars) == set(point)
-    assert all(np.abs(bar).max() > 0.0 for name, bar in bars.items() if "turn_z" not in name)
-    spun = 1e-6 * random.normal(size=3) * (1.0 if dimension == 3 else [0.0, 0.0, 1.0])
-    along = {name: 1e-6 * random.normal(size=value.shape) for name, value in point.items() if "turn_" not in name}
-    along |= {f"solid 1.turn_{x}": np.cross(spun, axes[:, k])[None, :dimension] for k, x in enumerate("xyz")}
-    for only in (*point, None):
-        names = set(point) if only is None else {n for n in point if n.split(".turn_")[0] == only.split(".turn_")[0]}
-        way = {name: value * (name in names) for name, value in along.items()}
-        derivative = sum((bars[name] * way[name]).sum() for name in bars)
-
-        def value(fields):
-            return 2.0 * float(gauge.value(Fields(fields))[0])
-
-        assert distance(value, point, way, derivative, [1e-1, 1e-2, 1e-3], enough=1e-4) < 1e-4, only
-
-
 def test_the_gradient_of_a_gauge_above_a_solid_that_moves():
     """Through a run, to how the solid begins and to the fluid."""
     solid = [{"name": "sill", "shape": "box", "lower": [0.1, 0.02], "upper": [0.3, 0.1], "motion": "path"}]
