@@ -339,7 +339,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     ),
     (
         "## Hinges: `[[hinge]]`",
-        'About them bodies with `motion = "free"` turn ([bodies that are held](solids.md#bodies-that-float)).',
+        'About them bodies with `motion = "free"` turn ([hinges](bodies.md#hinges)).',
         (
             (
                 "HingeTable",
@@ -352,7 +352,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     ),
     (
         "## Springs: `[[spring]]`",
-        'They pull bodies with `motion = "free"` ([springs and mooring lines](solids.md#bodies-that-float)).',
+        'They pull bodies with `motion = "free"` ([springs and mooring lines](bodies.md#springs-and-mooring-lines)).',
         (
             (
                 "SpringTable",
