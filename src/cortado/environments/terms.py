@@ -181,7 +181,7 @@ class Share(OverParticles):
 
 
 class Spread(OverParticles):
-    """A reward term: the mean distance |dx| + |dy| of all pairs of some particles, over ``everywhere``; along a
+    """A reward term: the mean distance ``|dx| + |dy|`` of all pairs of some particles, over ``everywhere``; along a
     periodic axis to the nearest image."""
 
     kernel = "apart"
@@ -225,7 +225,7 @@ class Missed(OverParticles):
 
 @dataclass(frozen=True)
 class Miss:
-    """A reward term: by how much another term misses the first number of the goal, |value - goal|."""
+    """A reward term: by how much another term misses the first number of the goal, ``|value - goal|``."""
 
     term: Term
 
@@ -238,7 +238,7 @@ class Miss:
 
 @dataclass(frozen=True)
 class Distance:
-    """A reward term: the distance |x - x*| [m] of a solid's middle from its goal along the first axis."""
+    """A reward term: the distance ``|x - x*|`` [m] of a solid's middle from its goal along the first axis."""
 
     solid: str
 

@@ -186,8 +186,8 @@ def _checksum(*parts: Any) -> str:
 
 @fixed
 class SolidPose:
-    """A loss of a moving solid, |x - x*|^2 + l^2 (3 - tr R*^T R) [m2]. To its middle's squared distance from a target
-    it adds, for small angles off a target rotation, the squared angle times l^2."""
+    """A loss of a moving solid, ``|x - x*|^2 + l^2 (3 - tr R*^T R)`` [m2]. To its middle's squared distance from a
+    target it adds, for small angles off a target rotation, the squared angle times l^2."""
 
     def __init__(self, name: str, position: Any = None, rotation: Any = None, length: float = 1.0):
         """Set the ``name`` of the solid; targets ``position`` (d,) of its middle [m] and ``rotation`` [rad], a vector
