@@ -9,7 +9,9 @@ import cortado
 from bad_scenes import one_sentence
 from cortado.errors import InputError
 from cortado.losses import Series
+from cortado.losses.distances import SensorMatch
 from cortado.runs.riding import Carrier
+from cortado.runs.sensor import value_of
 from cortado.scene.motions import matrix
 from cortado.sensors import PressureProbe, SolidLoad, WallForce, WaveGauge
 from finite_differences import both_modes, distance
@@ -176,6 +178,17 @@ def test_the_certificate_finds_the_gradient_of_a_riding_sensor_right_in_float32(
 
 
 # ---- runs and batches --------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("kind", MADE)
+def test_a_run_in_float32_reads_on_its_device_what_losses_read_of_its_states(kind):
+    simulation, sensors = simulated(kind, 2, "float32"), on_a_solid(2, MADE[kind][1])
+    run = simulation.run(7, record_every=1, sensors=sensors)
+    for name, sensor in sensors.items():
+        wanted = value_of(sensor, cortado.Problem(simulation, 4, SensorMatch(sensor, 0.0)).end({}))
+        size = np.abs(run.sensors[name].values).max()
+        np.testing.assert_allclose(run.sensors[name].values[4], wanted, atol=1e-11 * size, err_msg=name)
+        assert np.ptp(run.sensors[name].values, axis=0).max() > 1e-4 * size
+
+
 # ---- closed forms ------------------------------------------------------------------------------------------------
 def carried(start, rate, times, full=True, **sensors):
     """Readings in a tank that begins at a rate [m/s] with its water, gets faster by ``start`` [m/s2] all the time, and
