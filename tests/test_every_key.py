@@ -47,6 +47,7 @@ ABOUT = {"gravity": {"times": [0.0, 1.0], "values": [[0.1, -9.0], [2.0, -9.0]]}}
 GLASS = {"material": "glass", "colour": [0.3, 0.2, 0.1]}
 TWICE = [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]
 FRAMES = {"kind": "keyframes", "times": [0.0, 1.0], "cameras": TWICE, "look_at": TWICE[::-1]}
+SHEET = {"name": "sheet", "shape": "sheet", "corners": [[0.1, 0.02], [0.12, 0.1]], "scale": 1.1}
 SQUARE = [[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.0, 0.2]]
 COARSE = {"spacing": 0.1, "support": 2.0, "kernel": "cubic_spline"}
 FOLDER = Path(mkdtemp())
@@ -121,6 +122,7 @@ BASES = {
     ),
     "projection": lambda: jet(
         container=ROOM,
+        solid=[SHEET],
         emitter={**jet().emitter.model_dump(), "duration": 0.5},
         solver={"kind": "projection", "tolerance": 3e-5, "time_step": 0.001, "velocities_follow": True},
         schedule={"tilt": {"times": [0.0, 1.0], "values": [[5.0], [20.0]]}, "nozzle_path": MOVED},
@@ -188,6 +190,7 @@ ASIDE = {
     ("SinkDrain", "flow_rate"): "in place of flow_rates: tests/test_drains.py",
     ("Picture", "colour"): "what is computed colours: tests/test_films.py",
     ("SceneTables", "name"): "titles",
+    ("SheetSolid", "file"): "in place of corners: tests/test_sheets.py",
     ("SolidTable", "name"): "what others call it",
     ("HingeTable", "name"): "what messages call it",
     ("HingeTable", "axis"): "in space alone: tests/test_hinges.py",

@@ -275,6 +275,12 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "position = [0.75, 0.1, 0.25]",
             ),
             (
+                "SheetSolid",
+                "### A sheet",
+                '[[solid]]\nname = "baffle"\nshape = "sheet"\n'
+                "corners = [[0.5, 0.0, 0.0], [0.5, 0.4, 0.0], [0.5, 0.4, 0.5], [0.5, 0.0, 0.5]]",
+            ),
+            (
                 "PolygonSolid",
                 "### A polygon",
                 'name = "a ramp"\ndimension = 2\n\n[[fluid]]\nshape = "box"\nlower = [0.0, 0.0]\nupper = [0.4, 0.6]\n'

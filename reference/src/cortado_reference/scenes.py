@@ -41,6 +41,9 @@ def check_scene(scene: Scene) -> None:
         raise InputError(
             f"scene has solid[{moving[0]}], which moves, but must have solids at rest alone for the reference engine."
         )
+    sheets = [k for k, solid in enumerate(scene.solid) if solid.is_sheet]
+    if sheets:
+        raise InputError(f"scene has solid[{sheets[0]}], a sheet, but must have none for the reference engine.")
     walls = [*scene.solid, *([scene.container] if scene.container.extent() is not None else [])]
     if len({wall.sticks for wall in walls}) > 1:
         raise InputError("scene has walls with and without slip, but must have one kind for the reference engine.")

@@ -1,6 +1,7 @@
 """Solids out of files of triangles (STL, OBJ, PLY and glTF, as trimesh reads them), checked beside particles of a
 spacing and beside a container: their unit of length, and how thick they are."""
 
+import os
 import re
 import warnings
 from collections.abc import Iterator
@@ -67,6 +68,22 @@ def read_mesh(
 
 def mesh_in_file(path: str) -> FoundMesh:
     """Read the solid in a file, in its own unit of length, checked by itself; raise `InputError`."""
+    stat = _checked_file(path)
+    return _found(path, stat.st_mtime_ns, stat.st_size)
+
+
+def triangles_in_file(path: str) -> tuple[Points, Numbers]:
+    """Read the vertices (m, 3), in their own unit of length, and the triangles (k, 3) of a file, which need not be
+    closed; raise `InputError`."""
+    _checked_file(path)
+    vertices, triangles, _ = read_triangles(path)
+    if not np.isfinite(vertices).all():
+        raise InputError(f"{path!r} has a vertex that is not finite: export the mesh once more.")
+    return vertices, triangles
+
+
+def _checked_file(path: str) -> os.stat_result:
+    """Return the status of the file of a mesh; raise `InputError` where it cannot be one."""
     if Path(path).suffix.lower() not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}: export the mesh as one of these.")
     try:
@@ -75,7 +92,7 @@ def mesh_in_file(path: str) -> FoundMesh:
         raise InputError(f"{path!r} cannot be opened ({reason(problem)}).") from None
     if not stat.st_size:
         raise InputError(f"{path!r} is empty: export the mesh once more.")
-    return _found(path, stat.st_mtime_ns, stat.st_size)
+    return stat
 
 
 @lru_cache(maxsize=8)

@@ -436,10 +436,10 @@ def solid_places(solid: Solid, spacing: float, reach: float) -> Places:
     turned as the surface is may rest."""
     heights = spacing * (np.arange(int(np.ceil(reach / spacing - 0.5))) + 0.5)
     points = np.concatenate([surface_points(solid, spacing, -height).points for height in heights])
-    return Places(points, _frames(solid.outward(points)))
+    return Places(points, frames(solid.outward(points)))
 
 
-def _frames(normals: Points) -> Points:
+def frames(normals: Points) -> Points:
     """Return axes (n, d, d), a unit vector a row, of which the first are unit vectors (n, d)."""
     if normals.shape[1] == 2:
         return np.stack([normals, normals[:, ::-1] * np.array([-1.0, 1.0])], axis=1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cortado.discretise.room import Room
-from cortado.discretise.shapes import Points, Rows, apart, disc, grid, pairs_within
+from cortado.discretise.shapes import Points, Rows, Which, apart, disc, grid, pairs_within
 from cortado.discretise.smoothing import SmoothingKernel, lattice_offsets
 
 if TYPE_CHECKING:
@@ -274,9 +274,13 @@ CHUNK = 4096
 """Number of places that are looked at at a time: bounds the memory."""
 
 
-def _missing(lattice: RestLattice, places: Places, room: Room) -> Points:
+Crossed = Callable[[Points, Points], Which]
+"""Tells which segments between points (n, d) [m] go through a sheet."""
+
+
+def _missing(lattice: RestLattice, places: Places, room: Room, crossed: Crossed | None) -> Points:
     """Return for each of n places the part (n, 1 + d) of the `RestLattice.sums` that lattice points outside of the room
-    contribute. A point near the boundary counts by the part of its cell that is outside."""
+    contribute, and those behind a sheet. A point near the boundary counts by the part of its cell that is outside."""
     offsets = lattice.offsets
     cells = places.points[:, None] + offsets @ places.axes
     raised = places.points + RAISED * lattice.spacing * places.axes[:, 0]
@@ -285,6 +289,9 @@ def _missing(lattice: RestLattice, places: Places, room: Room) -> Points:
     open_cells = np.linalg.norm(cells - raised[:, None], axis=2) <= empty[:, None] - 0.5 * lattice.spacing
     shares = np.ones(open_cells.shape)
     shares[~open_cells] = room.cell_shares(cells[~open_cells], lattice.spacing)
+    if crossed is not None:
+        seen_from = np.repeat(places.points, len(offsets), axis=0)
+        shares[crossed(seen_from, cells.reshape(seen_from.shape)).reshape(shares.shape)] = 0.0
     found = (1.0 - shares) @ lattice.sums(-offsets)
     found[:, 1:] = (found[:, None, 1:] @ places.axes)[:, 0]
     return np.asarray(found)
@@ -304,6 +311,7 @@ def wall_weights(
     lower: Points,
     fit: Fit,
     known: int = 0,
+    crossed: Crossed | None = None,
 ) -> Points:
     """Compute the weights (b,) of wall particles in the density [-], a fluid particle being 1.
 
@@ -321,6 +329,8 @@ def wall_weights(
         lower: (d,) where the period begins [m].
         fit: `even_changes`, or `uneven_changes` where particles are on no lattice.
         known: how many of the wall particles, the last ones, have weights that are known.
+        crossed: of a sheet that these are the walls of, without those that are known. Fluid sees its particles through
+            it, and nothing else.
     """
     from scipy.sparse import vstack
 
@@ -328,7 +338,8 @@ def wall_weights(
     if not sought or not len(places):
         return flat.copy()
     chunks = [places.some(slice(start, start + CHUNK)) for start in range(0, len(places), CHUNK)]
-    demands = [_demands(walls, flat, chunk, lattice, room, lower) for chunk in chunks]
+    is_sheet = np.arange(len(walls)) < (0 if crossed is None else sought)
+    demands = [_demands(walls, flat, chunk, lattice, room, lower, is_sheet, crossed) for chunk in chunks]
     sums = vstack([part for part, _ in demands]).tocsr()
     left = np.concatenate([part for _, part in demands]) - sums.sum(axis=1)
     own = sums[:, :sought]
@@ -338,18 +349,28 @@ def wall_weights(
 
 
 def _demands(
-    walls: Points, flat: Points, places: Places, lattice: RestLattice, room: Room, lower: Points
+    walls: Points,
+    flat: Points,
+    places: Places,
+    lattice: RestLattice,
+    room: Room,
+    lower: Points,
+    is_sheet: Which,
+    crossed: Crossed | None,
 ) -> tuple["csr_array", Points]:
     """Return a matrix (m, b) of sums over wall particles at places, by their weights over the flat ones, and the sums
     (m,) that fluid at rest needs there."""
     from scipy.sparse import coo_array, vstack
 
     place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, room.periods)
+    if crossed is not None:
+        seen = crossed(places.points[place], walls[wall]) == is_sheet[wall]
+        place, wall = place[seen], wall[seen]
     separations = apart(places.points[place] - walls[wall], room.periods)
     shape, indices = (len(places), len(walls)), (place.astype(np.int32), wall.astype(np.int32))
-    seen = flat[wall, None] * lattice.sums(separations)
-    densities, *gradients = (coo_array((part, indices), shape=shape).tocsr() for part in seen.T)
-    missing = _missing(lattice, places, room)
+    parts = flat[wall, None] * lattice.sums(separations)
+    densities, *gradients = (coo_array((part, indices), shape=shape).tocsr() for part in parts.T)
+    missing = _missing(lattice, places, room, crossed)
     near = ~room.contains(places.points, -lattice.spacing)
     sums = vstack([densities, *(BALANCE * gradient[near] for gradient in gradients)]).tocsr()
     return sums, np.concatenate([missing[:, 0], 2.0 * BALANCE * missing[near, 1:].T.ravel()])

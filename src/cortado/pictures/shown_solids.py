@@ -109,7 +109,7 @@ def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
     behind them the images a period away that reach into the container."""
     found, domain = [], scene.domain
     for table in scene.solid:
-        (shape, _), is_tank = table.shape_about(), table.side == "inside"
+        shape, is_tank = table.shown_shape(scene.discretisation.spacing), table.side == "inside"
         position = domain.wrapped(table.centroid())
         found.append(ShownSolid(table.name, shape, position, table.turn(scene.dimension), table.finish, is_tank))
     ends, lengths = scene.container.extent(), scene.periods[1]

@@ -67,6 +67,24 @@ def check_free(scene: SceneTables) -> None:
                 raise field_error(("solid", index), Words(f"{depth.max():g} m deep in {name} at {place}"), wanted)
 
 
+def check_sheets(scene: SceneTables) -> None:
+    """Check that a scene with sheets has nothing that does not know of them."""
+    name = next((table.name for table in scene.solid if table.is_sheet), None)
+    if name is None:
+        return
+    why = f"as the solid {name!r} is a sheet"
+    if scene.solver.kind != "projection":
+        raise field_error(("solver", "kind"), scene.solver.kind, f'"projection", {why}')
+    if not scene.forces.pressure:
+        raise field_error(("forces", "pressure"), False, f"true, {why}")
+    if scene.periods[1].any():
+        axis = int(np.argmax(scene.periods[1] > 0.0))
+        raise field_error(("container", "periodic", axis), True, f"false, {why}, and sheets have no periodic images")
+    for index, table in enumerate(scene.solid):
+        if table.motion == "free":
+            raise field_error(("solid", index, "motion"), "free", f'"fixed" or "path", {why}, through which bodies go')
+
+
 def _nearest_images(points: Points, middle: Points, lengths: Points) -> Points:
     """Return the images of points (n, d) nearest to a middle (d,), for periods (d,), 0 along axes without one."""
     periods = np.where(lengths > 0.0, lengths, np.inf)
@@ -200,6 +218,7 @@ def check_scene(scene: SceneTables) -> None:
     check_springs(scene.spring, scene.hinge, scene.solid)
     check_free(scene)
     check_drains(scene)
+    check_sheets(scene)
     _check_sensors(scene)
     for index, fluid in enumerate(scene.fluid):
         _check_inside(scene, index, fluid)

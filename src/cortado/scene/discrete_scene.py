@@ -3,6 +3,7 @@
 It is the same for every device, every precision and every engine.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from cortado.discretise.packing import Packing
 from cortado.discretise.room import Domain, Region, Room
 from cortado.discretise.shapes import Points, Rows, check_crowding
+from cortado.discretise.sheet import Sheet
+from cortado.discretise.sheet_walls import sheet_points, sheet_weights
 from cortado.discretise.smoothing import (
     SmoothingKernel,
     lattice_laplacian_correction,
@@ -39,7 +42,7 @@ from cortado.scene.motions import moving, wall_numbers
 from cortado.scene.scene import Scene
 from cortado.scene.scene_warnings import standing_sentences, thin_sentences
 from cortado.scene.shape_tables import Container, NoContainer
-from cortado.scene.solids import SolidTable
+from cortado.scene.solids import SolidTable, thick
 from cortado.scene.solvers import ProjectionSolver
 
 if TYPE_CHECKING:
@@ -47,6 +50,9 @@ if TYPE_CHECKING:
 
 WHOLE = 1e-6
 """Relative length by which a solid may be shorter than a period that it fills."""
+OFF_SHEETS = 0.25
+"""In spacings: how near to a sheet fluid begins at most. Particles on both sides of one that are nearer push each other
+away."""
 NEAREST_PLACE = 0.4
 """In spacings: places that are looked at for the weights of walls are no nearer to any surface."""
 
@@ -81,8 +87,16 @@ def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     still = [_kept(scene, container, layers, lattice)]
     if container.room.solids:
         still.append(_around(scene, container, still[0], layers, lattice))
-    periods, tables = scene.periods[1], moving(scene.solid)
-    return Walls.joined([*still, *(_alone(table, k, periods, layers, lattice) for k, table in enumerate(tables))])
+    periods, numbers, tables = scene.periods[1], wall_numbers(scene.solid), moving(scene.solid)
+    sheets = [table for table in scene.solid if table.is_sheet and not table.moves]
+    still += _beside_sheets(sheets, [numbers[one.name] for one in sheets], container.room, still, layers, lattice)
+    empty = Room(Region.everywhere(scene.dimension), (), 0.0 * periods)
+    for k, table in enumerate(tables):
+        if table.is_sheet:
+            still += _beside_sheets([table], [k], empty, [], layers, lattice)
+        else:
+            still.append(_alone(table, k, periods, layers, lattice))
+    return Walls.joined(still)
 
 
 def _container(scene: Scene, layers: WallLayers, lattice: RestLattice) -> ContainerWalls:
@@ -121,7 +135,7 @@ def _even_points(container: Container, dimension: int, layers: WallLayers, spaci
 def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLayers, lattice: RestLattice) -> Walls:
     """Make the wall particles of all solids at rest and of the container near them, where fluid can touch them."""
     room, (lower, _) = container.room, scene.periods
-    resting = [solid for solid in scene.solid if not solid.moves]
+    resting = [solid for solid in thick(scene.solid) if not solid.moves]
     images = [room.images(solid) for solid in room.solids]
     tables: list[Container | SolidTable] = [scene.container for _ in container.solids]
     tables += [table for table, several in zip(resting, images, strict=True) for _ in several]
@@ -161,6 +175,34 @@ def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, 
     found = Walls.of(placed, weights, table.sticks)
     slides = np.tile(table.surface_velocity or (0.0,) * dimension, (len(points), 1))
     return replace(found, slides=slides, solid=np.full(len(points), number))
+
+
+def _beside_sheets(
+    tables: Sequence[SolidTable],
+    numbers: Sequence[int],
+    room: Room,
+    others: Sequence[Walls],
+    layers: WallLayers,
+    lattice: RestLattice,
+) -> list[Walls]:
+    """Make the wall particles on both sides of sheets in a room with other walls, in layers at the depths of those of
+    flat walls. Fluid sees those that are on the other side from it (`cortado.particles.sheets`)."""
+    if not tables:
+        return []
+    sheets, found = list[Sheet](), list[Walls]()
+    for table, number in zip(tables, numbers, strict=True):
+        about, middle, turn = table.own_solid(), table.middle(), table.turn(lattice.dimension)
+        assert isinstance(about, Sheet)
+        sheets.append(about.placed(middle, turn))
+        points = sheet_points(about, layers, lattice)
+        placed = replace(points, positions=middle + points.positions @ turn.T, feet=points.feet @ turn.T)
+        walls = Walls.of(placed, points.flat, table.sticks)
+        found.append(replace(walls, solid=np.full(len(points), number)))
+    own, every = Walls.joined(found), Walls.joined([*found, *others])
+    known = every.some(slice(len(own), None))
+    both = (own.positions, known.positions), (own.weights, known.weights)
+    weights = sheet_weights(Sheet.joined(sheets), *both, room, lattice, NEAREST_PLACE * lattice.spacing)
+    return [replace(own, weights=weights)]
 
 
 def _weighed(
@@ -263,7 +305,10 @@ def discretise(scene: Scene) -> DiscreteScene:
     lattice = Lattice.of(kernel, spacing, support, dimension, scene.container.domain(dimension))
     fluid = fluid_particles(scene)
     walls = walls_of(scene, layers, at_rest)
-    fluid = _packed(fluid, walls, at_rest, *scene.periods)
+    own = wall_numbers(scene.solid)
+    beside = ~np.isin(walls.solid, [own[table.name] for table in scene.solid if table.is_sheet])
+    fluid = _packed(fluid, walls.some(beside), at_rest, *scene.periods)  # which would see walls on both sides
+    fluid = replace(fluid, positions=_off_sheets(scene, fluid))
     masses = FluidMasses.of(scene, fluid)
     for sentence in (*thin_sentences(scene), *standing_sentences(scene)):
         warn(sentence)
@@ -285,6 +330,18 @@ def _velocities(scene: Scene, fluid: FluidSample) -> Points:
     found, ends = fluid.velocities.copy(), np.cumsum(fluid.sizes)
     for body, end, size in zip(scene.fluid, ends, fluid.sizes, strict=True):
         found[end - size : end] = body.velocities(fluid.positions[end - size : end])
+    return found
+
+
+def _off_sheets(scene: Scene, fluid: FluidSample) -> Points:
+    """Return first positions (n, d) [m]. Particles of a lattice that a sheet cuts are at least `OFF_SHEETS` from it."""
+    found, least = fluid.positions.copy(), OFF_SHEETS * scene.discretisation.spacing
+    for table in scene.solid:
+        about = table.own_solid()
+        if isinstance(about, Sheet):
+            sheet = about.placed(table.middle(), table.turn(scene.dimension))
+            near = np.flatnonzero(~fluid.is_placed & (sheet.distance(found) < least))
+            found[near] = sheet.aside(found[near], least)
     return found
 
 

@@ -22,7 +22,7 @@ from cortado.scene.parameters import PARAMETERS
 from cortado.scene.sensor_tables import AnySensor
 from cortado.scene.shape_tables import AnyContainer, NoContainer
 from cortado.scene.solid_shapes import AnySolid
-from cortado.scene.solids import solids_of
+from cortado.scene.solids import solids_of, thick
 from cortado.scene.solvers import AnySolver, what_suits
 from cortado.scene.springs import SpringTable
 from cortado.scene.tables import (
@@ -294,12 +294,12 @@ class SceneTables(Table):
     @property
     def room(self) -> Room:
         """Return the room of the fluid at the start, in the container and outside of solids."""
-        return Room(self.region, solids_of(self.solid), self.periods[1])
+        return Room(self.region, solids_of(thick(self.solid)), self.periods[1])
 
     @property
     def resting_room(self) -> Room:
         """Return the room that solids at rest alone leave."""
-        return replace(self.room, solids=solids_of(tuple(solid for solid in self.solid if not solid.moves)))
+        return replace(self.room, solids=solids_of(tuple(solid for solid in thick(self.solid) if not solid.moves)))
 
     @model_validator(mode="before")
     @classmethod

@@ -14,7 +14,7 @@ from cortado.scene.fluids import PointsFluid
 from cortado.scene.model import Carreau, SceneTables, Thinning, Yielding
 from cortado.scene.motions import courses, told
 from cortado.scene.shape_tables import BoxContainer
-from cortado.scene.solids import SolidTable
+from cortado.scene.solids import SolidTable, thick
 from cortado.scene.solvers import what_suits
 from cortado.scene.stability import fluid_lengths
 from cortado.scene.tables import FieldPath, Table, field_error, field_name
@@ -170,7 +170,7 @@ def standing_sentences(scene: SceneTables) -> Iterator[str]:
     if not isinstance(box, BoxContainer):
         return
     spacing, ends = scene.discretisation.spacing, box.extent()
-    for table in told(scene.solid):
+    for table in thick(told(scene.solid)):
         axes = [axis for axis in range(scene.dimension) if not box.periodic[axis] and _stays(table, axis, spacing)]
         if table.side == "inside" or not axes:
             continue
@@ -213,7 +213,7 @@ def thin_sentences(scene: SceneTables) -> Iterator[str]:
     """Yield a sentence on each solid that has fluid on both sides where it is too thin to hold any."""
     cut = scene.discretisation
     spacing, least = cut.spacing, (ONE_LAYER if cut.support <= 2.0 else TWO_LAYERS) * cut.spacing
-    for table in scene.solid if scene.forces.pressure else ():
+    for table in thick(scene.solid) if scene.forces.pressure else ():
         solid, resting = table.solid(), scene.resting_room
         room = Room(resting.region, (solid,), resting.periods) if table.moves else resting
         feet, away = surface_feet(solid, spacing)

@@ -1,26 +1,30 @@
 """The shapes that solids of a scene may have."""
 
+from functools import lru_cache
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from cortado.arrays import unit
+from cortado.discretise.mesh_files import triangles_in_file
 from cortado.discretise.primitives import HalfSpace, Polygon, Revolved, Round
 from cortado.discretise.shapes import Points
+from cortado.discretise.sheet import Sheet, Thickened
 from cortado.discretise.solid import Solid
-from cortado.errors import Words
+from cortado.errors import InputError, Words
 from cortado.scene.shape_tables import (
     INDEX_OF_AXIS,
     BoxShape,
     Container,
     CylinderShape,
+    File,
     MeshShape,
     PolygonShape,
     SphereShape,
 )
 from cortado.scene.solids import SolidTable
-from cortado.scene.tables import FieldPath, Length, Vector, field_error, quantity
+from cortado.scene.tables import MISSING, FieldPath, Length, Vector, field_error, quantity
 
 ALONG = 1e-9
 """Component of a normal along a period, of one that is none."""
@@ -198,7 +202,111 @@ class MeshSolid(MeshShape, SolidTable):
         return self.thinnest_sheet(spacing)
 
 
+FLAT = 1e-6
+"""Part of the size of a sheet with corners in space by which these may be off its plane."""
+
+
+class SheetSolid(SolidTable):
+    """A wall of no thickness with fluid on both sides, which do not see each other: in 2-D a line of straight parts, in
+    3-D a flat convex polygon, or the open mesh of a file."""
+
+    measures: ClassVar = ("scale",)
+    least_thickness: ClassVar = 0.0
+    is_sheet: ClassVar = True
+    shape: Literal["sheet"] = "sheet"
+    corners: Annotated[
+        tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=3)], ...] | None, Field(min_length=2)
+    ] = None
+    """(m, d) Its corners, one after the other: along it in 2-D, where the last may be the first, and around it in 3-D
+    [m]."""
+    file: File | None = None
+    """In 3-D the file of a mesh in place of corners, which may be open: STL, OBJ, PLY, glTF or GLB; beside the scene
+    file, and absolute once read."""
+    scale: Annotated[float, quantity(gt=0.0)] = 1.0
+    """Factor of its lengths, such as 0.001 where they are millimetres."""
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        turned = super().in_dimension(dimension, path)
+        for name, value, wanted in (
+            ("side", self.side, "outside"),
+            ("surface_velocity", self.surface_velocity, None),
+        ):
+            if value != wanted:
+                raise field_error((*path, name), value, "left out, as a sheet has fluid on both sides")
+        if self.motion == "free":
+            raise field_error((*path, "motion"), "free", '"fixed" or "path", as a sheet has no mass')
+        if (self.corners is None) == (self.file is None):
+            found = MISSING if self.file is None else Words("given")
+            raise field_error((*path, "corners"), found, "a list of corners, or a file in its place")
+        if self.file is not None:
+            self._check_file(dimension, path)
+        else:
+            self._check_corners(dimension, path)
+        return turned
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        found = _sheet_in(self.file) if self.corners is None else Sheet.along(np.array(self.corners))
+        middle = found.centroid()
+        return Sheet(self.scale * (found.vertices - middle), found.corners), self.scale * middle
+
+    def shown_shape(self, spacing: float) -> Solid:
+        about = self.shape_about()[0]
+        assert isinstance(about, Sheet)
+        return Thickened(about, SHOWN * spacing)
+
+    def thinnest(self, spacing: float) -> float:
+        return np.inf
+
+    def _check_file(self, dimension: int, path: FieldPath) -> None:
+        if dimension == 2:
+            raise field_error((*path, "file"), self.file, "left out in 2-D, where corners say where a sheet is")
+        assert self.file is not None
+        try:
+            _sheet_in(self.file)
+        except InputError as error:
+            raise field_error((*path, "file"), self.file, "a file of a mesh", f"cannot be used: {error}") from None
+
+    def _check_corners(self, dimension: int, path: FieldPath) -> None:
+        assert self.corners is not None
+        for index, corner in enumerate(self.corners):
+            if len(corner) != dimension:
+                raise field_error((*path, "corners", index), corner, f"a list of {dimension} coordinates")
+            if corner == self.corners[index - 1] and (index > 0 or dimension == 3):
+                raise field_error((*path, "corners", index), corner, "different from the corner before")
+        places = np.array(self.corners)
+        if dimension == 3:
+            if len(places) < 3:
+                raise field_error((*path, "corners"), self.corners, "a list of at least 3 corners in 3-D")
+            sides = np.roll(places, -1, axis=0) - places
+            turns = np.cross(sides, np.roll(sides, -1, axis=0))
+            normal = turns.sum(axis=0) / max(np.linalg.norm(turns.sum(axis=0)), 1e-300)
+            if np.ptp(places @ normal) > FLAT * np.ptp(places, axis=0).max() or (turns @ normal <= 0.0).any():
+                raise field_error((*path, "corners"), self.corners, "the corners of a flat convex polygon, in order")
+
+
+SHOWN = 0.1
+"""In spacings: half the thickness with which pictures show a sheet."""
+
+
+@lru_cache(maxsize=8)
+def _sheet_in(path: str) -> Sheet:
+    """Read the surface in a file of triangles, in its own unit of length; raise `InputError`."""
+    vertices, corners = triangles_in_file(path)
+    places, numbers = np.unique(vertices, axis=0, return_inverse=True)
+    found = Sheet(places, numbers.reshape(-1)[corners])
+    sides = found.pieces[:, 1:] - found.pieces[:, :1]
+    return Sheet(places, found.corners[np.cross(sides[:, 0], sides[:, 1]).any(axis=1)])
+
+
 AnySolid = Annotated[
-    BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid | PlaneSolid | MeshSolid,
+    BoxSolid
+    | SphereSolid
+    | CapsuleSolid
+    | CylinderSolid
+    | CupSolid
+    | PolygonSolid
+    | PlaneSolid
+    | MeshSolid
+    | SheetSolid,
     Field(discriminator="shape"),
 ]

@@ -1,6 +1,7 @@
 """Solids, which fluid flows around or is held by: what all have."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -36,6 +37,8 @@ class SolidTable(Coloured):
     """Fields with which its shape grows."""
     least_thickness: ClassVar = 1.0
     """Least thickness, in spacings."""
+    is_sheet: ClassVar = False
+    """True for a wall of no thickness."""
     materials: ClassVar = FINISHES
     plain: ClassVar = (0.55, 0.55, 0.58)
 
@@ -148,6 +151,10 @@ class SolidTable(Coloured):
     def shape_about(self) -> tuple[Solid, Points]:
         """Return the shape about its centroid, not turned, and the centroid by its measures, (d,) [m]."""
 
+    def shown_shape(self, spacing: float) -> Solid:
+        """Return the shape about its centroid, not turned, as pictures show it beside particles of a spacing [m]."""
+        return self.shape_about()[0]
+
     def stretched(self, scale: float) -> Self:
         """Return the solid ``scale`` times as large about its middle."""
         if scale == 1.0:
@@ -196,6 +203,11 @@ class SolidTable(Coloured):
             check_turn((*path, name), getattr(self, name), dimension)
         check_motion(self, dimension, path)
         return super().in_dimension(dimension, path)
+
+
+def thick(tables: Sequence[SolidTable]) -> tuple[SolidTable, ...]:
+    """Return the solids that are no sheets."""
+    return tuple(table for table in tables if not table.is_sheet)
 
 
 @lru_cache(maxsize=8)

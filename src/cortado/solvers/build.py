@@ -22,6 +22,7 @@ from cortado.particles.mirrors import MOST_FACES, most_imaged
 from cortado.particles.moving_walls import WallArrays
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.sheets import Sheets
 from cortado.particles.state import Layout, padded
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
 from cortado.scene.drain_tables import drain_parameters
@@ -37,7 +38,7 @@ from cortado.scene.solvers import OWN, PackageSolver, SolverTable
 from cortado.scene.springs import ends_of, spring_parameters, turned_by
 from cortado.solvers.contacts import Contacts, Touching
 from cortado.solvers.drained import drained_of
-from cortado.solvers.obstacles import FINE, ON, FlatFaces, NamedSolid, Obstacle, Walled, flat_faces
+from cortado.solvers.obstacles import FINE, ON, FlatFaces, NamedSolid, Obstacle, Walled, flat_faces, placed_sheets
 from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.solver import Solver
 from cortado.sph.drains import Drains
@@ -242,6 +243,8 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     most = MOST_FACES if layout.all_particles <= most_imaged(moving=True) else 0
     faces = flat_faces(scene, discrete.lattice.support, most)
     search = _search(scene, discrete, shared, layout, bool(np.isfinite(mirrors).any()), faces)
+    placed = placed_sheets(scene)
+    sheets = Sheets(placed, scene.discretisation.spacing, layout) if placed else None
 
     def system(discretisation: Discretisation) -> ParticleSystem:
         return ParticleSystem(
@@ -261,6 +264,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
             mirrors,
             faces,
             _named_solids(scene),
+            sheets,
             of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
         )
 

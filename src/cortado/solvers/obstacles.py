@@ -14,8 +14,10 @@ from cortado.device.precision import Precision
 from cortado.discretise.primitives import Box
 from cortado.discretise.room import Region
 from cortado.discretise.shapes import Numbers, Points
+from cortado.discretise.sheet import Sheet
 from cortado.discretise.solid import Hollow, Solid
-from cortado.scene.motions import moving
+from cortado.particles.sheets import PlacedSheet
+from cortado.scene.motions import moving, wall_numbers
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import ProjectionSolver
 
@@ -114,6 +116,17 @@ def obstacle_mesh(one: Obstacle, spacing: float, device: wp.Device) -> wp.Mesh:
     )
 
 
+def placed_sheets(scene: Scene) -> list[PlacedSheet]:
+    """Return the sheets of a scene, with the numbers of their wall particles."""
+    numbers, placed = wall_numbers(scene.solid), []
+    for table in scene.solid:
+        about = table.own_solid()
+        if isinstance(about, Sheet):
+            own = about if table.moves else about.placed(table.middle(), table.turn(scene.dimension))
+            placed.append(PlacedSheet(numbers[table.name], own))
+    return placed
+
+
 LENGTH = 4.0
 """Length of the shortest face that mirrors, in support radii."""
 ON = 1e-6
@@ -155,7 +168,7 @@ def flat_faces(scene: Scene, support: float, most: int) -> FlatFaces:
     found = []
     if isinstance(scene.solver, ProjectionSolver) and not np.any(scene.container.periods(scene.dimension)[1]):
         for number, table in enumerate(moving(scene.solid)):
-            if table.motion != "free" and not table.sticks:
+            if table.motion != "free" and not (table.sticks or table.is_sheet):
                 solid = table.own_solid()
                 flat = _edges(solid, scene.discretisation.spacing) if scene.dimension == 2 else _sides(solid)
                 found += [(number, *face) for face in flat if (face[2][1:] >= 0.5 * LENGTH * support).all()]

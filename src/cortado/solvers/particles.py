@@ -22,6 +22,7 @@ from cortado.errors import MissingDerivativeError
 from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.sheets import Sheets
 from cortado.particles.state import POSITIONS, VELOCITIES, Fields, Layout, Parameters, State, StateField, check_fields
 from cortado.scene.discrete_scene import Lattice
 from cortado.solvers.containment import Containment
@@ -59,6 +60,8 @@ class ParticleSystem:
     """Faces of moving solids that mirror the fluid."""
     solids: Mapping[str, NamedSolid]
     """The solids of the scene by their names."""
+    sheets: Sheets | None
+    """Its walls of no thickness; None without any."""
     of_one_lane: Callable[[], "ParticleSystem"]
     """Makes a system over this search for neighbours, with kernels that Warp's tape can differentiate."""
 
@@ -227,6 +230,9 @@ class ParticleSolver(Staying):
         for part in self.parts:
             part.sort(context, state)
         self.search.fill(self._neighbourhood, self.fields["x"], self.containment.bad_step)
+        if self.system.sheets is not None:
+            known = {"s": self._neighbourhood, "x": self.fields["x"]}
+            self.system.sheets.hide(self.launch, self.discretisation, self.search, **known)
         self.density.measure(context)
         context.join()
         for part in self.parts:

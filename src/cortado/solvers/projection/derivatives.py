@@ -73,6 +73,8 @@ class ProjectionTangent(ParticleTangent):
         if solver.following is not None:
             ends = {"x_now": solver.repaired[counts[1]]["x_now"], "x_now_dot": self._x_now_dot}
             context.launch(solver.following.tangent, *known, flow, v_new, ends, v_end_dot=self._v_end_dot)
+        if solver.sides is not None:
+            solver.sides.tangent(context, self.dot, solver.repaired[counts[1]]["x_now"], self._x_now_dot)
         carried = {IMPULSE: self._k_dot, KICK: self._kick_dot}
         self.unsort(context, self._x_now_dot, self._v_end_dot, state_dot, **carried)
 
@@ -209,6 +211,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         last = solver.iterates[counts[0]]
         flow = {"A": solver.last_gradient(counts[0]), "A_bar": self._A_bar}
         v_new = {"v_new": last["u"], "v_new_bar": self._u_bar}
+        if solver.sides is not None:
+            solver.sides.adjoint(context, self.bar, solver.repaired[counts[1]]["x_now"], self._x_now_bar)
         if solver.following is not None:
             ends = {"x_now": solver.repaired[counts[1]]["x_now"], "x_now_bar": self._x_now_bar}
             context.launch(solver.following.adjoint, *known, flow, v_new, ends)

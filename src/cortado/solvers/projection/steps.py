@@ -54,6 +54,7 @@ from cortado.solvers.projection.mean_stress import ImageLoads, MeanStress, press
 from cortado.solvers.projection.names import types_by_name
 from cortado.solvers.projection.pressure import PressureKernels, beginning_kernels, pressure_kernels
 from cortado.solvers.projection.repair import RepairKernels, repair_kernels
+from cortado.solvers.projection.sides import Sides
 from cortado.solvers.projection.sums import VelocityKernels, velocity_kernels
 from cortado.solvers.projection.surroundings import Surroundings
 from cortado.solvers.projection.wall_sums import ProjectionPush
@@ -209,6 +210,8 @@ class ProjectionSteps(ParticleSolver):
         self.repaired = [self.layout.arrays(**self._repair_kinds)]
         """x_k, lambda and n - 1 before each repair, and which part of its way a particle has gone to x_k."""
         self.x_star, self.v_star, self.kick, self.x_moved, self.delta = (self.vectors() for _ in range(5))
+        self.sides = None if system.sheets is None else Sides(system.sheets, constants.spacing, self.layout)
+        """What keeps particles on their sides of sheets; None without any."""
         self.following = following_kernels(self.discretisation, system.walled.dimension) if follow else None
         """Those of velocities that follow the shift and the repairs; None where they do not."""
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
@@ -401,5 +404,6 @@ class ProjectionSteps(ParticleSolver):
         if self.following is not None:
             moved, v_end = {"x_now": x_now, "v_new": v_end, "v_end": self.delta}, self.delta  # which is moved by now
             context.launch(self.following.forward, self.around, moved, A=self.last_gradient(iterations))
-        self.unsort(context, x_now, v_end, new_state, **{IMPULSE: end["k"], KICK: self.kick})
+        x_end = x_now if self.sides is None else self.sides.keep(context, x_now)
+        self.unsort(context, x_end, v_end, new_state, **{IMPULSE: end["k"], KICK: self.kick})
         return v_end

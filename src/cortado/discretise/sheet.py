@@ -1,0 +1,160 @@
+"""Sheets, which are walls of no thickness, in float64: open surfaces of edges in the plane, of triangles in space."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cortado.discretise.mesh import TriangleTree
+from cortado.discretise.shapes import ROUND_OFF, Numbers, Points, Which, in_space, launch_on_cpu
+from cortado.discretise.solid import Faces, Solid
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet(Solid):
+    """A surface with fluid on both sides, to which nothing is inside: distances from it are never negative."""
+
+    vertices: Points
+    """(m, d) [m]"""
+    corners: Numbers
+    """(k, d) numbers of the vertices of each edge or triangle"""
+
+    @classmethod
+    def along(cls, places: Points) -> "Sheet":
+        """Return the sheet along a polyline (m, 2) [m], or the flat one within a convex polygon (m, 3) [m] of space."""
+        numbers, is_flat = np.arange(len(places)), places.shape[1] == 2
+        around = [0 * numbers[2:], numbers[1:-1], numbers[2:]]
+        return cls(places, np.stack([numbers[:-1], numbers[1:]] if is_flat else around, axis=1))
+
+    @property
+    def pieces(self) -> Points:
+        """Return the corners (k, d, d) of its edges or triangles [m]."""
+        return self.vertices[self.corners]
+
+    @property
+    def normals(self) -> Points:
+        """Return a unit normal (k, d) of each edge or triangle."""
+        first, *others = np.moveaxis(self.pieces, 1, 0)
+        along = [other - first for other in others]
+        across = along[0][:, ::-1] * np.array([-1.0, 1.0]) if len(along) == 1 else np.cross(*along)
+        return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
+
+    def centroid(self) -> Points:
+        """Return the middle (d,) of its length or its area [m]."""
+        first, *others = np.moveaxis(self.pieces, 1, 0)
+        along = [other - first for other in others]
+        sizes = np.linalg.norm(along[0] if len(along) == 1 else np.cross(*along), axis=1)
+        return np.asarray(sizes @ self.pieces.mean(axis=1) / sizes.sum())
+
+    @classmethod
+    def joined(cls, sheets: Sequence["Sheet"]) -> "Sheet":
+        """Return several sheets, at least one, as one."""
+        starts = np.cumsum([0, *(len(one.vertices) for one in sheets[:-1])])
+        corners = [one.corners + start for one, start in zip(sheets, starts, strict=True)]
+        return cls(np.concatenate([one.vertices for one in sheets]), np.concatenate(corners))
+
+    def placed(self, position: Points, turn: Points) -> "Sheet":
+        """Return the sheet turned by a matrix (d, d) and then moved (d,) [m]."""
+        return Sheet(self.vertices @ turn.T + position, self.corners)
+
+    def extent(self) -> tuple[Points, Points]:
+        return self.vertices.min(axis=0), self.vertices.max(axis=0)
+
+    def distance(self, points: Points) -> Points:
+        return np.asarray(np.linalg.norm(points - self.nearest(points), axis=1))
+
+    def nearest(self, points: Points) -> Points:
+        if points.shape[1] == 3:
+            return self._tree.nearest(points)[0]
+        found, least = np.zeros_like(points), np.full(len(points), np.inf)
+        for start, end in self.pieces:
+            along = np.clip((points - start) @ (end - start) / ((end - start) @ (end - start)), 0.0, 1.0)
+            places = start + along[:, None] * (end - start)
+            squares = ((points - places) ** 2).sum(axis=1)
+            found = np.where((squares < least)[:, None], places, found)
+            least = np.minimum(squares, least)
+        return found
+
+    def aside(self, points: Points, distance: float) -> Points:
+        """Return the points (n, d) [m] at a distance [m] from the sheet on the sides of points (n, d) [m]; of
+        those that are on it, on the side of its normals."""
+        feet = self.nearest(points)
+        away = points - feet
+        length = np.linalg.norm(away, axis=1)
+        on_it = length < ROUND_OFF * distance
+        middles = self.pieces.mean(axis=1)
+        for k in np.flatnonzero(on_it):
+            away[k] = self.normals[np.argmin(np.linalg.norm(middles - points[k], axis=1))]
+            length[k] = 1.0
+        return np.asarray(feet + distance * away / length[:, None])
+
+    def faces(self, fine: float) -> Faces:
+        """Return both sides of the sheet, which enclose nothing."""
+        return Faces(self.vertices, np.concatenate([self.corners, self.corners[:, ::-1]]))
+
+    def crossed(self, starts: Points, ends: Points, spacing: float) -> Which:
+        """Test (n,) which segments between points (n, d) [m] go through the sheet, beside particles a spacing [m]
+        apart."""
+        from cortado.device.warp_start import start_warp
+
+        start_warp()
+        import warp as wp
+
+        from cortado.device.precision import FLOAT64
+        from cortado.discretise.sheet_kernels import faces_on, find_crossing
+
+        faces, trees = faces_on([(self.pieces, self.normals)], spacing, FLOAT64, wp.get_device("cpu"))
+        found = np.zeros(len(starts), dtype=bool)
+        start, end = (np.ascontiguousarray(in_space(places)) for places in (starts, ends))
+        launch_on_cpu(find_crossing(), len(starts), faces=faces, starts=start, ends=end, found=found)
+        del trees
+        return found
+
+    @cached_property
+    def _tree(self) -> TriangleTree:
+        return TriangleTree.of(self.pieces)
+
+
+@dataclass(frozen=True, eq=False)
+class Thickened(Solid):
+    """All that is no further from a sheet than a depth."""
+
+    sheet: Sheet
+    depth: float
+    """[m]"""
+
+    def extent(self) -> tuple[Points, Points]:
+        lower, upper = self.sheet.extent()
+        return lower - self.depth, upper + self.depth
+
+    def distance(self, points: Points) -> Points:
+        return self.sheet.distance(points) - self.depth
+
+    def nearest(self, points: Points) -> Points:
+        feet = self.sheet.nearest(points)
+        away = points - feet
+        length = np.linalg.norm(away, axis=1, keepdims=True)
+        return np.asarray(feet + self.depth * away / np.maximum(length, 1e-300))
+
+    def faces(self, fine: float) -> Faces:
+        """Return its surface with sharp edges: the sheet moved to both sides, and strips between their ends."""
+        sheet, count = self.sheet, len(self.sheet.vertices)
+        aside = np.zeros_like(sheet.vertices)
+        for corner in sheet.corners.T:
+            np.add.at(aside, corner, sheet.normals)
+        aside *= self.depth / np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-300)
+        vertices = np.concatenate([sheet.vertices + aside, sheet.vertices - aside])
+        both = [sheet.corners, sheet.corners[:, ::-1] + count]
+        if sheet.vertices.shape[1] == 2:
+            uses = np.bincount(sheet.corners.ravel(), minlength=count)
+            starts = [a for a in sheet.corners[:, 0] if uses[a] == 1]
+            ends = [b for b in sheet.corners[:, 1] if uses[b] == 1]
+            strips = [(a + count, a) for a in starts] + [(b, b + count) for b in ends]
+            joined = np.array(strips, dtype=np.int64).reshape(-1, 2)
+            return Faces(vertices, np.concatenate([*both, joined])[:, ::-1])
+        sides = np.concatenate([sheet.corners[:, [k, (k + 1) % 3]] for k in range(3)])
+        _, first, uses = np.unique(np.sort(sides, axis=1), axis=0, return_index=True, return_counts=True)
+        a, b = sides[first[uses == 1]].T
+        edges = [np.stack([b, a, a + count], axis=1), np.stack([b, a + count, b + count], axis=1)]
+        return Faces(vertices, np.concatenate([*both, *edges]))

@@ -1,0 +1,191 @@
+"""Sheets: walls of no thickness, through which particles do not see each other.
+
+Lists of neighbours are made as if there were no sheets. Then what is hidden is taken out of them, once in each step:
+
+- particle j, where the segment from i to j goes through a sheet;
+- the image of j, where the segment to it goes through a sheet, or that from the image of i to j does;
+- a wall particle of a sheet, where the segment to it does not go through this sheet, or goes through another one;
+- any other wall particle, where the segment to it goes through a sheet.
+
+So whatever part of its support a particle does not see for a sheet has this sheet's wall particles, and tips and holes
+need no rule of their own. All are where they are before the step, the sheets too: a particle that begins a step on one
+side of a sheet ends it there (`cortado.solvers.projection.sides`). Lists are symmetric, as a segment begins at the
+particle with the lower number. What is seen does not change within a step, and has no derivative.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.modules import kernel_module
+from cortado.device.precision import Precision, TypesByName
+from cortado.discretise.sheet import Sheet
+from cortado.discretise.sheet_kernels import face_functions, faces_on, faces_type
+from cortado.particles.mirrors import CONTAINER, reflections
+from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.state import Layout
+
+
+@dataclass(frozen=True)
+class PlacedSheet:
+    """A sheet of a scene."""
+
+    number: int
+    """Number of its wall particles (`cortado.scene.motions.wall_numbers`): from 0 on for one that moves."""
+    sheet: Sheet
+    """One that moves about its middle and not turned, another one in its place."""
+
+
+@cache
+def sheets_type(precision: Precision) -> Any:
+    """Make the Warp struct of the sheets of a scene."""
+
+    class Sheets:
+        faces: faces_type(precision)
+        """Their edges or triangles, of those that move in the frames of their solids, of others in space."""
+        numbers: wp.array(dtype=wp.int32)
+        """Number of the wall particles of each sheet."""
+
+    Sheets.__name__ = Sheets.__qualname__ = f"Sheets_{precision.name}"
+    return wp.struct(Sheets)
+
+
+@cache
+def sheet_functions(precision: Precision) -> tuple[Any, Any]:
+    """Make Warp functions: ``scale_of`` sheet k; and ``seen_from``, a place before a step as the sheet has it about its
+    middle, in units of its scale."""
+    real, vector, sheets_of = precision.real, precision.vector, sheets_type(precision)
+    neighbourhood = neighbourhood_type(precision)
+
+    @wp.func
+    def scale_of(k: int, member: int, s: neighbourhood, sheets: sheets_of) -> real:
+        scale = real(1.0)
+        if sheets.numbers[k] >= 0:
+            scale = s.scales[member, sheets.numbers[k]]
+        return scale
+
+    @wp.func
+    def seen_from(x: vector, k: int, member: int, s: neighbourhood, sheets: sheets_of) -> vector:
+        number, y = sheets.numbers[k], x
+        if number >= 0:
+            y = wp.transpose(s.turns_before[member, number]) * (x - s.before[member, number])
+            y = y / s.scales[member, number]
+        return y - sheets.faces.middles[k]
+
+    return scale_of, seen_from
+
+
+@cache
+def hiding_kernel(discretisation: Discretisation) -> Any:
+    """Make the kernel that takes out of lists of neighbours what sheets hide, with a thread for each particle."""
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    sheets_of, (scale_of, seen_from) = sheets_type(precision), sheet_functions(precision)
+    query, _, goes_through = face_functions(precision)
+    pair = pair_functions(discretisation)
+    reflection, turned = pair.reflection, pair.turned
+    REFLECTIONS, MOVES = wp.constant(reflections(discretisation.moving)), wp.constant(discretisation.moving)
+    module = kernel_module(f"sheets_{precision.name}{'_moving' * discretisation.moving}")
+    typed = TypesByName(wp.int32, {neighbourhood: "s", sheets_of: "sheets", vector: "x"})
+
+    @wp.func
+    def crossed(p: vector, q: vector, own: int, member: int, s: neighbourhood, sheets: sheets_of) -> int:
+        """Return 1 where a segment goes through the sheet of the wall particles ``own``, 2 where it does through
+        another one, 3 for both."""
+        found = int(0)
+        for k in range(sheets.numbers.shape[0]):
+            start, end = seen_from(p, k, member, s, sheets), seen_from(q, k, member, s, sheets)
+            if goes_through(start, end, k, sheets.faces):
+                found = found | wp.where(sheets.numbers[k] == own, 1, 2)
+        return found
+
+    @wp.func
+    def is_near(x: vector, member: int, reach: real, s: neighbourhood, sheets: sheets_of) -> bool:
+        """Test whether a face of a sheet may be so near that its wall particles are within reach."""
+        for k in range(sheets.numbers.shape[0]):
+            y = seen_from(x, k, member, s, sheets)
+            face = int(0)
+            candidates = query(y, y, reach / scale_of(k, member, s, sheets), k, sheets.faces)
+            while wp.bvh_query_next(candidates, face):
+                return True
+        return False
+
+    @wp.func
+    def place_before(b: int, member: int, s: neighbourhood) -> vector:
+        """Return where a wall particle is before the step."""
+        x = s.wall_positions[b]
+        if MOVES:
+            number = s.wall_solids[b]
+            if number >= 0:
+                own = wp.transpose(s.turns[member, number]) * (x - s.after[member, number])
+                x = s.before[member, number] + s.turns_before[member, number] * own
+        return x
+
+    @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
+    def hide(s, sheets, x, fluid_count, filling, count, all_count):
+        i = s.first + wp.tid()
+        member, x_i, listed = i // s.particles, x[i], int(all_count[i])
+        if listed == 0 or not is_near(x_i, member, real(2.0) * s.reach, s, sheets):
+            return
+        fluid_end, wall_end, kept = int(fluid_count[i]), int(count[i]), int(0)
+        for place in range(fluid_end - filling[i]):
+            j = s.neighbours[place, i]
+            if crossed(x[wp.min(i, j)], x[wp.max(i, j)], wp.static(CONTAINER), member, s, sheets) == 0:
+                s.neighbours[kept, i] = j
+                kept += 1
+        to_fill = -kept & (wp.static(UNROLL) - 1)
+        for _more in range(to_fill):
+            s.neighbours[kept, i] = i
+            kept += 1
+        fluid_count[i] = kept
+        filling[i] = to_fill
+        for place in range(fluid_end, wall_end):
+            b = s.neighbours[place, i]
+            hidden = crossed(x_i, place_before(b, member, s), s.wall_solids[b], member, s, sheets)
+            wanted = int(0)
+            for k in range(sheets.numbers.shape[0]):
+                if sheets.numbers[k] == s.wall_solids[b]:
+                    wanted = 1
+            if hidden == wanted:
+                s.neighbours[kept, i] = b
+                kept += 1
+        count[i] = kept
+        for place in range(wall_end, listed):
+            image = s.neighbours[place, i]
+            j = image // REFLECTIONS
+            R, offset = reflection(image % REFLECTIONS, member, s)
+            first, second = x[wp.min(i, j)], x[wp.max(i, j)]
+            hidden = crossed(first, turned(R, second) + offset, wp.static(CONTAINER), member, s, sheets)
+            hidden = hidden | crossed(turned(R, first) + offset, second, wp.static(CONTAINER), member, s, sheets)
+            if hidden == 0:
+                s.neighbours[kept, i] = image
+                kept += 1
+        all_count[i] = kept
+
+    return hide
+
+
+class Sheets:
+    """The sheets of a scene, in one precision and on one device."""
+
+    def __init__(self, placed: Sequence[PlacedSheet], spacing: float, layout: Layout):
+        """Take sheets beside particles a ``spacing`` [m] apart."""
+        self.numbers, device = [one.number for one in placed], layout.device
+        self.struct = sheets_type(layout.precision)()
+        """As kernels know them."""
+        faces = [(one.sheet.pieces, one.sheet.normals) for one in placed]
+        self.struct.faces, self._trees = faces_on(faces, spacing, layout.precision, device)
+        self.struct.numbers = wp.array(self.numbers, dtype=wp.int32, device=device)
+
+    def hide(
+        self, launch: Callable[..., None], discretisation: Discretisation, search: NeighbourSearch, **known: Any
+    ) -> None:
+        """Take what sheets hide out of the lists of a search, given the neighbourhood ``s`` and the sorted positions
+        ``x``."""
+        names = "fluid_count", "filling", "count", "all_count"
+        lists = {name: getattr(search, name) for name in names}
+        launch(hiding_kernel(replace(discretisation, lanes=1)), lists, sheets=self.struct, **known)

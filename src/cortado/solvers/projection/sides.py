@@ -1,0 +1,250 @@
+"""Particles stay on their side of a sheet: the positions at the end of a step are moved back where they would not.
+
+About the middle of a sheet, in its frame, a particle is at y_0 before the step and at y after it, with the sheet in its
+pose after the step. Where the way from y_0 to y goes through a face of the sheet, with the normal n and the height
+h = n . (y - a) above it, or ends above the face but nearer than e = s / 20, the particle is put on the side of y_0:
+
+    y' = y + (e sign h_0 - h) n.
+
+This is done up to three times, with the face that is met first each time. Where the way still goes through the sheet,
+as in a sharp corner, the particle stays beside the sheet where it was, y' = y_0. Velocities stay as they are.
+
+Where a pose changes by c', w' and g' (`MovingWalls`), a point x of the solid does by t(x) = c' + w' x (x - c) +
+g' (x - c).
+With N = R n, what remains of a change D = x' - t(x) is D - N (N . D + e sign h_0 g'), to which t is added again.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.launching import bundle
+from cortado.device.modules import Kernels, kernel_module
+from cortado.device.precision import Precision, TypesByName
+from cortado.discretise.sheet_kernels import face_functions
+from cortado.particles.moving_walls import matrix_of
+from cortado.particles.neighbourhood import neighbourhood_type
+from cortado.particles.sheets import Sheets, sheet_functions, sheets_type
+from cortado.particles.state import Layout
+from cortado.particles.wall_terms import share_kinds
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+NEAREST = 0.05
+"""In spacings: e, how near to a sheet a particle may be at the end of a step."""
+ROUNDS = 3
+"""How often a particle is put on its side at most."""
+NONE = -1
+"""In place of a face."""
+
+
+@cache
+def side_kernels(precision: Precision) -> Kernels:
+    """Make the kernels that keep particles on their side of sheet k, where ``least`` is e."""
+    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    neighbourhood, sheets_of = neighbourhood_type(precision), sheets_type(precision)
+    (scale_of, seen_from), (query, meets, goes_through) = sheet_functions(precision), face_functions(precision)
+    bars = bundle(**share_kinds(precision), x=vector)
+    modules = [kernel_module(f"sheet_sides{kind}_{precision.name}") for kind in ("", "_tangent", "_adjoint")]
+    typed = TypesByName(vector, {neighbourhood: "s", sheets_of: "sheets", bars: "bar"})
+    one = wp.constant(real(1.0))
+
+    @wp.func
+    def seen_after(x: vector, k: int, member: int, s: neighbourhood, sheets: sheets_of) -> vector:
+        number, y = sheets.numbers[k], x
+        if number >= 0:
+            y = wp.transpose(s.turns[member, number]) * (x - s.after[member, number])
+            y = y / s.scales[member, number]
+        return y - sheets.faces.middles[k]
+
+    @wp.func
+    def turn_of(k: int, member: int, s: neighbourhood, sheets: sheets_of) -> matrix:
+        R = wp.identity(n=3, dtype=real)
+        if sheets.numbers[k] >= 0:
+            R = s.turns[member, sheets.numbers[k]]
+        return R
+
+    @wp.func
+    def side_of(start: vector, face: int, sheets: sheets_of) -> real:
+        h = wp.dot(sheets.faces.normals[face], start - sheets.faces.places[face, 0])
+        return wp.where(h < real(0.0), -one, one)
+
+    @wp.func
+    def time_of(start: vector, y: vector, face: int, least: real, sheets: sheets_of) -> real:
+        """Return which part of its way a particle has gone where it meets a face; 1 if it ends too near, or 2."""
+        n, a = sheets.faces.normals[face], sheets.faces.places[face, 0]
+        side = side_of(start, face, sheets)
+        h_0, h = side * wp.dot(n, start - a), side * wp.dot(n, y - a)
+        found = real(2.0)
+        if h < real(0.0):
+            if meets(start, y, face, sheets.faces):
+                found = h_0 / (h_0 - h)
+        elif h < least:
+            found = one
+            for end in range(3):
+                way = y - sheets.faces.places[face, end]
+                if wp.dot(sheets.faces.inwards[face, end], way) < -sheets.faces.margin:
+                    found = real(2.0)
+        return found
+
+    @wp.func
+    def kept(start: vector, end: vector, k: int, least: real, sheets: sheets_of):
+        """Return y', the faces by which it was moved, and 1 if it stays beside the sheet, else 0."""
+        y, used = end, wp.vec3i(NONE, NONE, NONE)
+        rounds = int(ROUNDS)
+        for round in range(rounds):
+            first = int(NONE)
+            earliest = real(2.0)
+            face = int(0)
+            candidates = query(start, y, least + sheets.faces.around, k, sheets.faces)
+            while wp.bvh_query_next(candidates, face):
+                f = sheets.faces.starts[k] + face
+                if f != used[0] and f != used[1]:
+                    t = time_of(start, y, f, least, sheets)
+                    if t < earliest or (t == earliest and t < real(2.0) and f < first):
+                        first = f
+                        earliest = t
+            if first != NONE:
+                n, a = sheets.faces.normals[first], sheets.faces.places[first, 0]
+                y += (side_of(start, first, sheets) * least - wp.dot(n, y - a)) * n
+                used[round] = first
+        stays = wp.where(goes_through(start, y, k, sheets.faces), 1, 0)
+        if stays == 1:
+            y = start
+        return y, used, stays
+
+    @wp.kernel(module=modules[0], enable_backward=False)
+    @typed.arrays
+    def keep(s, sheets, k: int, least: real, x, x_now, x_kept):
+        i = s.first + wp.tid()
+        member = i // s.particles
+        start, end = seen_from(x[i], k, member, s, sheets), seen_after(x_now[i], k, member, s, sheets)
+        y, used, stays = kept(start, end, k, least / scale_of(k, member, s, sheets), sheets)
+        number = sheets.numbers[k]
+        x_end = vector(x_now[i])
+        if used[0] != NONE or stays == 1:
+            x_end = y + sheets.faces.middles[k]
+            if number >= 0:
+                x_end = s.after[member, number] + s.scales[member, number] * (s.turns[member, number] * x_end)
+        x_kept[i] = x_end
+
+    @wp.func
+    def twist(x: vector, k: int, member: int, s: neighbourhood) -> vector:
+        arm = x - s.after[member, k]
+        grown = s.scales_dot[member, k] / s.scales[member, k]
+        return s.after_dot[member, k] + wp.cross(s.turned_dot[member, k], arm) + grown * arm
+
+    @wp.func
+    def twist_before(x: vector, k: int, member: int, s: neighbourhood) -> vector:
+        arm = x - s.before[member, k]
+        grown = s.scales_dot[member, k] / s.scales[member, k]
+        return s.before_dot[member, k] + wp.cross(s.turned_before_dot[member, k], arm) + grown * arm
+
+    @wp.kernel(module=modules[1], enable_backward=False)
+    @typed.arrays
+    def keep_tangent(s, sheets, k: int, least: real, x, x_dot, x_now, x_kept, x_now_dot):
+        i = s.first + wp.tid()
+        member, number = i // s.particles, sheets.numbers[k]
+        start, end = seen_from(x[i], k, member, s, sheets), seen_after(x_now[i], k, member, s, sheets)
+        _y, used, stays = kept(start, end, k, least / scale_of(k, member, s, sheets), sheets)
+        if used[0] == NONE and stays == 0:
+            return
+        R, grown = turn_of(k, member, s, sheets), real(0.0)
+        change = vector(x_now_dot[i])
+        if number >= 0:
+            grown = s.scales_dot[member, number] / s.scales[member, number]
+            change -= twist(x_now[i], number, member, s)
+        rounds = int(ROUNDS)
+        for round in range(rounds):
+            if used[round] != NONE:
+                N = R * sheets.faces.normals[used[round]]
+                change -= (wp.dot(N, change) + side_of(start, used[round], sheets) * least * grown) * N
+        if stays == 1:
+            change = vector(x_dot[i])
+            if number >= 0:
+                change -= twist_before(x[i], number, member, s)
+                change = R * (wp.transpose(s.turns_before[member, number]) * change)
+        if number >= 0:
+            change += twist(x_kept[i], number, member, s)
+        x_now_dot[i] = change
+
+    @wp.kernel(module=modules[2], enable_backward=False)
+    @typed.arrays
+    def keep_adjoint(s, sheets, k: int, least: real, x, x_now, x_kept, x_now_bar, bar):
+        i = s.first + wp.tid()
+        member, number = i // s.particles, sheets.numbers[k]
+        start, end = seen_from(x[i], k, member, s, sheets), seen_after(x_now[i], k, member, s, sheets)
+        _y, used, stays = kept(start, end, k, least / scale_of(k, member, s, sheets), sheets)
+        if used[0] == NONE and stays == 0:
+            return
+        R, grown = turn_of(k, member, s, sheets), real(0.0)
+        whole, left = vector(x_now_bar[i]), vector(x_now_bar[i])
+        rounds = int(ROUNDS)
+        for back in range(rounds):
+            face = used[rounds - 1 - back]
+            if face != NONE and stays == 0:
+                N = R * sheets.faces.normals[face]
+                along = wp.dot(N, left)
+                grown -= side_of(start, face, sheets) * least * along
+                left -= along * N
+        if stays == 1:
+            left = vector()
+            began = vector(whole)
+            if number >= 0:
+                began = s.turns_before[member, number] * (wp.transpose(R) * whole)
+                arm = x[i] - s.before[member, number]
+                bar.force_before[i] = bar.force_before[i] - began
+                bar.torque_before[i] = bar.torque_before[i] - wp.cross(arm, began)
+                grown -= wp.dot(arm, began)
+            bar.x[i] = bar.x[i] + began
+        x_now_bar[i] = left
+        if number >= 0:
+            arm, arm_kept = x_now[i] - s.after[member, number], x_kept[i] - s.after[member, number]
+            bar.force[i] = bar.force[i] + whole - left
+            bar.torque[i] = bar.torque[i] + wp.cross(arm_kept, whole) - wp.cross(arm, left)
+            grown += wp.dot(arm_kept, whole) - wp.dot(arm, left)
+            bar.growth[i] = bar.growth[i] + grown / s.scales[member, number]
+
+    return Kernels(keep, keep_tangent, keep_adjoint)
+
+
+class Sides:
+    """Keeps the particles of a solver on their sides of all sheets: of one after the other, and where there are several
+    of each once more."""
+
+    def __init__(self, sheets: Sheets, spacing: float, layout: Layout):
+        """Prepare for particles a ``spacing`` [m] apart."""
+        self._kernels, self._sheets, count = side_kernels(layout.precision), sheets, len(sheets.numbers)
+        self._known: dict[str, Any] = {"sheets": sheets.struct, "least": NEAREST * spacing}
+        self._passes = [*range(count)] * (1 if count == 1 else 2)
+        vector = layout.precision.vector
+        self._kept = [layout.arrays(x=vector)["x"] for _ in self._passes]
+        self._none = layout.arrays("_bar", **share_kinds(layout.precision))
+        """Shares of a sheet that does not move."""
+
+    def keep(self, step: StepContext, x_now: wp.array) -> wp.array:
+        """Return the positions (n,) of sorted particles at the end of a step, given what they would be without
+        sheets."""
+        for k, x_kept in zip(self._passes, self._kept, strict=True):
+            step.launch(self._kernels.forward, self._known, k=k, x_now=x_now, x_kept=x_kept)
+            x_now = x_kept
+        return x_now
+
+    def tangent(self, step: StepContext, dot: Tangents, x_now: wp.array, x_now_dot: wp.array) -> None:
+        """Replace the tangent of positions without sheets by that of the positions that are kept."""
+        self.keep(step, x_now)
+        for k, x_kept in zip(self._passes, self._kept, strict=True):
+            own = {"x_now": x_now, "x_kept": x_kept, "x_now_dot": x_now_dot}
+            step.launch(self._kernels.tangent, *dot.named, self._known, own, k=k)
+            x_now = x_kept
+
+    def adjoint(self, step: StepContext, bar: Adjoints, x_now: wp.array, x_now_bar: wp.array) -> None:
+        """Replace the adjoint of the positions that are kept by that of positions without sheets. It adds to those of
+        positions at the start of the step and of solids."""
+        self.keep(step, x_now)
+        given = [x_now, *self._kept]
+        for k, before, x_kept in reversed([*zip(self._passes, given, self._kept, strict=False)]):
+            number = self._sheets.numbers[k]
+            shares = bar.solids.of(number) if number >= 0 else self._none
+            own = {"x_now": before, "x_kept": x_kept, "x_now_bar": x_now_bar}
+            step.launch(self._kernels.adjoint, *bar.named, self._known, shares, own, k=k)
