@@ -207,8 +207,8 @@ FLAT = 1e-6
 
 
 class SheetSolid(SolidTable):
-    """A wall of no thickness with fluid on both sides, which do not see each other: in 2-D a line of straight parts, in
-    3-D a flat convex polygon, or the open mesh of a file."""
+    """A wall of no thickness with fluid on both sides, which do not see each other. It is a line of straight parts in
+    2-D, and a flat convex polygon or the open mesh of a file in 3-D."""
 
     measures: ClassVar = ("scale",)
     least_thickness: ClassVar = 0.0
