@@ -133,22 +133,13 @@ class Twin:
 
     def back(self, bar, estimator):
         """Without an extrapolation."""
-        chain = [estimator]
-        while hasattr(chain[0], "base"):
-            chain.insert(0, chain[0].base)
         for state, jacobian in zip(reversed(self.states[:-1]), reversed(self.jacobians), strict=True):
             bar = jacobian.T @ bar
-            for each in chain[1:]:
-                bar = self.filtered(bar, state, each)
+            if isinstance(estimator, gradients.AdjointViscosity):
+                viscosity = self.viscosity(state, estimator.coefficient)
+                filtered = (limited(viscosity @ a, estimator.limit) for a in bar.reshape(2, *self.shape))
+                bar = np.concatenate([a.ravel() for a in filtered])
         return bar
-
-    def filtered(self, bar, state, estimator):
-        """What an estimator does to the adjoint of a state."""
-        x_bar, v_bar = bar.reshape(2, *self.shape)
-        if isinstance(estimator, gradients.AdjointViscosity):
-            viscosity = self.viscosity(state, estimator.coefficient)
-            x_bar, v_bar = (limited(viscosity @ a, estimator.limit) for a in (x_bar, v_bar))
-        return np.concatenate([x_bar.ravel(), v_bar.ravel()])
 
 
 def limited(vectors, times):
@@ -165,7 +156,6 @@ ESTIMATORS = (
     gradients.AdjointViscosity(1000.0, limit=np.inf),
     gradients.AdjointViscosity(5.0, limit=1.1),
     gradients.AdjointViscosity(5.0, limit=1.1, order=2),
-    gradients.AdjointViscosity(5.0, base=gradients.Tape()),
 )
 
 

@@ -286,12 +286,8 @@ def test_segments_chained_by_vjp_have_the_bits_of_one_run(name, precision):
             assert (np.abs(found - gradient[parameter]) <= ROUND_OFF[precision] * size).all(), parameter
 
 
-@pytest.mark.parametrize(
-    "estimator",
-    [gradients.AdjointViscosity(), gradients.AdjointViscosity(base=gradients.Tape())],
-    ids=["viscosity", "viscosity of a tape"],
-)
-def test_segments_go_back_by_an_estimator_as_one_run_does(estimator):
+def test_segments_go_back_by_an_estimator_as_one_run_does():
+    estimator = gradients.AdjointViscosity()
     simulation = Simulation(plane(), precision="float64")
     start = {"initial_velocities": simulation.velocities + np.random.default_rng(2).normal(0, 0.3, (64, 2))}
     wanted = Problem(simulation, 20, Weighted()).value_and_gradient({"viscosity": 0.1, **start}, estimator)[1]

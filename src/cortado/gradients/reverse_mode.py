@@ -13,7 +13,7 @@ import warp as wp
 from cortado.arrays import as_number, is_whole
 from cortado.device.precision import TypesByName
 from cortado.errors import InputError, shown
-from cortado.gradients.estimator import AdjointEstimator, Filtered, ForwardPass, checked_estimator
+from cortado.gradients.estimator import AdjointEstimator, Filtered, ForwardPass
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum
 from cortado.particles.state import Parameters, State
@@ -281,34 +281,29 @@ class AdjointViscosity(AdjointEstimator):
     """
 
     coefficient: float = 2.0
-    """Coefficient C of the viscosity, at least 0, with which it equals the base estimator."""
+    """Coefficient C of the viscosity, at least 0, with which it equals `Exact`."""
     limit: float = 4.0
     """Greatest vector of a particle, in root mean squares over all; infinite for none."""
     order: int = 1
-    """Order 1, or 2 for an extrapolation by two passes over a whole run: not as the base of another estimator, nor with
-    respect to the first state, nor step by step."""
-    base: AdjointEstimator = EXACT
-    """The estimator whose adjoint is filtered."""
+    """Order 1, or 2 for an extrapolation by two passes over a whole run: not with respect to the first state, nor step
+    by step."""
 
     def __post_init__(self) -> None:
         if not is_whole(self.order) or self.order not in (1, 2):
             raise InputError(f"order is {shown(self.order)}, but must be 1 or 2.")
-        checked_estimator(self.base)
         if not (isinstance(self.limit, float) and self.limit == np.inf) and (as_number(self.limit) or 0.0) < 1.0:
             raise InputError(f"limit is {shown(self.limit)}, but must be a number of at least 1.")
         coefficient = as_number(self.coefficient)
         if coefficient is None or coefficient < 0.0:
             raise InputError(f"coefficient is {shown(self.coefficient)}, but must be a number of at least 0.")
 
-    @property
-    def batches(self) -> bool:
-        return self.base.batches
+    batches = True
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
         """Return the backward step of the first order; raise `InputError` for another, which takes two passes."""
         if self.order != 1:
             raise InputError(f"order is {self.order}, but must be 1 where a gradient goes on to the state before.")
-        step = self.base.derivative(rollout)
+        step = EXACT.derivative(rollout)
         return _ViscousStep(step, rollout, self) if self.coefficient > 0.0 else step
 
     def back(self, forward_pass: ForwardPass, observe: Observer | None = None) -> Arrays:
