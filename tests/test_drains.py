@@ -1,28 +1,27 @@
-"""Drains: what they take is out of everybody's reach and counted to a particle, sinks take their flow rate, and every
-gradient is right."""
+"""Drains: what they take is out of everybody's reach and counted to a particle, and sinks take their flow rate; for
+their derivatives, batches and runs that go on see tests/test_features.py."""
 
 import json
 
 import numpy as np
 import pytest
 
-from cortado import Problem, Scene, SceneError, Simulation
+from cortado import Scene, SceneError, Simulation
 from cortado.runs.balance import Balance
 from cortado.scene.drain_tables import open_sphere
-from finite_differences import both_modes, decades, distance
-from scenes import Weighed, jet, plane, scene, thrown
+from scenes import jet, plane, scene
 
-STEPS = 8
 SPACING = 0.025
 HOLE = {"shape": "sink", "name": "hole"}
+OVER = {"shape": "box", "name": "over", "lower": [0.3, 0.36]}
 SOLVER = {"kind": "projection", "time_step": 0.002}
 
 
-def emptied(d, **keys):
-    """A block of fluid beside a wall, with a sink off the floor and two other drains above."""
+def emptied(d, made=None, **keys):
+    """A block of fluid beside a wall, or another scene, with a sink off the floor and a box above."""
     sink = {**HOLE, "position": [0.22, 0.02, 0.13][:d], "radius": 0.05, "flow_rate": [0.05, 0.01][d - 2]}
-    box = {"shape": "box", "name": "over", "lower": [0.3, 0.36, 0.0][:d]}
-    return (plane if d == 2 else scene)(drain=[sink, box], solver=SOLVER, **keys)
+    box = {**OVER, "lower": [*OVER["lower"], 0.0][:d]}
+    return (made or (plane if d == 2 else scene))(drain=[sink, box], solver=SOLVER, **keys)
 
 
 def tank(depth=0.5, time_step=1e-3, **keys):
@@ -37,33 +36,6 @@ def tank(depth=0.5, time_step=1e-3, **keys):
         "solver": {"kind": "projection", "time_step": time_step},
     }
     return Scene.from_json(json.dumps({**tables, **keys}))
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_every_number_of_a_sink_has_its_derivatives(d):
-    simulation = Simulation(emptied(d), precision="float64")
-    problem, own = Problem(simulation, STEPS, Weighed(simulation)), simulation.parameters()
-    point = {name: own[name] for name in ("hole.position", "gravity", "time_step")} | thrown(simulation)
-    point["hole.flow_rate"] = np.linspace(0.5, 1.0, STEPS) * own["hole.flow_rate"]
-    taken = (problem.run(point).others["drained"] > 0).sum(axis=1)
-    assert taken[0] == 0 < taken[-1]
-    random, sizes = np.random.default_rng(4), {"time_step": 1e-4, "gravity": 1.0}
-    for name, value in point.items():
-        along = {name: sizes.get(name, 0.01) * random.standard_normal(np.shape(value))}
-        tangent = both_modes(problem, point, along)[1]
-        assert distance(problem.value, point, along, tangent, decades(2.0, 7.0), enough=1e-7) < 1e-6
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_runs_with_drains_go_on_and_are_batched_with_the_same_bits(d):
-    places, simulation = np.array([[0.2, 0.1, 0.1], [0.1, 0.0, 0.1]])[:, :d], Simulation(emptied(d))
-    whole, first = simulation.run(12).last_state, simulation.run(5).last_state
-    rest = simulation.run(7, state=first).last_state
-    assert (whole["drained"] > 0).any() and all(np.array_equal(whole[name], rest[name]) for name in rest.fields)
-    batch = Simulation(emptied(d), batch=2).run(12, {"hole.position": places})
-    for place, run in zip(places, batch, strict=True):
-        alone = simulation.run(12, {"hole.position": place}).last_state
-        assert all(np.array_equal(alone[name], run.last_state[name]) for name in alone.fields)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -134,6 +106,19 @@ def test_a_flow_rate_over_time_opens_and_shuts_a_sink():
     assert out[6] - out[1] > 30 and out[-1] - out[7] <= 2
     top = np.sort(run.positions[-1][run.others["drained"][-1] == 0][:, 1])[-40:]
     assert top.mean() == pytest.approx(0.5 - 0.5 * SPACING - out[-1] * SPACING**2, abs=SPACING)
+
+
+def test_a_flow_rate_may_be_in_a_file(tmp_path):
+    file = tmp_path / "valve.csv"
+    file.write_text("time [s],flow_rate [m2/s]\n0,0.1\n0.5,0.0\n")
+    sink = {**HOLE, "position": [0.5, 0.0]}
+    listed = tank(drain=[{**sink, "times": [0.0, 0.5], "flow_rates": [0.1, 0.0]}])
+    read = tank(drain=[{**sink, "file": str(file)}])
+    assert read.computed_json() == listed.computed_json()
+    file.write_text("time [s],flow_rate [l/s]\n0,0.1\n0.5,0.0\n")
+    for wrong in ({"file": str(file)}, {"file": str(tmp_path / "gone.csv")}, {"file": str(file), "flow_rate": 0.1}):
+        with pytest.raises(SceneError, match="file"):
+            tank(drain=[{**sink, **wrong}])
 
 
 def test_the_balance_is_right_to_a_particle():

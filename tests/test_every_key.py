@@ -187,6 +187,7 @@ ASIDE = {
     ("BoxDrain", "name"): "what the balance calls it",
     ("PlaneDrain", "name"): "what the balance calls it",
     ("SinkDrain", "name"): "what parameters call it",
+    ("SinkDrain", "file"): "in place of flow_rates: tests/test_drains.py",
     ("SinkDrain", "flow_rate"): "in place of flow_rates: tests/test_drains.py",
     ("Picture", "colour"): "what is computed colours: tests/test_films.py",
     ("SceneTables", "name"): "titles",

@@ -35,6 +35,7 @@ MISTAKES = {
     "custom_loss.py": ("2.0 * (share - self.wanted)", "(share - self.wanted)", "the adjoint is not the derivative"),
     "carried_cup.py": ("2.0 * end.velocities", "-2.0 * end.velocities", "water is spilt, or sloshes"),
     "flipped_bottle.py": ("optimiser, 4)", "optimiser, 1)", "the bottle does not plunge upright where it should"),
+    "kept_level.py": ("np.full(STEPS, LEVEL)", "np.full(STEPS, 1.2 * LEVEL)", "the level is"),
     "poured_jug.py": ("(-1.0, 1.0)", "(-0.01, 0.01)", "too much of the syrup is not in the glass"),
     "steered_raft.py": ("optimiser, 16,", "optimiser, 1,", "the raft is not where it should be"),
     "stirred_tank.py": ("optimiser, ITERATIONS,", "optimiser, 1,", "the viscosity is not that of the torque"),
@@ -67,9 +68,9 @@ SAME_FLAGS = f"import warp as wp; wp.config.cpu_compiler_flags = {wp.config.cpu_
 """First line of an example, so that its kernels are those of the tests."""
 
 
-def test_there_are_nine_short_ones():
+def test_there_are_ten_short_ones():
     paths = list(FOLDER.glob("*.py"))
-    assert {path.name for path in paths} == MISTAKES.keys() and len(paths) == 9
+    assert {path.name for path in paths} == MISTAKES.keys() and len(paths) == 10
     assert all(len(path.read_text().splitlines()) <= 60 for path in paths)
 
 

@@ -20,6 +20,7 @@ from own_forces import Breeze
 from remembering_force import Memory
 from scenes import MIXING, Weighed, box, jet, plane, plane_of_three, pour, scene, splash, two_layers
 from test_body_masses import KEEL, KEELS, massive
+from test_drains import OVER, emptied
 from test_faces import flume
 from test_free_bodies import BRICK, RAFT, SHEAR_THINNING, rough, touching, touching_across, touching_in_space
 from test_free_bodies import plane as afloat
@@ -134,6 +135,10 @@ FEATURES = {
     "three fluids": Feature(plane_of_three),
     "miscible fluids": Feature(lambda: two_layers(mixture=MISCIBLE)),
     "a jet": Feature(jet),
+    "a sink and a box": Feature(lambda: emptied(2), has_tape=False),
+    "a sink and a box in space": Feature(lambda: emptied(3), has_tape=False),
+    "a jet over a sink": Feature(lambda: emptied(2, jet, forces={"gravity": [0.7, -9.81]}), has_tape=False),
+    "a box with PCISPH": Feature(lambda: plane(drain=[OVER]), has_tape=True),
     "a nozzle over a pool": Feature(pour),
     "surface tension": Feature(lambda: tense(plane)),
     "surface tension of two fluids": Feature(lambda: tense(two_layers)),
@@ -247,7 +252,7 @@ def test_float32_is_near_float64(name):
 
 def own_rows(point: dict[str, Any]) -> dict[str, Any]:
     """Gravity and numbers of a point for two scenes, but those that may have rows or that diffusion is cut by."""
-    others = ("mobility", "interface_width", "gust.k", "spring.damping", ".torque")
+    others = ("mobility", "interface_width", "gust.k", "spring.damping", ".torque", "hole.flow_rate")
     names = [key for key, one in point.items() if np.ndim(one) == 0 and not key.endswith((".turn", *others))]
     numbers = {key: point[key] * np.array([1.0, 0.98]) for key in names}
     return {**numbers, "gravity": np.stack([point["gravity"], 0.8 * point["gravity"]])[:, None]}
@@ -288,6 +293,7 @@ CERTIFIED = {
     "a force with kernels": ["breeze.k", "breeze.wind", "time_step"],
     "one that keeps a field in a jet": ["memory.k", "time_step"],
     "a network": ["net.w", "net.bias"],
+    "a sink and a box": ["hole.flow_rate", "hole.position"],
     "forces by mass fractions": ["mass_fractions", "oily.w"],
 }
 """Names of parameters that are certified, in float32 and, as problems in float64 are, in float64."""

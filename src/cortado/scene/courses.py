@@ -137,6 +137,8 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
     "rad": {"rad": 1.0, "deg": np.pi / 180.0},
     "degrees": {"deg": 1.0, "rad": 180.0 / np.pi},
+    "m3/s": {"m^3/s": 1.0, "m3/s": 1.0, "m³/s": 1.0, "l/s": 1e-3, "l/min": 1e-3 / 60.0},
+    "m2/s": {"m^2/s": 1.0, "m2/s": 1.0, "m²/s": 1.0},
     "m/s2": {"m/s^2": 1.0, "m/s2": 1.0, "m/s²": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3, "g": 9.80665},
 }
 """Factors of the units that columns of a file may have, by the unit in which a scene has them."""

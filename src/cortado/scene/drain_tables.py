@@ -10,10 +10,10 @@ from pydantic import Field, model_validator
 
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points
-from cortado.errors import Words
-from cortado.scene.courses import Knots
+from cortado.errors import InputError, Words
+from cortado.scene.courses import Knots, values_in_file
 from cortado.scene.parameters import Axis, Parameter, Range
-from cortado.scene.shape_tables import check_order
+from cortado.scene.shape_tables import File, check_order
 from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity
 
 PRESCRIBED, BLENDED = 3.0, 3.0
@@ -91,12 +91,17 @@ class SinkDrain(Table):
     straight lines."""
     flow_rates: tuple[Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)], ...] | None = None
     """(k,) Flow rates at these times, in place of `flow_rate` [m3/s (m2/s in 2-D)]."""
+    file: File | None = None
+    """CSV file in place of `times` and `flow_rates`, with the columns `time` and `flow_rate` and units in its head. A
+    relative name begins at the scene file."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        if self.file is not None:
+            return self._read(dimension, path)
         times, rates = self.times or (), self.flow_rates
         if self.times is None and rates is None:
             if self.flow_rate is None:
-                raise field_error((*path, "flow_rate"), MISSING, "given, or times with flow_rates")
+                raise field_error((*path, "flow_rate"), MISSING, "given, or times with flow_rates, or a file")
         elif len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
             wanted = "at least two times, from 0 on, each greater than the one before"
             raise field_error((*path, "times"), MISSING if self.times is None else times, wanted)
@@ -106,6 +111,25 @@ class SinkDrain(Table):
         elif self.flow_rate is not None:
             raise field_error((*path, "flow_rate"), self.flow_rate, "left out, as there are flow_rates")
         return super().in_dimension(dimension, path)
+
+    def _read(self, dimension: int, path: FieldPath) -> Self:
+        """Return this table with the times and flow rates of its file, which is read once and stays as it was."""
+        for key in ("flow_rate", "times", "flow_rates"):
+            if (found := getattr(self, key)) is not None:
+                raise field_error((*path, key), found, "left out, as there is a file")
+        assert self.file is not None
+        unit = "m3/s" if dimension == 3 else "m2/s"
+        try:
+            times, found = values_in_file(self.file, (("flow_rate", unit),), True)
+        except InputError as error:
+            wanted = "the file of a flow rate"
+            raise field_error((*path, "file"), self.file, wanted, f"cannot be used: {error}") from None
+        rates = found["flow_rate"]
+        if times[0] != 0.0 or (rates < 0.0).any():
+            wanted = "a file with times from 0 on and flow rates of at least 0"
+            raise field_error((*path, "file"), self.file, wanted)
+        given = {"file": None, "times": tuple(times.tolist()), "flow_rates": tuple(rates.tolist())}
+        return self.model_copy(update=given).in_dimension(dimension, path)
 
     def middle(self, dimension: int) -> Points:
         """Return the position (d,) [m]."""
