@@ -13,8 +13,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-
-from launched_kernels import kernels_of_both_ways
+from unittest.mock import patch
 
 ADDRESS, NO_PLANT = 0x5000_0000_0000, -1
 MODULE = f'''"""The sign of a term, flipped where its number is the one in memory."""
@@ -42,6 +41,30 @@ STEPS = 3
 """Of the runs that are judged."""
 WHOLE = 40
 """Of the plants that are found, one in so many has its certificate made to the end."""
+
+
+def kernels_of_both_ways(cases) -> dict[str, list[str]]:
+    """Keys of the kernels that problems launch at points: in runs "forward", and "backward"."""
+    from cortado.device.launching import KernelLauncher
+    from cortado.rollout.rollout import Rollout
+
+    seen: dict[str, set[str]] = {"forward": set(), "backward": set()}
+    launch, back, way = KernelLauncher.__call__, Rollout.backward, ["forward"]
+
+    def keep(self, kernel, *arguments, **options):
+        seen[way[0]].add(kernel.key)
+        launch(self, kernel, *arguments, **options)
+
+    def backward(*arguments, **options):
+        way[0] = "backward"
+        found = back(*arguments, **options)
+        way[0] = "forward"
+        return found
+
+    with patch.object(KernelLauncher, "__call__", keep), patch.object(Rollout, "backward", backward):
+        for problem, point in cases:
+            problem.value_and_gradient({**problem.simulation.parameters(), **point})
+    return {name: sorted(keys) for name, keys in seen.items()}
 
 
 class Planter(ast.NodeTransformer):

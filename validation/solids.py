@@ -16,12 +16,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from loads import LOADS
+from piston_waves import piston
 
 from cortado import Scene, Simulation
 from cortado.errors import CortadoWarning
 from floating_bodies import added_mass, disc_in_a_round_tank, floating_box, settling_disc, stopping_cylinder
 from held_water import MESHES, cup_turned, meshes, stirred
-from piston_waves import piston
 
 DATA = Path(__file__).parents[1] / "tests" / "data"
 LATE = 0.8
