@@ -410,7 +410,7 @@ def file_schema() -> dict[str, Any]:
     tables = {**scene["$defs"], **task["$defs"], **fit["$defs"], **data_set["$defs"]}
     for table in tables.values():
         if "shape" in table.get("properties", {}):  # it has a default in Python, but has to be named in a file
-            table["required"] = ["shape", *table.get("required", [])]
+            table["required"] = list(dict.fromkeys(["shape", *table.get("required", [])]))
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **{key: value for key, value in scene.items() if key != "$defs"},
