@@ -173,13 +173,6 @@ def test_a_reserve_joins_the_column_for_as_long_as_the_run_goes():
     assert (np.abs(waiting - 0.5 * np.array(made.container.upper)) > 0.5 * np.array(made.container.upper)).all()
 
 
-def test_gradients_go_through_a_reserve():
-    simulation = Simulation(supplied(duration=0.4, flow_rate=0.3), precision="float64")
-    point = {key: value for key, value in simulation.parameters().items() if key in SIZES}
-    directions = {key: direction_of(key, value) for key, value in point.items()}
-    both_modes(Problem(simulation, STEPS, Weighed(simulation)), point, directions)
-
-
 def test_a_run_says_when_its_emitter_runs_dry():
     """One with a duration, and one along a period, which leaves no place for a reserve."""
     room = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8], "periodic": [True, False]}

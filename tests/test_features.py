@@ -21,6 +21,7 @@ from remembering_force import Memory
 from scenes import MIXING, Weighed, box, jet, plane, plane_of_three, pour, scene, splash, two_layers
 from test_body_masses import KEEL, KEELS, massive
 from test_drains import OVER, emptied
+from test_emitter import supplied
 from test_faces import flume
 from test_free_bodies import BRICK, RAFT, SHEAR_THINNING, rough, touching, touching_across, touching_in_space
 from test_free_bodies import plane as afloat
@@ -139,6 +140,7 @@ FEATURES = {
     "a sink and a box in space": Feature(lambda: emptied(3), has_tape=False),
     "a jet over a sink": Feature(lambda: emptied(2, jet, forces={"gravity": [0.7, -9.81]}), has_tape=False),
     "a box with PCISPH": Feature(lambda: plane(drain=[OVER]), has_tape=True),
+    "a jet with a reserve": Feature(lambda: supplied(duration=0.4, flow_rate=0.3)),
     "a nozzle over a pool": Feature(pour),
     "surface tension": Feature(lambda: tense(plane)),
     "surface tension of two fluids": Feature(lambda: tense(two_layers)),

@@ -60,18 +60,6 @@ def test_chained_steps_have_the_bits_of_one_run(name, precision):
     assert_same_state(simulation.step(simulation.state(), steps=40), whole.last_state)
 
 
-def test_steps_of_a_batch_have_the_bits_of_one_run():
-    simulation = Simulation(scheduled(), batch=3)
-    parameters = {"viscosity": [0.05, 0.1, 0.3]}
-    whole = simulation.run(30, parameters)
-    states = simulation.state()
-    for _ in range(3):
-        states = simulation.step(states, parameters, steps=10)
-    assert isinstance(states, tuple) and len(states) == 3
-    for b in range(3):
-        assert_same_state(states[b], whole[b].last_state)
-
-
 def test_parameters_of_steps_are_those_of_the_steps_to_come():
     simulation = Simulation(moving_jet(), precision="float64")
     gravity = np.array([0.0, -9.81]) + np.sin(np.arange(20))[:, None]
