@@ -132,6 +132,26 @@ def test_the_balance_is_right_to_a_particle():
     assert balance.first == simulation.free_particles and balance.came > 20 and balance.went["hole"] > 20
 
 
+def test_a_jet_out_of_a_slot_contracts():
+    """By 0.611 = pi / (pi + 2), with the speed of a fall to where it is narrowest, half the slot's width below it. The
+    slot is in the floor, beside a wall in place of its plane of symmetry."""
+    spacing, half, across, depth = 0.01, 0.06, 0.5, 0.6
+    floor = {"shape": "box", "name": "floor", "lower": [half, -0.05], "upper": [across + 0.05, 0.0]}
+    full = tank(
+        discretisation={"spacing": spacing},
+        fluid=[{"shape": "box", "phase": "water", "lower": [0.0, 0.0], "upper": [across, depth]}],
+        container={"shape": "box", "lower": [0.0, -0.4], "upper": [across, depth + 0.2]},
+        solid=[floor],
+        drain=[{"shape": "box", "name": "below", "upper": [across, -0.2]}],
+        solver={"kind": "projection", "time_step": 6.5e-4},
+    )
+    run = Simulation(full).run(900, record_every=150)
+    above = ((run.others["drained"] == 0) & (run.positions[..., 1] > 0.0)).sum(axis=1) * spacing**2
+    flow = (above[2] - above[-1]) / (run.times[-1] - run.times[2])
+    level = 0.5 * (above[2] + above[-1]) / across
+    assert flow / (half * np.sqrt(2.0 * 9.81 * (level + half))) == pytest.approx(np.pi / (np.pi + 2.0), rel=0.05)
+
+
 def test_walls_around_a_sink_are_taken_out_of_its_sphere():
     room = tank().resting_room
     for place, part in (([0.5, 0.25], 1.0), ([0.5, 0.0], 0.5), ([0.0, 0.0], 0.25)):
