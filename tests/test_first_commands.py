@@ -108,8 +108,8 @@ def test_a_template_is_a_scene_that_says_how_it_is_run(cortado_command, template
     assert ("open at the top" in text) is (getattr(scene.container, "lid", True) is False)
 
 
-def test_there_are_eleven_templates_and_the_help_names_them(cortado_command):
-    assert len(templates()) == 11
+def test_there_are_thirteen_templates_and_the_help_names_them(cortado_command):
+    assert len(templates()) == 13
     told = " ".join(cortado_command("new", "--help")[1].split())
     assert all(re.search(rf"\b{name}\b", told) for name in templates())
     assert_refused(

@@ -92,6 +92,26 @@ def flume(times, stroke, deep, long, has_section, moves):
     )
 
 
+def simulated(times, stroke, places, asked, has_section=False, moves=False, often=None):
+    """The run of a flume by the stroke of its flap, with gauges at places, and with a frame every ``often`` [s]."""
+    step = 0.1 / asked.deep
+    force = cortado.forces.Body(beach, k=6.0, start=asked.long - BEACH, length=BEACH)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", cortado.CortadoWarning)  # the limit "solids" is of water that falls: none does
+        scene = flume(times, stroke, asked.deep, asked.long, has_section, moves)
+        simulation = cortado.Simulation(scene, device=asked.device, forces=[force])
+        sensors = {f"{place:g}": WaveGauge([place, 0.0], radius=2.0 / asked.deep) for place in places}
+        sensors |= {"load": SolidLoad("section")} if has_section and not moves else {}
+        frames = 10**9 if often is None else max(round(often / step), 1)
+        return simulation.run(round(asked.end / step), record_every=frames, sensors=sensors)
+
+
+def surface(run, times, places):
+    """The surface (times, places) [m] over its rest in a run of `simulated`."""
+    gauges = [run.sensors[f"{place:g}"] for place in places]
+    return np.stack([np.interp(times, gauge.times, gauge["height"]) - DEPTH for gauge in gauges], axis=1)
+
+
 def theory(times, stroke, places, length=40.0, modes=4000):
     """The surface (times, places) [m] by linear theory in a long channel, mode by mode: E'' + w^2 E = S stroke''."""
     k = np.arange(modes) * np.pi / length
@@ -99,16 +119,19 @@ def theory(times, stroke, places, length=40.0, modes=4000):
     profile = np.exp(np.multiply.outer(k, y - DEPTH)) + np.exp(-np.multiply.outer(k, y + DEPTH))
     profile /= (1.0 + np.exp(-2.0 * k * DEPTH))[:, None]
     source = np.trapezoid((y - HINGE) / (DEPTH - HINGE) * profile, y, axis=1)
-    step, speed = times[1] - times[0], np.gradient(stroke, times)
+    parts = max(round((times[1] - times[0]) / 4e-3), 1)  # so many shorter steps in each
+    fine = np.linspace(times[0], times[-1], parts * (len(times) - 1) + 1)
+    step, speed = fine[1] - fine[0], np.gradient(np.interp(fine, times, stroke), fine)
     cos, sin = np.cos(w * step), np.sin(w * step) / np.where(w > 0.0, w, 1.0)
     level, rate, shapes = np.zeros(modes), np.zeros(modes), np.cos(np.multiply.outer(places, k))
     found = np.zeros((len(times), len(places)))
-    for n in range(len(times) - 1):
+    for n in range(len(fine) - 1):
         push = 0.25 * step * (speed[n] + speed[n + 1]) * source
         level = level + push
         level, rate = cos * level + sin * rate, cos * rate - w * w * sin * level
         level = level + push
-        found[n + 1] = (level[0] + 2.0 * shapes[:, 1:] @ level[1:]) / length
+        if (n + 1) % parts == 0:
+            found[(n + 1) // parts] = (level[0] + 2.0 * shapes[:, 1:] @ level[1:]) / length
     return found
 
 
@@ -164,24 +187,14 @@ def main():
     measured, names = np.stack([record[name] for name in probes], axis=1), record.dtype.names
     is_held, moves = "fz_n" in names, "heave_m" in names
 
-    step = 0.1 / asked.deep
-    force = cortado.forces.Body(beach, k=6.0, start=asked.long - BEACH, length=BEACH)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", cortado.CortadoWarning)  # the limit "solids" is of water that falls: none does
-        scene = flume(times, stroke, asked.deep, asked.long, is_held or moves, moves)
-        simulation = cortado.Simulation(scene, device=asked.device, forces=[force])
-        sensors = {name: WaveGauge([place, 0.0], radius=2.0 / asked.deep) for name, place in probes.items()}
-        sensors |= {"load": SolidLoad("section")} if is_held else {}
-        steps, often = round(asked.end / step), max(round(0.04 / step), 1) if asked.film or moves else 10**9
-        run = simulation.run(steps, record_every=often, sensors=sensors)
-    here = np.stack([np.interp(times, run.sensors[n].times, run.sensors[n]["height"]) - DEPTH for n in probes], axis=1)
-    fine = np.arange(0.0, asked.end + 1e-3, 4e-3)
-    exact = theory(fine, np.interp(fine, times, stroke), np.array(list(probes.values())))
-    linear = np.stack([np.interp(times, fine, one) for one in exact.T], axis=1)
+    often = 0.04 if asked.film or moves else None
+    run = simulated(times, stroke, probes.values(), asked, is_held or moves, moves, often)
+    here = surface(run, times, probes.values())
+    linear = theory(times, stroke, np.array(list(probes.values())))
 
     long, late = period(times, stroke), (times >= asked.begin) & (times <= asked.end)
     other, name = (measured, "measured") if is_held or moves else (linear, "theory")  # which has no section
-    print(f"{len(simulation.positions):,} particles, waves of {long:.3f} s, from {asked.begin:g} to {asked.end:g} s")
+    print(f"{run.positions.shape[1]:,} particles, waves of {long:.3f} s, from {asked.begin:g} to {asked.end:g} s")
     print(f"probe [m]  measured [mm]  linear theory [mm]  here [mm]  here / {name}  phase after {name} [deg]")
     for n, place in enumerate(probes.values()):
         own, true = (swing(times[late], each[late, n], long) for each in (here, other))
@@ -198,8 +211,8 @@ def main():
         print(f"{name}: {abs(own):.4g} here, {abs(true):.4g} measured, {abs(own / true):.3f} times;", end=" ")
         print(f"{np.degrees(np.angle(true / own)):.0f} degrees after, mean {found[late].mean():.3g} here, ", end="")
         print(f"{record[name][late].mean():.3g} measured")
-    surface = 1e3 * np.stack([measured.T, here.T, linear.T], axis=1)
-    rows = {f"{place:g} m [mm]": each for place, each in zip(probes.values(), surface, strict=True)}
+    heights = 1e3 * np.stack([measured.T, here.T, linear.T], axis=1)
+    rows = {f"{place:g} m [mm]": each for place, each in zip(probes.values(), heights, strict=True)}
     draw(times, rows | {name: (record[name], found) for name, found in section.items()}, asked.end)
     if asked.film:
         run.film("wave_flume.mp4", device=asked.device, width=1280, height=240, film_frames=150)
@@ -219,7 +232,7 @@ def on_section(run, is_held, moves):
     return {name: (load.times, BREADTH * one) for name, one in zip(LOADS, loads, strict=True)}
 
 
-def draw(times, series, end):
+def draw(times, series, end, path="wave_flume.png"):
     """Draw what was measured, what is here, and at probes linear theory, over time: a row each, by its name."""
     styles = ("measured", "0.65", 3.0, 1), ("here", "tab:blue", 1.2, 3), ("linear theory", "tab:orange", 1.0, 2)
     figure, axes = plt.subplots(len(series), sharex=True, squeeze=False, figsize=(9.0, 1.4 * len(series) + 0.7))
@@ -230,7 +243,7 @@ def draw(times, series, end):
     axes[-1, 0].set_xlabel("time [s]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="upper center", ncols=3)
     figure.tight_layout(rect=(0.0, 0.0, 1.0, 1.0 - 0.4 / figure.get_figheight()))
-    figure.savefig("wave_flume.png", dpi=150)
+    figure.savefig(path, dpi=150)
 
 
 if __name__ == "__main__":
