@@ -60,6 +60,7 @@ FLOOR = 1e-2
 """The norm of a gradient counts as this part of the greatest one of its row at least: some are mostly round-off."""
 GROWING = {"baffles", "beach", "drop", "drop_large", "ink", "jug", "match_image", "materials", "pour", "rotor"}
 GROWING |= {f"new {name}" for name in ("drop", "pillar", "pour", "raft", "rayleigh_taylor", "shaken", "stirred")}
+GROWING |= {"new baffled_tank"}
 """Scenes in which a last bit of NumPy's grows beyond that, as splashes do: they have their numbers on one machine."""
 MODULES = ("errors", "environments", "jax", "torch")
 """Public ones besides those among the names of `cortado`."""
@@ -80,6 +81,7 @@ SPACINGS = {
         0.025: ["new shaken", "shaken"],
         0.03: ["baffles"],
         0.04: ["ink", "match_image_fractions", "new rayleigh_taylor", "shear"],
+        0.06: ["new baffled_tank"],
         0.07: ["beach"],
         0.08: ["dam_break", "new pillar", "new raft"],
         0.1: ["dam_break_large", "recover_gravity", "two_dams"],

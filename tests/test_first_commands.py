@@ -108,12 +108,12 @@ def test_a_template_is_a_scene_that_says_how_it_is_run(cortado_command, template
     assert ("open at the top" in text) is (getattr(scene.container, "lid", True) is False)
 
 
-def test_there_are_thirteen_templates_and_the_help_names_them(cortado_command):
-    assert len(templates()) == 13
+def test_there_are_fourteen_templates_and_the_help_names_them(cortado_command):
+    assert len(templates()) == 14
     told = " ".join(cortado_command("new", "--help")[1].split())
     assert all(re.search(rf"\b{name}\b", told) for name in templates())
     assert_refused(
-        cortado_command("new", "x", "--template", "lake"), "--template is 'lake', but must be one of dam, drop"
+        cortado_command("new", "x", "--template", "lake"), "--template is 'lake', but must be one of dam, baffled_tank"
     )
     assert_refused(cortado_command("new", "x", "--template", "drop", "--dimension", 3), "--dimension is given")
 

@@ -18,6 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from loads import LOADS
 from piston_waves import piston
 
+from baffles import held, sloshed
 from cortado import Scene, Simulation
 from cortado.errors import CortadoWarning
 from floating_bodies import added_mass, disc_in_a_round_tank, floating_box, settling_disc, stopping_cylinder
@@ -99,6 +100,12 @@ def cases(device: str) -> dict[str, Callable[[], object]]:
         **found,
         "stirred, 8,000 particles": lambda: stirred(92, 2000),
         "cup-turned, 8,000 particles": lambda: cup_turned(100, 6000),
+        "sheet, two levels, 1,000 steps": lambda: held(1000, 0.001),
+        **{
+            f"baffle, {1000.0 * thickness:g} mm, {1000.0 * spacing:g} mm apart": partial(sloshed, thickness, spacing)
+            for spacing in (0.02, 0.01)
+            for thickness in (0.0, 0.06)
+        },
         "piston, kd = 1.5, 20 deep": lambda: piston(20, 1.5, 0.03, device),
         "piston, kd = 1.5, 60 deep": lambda: piston(60, 1.5, 0.03, device),
         **{f"stopping-cylinder, {across} across": partial(stopping_cylinder, across) for across in (8, 12, 24)},

@@ -84,8 +84,8 @@ def new(
 
     Args:
         name: The file, dam.toml or only dam.
-        template: What happens in it: dam, drop, honey, jet, moored_raft, pillar, pour, raft, rayleigh_taylor, shaken,
-            stirred, stirred_tank or tap_and_drain.
+        template: What happens in it: dam, baffled_tank, drop, honey, jet, moored_raft, pillar, pour, raft,
+            rayleigh_taylor, shaken, stirred, stirred_tank or tap_and_drain.
         dimension: 2 or 3, of the dam; 2 if left out.
     """
     from cortado.cli.commands.new import new_scene
