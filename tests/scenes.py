@@ -1,6 +1,6 @@
 """Scenes that the tests share."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -194,6 +194,19 @@ class Weighed:
 
     def adjoint(self, end: Any) -> dict[str, np.ndarray]:
         return self.weights
+
+
+class Squares:
+    """A loss: the sum of weights times the squares of fields and quantities, by their names."""
+
+    def __init__(self, weights: Mapping[str, Any]):
+        self.weights = weights
+
+    def value(self, end: Any) -> float:
+        return sum(float((weights * end[name] ** 2).sum()) for name, weights in self.weights.items())
+
+    def adjoint(self, end: Any) -> dict[str, np.ndarray]:
+        return {name: 2.0 * weights * end[name] for name, weights in self.weights.items()}
 
 
 def aimed(simulation: Simulation, steps: int) -> Problem:

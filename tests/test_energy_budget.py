@@ -10,11 +10,11 @@ from cortado import Problem, Simulation
 from cortado.particles.neighbourhood import neighbourhood_type
 from cortado.particles.state import to_device
 from reference_projection import Projection
-from scenes import OIL, box, plane, plane_of_three, scene, simulated, two_layers
+from scenes import OIL, Squares, box, plane, plane_of_three, scene, simulated, two_layers
 from still_fluids import still_water
 from test_faces import flume
 from test_moving_solids import ROTOR
-from test_quantities import Weighted, around
+from test_quantities import around
 from test_solid_parameters import SCENES, STEPS, check, point_of
 
 SUPPORTS = {"cubic_spline": 2.0, "wendland_c2": 2.6}
@@ -214,7 +214,7 @@ def test_pressures_beside_moving_solids_have_derivatives(name):
     point, along = point_of(own)
     point |= {"gravity": np.array(own.forces.gravity) + 0.5, "time_step": np.array(0.001)}
     along |= {"gravity": np.ones(own.dimension), "time_step": np.array(1e-4)}
-    check(Problem(simulation, STEPS, Weighted("pressure", weights)), point, along)
+    check(Problem(simulation, STEPS, Squares({"pressure": weights})), point, along)
 
 
 def test_loads_do_without_stresses():

@@ -7,8 +7,7 @@ from cortado import Problem, Simulation
 from cortado.losses import CentreOfMass
 from cortado.sensors import SolidLoad, WallForce
 from reference_projection import Projection
-from scenes import box, pool, simulated
-from test_quantities import Weighted
+from scenes import Squares, box, pool, simulated
 from test_solid_parameters import check, point_of
 
 S = 0.05
@@ -149,7 +148,7 @@ def test_derivatives_by_what_the_solid_does(name, quantity):
     scene = SCENES[name]()
     simulation = simulated(scene)
     weights = np.random.default_rng(1).uniform(size=simulation.quantity(quantity).shape)
-    check(Problem(simulation, STEPS, Weighted(quantity, weights)), *point_of(scene))
+    check(Problem(simulation, STEPS, Squares({quantity: weights})), *point_of(scene))
 
 
 def test_in_float32_the_gradient_is_near_that_of_float64():

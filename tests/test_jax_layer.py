@@ -22,7 +22,7 @@ from layered import (
     uses_of_parameters,
     uses_of_state,
 )
-from scenes import plane, two_layers
+from scenes import Squares, plane, two_layers
 
 
 @pytest.fixture(scope="module")
@@ -90,14 +90,8 @@ def test_steps_go_back_by_an_estimator_one_by_one_and_mapped(jax, layer, simulat
         states = layer.rollout(simulation, state, parameters, 20, 10, viscous)
         return {name: array[-1] for name, array in states.items()}
 
-    class Far:
-        def value(self, end):
-            return float((end.positions**2).sum() + (end.velocities**2).sum())
-
-        def adjoint(self, end):
-            return 2.0 * end.positions, 2.0 * end.velocities
-
-    problem = Problem(simulation, 20, Far(), state=layer.restart_state(simulation, first))
+    squares = Squares({"positions": 1.0, "velocities": 1.0})
+    problem = Problem(simulation, 20, squares, state=layer.restart_state(simulation, first))
     wanted = problem.value_and_gradient({"gravity": point[2]}, viscous)[1]["gravity"]
     for way in (scanned, rolled):
         np.testing.assert_allclose(jax.jit(jax.grad(partial(far, way)))(point[2]), wanted, rtol=1e-12)

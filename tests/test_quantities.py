@@ -9,7 +9,7 @@ from cortado.cli import main
 from cortado.errors import InputError
 from cortado.scene.parameters import NAMES, QUANTITIES
 from finite_differences import both_modes, distance
-from scenes import jet, plane, scene, simulated, two_layers
+from scenes import Squares, jet, plane, scene, simulated, two_layers
 from test_moving_solids import ROTOR
 
 PROJECTION = {"kind": "projection", "time_step": 0.0021}
@@ -22,19 +22,6 @@ SCENES = {
 }
 
 SIZES = [1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7]
-
-
-class Weighted:
-    """The sum of weights times the squares of a quantity's values."""
-
-    def __init__(self, name, weights):
-        self.name, self.weights = name, weights
-
-    def value(self, end):
-        return float((self.weights * end[self.name] ** 2).sum())
-
-    def adjoint(self, end):
-        return {self.name: 2.0 * self.weights * end[self.name]}
 
 
 def problem_of(make, name, steps=6, precision="float64", seed=0):
@@ -55,7 +42,7 @@ def problem_of(make, name, steps=6, precision="float64", seed=0):
         del point["initial_positions"], point["initial_velocities"]
     sizes = {"gravity": 1.0, "initial_velocities": 0.1, "initial_positions": 1e-3, "rest_density": 3.0}
     along = {name: sizes.get(name, 1e-5) * random.normal(size=value.shape) for name, value in point.items()}
-    return cortado.Problem(simulation, steps, Weighted(name, weights)), point, along
+    return cortado.Problem(simulation, steps, Squares({name: weights})), point, along
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -70,16 +57,7 @@ def test_the_gradient_of_a_quantity_is_that_of_forward_mode_and_of_differences(m
 def test_a_loss_of_several_quantities_has_the_sum_of_their_gradients(make):
     """Of a pressure and a speed: the adjoint of velocities at the start of a step is none of the forces in it."""
     problem, point, along = problem_of(make, "pressure")
-    speed = Weighted("speed", 1e4)
-
-    class Both:
-        def value(self, end):
-            return problem.loss.value(end) + speed.value(end)
-
-        def adjoint(self, end):
-            return {**problem.loss.adjoint(end), **speed.adjoint(end)}
-
-    both = cortado.Problem(problem.simulation, 6, Both())
+    both = cortado.Problem(problem.simulation, 6, Squares({**problem.loss.weights, "speed": 1e4}))
     _, derivative = both_modes(both, point, along, 1e-11)
     assert distance(both.value, point, along, derivative, SIZES, enough=1e-6) < 1e-6
 
@@ -180,7 +158,7 @@ def test_a_wrong_name_is_told_those_that_there_are():
         simulation.quantity("presure")
     with pytest.raises(InputError, match="without a pressure"):
         cortado.Simulation(plane(forces={"pressure": False})).quantity("pressure")
-    end = cortado.Problem(simulation, 1, Weighted("density", 1.0)).end({})
+    end = cortado.Problem(simulation, 1, Squares({"density": 1.0})).end({})
     with pytest.raises(InputError, match="a field of a state is 'rho', but must be one of positions, velocities"):
         end["rho"]
     assert np.array_equal(end["velocities"], end.velocities)
@@ -189,11 +167,11 @@ def test_a_wrong_name_is_told_those_that_there_are():
 
 @pytest.mark.parametrize("bar", [{"rho": np.zeros(64)}, {"density": np.zeros(3)}])
 def test_a_wrong_adjoint_is_told_what_it_must_be(bar):
-    class Wrong(Weighted):
+    class Wrong(Squares):
         def adjoint(self, end):
             return bar
 
-    problem = cortado.Problem(cortado.Simulation(plane()), 1, Wrong("density", 1.0))
+    problem = cortado.Problem(cortado.Simulation(plane()), 1, Wrong({"density": 1.0}))
     with pytest.raises(InputError, match="the loss's adjoint"):
         problem.value_and_gradient({"gravity": np.array([0.0, -9.81])})
 
@@ -205,7 +183,7 @@ def test_a_trajectory_is_looked_at_frame_by_frame(name):
     trajectory = simulation.run(7, {"gravity": gravity}, record_every=3)
     found = simulation.quantity(name, trajectory, {"gravity": gravity})
     assert found.shape == (4, *QUANTITIES[name].shape(simulation.particles, 2))
-    ends = cortado.Problem(simulation, 7, Weighted(name, 1.0)).states({"gravity": gravity}, [0, 3, 6, 7])
+    ends = cortado.Problem(simulation, 7, Squares({name: 1.0})).states({"gravity": gravity}, [0, 3, 6, 7])
     for own, end in zip(found, ends.values(), strict=True):
         np.testing.assert_array_equal(own, end[name])
 

@@ -80,12 +80,6 @@ class Seen(Weighed):
         random, first = np.random.default_rng(9), {name: simulation.quantity(name) for name in names}
         self.weights = {name: random.standard_normal(array.shape) for name, array in first.items()}
 
-    def value(self, end):
-        return sum(float((w * end[name]).sum()) for name, w in self.weights.items())
-
-    def adjoint(self, end):
-        return self.weights
-
 
 def results(name) -> dict[str, bytes]:
     """Bits of a short run of a disturbed start, of tangents, and of gradients by every estimator."""

@@ -7,10 +7,9 @@ from cortado import InputError, Problem, Scene, SceneError, Simulation
 from cortado.discretise.solid import Mass
 from cortado.losses import Series
 from cortado.sensors import SolidLoad, WallForce
-from scenes import simulated
+from scenes import Squares, simulated
 from test_free_bodies import RAFT
 from test_moving_solids import ROTOR, plane, space
-from test_quantities import Weighted
 from test_solid_parameters import PCISPH, PROJECTION, SCENES, STEPS, body, check, pasty, point_of, problem_of
 
 POST = {"name": "post", "shape": "sphere", "centre": [0.5, 0.2], "radius": 0.07, "slip": "no"}
@@ -73,18 +72,10 @@ def test_what_fluid_does_to_a_free_body_is_what_moves_it(slip):
     np.testing.assert_allclose(torque, RAFT["density"] * own.inertia[2, 2] * turned, atol=1e-10 * np.abs(torque).max())
 
 
-class Loads(Weighted):
-    """The sum of weights times the squares of all loads."""
-
-    def __init__(self, scene):
-        self.names = [f"{solid.name}.load" for solid in scene.solid]
-        self.weights = np.random.default_rng(1).uniform(size=(len(self.names), 3 * scene.dimension - 3))
-
-    def value(self, end):
-        return sum(float((w * end[name] ** 2).sum()) for name, w in zip(self.names, self.weights, strict=True))
-
-    def adjoint(self, end):
-        return {name: 2.0 * w * end[name] for name, w in zip(self.names, self.weights, strict=True)}
+def of_loads(scene):
+    """A loss of all loads, with random weights."""
+    weights = np.random.default_rng(1).uniform(size=(len(scene.solid), 3 * scene.dimension - 3))
+    return Squares({f"{solid.name}.load": own for solid, own in zip(scene.solid, weights, strict=True)})
 
 
 SEEN = {
@@ -104,7 +95,7 @@ SEEN = {
 def test_loads_have_derivatives(name):
     """Reverse and forward mode to round-off, and differences, for gravity, viscosity, density, and what solids do."""
     scene = SEEN[name]()
-    problem = Problem(simulated(scene), STEPS, Loads(scene))
+    problem = Problem(simulated(scene), STEPS, of_loads(scene))
     point, along = ({}, {}) if "raft" in name else point_of(scene)
     point |= {name: np.array(getattr(scene.phase[0], name)) for name in ("viscosity", "rest_density")}
     along |= {name: 0.3 * point[name] for name in ("viscosity", "rest_density")}
@@ -126,7 +117,7 @@ def test_a_series_of_a_load_has_a_gradient():
 
 def test_loads_of_a_batch_are_those_of_single_scenes_and_twice_the_same():
     scene = plane(ROTOR, POST)
-    viscosities, loss = [1.0, 3.0], Loads(scene)
+    viscosities, loss = [1.0, 3.0], of_loads(scene)
     alone = Problem(Simulation(scene), STEPS, loss)
     single = [alone.value_and_gradient({"viscosity": one}) for one in (*viscosities, viscosities[0])]
     values, gradients = Problem(Simulation(scene, batch=2), STEPS, loss).value_and_gradient({"viscosity": viscosities})

@@ -16,9 +16,8 @@ from cortado.runs.frames import posed
 from cortado.sensors import PressureProbe, WallForce
 from finite_differences import decades, directional, distance
 from freeze import FLOOR
-from scenes import box, simulated
+from scenes import Squares, box, simulated
 from test_moving_solids import PADDLE, ROTOR, WATER, plane, space
-from test_quantities import Weighted
 
 PASTE = {"name": "paste", "rest_density": 1000.0, "viscosity": 4.0}
 PASTE["rheology"] = {"kind": "bingham", "yield_stress": 8.0, "regularisation": 0.5}
@@ -90,7 +89,7 @@ def point_of(scene, steps=STEPS, seed=0):
 def problem_of(scene, quantity="speed", precision="float64"):
     simulation = simulated(scene, precision)
     weights = np.random.default_rng(1).uniform(size=simulation.quantity(quantity).shape)
-    return Problem(simulation, STEPS, Weighted(quantity, weights))
+    return Problem(simulation, STEPS, Squares({quantity: weights}))
 
 
 def check(problem, point, along):

@@ -18,7 +18,7 @@ from layered import (
     uses_of_parameters,
     uses_of_state,
 )
-from scenes import plane, scene, two_layers
+from scenes import Squares, plane, scene, two_layers
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: its CPU wheel is optional", exc_type=ImportError)
 
@@ -121,16 +121,6 @@ def test_a_lost_scene_of_a_map_adds_nothing_where_its_cotangent_is_0(layer, simu
         assert found == torch.func.grad(lambda v, each=each: each(gravities[[0, 2]], v).sum())(viscosity) != 0.0
 
 
-class Far:
-    """A loss of the last positions."""
-
-    def value(self, end):
-        return float((end.positions**2).sum())
-
-    def adjoint(self, end):
-        return 2.0 * end.positions, np.zeros_like(end.velocities)
-
-
 def test_a_module_learns_its_parameters(layer, simulation):
     target = simulation.run(20, {"gravity": [1.0, -9.0]}).positions[-1]
     module = layer.Steps(simulation, 20, trained={"gravity": [0.0, -9.81]})
@@ -148,7 +138,7 @@ def test_a_module_learns_its_parameters(layer, simulation):
     np.testing.assert_allclose(gravity.detach(), [1.0, -9.0], atol=0.02)
     assert losses[-1] < 1e-3 * losses[0]
     viscous = layer.Steps(simulation, 20, {"gravity": [0.0, -9.81]}, gradients.AdjointViscosity())
-    problem = Problem(simulation, 20, Far(), state=simulation.state())
+    problem = Problem(simulation, 20, Squares({"positions": 1.0}), state=simulation.state())
     (viscous(first)["positions"] ** 2).sum().backward()
     wanted = problem.value_and_gradient({"gravity": [0.0, -9.81]}, gradients.AdjointViscosity())[1]
     np.testing.assert_allclose(next(viscous.parameters()).grad, wanted["gravity"], rtol=1e-12)
