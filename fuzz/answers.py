@@ -3,6 +3,7 @@
 import json
 import math
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -53,8 +54,7 @@ def trajectory_complaints(scene: Scene, trajectory: Trajectory) -> list[str]:
     positions = trajectory.positions.astype(np.float64)
     tolerance = TOLERANCE * spacing + 4.0 * float(precision) * float(np.abs(positions).max())
     region = scene.container.region(scene.dimension).opened(scene.container.periods(scene.dimension)[1])
-    emitted = trajectory.others.get("emitted", [None] * len(positions))
-    waiting = (_waiting(scene, *state) for state in zip(positions, emitted, strict=True))
+    waiting = (_waiting(scene, x, frame.others) for x, frame in zip(positions, trajectory, strict=True))
     lost = [~region.contains(points, tolerance) & ~held for points, held in zip(positions, waiting, strict=True)]
     first = next((k for k, outside in enumerate(lost) if outside.any()), None)
     if first is None:
@@ -65,9 +65,9 @@ def trajectory_complaints(scene: Scene, trajectory: Trajectory) -> list[str]:
     ]
 
 
-def _waiting(scene: Scene, points: np.ndarray, emitted: np.ndarray | None) -> np.ndarray:
-    """(n,) whether a particle of the nozzle has not come out yet, or by less than a spacing."""
-    waiting = ~is_out(scene, emitted, len(points))
+def _waiting(scene: Scene, points: np.ndarray, others: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(n,) whether a particle of the nozzle has not come out yet, or by less than a spacing, or is in a drain."""
+    waiting = ~is_out(scene, others, len(points))
     if scene.emitter is not None:
         spacing = scene.discretisation.spacing
         along = (points - scene.emitter.outlet) @ np.array(scene.emitter.direction)

@@ -164,9 +164,7 @@ def test_a_scale_covers_nothing_that_is_shown(upper, is_beside):
 def test_what_waits_in_an_emitter_is_not_drawn():
     simulation = cortado.Simulation(jet(picture=SMALL))
     trajectory = simulation.run(30)
-    first, last = (
-        is_out(simulation.scene, frame.others["emitted"], trajectory.particles) for frame in trajectory[::30]
-    )
+    first, last = (is_out(simulation.scene, frame.others, trajectory.particles) for frame in trajectory[::30])
     assert first.sum() == 48 and 48 < last.sum() < trajectory.particles
     old = ages(simulation.scene, trajectory)
     np.testing.assert_allclose(old[-1, :48], trajectory.times[-1])
