@@ -12,7 +12,7 @@ from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.device.reduction import sum_and_maximum, sum_of
 from cortado.pictures.painter import painter
 from cortado.scene.motions import told
-from scenes import HONEY, box, plane, plane_of_three, scene, splash, thrown, two_layers
+from scenes import HONEY, Squares, box, plane, plane_of_three, scene, splash, thrown, two_layers
 from test_neighbours import CLOUDS, check_same, lists
 from test_step_reader import CASES as READ
 
@@ -159,20 +159,10 @@ def read(made, device, names):
     simulation = Simulation(made, device, "float64")
     point = {**thrown(simulation), "gravity": GRAVITY[: simulation.dimension]}
 
-    class Squares:
-        def __init__(self, scales):
-            self.scales = scales
-
-        def value(self, end):
-            return sum(float((end[name] ** 2).sum()) / size for name, size in self.scales.items())
-
-        def adjoint(self, end):
-            return {name: 2.0 * end[name] / size for name, size in self.scales.items()}
-
     end = Problem(simulation, 20, losses.FinalPositions(simulation.positions)).end(point)
     values = [end[name] for name in names]
-    sizes = {name: float((value**2).sum()) or 1.0 for name, value in zip(names, values, strict=True)}
-    loss, gradient = Problem(simulation, 20, Squares(sizes)).value_and_gradient(point)
+    weights = {name: 1.0 / (float((value**2).sum()) or 1.0) for name, value in zip(names, values, strict=True)}
+    loss, gradient = Problem(simulation, 20, Squares(weights)).value_and_gradient(point)
     return [*values, np.array(loss), *gradient.values()]
 
 

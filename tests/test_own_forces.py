@@ -13,7 +13,7 @@ from cortado.sph.parts import Carried, Part
 from finite_differences import both_modes, central_difference
 from own_forces import Breeze
 from remembering_force import TAU, Memory, MemoryForce, U
-from scenes import aimed, plane, splash
+from scenes import Squares, aimed, plane, splash
 
 STEPS = 8
 
@@ -188,18 +188,8 @@ def test_fields_of_a_scene_are_not_sorted():
         Carried([StateField("u", "", Entry.NUMBER, Axis.SCALAR)], layout)
 
 
-class Memories:
-    """The mean square of the velocities that particles had."""
-
-    def value(self, end):
-        return float((end[U.name] ** 2).mean())
-
-    def adjoint(self, end):
-        return {U.name: 2.0 * end[U.name] / end[U.name].size}
-
-
 def test_its_field_is_in_losses_and_derivatives_go_through_it():
-    judged = Problem(Simulation(plane(), precision="float64", forces=[Memory()]), 12, Memories())
+    judged = Problem(Simulation(plane(), precision="float64", forces=[Memory()]), 12, Squares({U.name: 0.01}))
     point = {"memory.k": 30.0, "gravity": np.array([1.0, -9.81])}
     along = {"memory.k": 2.0, "gravity": np.array([0.3, 0.7])}
     gradient, derivative = both_modes(judged, point, along, 1e-12)
@@ -220,7 +210,7 @@ def test_its_field_is_read_by_name(tmp_path):
     np.testing.assert_array_equal(simulation.quantity(U.name, trajectory), field)
     with pytest.raises(InputError, match=f"quantity is 'memories', but must be one of .*, {U.name}, density"):
         trajectory.quantity("memories")
-    end = Problem(simulation, 6, Memories()).end({})
+    end = Problem(simulation, 6, Squares({U.name: 1.0})).end({})
     np.testing.assert_array_equal(end[U.name], field[-1])
 
 
