@@ -74,6 +74,26 @@ def test_a_plane_takes_what_is_beyond_it_and_waiting_particles_are_left_alone():
     assert np.array_equal(run.others["drained"][1][: len(before)] == 1, before > 0.12)
 
 
+@pytest.mark.parametrize("d", [2, 3])
+def test_without_pressure_fluid_flows_to_a_sink_by_its_formula(d):
+    """From the velocity that it has, with phi from 0 at r_2 to 1 at r_1; a step of NumPy beside one on the device."""
+    forces = {"gravity": [0.0] * d, "viscosity": "none", "pressure": False}
+    simulation = Simulation(emptied(d, forces=forces), precision="float64")
+    sink, x = simulation.scene.drain[0], simulation.positions
+    v = 0.1 * np.sin(9.0 * x)
+    run = simulation.run(1, {"initial_velocities": v})
+    y = x - sink.position
+    r, r_1 = np.linalg.norm(y, axis=1, keepdims=True), 0.05 + 3.0 * 0.05
+    t = np.clip((r_1 + 3.0 * 0.05 - r) / (3.0 * 0.05), 0.0, 1.0)
+    phi = t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
+    sphere = open_sphere(simulation.scene.resting_room, np.array(sink.position), r_1)
+    wanted = (1.0 - phi) * v - phi * sink.flow_rate * y / (sphere * r**d)
+    left = run.others["drained"][1] == 0
+    assert (phi[left] == 1.0).sum() > 5 and ((phi > 0.0) & (phi < 1.0)).sum() > 5 and (~left).any()
+    np.testing.assert_allclose(run.velocities[1][left], wanted[left], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(run.positions[1][left], (x + 0.002 * wanted)[left], rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("depth", [0.5, 1.5])
 def test_a_sink_takes_its_flow_rate(depth):
     """Within a few particles, also of those that it begins with; pressure does not drive fluid through it."""
