@@ -3,6 +3,7 @@
 import runpy
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -52,3 +53,17 @@ def test_waves_come_to_the_probes_as_they_were_measured(monkeypatch, tmp_path, c
     assert places.tolist() == [3.0, 4.95, 5.2, 5.5]
     assert (np.abs(ratios - 0.95) < 0.15).all() and (np.abs(phases) < 25.0).all()
     assert np.ptp(read_picture(tmp_path / "wave_flume.png")) > 0.5
+
+
+def test_a_flap_makes_waves_meet_where_they_shall(monkeypatch):
+    """In linear theory, whose derivative it is, one round is enough: the crest is as high as was asked, and in time."""
+    monkeypatch.syspath_prepend(str(EXAMPLE.parent))
+    backward = runpy.run_path(str(EXAMPLE.with_name("backward.py")))
+    names = backward["found"].__globals__
+    names["simulated"] = lambda times, stroke, places, asked: stroke
+    names["surface"] = lambda stroke, times, places: FLUME["theory"](times, stroke, np.array(places))
+    times = np.arange(0.0, 17.01, 0.02)
+    stroke, here = backward["found"](times, backward["focused"](times), SimpleNamespace(rounds=1), [8.0])
+    before = times < 14.0
+    assert here[700, 0] == pytest.approx(0.036, rel=0.05) and here[:, 0].argmax() == 700
+    assert here[before, 1].max() < 0.02 and 0.005 < np.abs(stroke).max() < 0.05
