@@ -32,6 +32,7 @@ KEPT = {
         "test_reverse_forward_tape_and_differences_agree[a face that mirrors]",
         "test_reverse_forward_tape_and_differences_agree[two layers]",
         "test_reverse_forward_tape_and_differences_agree[a nozzle over a pool]",
+        "test_reverse_forward_tape_and_differences_agree[a sink and a box]",
         "test_reverse_forward_tape_and_differences_agree[surface tension]",
         "test_reverse_forward_tape_and_differences_agree[a body]",
         "test_reverse_forward_tape_and_differences_agree[a body on a spring, to a ball]",
