@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from cortado import CortadoWarning, Scene, SceneError, Simulation
+from cortado.discretise.shapes import EXCESS, block_filling
 from cortado.errors import InputError, unwarned
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.fluid_particles import fluid_particles
@@ -349,3 +350,11 @@ def test_the_time_step_knows_how_fast_the_fastest_particle_is():
 def test_wrong_spins_are_sentences(dimension, spin, words):
     with pytest.raises(SceneError, match=words):
         spinning_bodies(dimension, box([0.0] * dimension, [1.0] * dimension, angular_velocity=spin))
+
+
+def test_a_lattice_that_is_stretched_has_no_more_points_than_its_box_holds():
+    """A flume of 13.63 m began with 25 particles too many at a spacing of 0.02 m, and packing moved all of them."""
+    for long, spacing, layers in ((13.63, 0.02, 681), (6.97, 0.05, 139), (7.03, 0.05, 140)):
+        block = block_filling([0.0, 0.0], [long, 1.0], spacing)
+        assert block.counts.tolist() == [layers, round(1.0 / spacing)]
+        assert block.size * spacing**2 == pytest.approx(long, rel=EXCESS) and block.size * spacing**2 <= long + 1e-9

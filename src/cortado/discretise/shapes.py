@@ -101,15 +101,18 @@ def block_between(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
 def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
     """Return points ``lower + (i + 1/2) spacing`` of a box whose sides are whole cells; lower and upper (d,) [m]. In
     another box they are stretched along some axes and narrowed along others, by `MOST_STRETCHED` at most, to be as many
-    as its volume holds, within `EXCESS`. Where no lattice has both, they are those whose cells lie within."""
+    as its volume holds, within `EXCESS`, and no more than that if they can: fluid that begins compressed bursts apart.
+    Where no lattice has both, they are those whose cells lie within."""
     first, last = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cells, plain = (last - first) / spacing, block_between(lower, upper, spacing)
     if (np.abs(cells - np.rint(cells)) <= ROUND_OFF).all() or not plain.counts.all():
         return plain
     counts = grid([np.maximum(n + np.arange(-NEARBY, NEARBY + 1.0), 1.0) for n in plain.counts])
-    errors = np.abs(np.prod(counts / cells, axis=1) - 1.0)
+    errors = np.prod(counts / cells, axis=1) - 1.0
     stretched = np.abs(np.log(cells / counts)).max(axis=1)
-    fit = np.flatnonzero((errors <= EXCESS) & (stretched <= MOST_STRETCHED))
+    fit = np.flatnonzero((np.abs(errors) <= EXCESS) & (stretched <= MOST_STRETCHED))
+    loose = fit[errors[fit] <= ROUND_OFF]
+    fit = loose if len(loose) else fit
     if not len(fit):
         return plain
     best = counts[fit[np.argmin(stretched[fit])]]
