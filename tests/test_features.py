@@ -233,6 +233,7 @@ NEAR = {
         ["the cubic spline", "two layers", "a jet", "projection, plane", "surface tension by curvature"], 5e-3
     ),
     "those of three fluids in a projection": 1e-2,
+    "a sink and a box": 5e-3,
     **dict.fromkeys(["a body force", "a pair force", "a pair force that is not odd", "a network"], 5e-3),
     "implicit viscosity, no slip": 1e-2,
     "a bingham fluid": 2e-2,

@@ -253,11 +253,15 @@ def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Fi
     shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
     titles = [f"t = {trajectory.times[frame]:.3f} s" for frame in shown]
     motions = solid_motions(scene, trajectory.others)
+    none = np.zeros(trajectory.particles)
+    left = [np.ravel(trajectory[frame].others.get("drained", none)) == 0.0 for frame in shown]
     path = particles(
-        [trajectory.positions[frame] for frame in shown],
+        [trajectory.positions[frame][here] for frame, here in zip(shown, left, strict=True)],
         titles,
         folder / "particles.png",
-        colours=[np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown],
+        colours=[
+            np.linalg.norm(trajectory.velocities[frame][here], axis=1) for frame, here in zip(shown, left, strict=True)
+        ],
         colour_label="speed [m/s]",
         container=scene.container.extent(),
         lines=[solid_outline(posed(scene, motions, frame)) for frame in shown],
