@@ -182,6 +182,9 @@ def test_walls_around_a_sink_are_taken_out_of_its_sphere():
         assert open_sphere(room, np.array(place), 0.1) == pytest.approx(2.0 * np.pi * part, rel=3e-3)
     space = scene().resting_room
     assert open_sphere(space, np.zeros(3), 0.1) == pytest.approx(0.5 * np.pi, rel=1e-2)
+    floor = {"name": "floor", "shape": "box", "lower": [-1.0, -0.06], "upper": [1.0, 0.0]}
+    above = plane(solid=[floor], container={"shape": "none"}).resting_room
+    assert open_sphere(above, np.array([0.5, 0.0]), 0.1) == pytest.approx(np.pi, rel=3e-2), "not what is below a floor"
 
 
 WRONG = [

@@ -235,11 +235,13 @@ def _of_sink(sink: SinkDrain, unit: str, spacing: float) -> list[Parameter]:
 
 DIRECTIONS = 1024
 """Number of directions in which it is looked for walls around a sink."""
+PARTS = 16
+"""Number of places along each of them; they are a third of a spacing apart."""
 
 
 def open_sphere(room: Room, place: Points, radius: float) -> float:
-    """Return the part of the unit sphere, in 2-D of the unit circle, around a place (d,) [m] that is not behind walls
-    at a radius [m], as an angle [rad] or solid angle [sr]."""
+    """Return the part of the unit sphere, in 2-D of the unit circle, around a place (d,) [m] in which no wall stands
+    up to a radius [m], as an angle [rad] or solid angle [sr]. So what is beyond a thin floor does not count as open."""
     k = np.arange(DIRECTIONS) + 0.5
     if len(place) == 2:
         turn = 2.0 * np.pi * k / DIRECTIONS
@@ -248,4 +250,5 @@ def open_sphere(room: Room, place: Points, radius: float) -> float:
         z, turn = 1.0 - 2.0 * k / DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
         across = np.sqrt(1.0 - z * z)
         ways, whole = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1), 4.0 * np.pi
-    return whole * float(room.contains(place + radius * ways, 0.0).mean())
+    seen = [room.contains(place + part * radius * ways, 0.0) for part in np.arange(1, PARTS + 1) / PARTS]
+    return whole * float(np.all(seen, axis=0).mean())
