@@ -185,7 +185,7 @@ def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
     least = solid.least_thickness * spacing
     if solid.side == "outside" and (thickness := solid.thinnest(spacing)) < least * (1.0 - 1e-6):
         found, of = Words(f"only {thickness:g} m thick"), "one spacing" if least == spacing else "half a spacing"
-        raise field_error(path, found, f"at least {of}, {least:g} m, thick, or a solid of the shape \"sheet\"")
+        raise field_error(path, found, f'at least {of}, {least:g} m, thick, or a solid of the shape "sheet"')
 
 
 def check_scene(scene: SceneTables) -> None:
