@@ -44,8 +44,8 @@ __all__ = ["NAMES", "UNITS", "Problem"]
 
 SPARSE = 8
 """From one state in so many on, quantities are read in every step. With a probe in every 8th state a loss costs 3 to
-6 % less so, and its gradient 1 to 9 %, of 408 and 7,824 particles in float32; in every 16th the same to 2 % (`python -m
-benchmarks probed`)."""
+6 % less so, and its gradient 1 to 9 %, with 408 and 7,824 particles in float32. With one in every 16th state the costs
+are the same to 2 % (`python -m benchmarks probed`)."""
 KEPT = 2
 """Number of batches of a problem, of different sizes, that are kept for the next evaluation."""
 
@@ -147,8 +147,9 @@ class Problem:
     Parameters, any of them together:
 
     - ``gravity`` (d,) or (steps, d) [m / s2]; ``time_step`` [s];
-    - in the place of gravity ``tilt`` (d - 1,) or (steps, d - 1) [degrees], how far the scene's gravity leans, with its
-      size kept: where it is along -y, towards x and, in 3-D, z; see `cortado.scene.parameter_values.Tilt`;
+    - in the place of gravity ``tilt`` (d - 1,) or (steps, d - 1) [degrees], the angle by which the scene's gravity
+      leans, with its size kept. Gravity along -y leans towards x and, in 3-D, z; see
+      `cortado.scene.parameter_values.Tilt`;
     - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d);
     - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3], a number, with several phases (phases,);
     - with several phases the first ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];
@@ -372,8 +373,8 @@ class Problem:
     @property
     def fingerprint(self) -> str:
         """Text that identifies the problem by words and checksums: steps, precision, scene, first positions (which may
-        be in a file), free energy (by its name, curvature and code), forces and solver of one's own, ``fingerprint`` of
-        the loss, or the code of a function. For any other loss only its type is known."""
+        be in a file), and free energy (by its name, curvature and code). It also covers forces and solver of one's own,
+        and the ``fingerprint`` of the loss, or the code of a function. For any other loss only its type is known."""
         return _fingerprint(self.simulation, self.steps, self.loss, self._states)
 
     def iterations(self) -> np.ndarray:

@@ -194,12 +194,12 @@ class Simulation(Stepping):
 
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity, its schedule included; so
         does any other parameter of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same
-        scene, the run goes on from there, with the same bits as if it had not stopped; a parameter over time is then
-        one of the steps to come, and a rest density that the earlier run was given is given again. A batch goes on from
-        one state for each scene. ``record=["density"]`` keeps quantities of the particles with every frame: see
-        `quantity`. ``sensors`` by name are read in every step, besides those of the scene: see `cortado.sensors`. Warns
-        when the pressure did not converge; raises `DivergedError` when a particle is
-        lost, where a batch warns, and goes on without the scene.
+        scene, the run goes on from there, with the same bits as if it had not stopped. A parameter over time then has a
+        value for each of the steps to come, and a rest density that the earlier run was given is given again. A batch
+        goes on from one state for each scene. ``record=["density"]`` keeps quantities of the particles with every
+        frame: see `quantity`. ``sensors`` by name are read in every step, besides those of the scene: see
+        `cortado.sensors`. Warns when the pressure did not converge; raises `DivergedError` when a particle is lost,
+        where a batch warns, and goes on without the scene.
         """
         own, number = self.__dict__, steps_of_run(self, steps, time, {} if controls is None else controls)
         rollout = own.pop("_idle", None)  # not to be had by a run within this one

@@ -176,9 +176,9 @@ def certify(
     round-off does not hide what is wrong. A loss of your own is still computed in float32 then; its adjoint is compared
     with finite differences of its values, and may be off by a tenth, which is what float32 allows.
 
-    The adjoint is checked with respect to every parameter of the scene. The horizon, which is the number of steps up to
-    which the exact gradient is useful, and the estimator to use beyond it, are found for ``parameters`` alone: these
-    are either values by name, or names of parameters whose values are the scene's.
+    The adjoint is checked with respect to every parameter of the scene. Two things are found for ``parameters`` alone:
+    the horizon, which is the number of steps up to which the exact gradient is useful, and the estimator to use beyond
+    it. These ``parameters`` are either values by name, or names of parameters whose values the scene gives.
 
     Args:
         problem: a problem; or, with a number of ``steps``, a simulation, a scene or the path of a scene's file. The

@@ -123,8 +123,8 @@ def describe(
     precision: Precision = "float32",
     json: Json = False,
 ) -> Work:
-    """Describe a scene before it is run: its particles, what limits its time step, its memory, and of a run how long it
-    takes, how large it is on disk, and how long its film is.
+    """Describe a scene before it is run: its particles, the limits of its time step and its memory. Of a run it also
+    tells the duration, the size on disk and the length of its film.
 
     Args:
         scene: The scene file, or a task file.

@@ -1,13 +1,14 @@
 """viser's server, with a door before it, and with ears that hear only what a page may say.
 
-Who gets in is who has the address of the window, which ends in a random token. Every page that is open in a browser can
-ask this machine for pages and open websockets to it, with the browser's own ``Origin``, and can give itself a name that
-leads to this machine (DNS rebinding). So a request is refused if it has not the token, if it calls the machine by
-another name, or if it comes from another page than the window's own. A program that is no browser sends no ``Origin``,
-and needs the token alone.
+Whoever has the address of the window, which ends in a random token, gets in. Every page that is open in a browser can
+ask this machine for pages and open websockets to it, with the browser's own ``Origin``. Such a page can also give
+itself a name that leads to this machine (DNS rebinding). So a request is refused if it has not the token, if it calls
+the machine by another name, or if it comes from another page than the window's own. A program that is no browser sends
+no ``Origin``, and needs the token alone.
 
-What may be said is where the camera is, and values that controls can have. viser takes any value of any attribute of a
-control, and does more that no window here has, such as a tunnel to the internet; all of that is left aside.
+A page may send the position of the camera, and values that controls can have. The server of viser takes any value of
+any attribute of a control, and offers more that no window here has, such as a tunnel to the internet. All of that is
+left aside.
 """
 
 import logging

@@ -1,7 +1,7 @@
 """Particles sorted by cell, the scenes of a batch one behind the other.
 
-The grid of cells wraps around in every direction, so that no position lies outside of it: along a periodic axis
-the cells divide the period, elsewhere cells that share a number are told apart by the distance test.
+The grid of cells wraps around in every direction, so that no position lies outside of it. Along a periodic axis the
+cells divide the period; elsewhere the distance test tells apart cells that share a number.
 """
 
 from functools import cache, partial

@@ -1,10 +1,10 @@
 """The Warp modules that kernels are compiled in, before they are launched: all that a step needs, side by side, and one
 line says so.
 
-For a CPU LLVM finds what can be done four numbers at a time in loops over neighbours, which take `UNROLL` of them at
-once (`cortado.particles.neighbourhood`), if it looks deep enough: with Warp's depth of 4 a step of the projection takes
-a fifth longer, one of PCISPH a twentieth, and both have the same bits. With LLVM's own depth of 12 the density takes a
-fifth longer than with 7.
+On a CPU, LLVM vectorises loops over neighbours, four numbers at a time, if it looks deep enough. These loops take
+`UNROLL` neighbours at once (`cortado.particles.neighbourhood`). With Warp's depth of 4 a step of the projection takes a
+fifth longer and a step of PCISPH a twentieth, with the same bits. With LLVM's own depth of 12 the density takes a fifth
+longer than with 7.
 
 Warp compiles a module when the first of its kernels is launched, one module after the other. `wp.force_load` of all of
 them with workers of its own is as fast as what is done here. But after Ctrl-C it waits for all of them, and of a few at

@@ -200,7 +200,7 @@ class Domain:
 
     def images(self, reach: float, seen: Callable[[Points], Points]) -> tuple[Points, Points, Points]:
         """Return the translations (m, k) [m] between the images that ``seen`` tells apart, their inverse (k, m), and
-        the shifts (i, k) [m] from the nearest image to all within a reach [m] of a place."""
+        shifts (i, k) [m]. The shifts lead from the nearest image to all images within a reach [m] of a place."""
         lengths = np.array(self.lengths)
         steps = _independent(seen(np.eye(len(lengths))), lengths) if lengths.any() else np.zeros((0, 0))
         if not len(steps):

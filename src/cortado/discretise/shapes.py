@@ -100,9 +100,9 @@ def block_between(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
 
 def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
     """Return points ``lower + (i + 1/2) spacing`` of a box whose sides are whole cells; lower and upper (d,) [m]. In
-    another box they are stretched along some axes and narrowed along others, by `MOST_STRETCHED` at most, to be as many
-    as its volume holds, within `EXCESS`, and no more than that if they can: fluid that begins compressed bursts apart.
-    Where no lattice has both, they are those whose cells lie within."""
+    another box they are stretched along some axes and narrowed along others, by `MOST_STRETCHED` at most. Their number
+    matches the volume within `EXCESS`, and does not exceed it if possible: fluid that begins compressed bursts apart.
+    Where no lattice has both, the points are those whose cells lie within."""
     first, last = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cells, plain = (last - first) / spacing, block_between(lower, upper, spacing)
     if (np.abs(cells - np.rint(cells)) <= ROUND_OFF).all() or not plain.counts.all():

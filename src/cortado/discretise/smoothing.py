@@ -88,8 +88,8 @@ SKIN = 0.03
 SLACK = 1e-4
 """How far the lattice stays below the rest density, relative.
 
-At the rest density exactly, every particle of a block that starts as a lattice sits on the kink of the pressure clamp:
-round-off would choose the pressure's derivative, and no finite difference could confirm it.
+At the rest density exactly, every particle of a block that starts as a lattice sits on the kink of the pressure clamp.
+Round-off would then choose the derivative of the pressure, and no finite difference could confirm it.
 """
 RATE_LIMIT = 1.5
 """Bound on `greatest_rate`, as the iteration converges below 2; the margin is for particles off the lattice."""
@@ -218,8 +218,8 @@ def stress_control(kernel: SmoothingKernel, spacing: float, support: float, dime
 @cache
 def stress_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """Return the greatest eigenvalue [1 / m2] on the lattice of viscosity as a stress (`cortado.sph.stress_kernels`),
-    in a wave of compression: of 2 |g|^2 + C (sum_j 2 s_j (1 - cos k . x_j) - m_2 |g|^2) with g = sum_j s_j x_j sin(k .
-    x_j) / m_2."""
+    in a wave of compression. It is the greatest value of 2 |g|^2 + C (sum_j 2 s_j (1 - cos k . x_j) - m_2 |g|^2) over
+    wave vectors k, with g = sum_j s_j x_j sin(k . x_j) / m_2."""
     offsets, gradients, volume = _filled(kernel, spacing, support, dimension)
     others = np.any(offsets != 0.0, axis=1)
     offsets, gradients = offsets[others], gradients[others]

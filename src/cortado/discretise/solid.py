@@ -128,9 +128,9 @@ class Moments:
 
 
 def enclosed_moments(corners: Points, weights: Points) -> Moments:
-    """Return the moments of a body that edges (k, 2, 2) or triangles (k, 3, 3) [m] enclose, counterclockwise as seen
-    from outside and each with a weight (k,), by integrals over the surface (Mirtich 1996). They are bases of cones
-    about a place near by."""
+    """Return the moments of a body that edges (k, 2, 2) or triangles (k, 3, 3) [m] enclose, by integrals over the
+    surface (Mirtich 1996). They run counterclockwise as seen from outside, and each has a weight (k,). They are bases
+    of cones about a place near by."""
     d = corners.shape[1]
     origin = whole_origin(corners.reshape(-1, d))
     about = corners - origin

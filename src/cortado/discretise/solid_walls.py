@@ -34,8 +34,8 @@ OFF_FACES = (0.31, 0.17, 0.23)
 """Shift of fine lattices off the faces of solids that are aligned with them, in cells."""
 HALVINGS = 20
 MANY, MOST = 50_000, 2_000_000
-"""Numbers of points: with more than the first several cores look for what is nearest, which with fewer wait for each
-other; no more than the second are looked at at a time, which bounds the memory."""
+"""Numbers of points. Above the first, several cores search for the nearest faces; with fewer points they only wait for
+each other. At most the second number of points is searched at a time, which bounds the memory."""
 SEED = 1
 
 

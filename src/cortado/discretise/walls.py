@@ -224,8 +224,8 @@ def wall_layers(lattice: RestLattice) -> WallLayers:
     """Find the layers that meet these conditions at a flat wall, with fluid on the lattice from half a spacing on:
 
     - the fluid has the rest density (Band et al. 2018 scale volumes for that), in its first layer and in its second;
-    - a uniform pressure pushes no particle of the first layer: what a wall adds to the density of a particle is steep
-      enough to balance the pressure of the particle and that of all its neighbours.
+    - a uniform pressure pushes no particle of the first layer. The contribution of a wall to the density of a particle
+      is steep enough to balance the pressure of the particle and of all its neighbours.
 
     One layer is enough where the second layer of the fluid does not see the wall, with a support of up to two spacings.
     """

@@ -1,5 +1,5 @@
-"""All tasks, by name: a cup that is carried, a latte, a jug that pours, a raft, a splash, and a cup that is stirred;
-the cup and the jug in the plane and in space."""
+"""All tasks, by name: a cup that is carried, a latte, a jug that pours, a raft, a splash, and a cup that is stirred.
+The cup and the jug come in the plane and in space."""
 
 import warnings
 from collections.abc import Sequence
@@ -126,9 +126,9 @@ class CarryInSpace(Carry):
 class Latte(Task):
     """The task of pouring milk from a nozzle into coffee as a hidden path of the nozzle would have done.
 
-    Actions: where the nozzle is sent to, along x. After LatteArt of FluidLab (Xian et al. 2023), with its reward but
-    for scale and a constant: minus the squared distances of the milk that has been poured from where it is under the
-    hidden path at the same time, their mean over the squared radius of the cup.
+    Actions: the positions along x to which the nozzle is sent. The task follows LatteArt of FluidLab (Xian et al.
+    2023), with its reward but for scale and a constant. The reward is minus the mean squared distance between the
+    poured milk and its places under the hidden path at the same time. It is divided by the squared radius of the cup.
     """
 
     name = "Latte"
@@ -339,9 +339,9 @@ class Letter:
 class Stir(Task):
     """The task of stirring milk in a corner of a cup of coffee until it is everywhere.
 
-    Actions: where the spoon, a disc in the plane, is sent to. After Mixing of FluidLab (Xian et al. 2023), with its
-    reward but for scale: the mean distance of all pairs of milk particles, component by component, over that of all
-    particles at the start, less 1.
+    Actions: the positions to which the spoon, a disc in the plane, is sent. The task follows Mixing of FluidLab (Xian
+    et al. 2023), with its reward but for scale. The reward is the mean distance of all pairs of milk particles,
+    component by component, over the mean distance of all particles at the start, less 1.
     """
 
     name = "Stir"

@@ -1,5 +1,5 @@
-"""Environments of Gymnasium's: one, or many of one task in one launch; what both need of Gymnasium, or one sentence
-where it is not installed; and `Twin`, an episode as a differentiable function of its actions.
+"""Environments of Gymnasium: one, or many of one task in one launch, and the parts of Gymnasium that both need. Where
+it is not installed, one sentence says so. `Twin` is an episode as a differentiable function of its actions.
 """
 
 from collections.abc import Mapping

@@ -331,7 +331,7 @@ class Guided(Ensemble):
     differences of the loss.
 
     Formula: in units of the spreads, the mean of the surrogate's gradients is cut along the first axis of each
-    parameter, the steps or knots, into equal parts: p_1 ... p_K are their directions, of length 1, and
+    parameter, the steps or knots, into equal parts. Their directions p_1 ... p_K have length 1, and
 
         g = sum_k D_k p_k,   D_k = mean over samples of (L(u + r_k p_k) - L(u - r_k p_k)) / (2 r_k),   r_k = sqrt(N_k),
 
@@ -344,8 +344,9 @@ class Guided(Ensemble):
     of freedom by Welch and Satterthwaite. Cost: ``samples`` gradients of the surrogate and 1 + 2 K ``differences``
     forward runs, however many numbers a parameter has.
 
-    Runs that diverge: as in `EnsembleMean` for the surrogate's; a sample of the differences is left out as a whole, up
-    to a quarter of them, so that all D_k are means over the same samples. With fewer than 4 none can be left out.
+    Runs that diverge: those of the surrogate count as in `EnsembleMean`. A sample of the differences is left out as a
+    whole, up to a quarter of them, so that all D_k are means over the same samples. With fewer than 4 none can be left
+    out.
     """
 
     samples: int = 4

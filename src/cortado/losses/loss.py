@@ -151,8 +151,8 @@ ADJOINT_FIELDS = ("positions", "velocities", "mass_fractions")
 """Names of the fields that the arrays of an adjoint tuple differentiate by, in their order."""
 Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...] | Mapping[str, np.ndarray]
 """Derivatives of a loss with respect to positions and velocities, (n, d) each, and, if there is a third array, mass
-fractions (n, phases); or by the names of fields of a state and of quantities, what is left out being 0; or as Warp
-arrays."""
+fractions (n, phases). They may also come by the names of fields of a state and of quantities, where names left out mean
+0; or as Warp arrays."""
 
 
 def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
@@ -201,9 +201,9 @@ class Loss(Protocol):
         """Return the value of the loss for the end of a run."""
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """Return the loss and its derivatives, which often share work: a tuple of NumPy arrays, or a table of them by
-        the names of fields and quantities, ``{"density": array}``, or a `State` of Warp arrays, which
-        ``end.state.like()`` makes, all 0, and ``set({"positions": array})`` of it fills."""
+        """Return the loss and its derivatives, which often share work. They are a tuple of NumPy arrays, a table of
+        them by the names of fields and quantities, ``{"density": array}``, or a `State` of Warp arrays. The method
+        ``end.state.like()`` makes such a state, all 0, and its ``set({"positions": array})`` fills it."""
 
 
 @fixed

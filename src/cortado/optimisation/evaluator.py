@@ -38,8 +38,8 @@ FELT = 0.01
 ROUND_OFF = 1e-5
 """Of the greatest loss: smaller promises tell nothing, as losses of runs in float32 are not as precise."""
 MISLED = 0.25
-"""Share of the steps that tell, of which at least `FEW` have to contradict: in searches of 30 to 400 steps of a splash
-it was 0 within the horizon, and 0.3 to 0.9 beyond it."""
+"""Share of the telling steps that must contradict, and at least `FEW` of them must. In searches of 30 to 400 steps of a
+splash the share was 0 within the horizon, and 0.3 to 0.9 beyond it."""
 FEW = 2
 STAYED = 1.0 / 3.0
 """Share of the evaluations, the last ones, by which the loss has fallen by less than `FELT` where it stays."""

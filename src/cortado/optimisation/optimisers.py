@@ -136,12 +136,11 @@ class LBFGS:
 
     For smooth losses; it reaches tight optima in few evaluations, and stops early where the gradient is
     noisy. It works on (x - start) / scale, and divides the loss by the greatest component of its first
-    gradient in these coordinates, so that the first trial step is at most about `scale` long, whatever the
-    unit of the loss.
+    gradient in these coordinates. So the first trial step is at most about `scale` long, whatever the unit of the loss.
 
-    Where a trial leads to a run that diverges, the line search is told the loss and the slope there of the parabola
-    that has those of the last iterate, and rises where its slope promised to fall. Its next trial is then about a
-    quarter as long, and the approximate Hessian knows nothing of it.
+    Where a trial leads to a run that diverges, the line search gets the loss and the slope of a parabola there. This
+    parabola has the loss and the slope of the last iterate, and rises where its slope promised to fall. The next trial
+    is then about a quarter as long, and the approximate Hessian knows nothing of it.
 
     Its sums over components are BLAS's: beyond some 10^4 components their last bits, and with them resuming
     bit for bit, depend on the number of BLAS threads. A resumed run that comes out otherwise is refused.
@@ -232,8 +231,8 @@ class _Trial:
     gradient: Vector
 
     def rising(self, y: Vector) -> tuple[float, Vector]:
-        """Return a loss and a gradient at y, where the run diverged. Along the way from here they are those of a
-        parabola f + s t - 2 s t^2 at t = 1, with its minimum at t = 1 / 4. f is the loss here, s < 0 its slope."""
+        """Return a loss and a gradient at y, where the run diverged. Along the way from here they follow a parabola
+        f + s t - 2 s t^2 to t = 1, with its minimum at t = 1 / 4. The loss here is f, and s < 0 is its slope."""
         return self.loss - float(self.gradient @ (y - self.y)), -3.0 * self.gradient
 
 

@@ -5,14 +5,14 @@ the container has a bit for each side: 1, 2 and 4 for those at the lower ends of
 ones. Beyond these numbers, from `FACES` on, are the flat faces of solids that move. A reflection is x -> R x + o, with
 R diagonal at the container. Seen from particle i, the image of j is where the image of i sees j, so that every image
 that i can see is one of its neighbours, or its own. In lists of neighbours the image of j by a reflection has the
-number ``reflections j + reflection``. A wall mirrors what is in front of it, for what is in front of it, and not a
-column that waits behind it to come out of an opening; a face mirrors nothing that is beyond its ends.
+number ``reflections j + reflection``. A wall mirrors fluid in front of it, for particles in front of it, and not a
+column that waits behind it to come out of an opening. A face mirrors nothing that is beyond its ends.
 
 A solid takes the points x of a face to x' from c_0 + Q (x - c) = x - D(x), with its middle c, at c_0 before the step,
 and Q = R_0 R^T. An image moves by R u + (D(R x + o) - R D(x)) / dt where its particle moves by u: the second part,
-times dt, is what the face has ``swept``. Where the pose of a solid changes by c', w' and g' (`MovingWalls`), so do D by
-what follows from it, images by t(R x + o) - R t(x) with t(x) = c' + w' x (x - c) + g' (x - c), and mirrored vectors by
-w' x R u - R (w' x u).
+times dt, is what the face has ``swept``. Let the pose of a solid change by c', w' and g' (`MovingWalls`), and let
+t(x) = c' + w' x (x - c) + g' (x - c). Then images change by t(R x + o) - R t(x), mirrored vectors by
+w' x R u - R (w' x u), and D follows the pose.
 """
 
 from functools import cache

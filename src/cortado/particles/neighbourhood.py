@@ -1,5 +1,5 @@
 """The neighbourhood of a particle: other particles, walls and images in these, as one argument of kernels that sum over
-them; and how the entries of particles and of wall particles are read in a sum.
+them. Functions here read the entries of particles and of wall particles in a sum.
 
 Entries are read without the count from an array's end that Warp's own indices allow: a negative index takes a
 comparison and an addition, for every neighbour and every array.
@@ -73,8 +73,8 @@ def _direct(precision: Precision) -> SimpleNamespace:
 
 
 UNROLL = 4
-"""Fluid neighbours that a loop takes at a time, so that their loads overlap; lists are filled up to a multiple of it
-with the particle itself, which adds nothing to a sum but W(0) to the density's."""
+"""Fluid neighbours that a loop takes at a time, so that their loads overlap. Lists are filled up to a multiple of it
+with the particle itself, which adds nothing to any sum except W(0) to the density."""
 
 
 @dataclass(frozen=True)
@@ -235,9 +235,9 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x);
     ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
     per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
-    list of i), ``several`` (the numbers of `UNROLL` of them from the k-th on), those of `loads` and of
-    `mirror_functions`; and ``vectors``, ``numbers`` and ``sixes``, which load what several neighbours have before any
-    of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
+    list of i), ``several`` (the numbers of `UNROLL` of them from the k-th on), and the functions of `loads` and of
+    `mirror_functions`. Three more, ``vectors``, ``numbers`` and ``sixes``, load the values of several neighbours before
+    any of them is used. So the loads do not wait for one another (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)

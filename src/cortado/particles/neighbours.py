@@ -8,8 +8,8 @@ The list holds j for i exactly when it holds i for j, because |x_i - x_j| is com
 sides.
 
 Candidates are the particles in the cells around one's own that are within reach. They come in the order of the cells,
-rows along x one after the other, and within a cell in the order of the particles, whoever looks for them: one thread,
-or the lanes of a particle.
+rows along x one after the other. Within a cell they come in the order of the particles, whether one thread or the lanes
+of a particle look for them.
 
 One thread compares 32 candidates, keeps a bit for each, and then appends those within reach: on a GPU threads that
 compare go side by side, and threads that append wait for one another. Many lanes take the candidates of all rows as one

@@ -20,7 +20,7 @@ is the Warp function ``force(i, x, c, s)`` of particle i, the arrays x and c, an
     any other          what is the same for all neighbours of a particle, and stands between the arrays and s
 
 A term that returns several things makes as many sums in one loop. For a particle of a wall, which is at rest and has no
-pressure, all that has an index j is 0, and its term counts w_b times; walls that act in another way have a term of
+pressure, every value with an index j is 0, and its term counts w_b times. Walls that act in another way have a term of
 their own.
 
 With ``ahead=False`` entries of a neighbour are loaded when it is its turn, and not ahead of it. Loading ahead saves a

@@ -11,8 +11,8 @@ entries of the particle's scene. A sum finds its arrays by the names that they h
 others. A result "+x_bar" is added to the array's entry, and "acceleration:acceleration_in" is the result added to the
 entry of acceleration_in.
 
-A sum whose derivatives are known needs no function where what is computed of it is a multiple (`sum_kernels`), and a
-function of a particle's own numbers none for its derivatives, which Warp makes (`pointwise_kernels`): of results
+A sum whose derivatives are known needs no function if only a multiple of it is computed (`sum_kernels`). A function of
+a particle's own numbers needs none for its derivatives, which Warp makes (`pointwise_kernels`). For results
 r = f(x_i, ..., time_step, ...) they are
 
     tangent:  r_dot[i] = df/dx x_dot[i] + ... + df/dtime_step time_step_dot[scene]

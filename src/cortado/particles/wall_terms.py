@@ -1,5 +1,5 @@
-"""What the walls of one solid, or all walls, do to each particle by one term of a step, with its derivatives; and what
-the adjoint of such a sum gives to solids that move: to where they are, and to how large.
+"""The effect of the walls of one solid, or of all walls, on each particle by one term of a step, with its derivatives.
+The adjoint of such a sum also gives derivatives by the place and the size of solids that move.
 
 A term is told by its work W, a number that is linear in a vector ``bar`` of particle i. Its sum over wall particles b,
 such as the acceleration by them, is

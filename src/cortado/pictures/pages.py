@@ -1,5 +1,6 @@
-"""HTML: what notebooks show of objects, the repr with a picture, a film, a view in motion or a table below it; and
-report.html of a run folder, which holds its pictures and films inside and opens from disk, without a network.
+"""HTML for notebooks and run folders. Notebooks show an object as its repr with a picture, a film, a view in motion or
+a table below it. The report.html of a run folder holds its pictures and films inside and opens from disk, without a
+network.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 Where its pixels look, where along a ray samples lie, and which of them lie in a box.
 
 In the camera's frame x points to the right, y up and z backwards. Pixel coordinates (u, v) run from -1 to 1 over the
-width of the picture, v upwards and in the same unit; at depth z the pixel (u, v) sees (w u, w v, -z), with the half
-width w = half_width + growth z. So one formula holds for parallel rays (growth 0) and for rays from a point
-(half_width 0).
+width of the picture, v upwards and in the same unit. At depth z the pixel (u, v) sees (w u, w v, -z), with the half
+width w = half_width + growth z. So one formula holds for parallel rays (growth 0) and for rays from a point (half_width
+0).
 
 A sample is interpolated trilinearly between the nodes of the field, which is 0 at all nodes that are not there. So it
 is continuous everywhere, and a field of one layer (2-D) is a sheet that is one node distance thick.

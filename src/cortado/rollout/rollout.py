@@ -1,8 +1,8 @@
 """The only time loop: run forward, keep checkpoints, go back.
 
-Steps are launched in chunks without a host read in between; at the end of a chunk the host looks whether the
-neighbour lists were long enough (if not, they grow and the chunk is repeated) and whether a particle was lost. A chunk
-of steps, or a step back or along, is a captured graph on a GPU, and on a CPU where launches take one thread.
+Steps are launched in chunks without a host read in between. At the end of a chunk the host checks whether a particle
+was lost, and whether the neighbour lists were long enough; if not, they grow and the chunk is repeated. A chunk of
+steps, or a step back or along, is a captured graph on a GPU, and on a CPU where launches take one thread.
 """
 
 from collections.abc import Callable, Mapping

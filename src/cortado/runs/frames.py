@@ -189,9 +189,9 @@ class Pace:
     ) -> Pace:
         """Choose the pace for a run with frames at ``times`` [s]. ``count``: how many frames the film has, evenly
         chosen; if left out `USUAL` in each of its seconds. ``speed``: if left out, a film of ``count`` frames shows
-        `USUAL` in a second, and any other is in real time, or slower or faster where it would be shorter than
-        `SHORTEST` or longer than `LONGEST`. ``rate`` [1/s]: of frames that were recorded so many in a second; without
-        ``count`` the film has every one of them, or every second, and so on, and no state between two."""
+        `USUAL` in a second. Any other is in real time, or slower or faster where it would be shorter than `SHORTEST` or
+        longer than `LONGEST`. ``rate`` [1/s]: of frames that were recorded so many in a second; without ``count`` the
+        film has every one of them, or every second, and so on, and no state between two."""
         span = float(times[-1] - times[0])
         full, is_asked = speed or _easy_speed(span), speed is not None
         if speed is None:

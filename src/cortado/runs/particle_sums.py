@@ -138,8 +138,8 @@ def reach_of(given: float | None, at: Cut) -> float:
 
 
 def parts_of(reach: float, at: Cut, across: Across, axes: int) -> NDArray[Any]:
-    """Return the places (m, d) of parts of a particle from it [m]: evenly in its cell along ``axes`` axes, those that
-    are seen best, with `LEAST_REACH` of them to a reach, as then the weights of a lattice add up to 1."""
+    """Return the places (m, d) of parts of a particle from it [m]. They lie evenly in its cell, along the ``axes`` axes
+    that are seen best. There are `LEAST_REACH` of them to a reach, as then the weights of a lattice add up to 1."""
     spacing = at.lattice.cell ** (1.0 / at.dimension)
     count = min(int(np.ceil(LEAST_REACH * spacing / reach * (1.0 - 1e-9))), MOST_PARTS)
     best = np.argsort(-np.linalg.norm(across(np.eye(at.dimension)), axis=1), kind="stable")[:axes]

@@ -193,10 +193,10 @@ class SolidLoad(LoadSensor):
 
     F = sum_i f_i,   T = sum_i (x_i - c) x f_i,
 
-    over all particles. Here -f_i is the mass of particle i times the acceleration that the walls of the solid give it
-    in the step that begins at the state, by pressure and, without slip, by viscosity. c is where the middle of the
-    solid is at the end of that step, as its walls are. So the solid gets what momentum the fluid loses to it. Contact,
-    gravity and buoyancy in air are not in it, nor forces of one's own between fluid and walls.
+    over all particles. Here -f_i is the mass of particle i times the acceleration that the walls of the solid give it,
+    by pressure and, without slip, by viscosity. This is in the step that begins at the state. The point c is the middle
+    of the solid at the end of that step, where its walls are too. So the solid gets the momentum that the fluid loses
+    to it. Contact, gravity and buoyancy in air are not in it, nor forces of one's own between fluid and walls.
     """
 
     def __init__(self, solid: str, axes: Axes = "world"):

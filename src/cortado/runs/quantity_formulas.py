@@ -13,9 +13,9 @@ Particle i pushes walls, those of one solid or all, with
     f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i + B_i),
 
 where A_i is the sum over wall particles along which its pressure acts (``wall_push`` of
-`cortado.solvers.particles.ParticleSolver`), a_i the acceleration that they give it by a force such as viscosity, and
-B_i the part of images (`cortado.solvers.projection.mean_stress`), if walls mirror. The walls so get what momentum the
-fluid loses to them: the mass of a particle is m_i s^d, with the spacing s.
+`cortado.solvers.particles.ParticleSolver`). They give it the acceleration a_i by a force such as viscosity. The vector
+B_i is the part of images (`cortado.solvers.projection.mean_stress`), if walls mirror. So the walls get the momentum
+that the fluid loses to them: the mass of a particle is m_i s^d, with the spacing s.
 """
 
 from collections.abc import Callable
@@ -339,9 +339,9 @@ class WallForces:
 
 
 class SolidLoads:
-    """The quantity of force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i, with r_i from its middle at
-    the end of the step, where its walls are, to particle i. For viscosity as a stress r_i leads to the surface beneath
-    the particle."""
+    """The quantity of force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i. The vector r_i leads to
+    particle i from the middle of the solid at the end of the step, where its walls are. For viscosity as a stress r_i
+    leads to the surface beneath the particle."""
 
     def __init__(self, loads: WallLoads, solver: ParticleSolver, solid: NamedSolid):
         vector, layout, number = solver.layout.precision.vector, solver.layout, solid.number

@@ -2,7 +2,7 @@
 
 c_0 is the middle of the solid in the scene and c where it is; T = R R_0^T is how far it is turned since. The scale of a
 solid does not move its sensors. A value whose place is shifted by s and turned by a small vector t about c changes by
-its ``shift`` times s and its ``twist`` times t, which `Carrier.bars` turns into derivatives by fields of the state.
+its ``shift`` times s and its ``twist`` times t. `Carrier.bars` turns these into derivatives by fields of the state.
 """
 
 from dataclasses import dataclass

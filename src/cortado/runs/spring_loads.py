@@ -83,8 +83,8 @@ def spring_loads(solver: ParticleSolver) -> dict[str, QuantityFormula]:
 
 @fixed
 class SpringForce(Summed):
-    """A sensor of the force with which a spring pulls, less than 0 where it pushes, and of its length, as the state
-    has them; a damper's part is of how fast both ends go in the step that begins there."""
+    """A sensor of the force with which a spring pulls, less than 0 where it pushes, and of its length, as the state has
+    them. The part of a damper follows from the velocities of both ends in the step that begins there."""
 
     def __init__(self, spring: str):
         """Take the name of a ``spring`` in the scene."""

@@ -1,5 +1,6 @@
-"""What sensors read of a run on its device: quantities of each step, which captured steps keep, and sums over particles
-(`cortado.runs.particle_sums`) of all states of a chunk, launched behind it, in float64 and a fixed order."""
+"""The values that sensors read of a run on its device. They are quantities of each step, which captured steps keep, and
+sums over particles (`cortado.runs.particle_sums`) of all states of a chunk. The sums are launched behind the chunk, in
+float64 and a fixed order."""
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial

@@ -23,8 +23,8 @@ FINER = 4
 """Number of parts of a cell at the surface along each axis, to measure a volume."""
 LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
 """Particles that a round body lacks, over those in its outermost spacing near cells that are cut, and over all of its
-own: particles off the lattice see each other as denser than as many on it, by 4 % with the Wendland kernels and a
-support of 2 spacings."""
+own. Particles off the lattice see each other as denser than the same number on it, by 4 % with the Wendland kernels and
+a support of 2 spacings."""
 BESIDE = 2
 """In cells: the greatest distance along each axis from a cell that is cut at which particles may be left out."""
 FAR = 4.0

@@ -102,9 +102,9 @@ class Scene(SceneTables):
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """Return as JSON the part of the scene on which results depend. It has no [picture], [[sensor]] and materials,
-        nor an empty [[force]], [[solid]], [[hinge]], [[spring]] or [[drain]], a jitter of 0, keys of chosen time steps
-        where they are fixed, and options of the projection that are off."""
+        """Return as JSON the part of the scene on which results depend. It has no [picture], [[sensor]] and materials.
+        It also leaves out an empty [[force]], [[solid]], [[hinge]], [[spring]] or [[drain]], a jitter of 0, keys of
+        chosen time steps where they are fixed, and options of the projection that are off."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
         aside |= {name: True for name in ("force", "solid", "hinge", "spring", "drain") if not getattr(self, name)}
         jittered = {"discretisation": self.discretisation.jitter, "emitter": self.emitter and self.emitter.jitter}

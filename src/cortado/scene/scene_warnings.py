@@ -128,8 +128,8 @@ def _turned_off(scene: SceneTables) -> Iterator[Idle]:
 def creep_sentence(scene: SceneTables) -> str | None:
     """Return a sentence on creeping fluid with a yield stress; None without one, or without fluid at the start.
 
-    A film of depth H whose stress at the wall is a part r <= 1 of the yield stress has at its surface the speed
-    (H / m) (1 + (1 - r) ln(1 - r) / r), where the shear rate at each height is -ln(1 - stress / yield stress) / m. At
+    A film of depth H whose stress at the wall is a part r <= 1 of the yield stress has at its surface the speed (H / m)
+    (1 + (1 - r) ln(1 - r) / r). The shear rate at each height is -ln(1 - stress / yield stress) / m. The speed is at
     most H / m, with the ``regularisation`` m.
     """
     phase, law = scene.phase[0], scene.phase[0].rheology

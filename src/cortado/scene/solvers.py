@@ -13,8 +13,8 @@ from cortado.scene.tables import Flag, OrWord, Table, Text, count, field_error, 
 OWN = ("projection", "pcisph")
 """The kinds that are Cortado's own; a scene that names none has the first."""
 COURANT = 0.2
-"""The Courant number of a scene that gives none. With it PCISPH took 600 steps of seven scenes, dams, a drop, a jet and
-layers of 64 to 600 particles, in the plane and in space; with 0.3 it lost one of them, with 0.4 four."""
+"""The Courant number of a scene that gives none. With it PCISPH took 600 steps of seven scenes, in the plane and in
+space: dams, a drop, a jet and layers of 64 to 600 particles. With 0.3 it lost one of the scenes, with 0.4 four."""
 
 
 Suits = tuple[tuple[str, Mapping[str, Any]], ...]

@@ -153,8 +153,8 @@ NUMBERS = ("stiffness", "damping")
 
 
 def spring_limit(scene: Any, values: Arrays) -> float:
-    """Return the longest step [s] that is stable with the scene's springs: 4 / (c + sqrt(c^2 + 4 w^2)) for their
-    greatest frequency w and rate of damping c, each a bound, without the water that goes along with bodies."""
+    """Return the longest step [s] that is stable with the scene's springs, 4 / (c + sqrt(c^2 + 4 w^2)). Their greatest
+    frequency w and rate of damping c are both bounds, without the water that goes along with bodies."""
     bodies = {}
     for table in scene.solid:
         if table.motion == "free":

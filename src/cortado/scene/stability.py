@@ -96,10 +96,10 @@ pressure iterations a step; only 5 of them were too few at 20 spacings.
 
 
 RESTING, RUNNING = 0.63, 0.4
-"""C in the limit C s / sqrt(H |g|) of fluid H deep, with a coarse grid, which hands its pressure down at once: where it
-covers the floor of its container, and where it has room to run out. Water at rest sinks at C = 0.8. Dams, whose fronts
-are as fast as 2 sqrt(H |g|), are compressed by a quarter more at 0.5, and particles come to 2.7 times their
-density at 0.6; before repairs were bounded they were lost at 0.5.
+"""C in the limit C s / sqrt(H |g|) of fluid H deep, with a coarse grid, which hands its pressure down at once. The
+first is for fluid that covers the floor of its container, the second for fluid with room to run out. Water at rest
+sinks at C = 0.8. Dams, whose fronts are as fast as 2 sqrt(H |g|), are compressed by a quarter more at 0.5. At 0.6
+particles come to 2.7 times their density; before repairs were bounded they were lost at 0.5.
 """
 
 
@@ -110,9 +110,9 @@ FRICTION_STEP = 0.25
 0.25, and 3, 7 and 12 % at 0.36, 0.72 and 1.44, with 12 particles across; with 24 it is 2, 2, 3 and 4 %."""
 
 BESIDE, THROUGH = 0.4, 0.25
-"""In spacings, and in parts of the thickness of a solid: how far fluid may move in a step without getting into it. In
-funnels with walls 3 to 10 spacings thick steps of 0.5 spacings went wrong with PCISPH and of 0.8 with the projection;
-with walls 1.25 to 2 spacings thick those of 0.4 to 0.65 of their thickness."""
+"""How far fluid may move in a step without getting into a solid, in spacings and in parts of the thickness of the
+solid. In funnels with walls 3 to 10 spacings thick steps of 0.5 spacings went wrong with PCISPH, and steps of 0.8 with
+the projection. With walls 1.25 to 2 spacings thick steps of 0.4 to 0.65 of their thickness went wrong."""
 
 
 def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:

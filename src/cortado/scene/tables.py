@@ -5,7 +5,7 @@ A field is ``Annotated[float, quantity("kg/m3", gt=0.0)]``. Pydantic checks its 
 schema of its table. The sentences of errors are made from this schema, so that the checks, the sentences and the help
 of an editor always agree. A wrong value ends in a `SceneError`, whether the scene comes from a file or is built in
 Python. Schemas have the docstrings below fields as descriptions, which are read from the source when somebody asks for
-a schema: pydantic can read them as it makes a model, but then every process waits a third of a second for it.
+a schema. Pydantic can read them as it makes a model, but then every process waits a third of a second for it.
 """
 
 import ast

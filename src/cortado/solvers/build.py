@@ -1,6 +1,6 @@
-"""How forces and solvers are made: by makers, which `Simulation` takes as ``forces`` and ``solver`` and which a scene
-names by their kinds, with the parameters that these bring; and what any solver of a scene is made of: neighbours,
-forces, phases, nozzle, and where particles may go.
+"""Makers of forces and solvers. `Simulation` takes them as ``forces`` and ``solver``, and a scene names them by their
+kinds, with the parameters that these bring. Any solver of a scene is made of neighbours, forces, phases, nozzle, and
+the places where particles may go.
 """
 
 from collections.abc import Callable, Sequence

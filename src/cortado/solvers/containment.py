@@ -1,6 +1,6 @@
 """A search for lost particles at the end of every step, on the device: those outside of their container or in a solid,
-too far away, or not finite; and for walls that face one another nearer than a spacing, so that they leave particles no
-room. Any solver can use it."""
+too far away, or not finite. It also finds walls that face one another nearer than a spacing, so that they leave
+particles no room. Any solver can use it."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
-"""Where particles may go: the region of their container, and solids as solvers know them, by their wall particles and
-as meshes, for those who ask how deep something is; and flat faces of moving solids that mirror the
-fluid (`cortado.particles.mirrors`)."""
+"""Where particles may go: the region of their container, and solids as solvers know them. Solids come by their wall
+particles, and as meshes for those who ask how deep something is. Flat faces of moving solids mirror the fluid
+(`cortado.particles.mirrors`)."""
 
 import itertools
 from collections.abc import Iterator
@@ -162,9 +162,9 @@ class FlatFaces:
 
 
 def flat_faces(scene: Scene, support: float, most: int) -> FlatFaces:
-    """Find the faces that mirror, so many at ``most``, of a scene with a ``support`` radius [m]: long enough edges of
-    boxes and polygons in the plane, and sides of boxes in space, of solids with paths along which fluid slips freely.
-    There are none with other solvers, and in a scene with periods."""
+    """Find the faces that mirror, so many at ``most``, of a scene with a ``support`` radius [m]. They are long enough
+    edges of boxes and polygons in the plane, and sides of boxes in space. Their solids have paths, and fluid slips
+    freely along them. There are none with other solvers, and in a scene with periods."""
     found = []
     if isinstance(scene.solver, ProjectionSolver) and not np.any(scene.container.periods(scene.dimension)[1]):
         for number, table in enumerate(moving(scene.solid)):

@@ -4,21 +4,21 @@ Near the estimate the residuals are r = e - J t, with the noise e (frames, m), t
 and the error t of the estimate. A count of pixels takes the m numbers of a frame for independent; as neighbouring
 pixels, and the light of a whole frame, vary together, its error bars are several times too small. Here instead
 
-1. noise fades from frame to frame by exp(-dt / T): its correlation time T is the one with which the residuals, as they
-   are left by the fit, would have the correlation between neighbouring frames that they have (`correlation_time`);
-   the frames are then `whitened` in time and fitted once more;
+1. noise fades from frame to frame by exp(-dt / T), with the correlation time T. It is chosen so that the residuals left
+   by the fit would have the correlation between neighbouring frames that they have (`correlation_time`). The frames are
+   then `whitened` in time and fitted once more;
 2. within a frame the noise may have any covariance C, the same for every frame. The whitened residuals of all frames
    are samples of it, so that the covariance of the score is the pooled sum
 
-       B = sum_f J_f^T C J_f  with  C = 1 / F sum_h r_h r_h^T,
+       B = sum_f J_f^T C J_f  with  C = 1 / F sum_h r_h r_h^T.
 
-   F times as many samples as the cluster-robust sum of (J_f^T r_f)(J_f^T r_f)^T has (Liang and Zeger 1986), and the
+   It has F times the samples of the cluster-robust sum of (J_f^T r_f)(J_f^T r_f)^T (Liang and Zeger 1986). The
    covariance of the estimate is N^-1 B N^-1 with N = sum_f J_f^T J_f;
 3. the residuals lack what the fit took: B is made larger by what it lacks on average, and the degrees of freedom of
    Student's distribution are those of Satterthwaite (1946);
 4. T is estimated itself. With the correlation c from frame to frame the variance of an estimate goes like
-   (1 + c) / (1 - c), and that of c is (1 - c^2) / n of n independent numbers: to second order B is larger by the factor
-   1 + 2 / (n (1 - c)) on average.
+   (1 + c) / (1 - c), and the variance of c is (1 - c^2) / n for n independent numbers. So to second order B is larger
+   by the factor 1 + 2 / (n (1 - c)) on average.
 """
 
 from collections.abc import Sequence

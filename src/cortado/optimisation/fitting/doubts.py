@@ -1,7 +1,7 @@
 """What residuals say against the model: sentences about where it is wrong, by more than the noise, and about causes.
 
-A cause is a trend, a clock that is late, another density, walls that slip: a direction in which predictions would
-change, fitted together with the parameters, with an error of its own by the same rules.
+A cause is a trend, a clock that is late, another density, or walls that slip. Each is a direction in which predictions
+would change; it is fitted together with the parameters, and has an error of its own by the same rules.
 """
 
 import warnings

@@ -103,8 +103,8 @@ def search(
     enough: float,
     fixed: Sequence[int] = (),
 ) -> Searched:
-    """Lower the sum of the squared residuals, from a point whose Jacobian may be an estimate, until a step is predicted
-    to lower it by a share of at most ``enough``, with the coordinates of some numbers ``fixed``.
+    """Lower the sum of the squared residuals, until a step is predicted to lower it by a share of at most ``enough``.
+    The Jacobian at the first point may be an estimate, and the coordinates of some numbers stay ``fixed``.
 
     A trial point takes one forward run, also one that is no lower, and the Jacobian follows from all of them, see
     `TrialPoints`. After one that is no lower, or where the run diverges, steps are damped (Levenberg 1944, Marquardt

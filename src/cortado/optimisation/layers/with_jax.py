@@ -1,8 +1,9 @@
 """Layers as functions of JAX's arrays: primitives with rules for both modes, for `jax.vmap` and for compiled programs.
 
 A layer is one primitive. Its rule of forward mode applies it with the number of its residual as a further result, and
-then a second primitive, the tangent, which is linear in tangents; the transpose of this is a third, the adjoint. So
-`jax.jvp` and `jax.grad` come from the same rules, and both are linear functions that JAX may transpose again.
+then a second primitive, the tangent, which is linear in tangents. The transpose of the tangent is a third primitive,
+the adjoint. So `jax.jvp` and `jax.grad` come from the same rules, and both are linear functions that JAX may transpose
+again.
 
 As a program of JAX holds arrays alone, the residual itself waits in `RESIDUALS`, to be found by a ticket, which is one.
 Compiled programs call Python by Warp's foreign functions: on the memory of the program and, on a GPU, in its stream.

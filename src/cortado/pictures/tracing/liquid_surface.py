@@ -109,14 +109,14 @@ MOST_CELLS = 1 << 26
 CLEAREST = wp.constant(wp.float32(1.0e-3))
 """Scattering and absorption [1/m] that cannot be seen."""
 WITHIN, ASIDE = wp.constant(wp.float32(10.62)), wp.constant(wp.float32(1.93))
-"""Sum of the bumps of all particles around one within a lattice; on a side, an edge or a corner of the lattice it is
+"""Sum of the bumps of all particles around one within a lattice. On a side, an edge or a corner of the lattice it is
 less by exp(-1.93 a²), where the mean place of these particles is a spacings aside."""
 DROP, SHEET = wp.constant(wp.float32(0.82)), wp.constant(wp.float32(0.74))
 """Parts of the level that particles have which are alone, and which are in a sheet, or in a spray that fills half of
 space."""
 FILLED = wp.constant(wp.vec3(0.45, 0.6, 0.85))
-"""Parts of space that are filled: up to the first the level goes from that of a drop to that of a sheet, and from the
-second to the third from there to that within fluid."""
+"""Three filled parts of space. Up to the first, the level goes from the level of a drop to the level of a sheet. From
+the second to the third it goes on to the level within fluid."""
 FULL = wp.constant(wp.float32(2.84))
 """Sum of the bumps of others near a particle from which on it is not in a thin sheet."""
 

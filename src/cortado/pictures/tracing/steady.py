@@ -32,8 +32,9 @@ LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.35, 0.7), (0.4, 0.8), (0.02, 0.04)
 """How far the fluid in a block is, in spacings, and how much the level at a node and the light on the floor differ, for
 a frame to count fully, and not at all."""
 BODY_REACH, BODY = 6.0, (7.0, 12.0)
-"""How far around a block fluid is looked for, in spacings, and how much of it makes a drop and a body of fluid: as many
-particles, those that are farther away counted less, of the 85 that there are within fluid."""
+"""The distance around a block within which fluid is looked for, in spacings, and the amounts of it that make a drop and
+a body of fluid. They are numbers of particles, of the 85 that there are within fluid; particles farther away count
+less."""
 TOUCHING = wp.constant(27)
 """Number of blocks that touch one, itself included."""
 

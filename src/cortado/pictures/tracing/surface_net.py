@@ -2,7 +2,7 @@
 
 The level stands on the nodes of a lattice that is fixed in space, which is cut into blocks of `WIDTH` cubes along each
 axis. The level at the corners of all blocks tells which of them the surface may pass; those alone are looked at more
-closely. Corners of the net in cubes side by side are neighbours, so that each has at most six, and the net has a
+closely. Corners of the net in cubes side by side are neighbours, so that each has at most six. The net has a
 quadrilateral across each side of a cube whose ends are on either side of the surface.
 """
 

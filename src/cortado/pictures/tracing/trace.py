@@ -1,12 +1,12 @@
 """A ray tracer for one surface of fluid: light that it reflects, refracts, absorbs and scatters.
 
 Before rays are traced from the eye, `illuminate_kernel` finds the light that falls on surfaces. A ray that meets the
-fluid is split in two, by Fresnel's law. What is reflected sees the surroundings, or other fluid. What is refracted goes
-on through the fluid and out of it, up to `SEGMENTS` times; on a way L within the fluid it loses the part
-1 - exp(-scattering L), instead of which it gets the colour of the fluid in the light that falls on it, and of what
-remains the part colour^(absorption L) is left, by Beer and Lambert's law. Where it leaves the fluid for the
-surroundings near the critical angle, it is split again, and what is reflected goes on. Fluid is all the way what it is
-where a ray comes into it.
+fluid is split in two, by Fresnel's law. Reflected light sees the surroundings, or other fluid. Refracted light goes on
+through the fluid and out of it, up to `SEGMENTS` times. On a way L within the fluid it loses the part
+1 - exp(-scattering L), and gets instead the colour of the fluid in the light that falls on it. Of the rest the part
+colour^(absorption L) is left, by Beer and Lambert's law. Where it leaves the fluid for the surroundings near the
+critical angle, it is split again, and what is reflected goes on. Fluid is all the way what it is where a ray comes into
+it.
 """
 
 from functools import cache
@@ -117,8 +117,9 @@ SEGMENTS = 4
 INDEX = wp.constant(wp.float32(1.33))
 """Refractive index of water."""
 FAINT = wp.constant(wp.float32(0.05))
-"""Reflectance below which light that leaves fluid is not split: what remains of it grows from 0 there, and is 1 where
-reflection is total, or else there would be an edge in the light where a smooth surface comes near that angle."""
+"""Reflectance below which light that leaves fluid is not split. The reflectance that counts grows from 0 there, and is
+1 where reflection is total. Otherwise there would be an edge in the light where a smooth surface comes near that
+angle."""
 DARK = wp.constant(wp.float32(10.0))
 """Number of free paths of light within fluid beyond which nothing is seen: a part of 5e-5 goes as far."""
 

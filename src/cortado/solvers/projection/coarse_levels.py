@@ -1,11 +1,11 @@
 """Ever coarser grids, which make the solves on the coarse grid of the pressure take few iterations.
 
-Each level has half of the nodes of the finer one along every axis that has an even number of them, and the matrix
-R A R^T of that level (Galerkin), with bilinear R: the sum of what each cell adds, as A is. The solve
+Each level has half of the nodes of the finer one along every axis that has an even number of them. The matrix of each
+is R A R^T (Galerkin), with the matrix A of the finer level and bilinear R; like A, it is a sum over cells. The solve
 (`cortado.solvers.projection.coarse_solve`) smooths it by steps of Jacobi's method, x + w (r - A x), with
 w_I = W / (sqrt(A_II) sum_J |A_IJ| / sqrt(A_JJ)). With W below 2 that converges for every matrix that is symmetric and
-not negative: those with W = 1 (Baker, Falgout, Kolev and Yang 2011, applied to the matrix whose diagonal is scaled to
-1) have no eigenvalue of w A above 1. The grids wrap around as those of cells do.
+not negative. With W = 1, w A has no eigenvalue above 1 (Baker, Falgout, Kolev and Yang 2011, applied to the matrix
+whose diagonal is scaled to 1). The grids wrap around as those of cells do.
 """
 
 from functools import cache

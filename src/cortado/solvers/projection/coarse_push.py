@@ -31,9 +31,9 @@ from cortado.sph.moment_functions import cross_terms_function, matrix_type, mome
 
 @cache
 def coarse_sums(discretisation: Discretisation) -> Kernels:
-    """Make the Warp functions of the sums over neighbours of the push by a coarse pressure, for T = c L: sum T_j g_ij,
-    which T_i g_i and c_i gamma_i complete to h, and the rows of N. The adjoint is from those of h and N to the
-    symmetric part of that of T, as its diagonal and its other entries, and to that of x."""
+    """Make the Warp functions of the sums over neighbours of the push by a coarse pressure. For T = c L they are sum
+    T_j g_ij, which T_i g_i and c_i gamma_i complete to h, and the rows of N. From the adjoints of h and N follow the
+    adjoint of x and the symmetric part of the adjoint of T, as its diagonal and its other entries."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair = pair_functions(discretisation)
     packed, cross_terms = symmetric(precision), cross_terms_function(precision)

@@ -24,9 +24,9 @@ times, and the particles of walls that mirror 1 - h times, with
 
     h = S(0.7, 0.9) of sum V W_i' / (nu_m + 1e-6) q,   q = 1 / (1 + ((nu - nu_m) / 0.005)^4),
 
-the images' part in the number density over nu_m, that of the walls: 1 where as much fluid is beside a wall as it
-expects, and 0 in spray and beside solids, which walls do not mirror. With g_i' = V grad W of the separation from an
-image x_j' = R x_j + o, images add
+the part of the images in the number density over nu_m, the part of the walls. It is 1 where as much fluid is beside a
+wall as the wall expects, and 0 in spray and beside solids, which walls do not mirror. With g_i' = V grad W of the
+separation from an image x_j' = R x_j + o, images add
 
     h_i sum (v_i - R v_j) . g_i'                   to the divergence,
     sum (h_i k_i + h_j k_j) g_i'                   to its transpose, the force,

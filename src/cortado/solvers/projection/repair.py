@@ -5,13 +5,13 @@
 
 with images in n and d (`cortado.solvers.projection.effects`).
 
-No repair takes a particle further than a sixth of a spacing s: where walls leave no room, or where they press on what
-is in them, densities cannot be right, and a particle would be thrown through a wall.
+No repair takes a particle further than a sixth of a spacing s. Where walls leave no room, or where they press on the
+particles within, densities cannot be right, and a particle would be thrown through a wall.
 
-omega_k is another one in each (`cortado.solvers.projection.lattice`). Velocities stay as they are: in them a repair
-would be a force that acts once more in the next step. r of `cortado.solvers.projection.effects` lets low densities
-be repaired in the interior alone. g and a are those of the start of the step, n is that of the positions, over the
-neighbours of the start.
+Each iteration has its own omega_k (`cortado.solvers.projection.lattice`). Velocities stay as they are: in them a repair
+would be a force that acts once more in the next step. The factor r of `cortado.solvers.projection.effects` lets low
+densities be repaired in the interior alone. Both g and a belong to the start of the step; n belongs to the positions,
+over the neighbours of the start.
 """
 
 from dataclasses import dataclass

@@ -24,8 +24,9 @@ CROWDED = 0.25
 """R: how much more close pairs count in a shift (Monaghan 2000), boundedly: unbounded, the derivative of the shift is
 so steep among clumped particles that gradients of a splash grow by ten orders more."""
 APART = 0.65
-"""In spacings: how near pairs are that a shift moves apart. With 0.7 and 0.6 particles of a dam break 25 deep come as
-seldom to half a spacing; energy rises more with 0.7, 0.03 in place of 0.02 % in a dam 12 deep, and with 0.8."""
+"""In spacings: how near pairs are that a shift moves apart. With 0.7 and 0.6 particles of a dam break 25 deep come
+equally seldom to half a spacing. Energy rises more with 0.7, by 0.03 in place of 0.02 % in a dam 12 deep, and with
+0.8."""
 UNEQUAL = 2.0
 """By how much more a lighter neighbour counts in the diagonal of the projection's matrix. Without it an iteration goes
 too far where one light particle takes the pressures of many that are heavy. On the lattice it goes 1.2 and 1.5 times as
