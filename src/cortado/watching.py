@@ -41,8 +41,9 @@ class Watched(Steppable, Protocol):
 
 
 class Watch:
-    """An observer of one rollout that computes quantities and reads sensors: those that are sums over particles on the
-    device, where the run goes on meanwhile, and others with the arrays of another solver of the scene."""
+    """An observer of one rollout that computes quantities and reads sensors. Sensors that are sums over particles are
+    read on the device, where the run goes on meanwhile. Others are read with the arrays of another solver of the
+    scene."""
 
     def __init__(
         self,

@@ -4,11 +4,12 @@ Points of a body's surface that are in the other solid, d_j > 0 deep, give it th
 
     P = (q / dt) M sum_j f_j n_j,   f_j = d_j^3 / sqrt(S),   S = sum_j d_j^4,
 
-along the normals n_j of the faces above them, and the other one -P. This force has the potential q M sqrt(S) / (2
-dt^2), for a depth S^(1/4) that is near the greatest one whatever the number of points. It is the potential of a spring
-in which the lighter of two bodies, with M m / (M + m), would swing with sqrt(q) / dt. As d_j is where the body would
-go, a swing shrinks by sqrt(1 - q) in a step: a body leaves what it falls on with 0.6 of its speed, whatever the time
-step. At a depth of 0 f_j has two derivatives, both 0; where the face above a point changes, there is a corner.
+along the normals n_j of the faces above them, and the other one -P. This force has the potential
+q M sqrt(S) / (2 dt^2), for a depth S^(1/4) that is near the greatest one whatever the number of points. It is the
+potential of a spring in which the lighter of two bodies, with M m / (M + m), would swing with sqrt(q) / dt. As d_j is
+where the body would go, a swing shrinks by sqrt(1 - q) in a step: a body leaves what it falls on with 0.6 of its speed,
+whatever the time step. At a depth of 0 f_j has two derivatives, both 0; where the face above a point changes, there is
+a corner.
 """
 
 from collections.abc import Mapping, Sequence

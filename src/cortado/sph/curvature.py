@@ -10,27 +10,26 @@ b:
     a_i = V sum_j W_ij w_j kappa_j,   b_i = V sum_j W_ij w_j,
     k_i = (a_i / b_i) / (1 + delta a_i / b_i),   m_i times the acceleration = (sigma / J) k_i w_i q_i.
 
-g is the gradient of the colour of the fluid, which is 1 in it and 0 outside; q, its average (Shepard 1968), points into
-the fluid and forgets how the particles of a surface lie. w tells the surface from the inside, e is its normal, and D
-B^-1 the gradient of normals, corrected so that it is exact where they are linear (Bonet and Lok 1999). The particles
-that feel the force lie a mean depth delta below the surface, where a curvature of 1 / R is 1 / (R - delta): k is that
-of the surface. Over the layers of a flat surface w |q| adds up to J. Delta and J are from surfaces whose curvature is
-known. D comes as its symmetric part, which is all that the trace needs.
+g is the gradient of the colour of the fluid, which is 1 in it and 0 outside. Its average q (Shepard 1968) points into
+the fluid and forgets how the particles of a surface lie. The weight w tells the surface from the inside, and e is its
+normal. D B^-1 is the gradient of normals, corrected so that it is exact where they are linear (Bonet and Lok 1999). The
+particles that feel the force lie a mean depth delta below the surface, where a curvature of 1 / R is 1 / (R - delta): k
+is that of the surface. Over the layers of a flat surface w |q| adds up to J. Delta and J are from surfaces whose
+curvature is known. D comes as its symmetric part, which is all that the trace needs.
 
-Tangents go the way of the sums, adjoints from the last one to the first: what the adjoint of one adds to those of q, w,
-e, c, g and z, the next one takes up.
-J is that of flat surfaces: a lattice is cut across an axis and across a diagonal of a plane. In a layer all particles
-are alike, so that the sums of a few layers are all that it takes.
+Tangents go the way of the sums, adjoints from the last one to the first. Each takes up the terms that the one before it
+adds to the adjoints of q, w, e, c, g and z. J is that of flat surfaces: a lattice is cut across an axis and across a
+diagonal of a plane. In a layer all particles are alike, so that the sums of a few layers are all that it takes.
 
 What delta has to make up for was found on discs and balls whose particles lie in concentric rings and shells, a spacing
 apart. It is in spacings, for every kernel with a support of 2.5 spacings or more within 0.05. The curvature is found
 `DEEP` below the surface, where it is greater. And w |q| adds up to 1 + `EXCESS` / R times J, as more of what surrounds
 a particle is outside of a curved surface. With delta = DEEP / (d - 1) + EXCESS, d - 1 being the number of curvatures in
 the sum, the pressure in a drop is (d - 1) sigma / R. But the force acts `ACTS` below the surface, where a wave of the
-surface moves less: the square of the frequency of the mode n would be n ACTS / R too small in the plane, and (n + 1)
+surface moves less. The square of the frequency of the mode n would be n ACTS / R too small in the plane, and (n + 1)
 ACTS / R in space. A smaller delta raises pressures, and twice as much the force that a change of the curvature makes.
-So ACTS d / (3 (d - 1)) is taken off. Pressure and squared frequency of the mode 2 then err by as much, one to this side
-and one to that: by 0.5 / R in the plane and 0.75 / R in space, which gets less where particles are finer.
+So ACTS d / (3 (d - 1)) is taken off. Pressure and squared frequency of the mode 2 then err equally, in opposite
+directions. The error is 0.5 / R in the plane and 0.75 / R in space, and gets less where particles are finer.
 """
 
 from dataclasses import dataclass
@@ -101,8 +100,8 @@ SINGULAR = {2: 1e-3, 3: 1e-4}
 LONE = 1e-6
 """The number added to sum V W w: where no neighbour is part of the surface, the mean curvature is 0."""
 HOLLOW = 0.25
-"""delta kappa below which the depth of a hollow surface counts less, in a parabola, until it counts no more: bubbles of
-a radius below 3 delta, which the divisor 1 + delta kappa would be 0 in."""
+"""delta kappa below which the depth of a hollow surface counts less, in a parabola, until it counts no more. Such are
+bubbles of a radius below 3 delta, in which the divisor 1 + delta kappa would be 0."""
 
 
 @cache

@@ -250,9 +250,8 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
 
 
 SAFETY = 0.5
-"""Part of the lattice's limit on a step of diffusion that is taken; the rest is for particles off the lattice
-(eigenvalues were at most 1.08 times those of the lattice on random particles) and for fractions that stray out of [0,
-1]."""
+"""Part of the lattice's limit on a step of diffusion that is taken. The rest is for particles off the lattice and for
+fractions that stray out of [0, 1]. On random particles eigenvalues were at most 1.08 times those of the lattice."""
 MOST_SUBSTEPS = 10_000
 """Most explicit steps of diffusion in a time step; with more the mobility is taken for a mistake."""
 

@@ -42,9 +42,9 @@ from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepCont
 
 @cache
 def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
-    """Make the kernels of a free body in 2 or 3 dimensions, with a thread for each scene: of the pose in which its
-    walls are, with V, W and L, and of the state after the step, from V_1, W_1 and L_1. The adjoint of the latter stands
-    where that of the state before is written."""
+    """Make the kernels of a free body in 2 or 3 dimensions, with a thread for each scene. The first give the pose of
+    its walls, with V, W and L, the second the state after the step, from V_1, W_1 and L_1. The adjoint of this state
+    stands where the adjoint of the state before is written."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     flat, rotation, hold = rotations(precision, dimension), rotations(precision, 3).rotation, hold_functions(precision)
     rate, freed, spin, held = hold.rate, hold.freed, hold.spin, hold.kind
@@ -192,8 +192,8 @@ class FreeTable:
 
     @property
     def bounds(self) -> dict[str, float]:
-        """Return the volume by which pressures push the body, infinite if its middle is held, and the greatest inverse
-        of its inertia, 0 if it does not turn, by kernels' names: both are bounds of what they are for a held body."""
+        """Return by kernels' names the volume by which pressures push the body, infinite if its middle is held, and the
+        greatest inverse of its inertia, 0 if it does not turn. Both are bounds of the values of a held body."""
         goes, turns = any((*self.hold.moving, *self.hold.arm)), self.hold.turning > 0
         greatest = np.linalg.eigvalsh(np.linalg.pinv(self.mass.inertia)).max()
         return {"pushed_volume": self.mass.volume if goes else np.inf, "greatest": float(greatest) if turns else 0.0}

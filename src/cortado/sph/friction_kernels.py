@@ -1,9 +1,9 @@
 """Viscous friction between fluid and a free body without slip, by sums of each particle over the body's walls.
 
 A wall of the body is a neighbour at the point of its surface below particle i, as other walls without slip are
-(`cortado.sph.stress_forces`), and moves with the body there. With the weights s_b of its wall particles b, their y_b
-from the surface to the particle, and r from the body's middle c' to the particle, that point is at c' + r - y_b and has
-the velocity V + W x (r - y_b). So all that the body does to the particle follows from three sums,
+(`cortado.sph.stress_forces`), and moves with the body there. Its wall particles b have weights s_b, vectors y_b lead
+from the surface to the particle, and r leads there from the body's middle c'. Then that point is at c' + r - y_b and
+has the velocity V + W x (r - y_b). So all that the body does to the particle follows from three sums,
 
     H = sum_b s_b,   Y = sum_b s_b y_b,   N = sum_b s_b y_b y_b^T,
 
@@ -13,9 +13,9 @@ z Y^T + [W] N, and the acceleration and its couple about the particle are
     m_i a_i = -(T_i Y + C mu_i (H z + W x Y)),
     m_i c_i = -(ax(T_i N) + C mu_i (Y x z + (tr N - N) W)),   ax(B) = (B_zy - B_yz, B_xz - B_zx, B_yx - B_xy).
 
-The body gets the force F = -sum_i m_i a_i and the torque -sum_i m_i (r x a_i - c_i) about c': minus half the derivative
-of what is dissipated by V and by W, as m_i a_i is that by v_i. So momentum and angular momentum are kept, and nothing
-is dissipated where body and fluid turn as a whole.
+The body gets the force F = -sum_i m_i a_i and the torque -sum_i m_i (r x a_i - c_i) about c'. They are minus half the
+derivatives of the dissipation by V and by W, as m_i a_i is by v_i. So momentum and angular momentum are kept, and
+nothing is dissipated where body and fluid turn as a whole.
 """
 
 from functools import cache
@@ -66,10 +66,11 @@ def friction_functions(precision: Precision) -> SimpleNamespace:
 
 @cache
 def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels of friction with a body in 2 or 3 dimensions. ``hold`` are those of the sums H, Y and N and of
-    r, ``hang`` of a ``lift`` that is added to velocities u, ``thicken`` of the parts in M and R, ``lean``, ``rub`` and
-    ``bear`` of `friction_functions`. ``pull`` adds to A and T of some velocities, and ``push`` to B v of the implicit
-    viscosity and to shares in the product with v, and writes the load of the body, as solves do it."""
+    """Make the kernels of friction with a body in 2 or 3 dimensions. The kernels ``hold`` give the sums H, Y and N and
+    r, ``hang`` a ``lift`` that is added to velocities u, and ``thicken`` the parts in M and R. Others are ``lean``,
+    ``rub`` and ``bear`` of `friction_functions`. The kernel ``pull`` adds to A and T of some velocities. Finally
+    ``push`` adds to B v of the implicit viscosity and to shares in the product with v, and writes the load of the body,
+    as solves do it."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     matrix, six, known = matrix_of(precision), precision.six, moment_functions(precision, dimension)
     contact, cross_terms = contact_functions(discretisation), cross_terms_function(precision)

@@ -1,5 +1,5 @@
-"""A user's function means the same in Warp as in Python: numbers get the precision of the run, operators that Warp
-understands otherwise are replaced by Warp functions with Python's meaning, and what cannot be replaced is refused.
+"""A user's function means the same in Warp as in Python. Numbers get the precision of the run, and operators that Warp
+understands otherwise are replaced by Warp functions with Python's meaning. Anything that cannot be replaced is refused.
 """
 
 import ast

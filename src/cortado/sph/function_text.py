@@ -1,5 +1,5 @@
-"""The source text of a user's function, which Warp compiles: checked against the function itself, with the values of
-the names from outside as they are when the force is made, and refused where Warp cannot differentiate it."""
+"""The source text of a user's function, which Warp compiles. It is checked against the function itself, with the values
+of the names from outside as they are when the force is made. It is refused where Warp cannot differentiate it."""
 
 import ast
 import builtins

@@ -109,8 +109,8 @@ def free_module(precision: Precision) -> Any:
 @cache
 def move_kernels(precision: Precision) -> Kernels:
     """Make the kernels of V, L and W of a body by gravity and by the sums of momenta that it gets, with a thread for
-    each scene, and of the velocity changes V - V_0 and W - W_0, ``faster`` and ``turned_faster``. Adjoints of the sums
-    are written."""
+    each scene. They also give the velocity changes V - V_0 and W - W_0, ``faster`` and ``turned_faster``. Adjoints of
+    the sums are written."""
     real, vector, matrix, hold = precision.real, precision.vector, matrix_of(precision), hold_functions(precision)
     spin, vectors = hold.spin, "gravity V W L pulled twisted"
 

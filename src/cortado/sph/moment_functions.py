@@ -1,9 +1,9 @@
 """The second moment M = -V sum_j grad W_ij x_ij^T of a particle's neighbours, whose inverse corrects gradients (Bonet
 and Lok 1999), and how full the neighbourhood is by it.
 
-With the invariants of M, I_2 and I_3, fullness is H = 3 I_3 / I_2, in the plane 2 det M / tr M: 1 inside, about 0.6 at
-a flat surface, and 0 where neighbours lie on a line or are missing. On a line I_2 and I_3 are nothing but rounding:
-`ROUNDING` (tr M)^2 is added to I_2, so that H is 0 there in float32 too.
+With the invariants of M, I_2 and I_3, fullness is H = 3 I_3 / I_2, in the plane 2 det M / tr M. It is 1 inside, about
+0.6 at a flat surface, and 0 where neighbours lie on a line or are missing. On a line I_2 and I_3 are nothing but
+rounding: `ROUNDING` (tr M)^2 is added to I_2, so that H is 0 there in float32 too.
 
 The method of conjugate gradients (Hestenes and Stiefel 1952) is for B y = r, of numbers or vectors of particles.
 B is symmetric and positive with respect to the product sum_i w_i a_i . b_i with weights w, in which everything is

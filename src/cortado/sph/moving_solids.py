@@ -1,8 +1,8 @@
 """Solids that move as they are told: a part of a step that puts their walls where they are at its end; and rotations.
 
-A solid begins at the position c_0 with the rotation R(w_0). At the end of a step it is displaced by d and turned by w:
-a wall particle with the place r in its frame is at c_0 + d + R(w) R(w_0) r then, and has the velocity that leads there
-from where it was, over the time step. States have the position c, the turn w, w_0, and by which scale it is stretched
+A solid begins at the position c_0 with the rotation R(w_0). At the end of a step it is displaced by d and turned by w.
+A wall particle with the place r in its frame is then at c_0 + d + R(w) R(w_0) r. Its velocity leads there from its
+place before, over the time step. States have the position c, the turn w, w_0, and the scale by which it is stretched
 (`cortado.particles.moving_walls`).
 
 A rotation R(w) by the vector w, in the plane by an angle, turns by |w| about w (Rodrigues). Where w changes by w', it

@@ -6,9 +6,9 @@ Besides accelerating particles a part may keep fields from step to step, and wor
 step. The mixture, the emitter, and forces that remember are parts; a solver knows only their list.
 
 A step goes through its parts in their order at each of the times below, forward and in forward mode, and in the reverse
-order in reverse mode. A method that a part has not does nothing. Of what a step knows, kernels find at the `begin` of a
-part the parameters and the number of the step; at `sort` also the order of particles and x, v and m; from `settle` on
-neighbours and n as well, and at `end` everything.
+order in reverse mode. A method that a part has not does nothing. Kernels find at the `begin` of a part the parameters
+and the number of the step, and at `sort` also the order of particles and x, v and m. From `settle` on they find
+neighbours and n as well, and at `end` everything that a step knows.
 
 A derivative takes a step again from its state, but not its end. So what a tangent or an adjoint needs of a step has to
 stand in arrays that `begin`, `sort` or `settle` write.

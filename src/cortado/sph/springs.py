@@ -8,8 +8,8 @@ A spring leads from the point q = c + R p of a body to the point q' of another s
 where w and w' are how fast both points go in the step if nothing but their present motion moves them. The body gets the
 momentum dt t n and its moment about the body's middle, the other solid the opposite. All is of where bodies are at the
 start of a step, with whose new velocities they then go on: symplectic Euler. Without damping a spring of the frequency
-omega has the period of arccos(1 - (omega dt)^2 / 2) / dt, within (omega dt)^2 / 24, an energy that swings and does not
-drift, and no bound of dt but 2 / omega.
+omega has the period of arccos(1 - (omega dt)^2 / 2) / dt, within (omega dt)^2 / 24. Its energy swings and does not
+drift, and dt has no bound but 2 / omega.
 
 One that is slack only pulls: max(k (l - l_0) + s C n . (w' - w), 0), with s from 0 at l_0 to 1 at 1.01 l_0, and 0 below
 l_0. The derivative there is that of one side.
@@ -43,8 +43,8 @@ TURNING = ("stiffness", "rest_angle", "damping", "torque")
 
 @cache
 def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
-    """Make the kernels, with a thread for each scene, of the momenta that a spring gives; of its force and length, as
-    the first two components of a vector; and of the angular momentum that a hinge gives."""
+    """Make the kernels of springs and hinges, with a thread for each scene. They give the momenta by a spring, its
+    force and length as the first two components of a vector, and the angular momentum by a hinge."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     taut, tiny, no, one = (wp.constant(real(value)) for value in (TAUT, precision.tiny, 0.0, 1.0))
     places = "before after other_before other_after own anchor"

@@ -6,10 +6,10 @@ With the normal n of the wall, the distance d of particle i from its surface, an
     y_ib = d n,   s_w = w_b s_ib max(n . x_ib, 0) / max(d, e),
 
 for the weight s_ib of two particles of the fluid (`cortado.sph.stress_kernels`), as if velocities went on behind the
-wall with their sign turned (Morris, Fox and Zhu 1997). d is 0 behind the surface, and e is a distance, ``least``,
-closer than which a wall pulls no harder. n . x_ib is below 0 where b belongs to the other side of a thin wall, or to
-another face of an edge, and then b does not count: with a weight below 0 it would drive the particle on. At all three
-the derivative has a corner. Functions know n by the ``foot``, the vector from x_b to the surface.
+wall with their sign turned (Morris, Fox and Zhu 1997). Behind the surface d is 0, and e is a distance, ``least``,
+closer than which a wall pulls no harder. The product n . x_ib is below 0 where b belongs to the other side of a thin
+wall, or to another face of an edge. Such a b does not count: with a weight below 0 it would drive the particle on. At
+all three the derivative has a corner. Functions know n by the ``foot``, the vector from x_b to the surface.
 
 Laws of viscosity say how the viscosity of a fluid follows from its shear rate: a user's function, one of those that
 scenes name (`cortado.scene.model`), or the constant of a Newtonian fluid. Before a run begins each law is tried, as

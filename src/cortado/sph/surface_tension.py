@@ -5,9 +5,9 @@ continuum surface stress of Lafaurie et al. 1994, between particles):
     S_i = (|n_i|^2 1 - PART n_i n_i) / sqrt(1 + |n_i|^2)
     m_i s^d a_i = -(sigma / Gamma) sum_j s (1 - s)^2 (S_i + S_j) x_ij
 
-m_i s^d is the mass of a particle, with the spacing s of the lattice at rest. n points out of the fluid; its size is 1
-in the outermost layer of a lattice that is cut, and about 0 inside. S pulls along the surface, and with PART below 1
-also a little across it: a stress along the surface alone lets particles go, and one that is the same in all directions
+The mass of a particle is m_i s^d, with the spacing s of the lattice at rest. The vector n points out of the fluid. Its
+size is 1 in the outermost layer of a cut lattice, and about 0 inside. S pulls along the surface, and with PART below 1
+also a little across it. A stress along the surface alone lets particles go, and one that is the same in all directions
 makes a solid. The force of a pair grows with its distance up to 0.65 h, so that particles of the surface do not clump.
 
 N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis. Gamma is the tension of

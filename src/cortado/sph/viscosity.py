@@ -3,10 +3,10 @@
     a_i = kappa / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + mu_i sum_b V w_b phi(x_ib, v_ib)),
     phi(x, v) = v . x / (|x|^2 + 0.01 h^2) G(x),   kappa = 2 (d + 2).
 
-G = a x is the gradient of the smoothing kernel: functions call a the ``slope``, and 1 / (|x|^2 + 0.01 h^2) ``per_size``
-(`cortado.particles.neighbourhood.pair_functions`). mu_ij = 2 mu_i mu_j / (mu_i + mu_j) is the dynamic viscosity of a
-pair [Pa s] (Cleary and Monaghan 1999: the harmonic mean keeps the shear stress continuous between fluids). The sum over
-b is over walls without slip, where v_ib is against the wall's velocity. phi is odd in (x, v) together and central, so
+The gradient of the smoothing kernel is G = a x. Functions call a the ``slope``, and 1 / (|x|^2 + 0.01 h^2) ``per_size``
+(`cortado.particles.neighbourhood.pair_functions`). A pair has the dynamic viscosity mu_ij = 2 mu_i mu_j / (mu_i + mu_j)
+[Pa s]. This harmonic mean keeps the shear stress continuous between fluids (Cleary and Monaghan 1999). The sum over b
+is over walls without slip, where v_ib is against the wall's velocity. phi is odd in (x, v) together and central, so
 that momentum and angular momentum are kept.
 """
 

@@ -3,14 +3,14 @@ has no limit.
 
 T_i and mu_i of a particle follow from sums over all of its neighbours, so that the way back goes on from them to these.
 
-With the acceleration a by all other forces, and g(v) by the stress of fluid with velocities v, with M and mu of the
-velocities at the start, what acts at the end of a step is a' of
+Let a be the acceleration by all other forces, and g(v) the acceleration by the stress of fluid with velocities v, with
+M and mu of the velocities at the start. The acceleration at the end of a step is a' of
 
     a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y),
 
 which `cortado.sph.moment_functions` solves to round-off. B is symmetric and positive with respect to the product
 sum_i m_i a_i . b_i. mu is that of the velocities v at the start, the stress that of u = v + dt a' at the end. So the
-derivatives are those of the solution, whatever way led to it: the tangent is one more solve with B, and so is the
+derivatives are those of the solution, whatever way led to it. The tangent is one more solve with B, and so is the
 adjoint, as B is symmetric in the product weighted with masses.
 """
 
