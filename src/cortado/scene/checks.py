@@ -219,6 +219,7 @@ def check_scene(scene: SceneTables) -> None:
     check_free(scene)
     check_drains(scene)
     check_sheets(scene)
+    _check_names(scene)
     _check_sensors(scene)
     for index, fluid in enumerate(scene.fluid):
         _check_inside(scene, index, fluid)
@@ -242,6 +243,14 @@ def _bodies(scene: SceneTables) -> list[tuple[FieldPath, FluidBody]]:
     """Return all bodies with particles, in their order, each with its path in the scene."""
     fluids: list[tuple[FieldPath, FluidBody]] = [(("fluid", index), fluid) for index, fluid in enumerate(scene.fluid)]
     return fluids if scene.emitter is None else [*fluids, (("emitter",), scene.emitter)]
+
+
+def _check_names(scene: SceneTables) -> None:
+    """Check that names, which begin those of arrays in files of runs, are no paths."""
+    for key in ("solid", "drain", "spring", "hinge", "sensor"):
+        for index, table in enumerate(getattr(scene, key)):
+            if "/" in (table.name or ""):
+                raise field_error((key, index, "name"), table.name, 'without "/"')
 
 
 def _check_phases(scene: SceneTables) -> None:

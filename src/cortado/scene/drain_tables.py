@@ -32,9 +32,13 @@ class BoxDrain(Table):
     upper: Vector[Length] | None = None
     """(d,) upper corner of the box [m]; without an end there if left out."""
 
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        self.check_components(("lower", "upper"), dimension, path)
+        return super().in_dimension(dimension, path)
+
     @model_validator(mode="after")
     def _check_order(self) -> Self:
-        if self.lower is not None and self.upper is not None:
+        if self.lower is not None and self.upper is not None and len(self.lower) == len(self.upper):
             check_order(self.lower, self.upper)
         return self
 
@@ -165,10 +169,16 @@ def check_drains(scene: Any) -> None:
             if scene.solver.kind != "projection":
                 wanted = '"box" or "plane", as the solver is not "projection"'
                 raise field_error((*path, "shape"), drain.shape, wanted)
-            place, shell = np.array(drain.position), drain.inner(spacing) + PRESCRIBED * spacing
+            place, room, inner = np.array(drain.position), scene.resting_room, drain.inner(spacing)
             within = scene.container.contains(place[None], 1e-6 * spacing).all()
-            if not within or open_sphere(scene.resting_room, place, shell) == 0.0:
+            if not within or open_sphere(room, place, spacing) == 0.0:
                 raise field_error((*path, "position"), drain.position, "in the container, where fluid can come to")
+            if inner < spacing:
+                raise field_error((*path, "radius"), drain.radius, f"at least one spacing, {spacing:g} m")
+            if open_sphere(room, place, inner + PRESCRIBED * spacing) == 0.0:
+                raise field_error(
+                    (*path, "radius"), inner, "so small that fluid is around it, three spacings further out"
+                )
         elif ends is not None:
             _check_reached(drain, np.array(ends), path)
 
