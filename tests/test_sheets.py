@@ -288,12 +288,18 @@ def test_what_does_not_know_of_sheets_is_a_sentence(tables, sentence):
         plane(BAFFLE, **tables)
 
 
-def test_free_bodies_beside_sheets_and_corners_off_a_plane_are_sentences():
+def test_free_bodies_beside_sheets_and_corners_off_a_plane_are_sentences(tmp_path):
     body = box([0.2, 0.5], [0.3, 0.6], name="body", motion="free", density=300.0)
     with pytest.raises(SceneError, match=r"solid\[1\]\.motion is 'free', but must be .* through which bodies go"):
         plane(BAFFLE, body, phase=[WATER])
-    with pytest.raises(SceneError, match=r"corners is .* the corners of a flat convex polygon, in order"):
+    with pytest.raises(SceneError, match=r"corners is .* the corners of a flat convex polygon, once around"):
         space(solid=[{**FLAP, "corners": [*FLAP["corners"][:3], [0.25, 0.35, 0.1]]}])
+    with pytest.raises(SceneError, match=r"corners is .* the corners of a flat convex polygon, once around"):
+        space(solid=[{**FLAP, "corners": [*FLAP["corners"], *FLAP["corners"]]}])
+    flat = tmp_path / "flat.obj"
+    flat.write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
+    with pytest.raises(SceneError, match=r"file cannot be used: .*flat\.obj has no triangle with an area"):
+        space(solid=[{**FLAP, "corners": None, "file": str(flat)}])
     with pytest.raises(SceneError, match=r"corners is .* a list of at least 3 corners in 3-D"):
         space(solid=[{**FLAP, "corners": FLAP["corners"][:2]}])
     with pytest.raises(SceneError, match=r"file cannot be used: .*nothing\.stl' cannot be opened"):

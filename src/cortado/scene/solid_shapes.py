@@ -278,10 +278,14 @@ class SheetSolid(SolidTable):
             if len(places) < 3:
                 raise field_error((*path, "corners"), self.corners, "a list of at least 3 corners in 3-D")
             sides = np.roll(places, -1, axis=0) - places
-            turns = np.cross(sides, np.roll(sides, -1, axis=0))
+            later = np.roll(sides, -1, axis=0)
+            turns = np.cross(sides, later)
             normal = turns.sum(axis=0) / max(np.linalg.norm(turns.sum(axis=0)), 1e-300)
-            if np.ptp(places @ normal) > FLAT * np.ptp(places, axis=0).max() or (turns @ normal <= 0.0).any():
-                raise field_error((*path, "corners"), self.corners, "the corners of a flat convex polygon, in order")
+            around = np.arctan2(turns @ normal, (sides * later).sum(axis=1)).sum() / (2.0 * np.pi)
+            is_flat = np.ptp(places @ normal) <= FLAT * np.ptp(places, axis=0).max()
+            if not is_flat or (turns @ normal <= 0.0).any() or around > 1.5:
+                wanted = "the corners of a flat convex polygon, once around, none on a straight edge"
+                raise field_error((*path, "corners"), self.corners, wanted)
 
 
 SHOWN = 0.1
@@ -295,7 +299,10 @@ def _sheet_in(path: str) -> Sheet:
     places, numbers = np.unique(vertices, axis=0, return_inverse=True)
     found = Sheet(places, numbers.reshape(-1)[corners])
     sides = found.pieces[:, 1:] - found.pieces[:, :1]
-    return Sheet(places, found.corners[np.cross(sides[:, 0], sides[:, 1]).any(axis=1)])
+    with_area = np.cross(sides[:, 0], sides[:, 1]).any(axis=1)
+    if not with_area.any():
+        raise InputError(f"{path} has no triangle with an area.")
+    return Sheet(places, found.corners[with_area])
 
 
 AnySolid = Annotated[
