@@ -58,8 +58,8 @@ BEGINNING = f"""# The task file
 
 This page is for whoever writes a task and looks up a key. A task is a [scene](scene_file.md) with two more tables:
 `[problem]` says what is to be reached, `[optimise]` how it is searched, or `[fit]` what is fitted to measured data.
-[Tasks](tasks.md) explains them. Put these tables below the scene with which [the scene file](scene_file.md) begins. They
-make a task that finds gravity:
+[Tasks](tasks.md) explains them. Put these tables below the scene with which [the scene file](scene_file.md) begins.
+They make a task that finds gravity:
 
 {toml(WHOLE)}
     cortado optimise task.toml --out runs/task
