@@ -7,7 +7,7 @@ moved until the fluid is at rest everywhere: `cortado.discretise.packing`.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self, TypeGuard
+from typing import Any, Self, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,13 +104,17 @@ class CutBody:
     def _beside_cuts(self, points: Points) -> Which:
         """Test (n,) which points (n, d) [m] are within `BESIDE` cells of one that a surface cuts. Flat faces between
         cells cut none, so that layers along them stay whole."""
+        reach = (BESIDE + 0.5) * self.fluid.block(self.spacing).spacings.max()
+        return np.asarray(self._cut.query(points, p=np.inf, distance_upper_bound=reach)[0] < reach)
+
+    @cached_property
+    def _cut(self) -> Any:
+        """Make a tree of the middles of cells that a surface cuts."""
         from scipy.spatial import cKDTree
 
         lattice = self.fluid.block(self.spacing)
         cells = lattice.grown(1).points()
-        is_cut = np.abs(self.distance(cells, self.spacing)) < (0.5 - ALIGNED) * lattice.spacings.min()
-        reach = (BESIDE + 0.5) * lattice.spacings.max()
-        return np.asarray(cKDTree(cells[is_cut]).query(points, p=np.inf, distance_upper_bound=reach)[0] < reach)
+        return cKDTree(cells[np.abs(self.distance(cells, self.spacing)) < (0.5 - ALIGNED) * lattice.spacings.min()])
 
     def _cuts_cells(self) -> bool:
         """Return True where a surface goes through cells: that of the body, or that of a solid."""

@@ -264,14 +264,13 @@ def _first_speed(scene: SceneTables, values: Arrays) -> float:
 
 def viscous_limit(scene: SceneTables, values: Arrays) -> float:
     """Return the longest step at which viscosity is likely to be stable where it is explicit [s]."""
-    greatest = _kinematic(scene, values)
-    if greatest <= 0.0:
+    kinematic = _kinematic(scene, values)
+    if kinematic <= 0.0:
         return inf
     rate, part = VISCOUS_RATES[scene.forces.viscosity]
     cut = scene.discretisation
-    return (
-        part * 2.0 / (greatest * rate(smoothing_kernel(cut.kernel), cut.spacing, cut.support_radius, scene.dimension))
-    )
+    greatest = rate(smoothing_kernel(cut.kernel), cut.spacing, cut.support_radius, scene.dimension)
+    return part * 2.0 / (kinematic * greatest)
 
 
 def _kinematic(scene: SceneTables, values: Arrays) -> float:
