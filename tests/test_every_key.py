@@ -35,6 +35,7 @@ SENSORS = [
     {"name": "c", "kind": "flow_rate", "position": [0.3, 0.15], "normal": [1.0, 1.0], "reach": 0.1},
     {"name": "d", "kind": "wall_force", "lower": [0.28, -0.3], "upper": [0.4, 0.3], "about": [0.1, 0.1]},
 ]
+MOTION = {"name": "j", "kind": "body_motion", "solid": "disc"}
 ON_THE_ROD = [
     {"name": "e", "kind": "solid_load", "solid": "rod", "axes": "body"},
     {"name": "f", "kind": "pressure_probe", "position": [0.5, 0.28], "radius": 0.12, "on": "rod"},
@@ -150,7 +151,7 @@ BASES = {
         solid=IN_THE_PLANE,
         hinge=[PIN],
         spring=[LINE],
-        sensor=[*ON_THE_ROD, {"name": "i", "kind": "spring_force", "spring": "line"}],
+        sensor=[*ON_THE_ROD, {"name": "i", "kind": "spring_force", "spring": "line"}, MOTION],
         picture={"width": 80, "height": 64},
     ),
     "drains": lambda: plane(drain=DRAINS, solver={"kind": "projection", "time_step": 0.001}),

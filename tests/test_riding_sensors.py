@@ -13,7 +13,7 @@ from cortado.losses.distances import SensorMatch
 from cortado.runs.riding import Carrier
 from cortado.runs.sensor import value_of
 from cortado.scene.motions import matrix
-from cortado.sensors import PressureProbe, SolidLoad, WallForce, WaveGauge
+from cortado.sensors import BodyMotion, PressureProbe, SolidLoad, WallForce, WaveGauge
 from finite_differences import both_modes, distance
 from scenes import box, plane, pool
 from test_wave_gauges import Basin, turned
@@ -116,7 +116,8 @@ def afloat(dimension):
 def on_a_solid(dimension, on):
     """One of each sensor that rides, in the water beside the solid."""
     at, end = np.array([0.21, 0.13, 0.17])[:dimension], np.array([9.0, 0.8, 9.0])[:dimension]
-    return {
+    own = {"motion": BodyMotion(on)} if on == "raft" else {}
+    return own | {
         "probe": PressureProbe(at, 0.25, on=on),
         "gauge": WaveGauge(at, radius=0.16, on=on),
         "gauge in the body": WaveGauge(at, radius=0.16, on=on, axes="body"),
@@ -160,7 +161,7 @@ def problem_of(kind, dimension, name, precision="float64", steps=6):
     return cortado.Problem(simulation, steps, Series(sensor, np.linspace(0.0, steps * dt, 3), wanted, dt)), point, along
 
 
-CASES = [(kind, d, name) for kind in MADE for d in (2, 3) for name in on_a_solid(2, "tank")]
+CASES = [(kind, d, name) for kind in MADE for d in (2, 3) for name in on_a_solid(2, MADE[kind][1])]
 
 
 @pytest.mark.parametrize(("kind", "dimension", "name"), CASES, ids=["-".join(map(str, case)) for case in CASES])

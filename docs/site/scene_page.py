@@ -422,6 +422,13 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "point = [0.9, 0.2, 0.25]\nanchor = [0.95, 0.0, 0.25]\nstiffness = 500.0\n\n"
                 '[[sensor]]\nkind = "spring_force"\nname = "pull"\nspring = "line"',
             ),
+            (
+                "BodyMotionTable",
+                "### The motion of a body",
+                '[[solid]]\nname = "raft"\nshape = "box"\nlower = [0.6, 0.2, 0.1]\nupper = [0.9, 0.3, 0.4]\n'
+                'motion = "free"\ndensity = 300.0\n\n'
+                '[[sensor]]\nkind = "body_motion"\nname = "raft"\nsolid = "raft"',
+            ),
         ),
     ),
     (

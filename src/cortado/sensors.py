@@ -1,11 +1,23 @@
-"""What a gauge would read in the fluid: pressure at a point, the height of its surface, a flow, the load on a solid."""
+"""What a gauge would read in the fluid: pressure at a point, the height of its surface, a flow, the load on a solid,
+how a body moves."""
 
 from cortado.calls import face
+from cortado.runs.body_motion import BodyMotion
 from cortado.runs.probes import FlowRate, PressureProbe, SolidLoad, WallForce
 from cortado.runs.sensor import Readings, Sensor
 from cortado.runs.spring_loads import SpringForce
 from cortado.runs.wave_gauge import WaveGauge
 
-__all__ = ["FlowRate", "PressureProbe", "Readings", "Sensor", "SolidLoad", "SpringForce", "WallForce", "WaveGauge"]
+__all__ = [
+    "BodyMotion",
+    "FlowRate",
+    "PressureProbe",
+    "Readings",
+    "Sensor",
+    "SolidLoad",
+    "SpringForce",
+    "WallForce",
+    "WaveGauge",
+]
 
 __dir__ = face(globals())

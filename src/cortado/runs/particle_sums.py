@@ -259,6 +259,16 @@ class LoadSum:
         return np.concatenate([in_space(load[:d]), load[d:] if d == 3 else np.pad(load[d:], (2, 0))])
 
 
+@dataclass(frozen=True)
+class NoSum:
+    """The sum of a sensor that reads the motion of solids alone: 0."""
+
+    quantity: None = None
+
+    def on_host(self, at: Reading) -> NDArray[Any]:
+        return np.zeros(6)
+
+
 def load_bars(bar: NDArray[Any], dimension: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return derivatives by the three components each of a force and a torque, from those by what a scene has."""
     if dimension == 3:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cortado.calls import fixed
 from cortado.discretise.shapes import Points, corners, grid, in_space
 from cortado.errors import InputError, shown, warn
+from cortado.runs.body_motion import BodyMotion
 from cortado.runs.particle_sums import (
     ACROSS,
     Around,
@@ -232,6 +233,7 @@ SENSORS: dict[str, Callable[..., Sensor]] = {
     "wall_force": WallForce,
     "solid_load": SolidLoad,
     "spring_force": SpringForce,
+    "body_motion": BodyMotion,
 }
 """Classes of sensors by their kinds."""
 

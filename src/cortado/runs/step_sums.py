@@ -19,7 +19,7 @@ from cortado.discretise.room import Domain
 from cortado.discretise.shapes import in_space
 from cortado.errors import InputError
 from cortado.particles.state import Parameters, State, StateSeries
-from cortado.runs.particle_sums import LoadSum, ParticleSum, RegionSum, WeightedSum
+from cortado.runs.particle_sums import LoadSum, NoSum, ParticleSum, RegionSum, WeightedSum
 from cortado.runs.quantity_formulas import SIX, QuantityFormula
 from cortado.runs.riding import Ride, square
 from cortado.runs.sensor import SensedScene
@@ -294,7 +294,7 @@ class ChunkSums:
         self._stride, self._kernels = isqrt(layout.particles - 1) + 1, _kernels(layout.precision)
         self._none, rows = wp.empty(0, dtype=layout.precision.real, device=solver.device), length * layout.members
         self._partial = wp.empty(rows * self._stride, dtype=SIX, device=solver.device)
-        self._total = wp.empty(rows, dtype=SIX, device=solver.device)
+        self._total = wp.zeros(rows, dtype=SIX, device=solver.device)
         self._launches: dict[tuple[int, int], list[Callable[[], None]]] = {}
         """By the number of steps and the address of the first state, as in most chunks neither is another."""
         self._setting: Any = None
@@ -311,6 +311,8 @@ class ChunkSums:
         quantities that were ``kept``. Return them (at least count scenes,), which the next launch overwrites."""
         if isinstance(self._summed, LoadSum):
             return kept[self._summed.quantity]
+        if isinstance(self._summed, NoSum):
+            return self._total
         key = count, first.positions.ptr
         if key not in self._launches:
             self._launches[key] = self._recorded(self._summed, count, first, later, kept)

@@ -20,7 +20,13 @@ from cortado.scene.links import check_hinges
 from cortado.scene.model import MixtureTable, SceneTables
 from cortado.scene.motions import free
 from cortado.scene.parameters import BY_NAME
-from cortado.scene.sensor_tables import FlowRateTable, PressureProbeTable, SolidLoadTable, SpringForceTable
+from cortado.scene.sensor_tables import (
+    BodyMotionTable,
+    FlowRateTable,
+    PressureProbeTable,
+    SolidLoadTable,
+    SpringForceTable,
+)
 from cortado.scene.shape_tables import MeshShape, check_length
 from cortado.scene.solids import SolidTable
 from cortado.scene.springs import check_springs
@@ -291,6 +297,11 @@ def _check_sensors(scene: SceneTables) -> None:
             if sensor.spring not in springs:
                 wanted = f"the name of a spring, of {shown(springs)}" if springs else "of a scene with springs"
                 raise field_error((*path, "spring"), sensor.spring, wanted)
+        elif isinstance(sensor, BodyMotionTable):
+            free = [solid.name for solid in scene.solid if solid.motion == "free"]
+            if sensor.solid not in free:
+                wanted = f"the name of a free body, of {shown(free)}" if free else 'of a solid whose motion is "free"'
+                raise field_error((*path, "solid"), sensor.solid, wanted)
         elif not isinstance(sensor, FlowRateTable):
             if sensor.on is not None and sensor.on not in moving:
                 raise field_error((*path, "on"), sensor.on, on_moving)

@@ -355,6 +355,17 @@ class Pose:
         """Return the rotation matrix R (3, 3)."""
         return np.asarray(self.turned @ matrix(self.begun))
 
+    @property
+    def angles(self) -> NDArray[np.float64]:
+        """Return the rotation vector (3,) of R, in the plane the angle (1,), of at most half a turn [rad]."""
+        from scipy.spatial.transform import Rotation
+
+        return np.asarray(_angles(Rotation.from_matrix(self.rotation).as_rotvec(), len(self.position)).ravel())
+
+    def angle_bars(self, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """Turn the derivative with respect to `angles` into those of fields, by their names."""
+        return self.turning_bars(np.linalg.solve(_jacobian(_in_space(self.angles)).T, _in_space(bar)))
+
     def turning_bars(self, t: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """Turn ``t`` (3,), the derivative with respect to a further turn of R, into those of fields, by their names."""
         name, dimension = self.name, len(self.position)

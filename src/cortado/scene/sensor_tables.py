@@ -131,7 +131,22 @@ class SpringForceTable(SensorTable):
     """The name of the spring."""
 
 
+class BodyMotionTable(SensorTable):
+    """A sensor of where a free body is, how it is turned, and how fast it goes and turns."""
+
+    kind: Literal["body_motion"]
+    """Which sensor it is."""
+    solid: Text
+    """The name of the body."""
+
+
 AnySensor = Annotated[
-    PressureProbeTable | WaveGaugeTable | FlowRateTable | WallForceTable | SolidLoadTable | SpringForceTable,
+    PressureProbeTable
+    | WaveGaugeTable
+    | FlowRateTable
+    | WallForceTable
+    | SolidLoadTable
+    | SpringForceTable
+    | BodyMotionTable,
     Field(discriminator="kind"),
 ]
