@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from cortado.errors import SceneError, Words
-from cortado.scene.scene import Scene, scene_from_dict
+from cortado.scene.scene import Scene, read_toml, scene_from_dict
 from cortado.scene.tables import MISSING, sentences, wanted
-from cortado.scene.toml import read_toml
 from experiments.experiment import Experiment
 from experiments.registry import EXPERIMENT_TYPES
 from experiments.scenes import merged

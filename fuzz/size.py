@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cortado.errors import CortadoError, CortadoWarning
-from cortado.scene.scene import load_scene
-from cortado.scene.toml import read_toml
+from cortado.scene.scene import load_scene, read_toml
 
 MOST_PARTICLES, MOST_PIXELS, MOST_WORK = 30_000, 500_000, 2e6
 """Work is counted in pressure iterations of one particle."""

@@ -2,7 +2,7 @@
 
 import importlib
 
-from cortado.device.warp_start import silenced
+from cortado.device.modules import silenced
 
 MODULES = (
     "av",

@@ -42,8 +42,7 @@ import cortado
 from cortado import Problem, Scene, Simulation, forces, gradients, load_scene
 from cortado.certificate.horizon import directions, everything, scales
 from cortado.cli import main
-from cortado.cli.commands.new import new_scene, templates
-from cortado.cli.subcommands import CORTADO
+from cortado.cli.subcommands import CORTADO, new_scene, templates
 from cortado.optimisation.inverse.task_tables import file_schema
 from cortado.scene.parameters import Role
 from scenes import jet, plane, plane_of_three, scene, two_layers

@@ -220,7 +220,7 @@ def test_kernels_have_the_flags_that_were_measured():
 KERNEL = """
 import sys
 import warp as wp
-from cortado.device.warp_start import complaint, start_warp
+from cortado.device.modules import complaint, start_warp
 
 @wp.kernel(module="unique")
 def twice(x: wp.array(dtype=float)):
@@ -301,13 +301,13 @@ def test_a_cache_that_cannot_be_written_is_replaced(twice, tmp_path):
 
 
 def test_other_errors_are_no_complaint_of_the_cache():
-    from cortado.device.warp_start import complaint
+    from cortado.device.modules import complaint
 
     assert complaint(ValueError("steps")) is None and complaint(OSError(28, "No space left on device")) is None
 
 
 def test_what_another_process_is_compiling_is_not_damaged(tmp_path):
-    from cortado.device.warp_start import _trouble
+    from cortado.device.modules import _trouble
 
     for name in ("wp_cortado_a_846ebbe_p512_t139785425587072", "wp_cortado_a_846ebbe"):
         (tmp_path / name).mkdir()

@@ -635,7 +635,7 @@ def test_an_ensemble_that_is_too_large_is_refused_before_anything_is_run(make, m
     for name in ("samples", *(("differences", "parts") if make is gradients.Guided else ())):
         with pytest.raises(InputError, match=rf"{name} is 1000000000000, but must be at most 100,000"):
             make(**{name: 10**12})
-    monkeypatch.setattr("cortado.device.memory.available", lambda device=None: 1e6)
+    monkeypatch.setattr("cortado.device.threads.available", lambda device=None: 1e6)
     stub = Stub(quadratic)
     with pytest.raises(InputError, match=r"^This needs about .* of memory, most of it for .* samples.*; take fewer"):
         make(0.5, samples=100_000).estimate(stub, POINT)

@@ -16,14 +16,14 @@ import pytest
 import warp as wp
 
 import cortado.cli.commands.describe
-import cortado.cli.commands.new
 import cortado.cli.commands.optimise
 import cortado.cli.commands.run
 import cortado.cli.commands.sweep
+import cortado.cli.subcommands
 from compiling_notice import without_compiling
 from cortado import CortadoWarning, load_scene
 from cortado.cli import main
-from cortado.cli.commands.new import new_scene, templates
+from cortado.cli.subcommands import new_scene, templates
 from cortado.optimisation.inverse.task_files import load_task
 from cortado.pictures.image_files import read_picture
 from cortado.rollout.run_checks import unstable_sentence
@@ -163,7 +163,7 @@ def test_the_code_runs_as_printed(capsys):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_is_one(command, monkeypatch):
     for module, function in (
-        (cortado.cli.commands.new, "new_scene"),
+        (cortado.cli.subcommands, "new_scene"),
         (cortado.cli.commands.describe, "describe_scene"),
         (cortado.cli.commands.run, "run_scene"),
         (cortado.cli.commands.optimise, "optimise_task"),

@@ -16,9 +16,8 @@ import cortado
 from bad_scenes import assert_refused
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
-from cortado.cli.commands.new import scene_text, templates
 from cortado.cli.process import usage_sentence
-from cortado.cli.subcommands import COMMANDS, app, gradients
+from cortado.cli.subcommands import COMMANDS, app, gradients, scene_text, templates
 from cortado.files.disk import SCHEMA, examples_folder
 from cortado.optimisation.inverse.task_tables import file_schema, file_schema_text
 
@@ -59,7 +58,7 @@ def test_cortado_alone_shows_every_command(cortado_command):
 @pytest.mark.parametrize("example", COMMANDS)
 def test_what_it_shows_can_be_typed(example, cortado_command, monkeypatch):
     assert cortado.Simulation  # imported before its imports are replaced
-    monkeypatch.setattr("cortado.device.warp_start.start_warp", lambda: pytest.fail("the command was understood"))
+    monkeypatch.setattr("cortado.device.modules.start_warp", lambda: pytest.fail("the command was understood"))
     words = shlex.split(example)[1:]
     for word in words:
         if word.endswith(".toml"):

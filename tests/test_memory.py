@@ -9,7 +9,7 @@ import pytest
 
 from bad_scenes import plane
 from cortado import InputError, Problem, SceneError, Simulation, losses
-from cortado.device import memory
+from cortado.device import threads
 from cortado.render.renderer import scene_renderer
 from cortado.scene.scene import scene_from_dict
 
@@ -17,7 +17,7 @@ MEASURE = """
 import sys
 import numpy as np
 from cortado import Problem, Simulation, losses
-from cortado.device import memory
+from cortado.device import threads
 from benchmarks.bench.scene import dam_break
 
 def run(particles):
@@ -37,8 +37,8 @@ run(27)
 before = peak()
 simulation, forward = run(60_000)
 real = simulation.precision.bytes
-parts = memory.simulation_parts(simulation.particles, len(simulation.walls), simulation.solver.search.capacity, real)
-back = memory.gradient_parts(simulation.particles, 5, real)
+parts = threads.simulation_parts(simulation.particles, len(simulation.walls), simulation.solver.search.capacity, real)
+back = threads.gradient_parts(simulation.particles, 5, real)
 print((forward - before) / sum(parts.values()), (peak() - forward) / sum(back.values()))
 """
 
@@ -54,7 +54,7 @@ def test_the_estimate_is_what_a_run_and_its_gradient_take(precision):
 @pytest.fixture
 def scarce(monkeypatch) -> Callable[[float], None]:
     """Sets what is free [bytes]."""
-    return lambda free: monkeypatch.setattr(memory, "available", lambda device=None: free)
+    return lambda free: monkeypatch.setattr(threads, "available", lambda device=None: free)
 
 
 def problem() -> Problem:
@@ -94,16 +94,16 @@ def test_what_does_not_fit_is_refused_in_a_sentence(scarce, work, words):
 
 
 def test_the_limit_of_a_process_and_of_a_container_counts(monkeypatch, tmp_path):
-    program = "from cortado.device import memory; print(memory.available())"
+    program = "from cortado.device import threads; print(threads.available())"
     line = f'ulimit -v 2000000; "{sys.executable}" -c "{program}"'
     free = float(subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True).stdout)
     assert 1e8 < free < 2.05e9
     for name, content in {"max": "3000", "current": "1500", "stat": "anon 1\ninactive_file 400"}.items():
         (tmp_path / f"memory.{name}").write_text(content)
-    monkeypatch.setattr(memory, "_CGROUP", tmp_path)
-    assert memory.available() == 1900.0
+    monkeypatch.setattr(threads, "_CGROUP", tmp_path)
+    assert threads.available() == 1900.0
     (tmp_path / "memory.max").write_text("max")
-    assert memory.available() > 1e6
+    assert threads.available() > 1e6
 
 
 def test_checkpoints_leave_room_and_no_machine_has_it_for_all_steps(scarce):

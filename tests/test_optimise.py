@@ -854,7 +854,7 @@ def test_wrong_input_is_refused_before_anything_is_evaluated(change, message):
 
 @pytest.mark.parametrize("optimiser", [LineSearch(trials=1000), LBFGS(memory=1000)])
 def test_what_does_not_fit_into_memory_is_refused_before_anything_is_evaluated(optimiser, monkeypatch):
-    monkeypatch.setattr("cortado.device.memory.available", lambda device=None: 1e7)
+    monkeypatch.setattr("cortado.device.threads.available", lambda device=None: 1e7)
     problem = Quadratic({"x": np.zeros(2000)})
     with pytest.raises(InputError, match=r"^This needs about .* of memory, most of it for .*; take fewer"):
         optimise(problem, {"x": np.ones(2000)}, optimiser, 3)

@@ -20,9 +20,8 @@ from cortado.errors import CortadoWarning, DivergedError, InputError, MassWarnin
 from cortado.losses import CentreOfMass
 from cortado.scene.fluids import BoxFluid
 from cortado.scene.model import DiscretisationTable, MixtureTable
-from cortado.scene.scene import Scene, load_scene, scene_from_dict
+from cortado.scene.scene import Scene, load_scene, read_toml, scene_from_dict
 from cortado.scene.stability import stability_limits
-from cortado.scene.toml import read_toml
 from scenes import box, pool, stability_limit
 
 

@@ -11,7 +11,7 @@ from bad_scenes import GOOD_SCENE, assert_one_sentence, one_sentence, plane
 from cortado import InputError, Scene, SceneError, load_scene
 from cortado.files.vtkhdf import TrajectoryWriter
 from cortado.scene.point_files import read_points
-from cortado.scene.toml import MOST_BYTES, read_toml
+from cortado.scene.scene import MOST_BYTES, read_toml
 
 
 def test_positions_are_read_from_beside_the_scene(tmp_path, monkeypatch):

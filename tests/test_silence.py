@@ -7,12 +7,12 @@ import sys
 
 import pytest
 
-import cortado.device.warp_start
+import cortado.device.modules
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
 from compiling_notice import COMPILING, UNOPTIMISED
 from cortado import InputError, Simulation
-from cortado.device.warp_start import installed_driver, start_warp, why_no_gpu
+from cortado.device.modules import installed_driver, start_warp, why_no_gpu
 
 FIRST = f"""{UNOPTIMISED}
 BEFORE
@@ -123,19 +123,19 @@ def test_an_old_driver_is_told(tmp_path, version):
     ],
 )
 def test_what_is_said_of_versions(monkeypatch, found, needed, words):
-    monkeypatch.setattr(cortado.device.warp_start, "installed_driver", lambda: found)
-    monkeypatch.setattr(cortado.device.warp_start, "_needed", lambda: needed)
+    monkeypatch.setattr(cortado.device.modules, "installed_driver", lambda: found)
+    monkeypatch.setattr(cortado.device.modules, "_needed", lambda: needed)
     assert words in why_no_gpu()
 
 
 def test_warp_says_what_it_needs():
     start_warp()
-    assert (cortado.device.warp_start._needed() or (99, 0)) >= (11, 4)
+    assert (cortado.device.modules._needed() or (99, 0)) >= (11, 4)
 
 
 def test_python_is_told_too(monkeypatch, tmp_path):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
-    monkeypatch.setattr(cortado.device.warp_start, "installed_driver", lambda: (11, 0))
+    monkeypatch.setattr(cortado.device.modules, "installed_driver", lambda: (11, 0))
     monkeypatch.setattr("warp.get_cuda_device_count", lambda: 0)
     with pytest.raises(InputError, match=r"the CUDA driver is too old, as it supports CUDA 11\.0"):
         Simulation(str(tmp_path / "scene.toml"), device="cuda")

@@ -19,7 +19,7 @@ from cortado.rollout.rollout import Rollout
 from cortado.simulation import Simulation
 
 Row = dict[str, Any]
-MEASURED, ESTIMATED = "measured: high-water mark of the memory pool", "estimated: cortado.device.memory"
+MEASURED, ESTIMATED = "measured: high-water mark of the memory pool", "estimated: cortado.device.threads"
 
 
 def measure_dam_break(

@@ -19,12 +19,11 @@ from uuid import uuid4
 
 from cortado.arrays import require_arguments, require_function, require_whole
 from cortado.calls import face
+from cortado.device.modules import VISIBLE, visible_gpus
 from cortado.device.threads import CORES, usable_cores
-from cortado.device.warp_start import VISIBLE, visible_gpus
 from cortado.device.worker_calls import Answer, Lacking, Payload, call, in_words, pickled
-from cortado.errors import ComputationError, InputError, shown, warn
+from cortado.errors import ComputationError, InputError, counted, shown, warn
 from cortado.files.terminal import Hold
-from cortado.words import counted
 
 if TYPE_CHECKING:
     import distributed

@@ -15,7 +15,7 @@ from cortado.arrays import check_step_numbers, check_steps, require_arguments, r
 from cortado.calls import Staying, fixed, public
 from cortado.code_words import code_words
 from cortado.device.threads import Turn, in_turn
-from cortado.errors import DivergedError, InputError, warn
+from cortado.errors import DivergedError, InputError, counted, warn
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
 from cortado.gradients.estimator import checked_reverse
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch
@@ -38,7 +38,6 @@ from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
 from cortado.solvers.build import fingerprint as parts_fingerprint
 from cortado.sph.free_energy import FREE_ENERGIES
-from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]
 

@@ -13,12 +13,11 @@ import numpy as np
 from cortado.arrays import whole_number
 from cortado.calls import fixed, public
 from cortado.device.lanes import checked_lanes
-from cortado.device.memory import frame_parts, require, simulation_parts, within
+from cortado.device.modules import device_named, start_warp
 from cortado.device.precision import precision_named
-from cortado.device.threads import WARP, Turn, in_turn
-from cortado.device.warp_start import device_named, start_warp
+from cortado.device.threads import WARP, Turn, frame_parts, in_turn, require, simulation_parts, within
 from cortado.discretise.smoothing import circulation_factor
-from cortado.errors import InputError, shown, unwarned, warn
+from cortado.errors import InputError, counted, shown, unwarned, warn
 from cortado.files.image_encoding import ShadedPicture
 from cortado.lazy import on_top
 from cortado.particles.state import State
@@ -58,7 +57,6 @@ from cortado.solvers.build import (
 from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy, stable_substeps
 from cortado.watching import Watch
-from cortado.words import counted
 
 WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 """Number of particles of all scenes in one launch above which more are no faster, by kind of device."""

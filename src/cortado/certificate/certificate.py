@@ -34,7 +34,7 @@ from cortado.certificate.horizon import (
     horizon,
     scales,
 )
-from cortado.errors import DivergedError, InputError, shown
+from cortado.errors import DivergedError, InputError, counted, shown
 from cortado.gradients import AdjointNorms
 from cortado.gradients.estimator import NO_RUN
 from cortado.losses import FinalPositions
@@ -44,7 +44,6 @@ from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.parameters import Range, Role
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
-from cortado.words import counted
 
 BESIDE = 0.1 * PERTURBATION
 """Part of the spacing, and of the speed of a fall, by which particles are moved off a corner of the loss."""

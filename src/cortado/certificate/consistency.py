@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cortado.device.precision import FLOAT64
-from cortado.errors import DivergedError
+from cortado.errors import DivergedError, ShortRepr
 from cortado.gradients.estimator import NO_RUN
 from cortado.losses import (
     CentreOfMass,
@@ -30,7 +30,6 @@ from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.scene.parameter_values import Arrays
 from cortado.simulation import Simulation
-from cortado.words import ShortRepr
 
 
 def up_to(problem: Problem, steps: int) -> Problem | None:

@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cortado.certificate.consistency import LossHistory
-from cortado.errors import InputError, shown
+from cortado.errors import InputError, ShortRepr, shown
 from cortado.gradients import AdjointViscosity, EnsembleMean, Exact, GradientEstimator, Guided, RandomizedSmoothing
 from cortado.gradients.estimator import NO_RUN
 from cortado.problem import Problem
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.parameters import Axis, Parameter, Range, Role
-from cortado.words import ShortRepr
 
 PERTURBATION = 0.05
 """Size of a meaningful perturbation, relative to that of the parameter or, for states, of the flow (`scales`)."""

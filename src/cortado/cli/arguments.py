@@ -20,7 +20,7 @@ from tyro.extras import SubcommandApp
 
 from cortado.errors import InputError
 from cortado.files.terminal import quietly
-from cortado.scene.toml import read_toml
+from cortado.scene.scene import read_toml
 
 if TYPE_CHECKING:
     from cortado.runs.recording import FrameChoice

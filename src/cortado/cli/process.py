@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
             warnings.showwarning = _show_warning  # type: ignore[assignment]
             work = _understood(program, arguments)
             logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where its folder cannot be written it goes on
-            from cortado.device.warp_start import start_warp  # with Warp, once the command is understood
+            from cortado.device.modules import start_warp  # with Warp, once the command is understood
 
             start_warp()
             text = work()
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
     except BrokenPipeError:
         sys.exit(BROKEN_PIPE)
     except Exception as error:
-        from cortado.device.warp_start import complaint
+        from cortado.device.modules import complaint
 
         sentence = shortage(error) or complaint(error)
         if sentence is None:

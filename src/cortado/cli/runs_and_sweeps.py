@@ -20,7 +20,7 @@ from cortado.cli.arguments import (
     text_overrides,
 )
 from cortado.errors import InputError
-from cortado.scene.toml import read_toml
+from cortado.scene.scene import read_toml
 
 
 def compare(

@@ -117,7 +117,7 @@ class TriangleTree:
     def ask(self, kernel: str, points: Points, **arguments: Any) -> None:
         """Launch one of the `tree_kernels` for points (n, 3) [m], with its further arguments, which include arrays that
         it writes to."""
-        from cortado.device.warp_start import start_warp
+        from cortado.device.modules import start_warp
 
         start_warp()
         from cortado.discretise import tree_kernels

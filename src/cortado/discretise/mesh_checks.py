@@ -6,8 +6,7 @@ import numpy as np
 
 from cortado.discretise.mesh import Mesh, TriangleTree
 from cortado.discretise.shapes import Numbers, Points, Which, whole_origin
-from cortado.errors import InputError
-from cortado.words import counted
+from cortado.errors import InputError, counted
 
 SAME = 1e-6
 """Part of the length of a mesh: vertices that are no further apart are one where edges are open otherwise, as float32

@@ -84,7 +84,7 @@ class PointsAround:
     @cached_property
     def kernels(self) -> Any:
         """Make the `packing_kernels` for the lattice's smoothing kernel."""
-        from cortado.device.warp_start import start_warp
+        from cortado.device.modules import start_warp
 
         start_warp()
         from cortado.discretise.packing_kernels import packing_kernels

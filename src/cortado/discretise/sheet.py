@@ -96,7 +96,7 @@ class Sheet(Solid):
     def crossed(self, starts: Points, ends: Points, spacing: float) -> Which:
         """Test (n,) which segments between points (n, d) [m] go through the sheet, beside particles a spacing [m]
         apart."""
-        from cortado.device.warp_start import start_warp
+        from cortado.device.modules import start_warp
 
         start_warp()
         import warp as wp

@@ -18,7 +18,7 @@ from cortado.device.threads import WARP
 from cortado.environments.kernels import environment_kernels
 from cortado.environments.side_by_side import SideBySide, parts_of
 from cortado.environments.task import Task, checked_scene, split
-from cortado.errors import CortadoWarning, InputError, MassWarning, shown
+from cortado.errors import CortadoWarning, InputError, MassWarning, counted, shown
 from cortado.losses.loss import SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState
@@ -29,7 +29,6 @@ from cortado.scene.motions import AXES, angular_velocity_name, position_name, ve
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
-from cortado.words import counted
 
 JITTER = 0.02
 """Standard deviation of the noise of first positions, in spacings."""

@@ -7,8 +7,8 @@ import numpy as np
 
 from cortado.arrays import as_number, as_numbers, is_whole, require_at_most, require_whole
 from cortado.calls import keep_own
-from cortado.device.memory import require
 from cortado.device.precision import Precision
+from cortado.device.threads import require
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, OutOfRangeError, shown, warn
 from cortado.executors import Executor, InProcess, checked_executor
 from cortado.gradients.estimator import (

@@ -12,14 +12,13 @@ from cortado.calls import FixedDict, fixed
 from cortado.code_words import code_words
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.reduction import add
-from cortado.errors import InputError, shown
+from cortado.errors import InputError, counted, shown
 from cortado.particles.state import State
 from cortado.runs.quantity_values import Moment
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameters import check_readable
 from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
-from cortado.words import counted
 
 
 def precision_of(state: State) -> Precision:

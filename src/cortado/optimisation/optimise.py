@@ -23,7 +23,7 @@ from cortado.arrays import (
     require_truth,
 )
 from cortado.calls import public
-from cortado.errors import InputError, shown, warn
+from cortado.errors import InputError, counted, shown, sized, warn
 from cortado.executors import Executor, InProcess, OnResult, checked_executor
 from cortado.files.disk import as_path
 from cortado.gradients import Estimate, GradientEstimator
@@ -33,7 +33,6 @@ from cortado.optimisation.evaluator import Evaluator, Optimisable, Parameters, R
 from cortado.optimisation.optimisers import as_optimiser
 from cortado.optimisation.search import MemoryLog, Optimiser, ParameterLayout, ReplayLog, Search, Vector
 from cortado.scene.parameter_values import Values
-from cortado.words import counted, sized
 
 LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
 """Parameters by name -> the loss, and its gradient by the same names."""

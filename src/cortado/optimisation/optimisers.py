@@ -13,8 +13,8 @@ import numpy as np
 
 from cortado.arrays import is_whole, require_at_most
 from cortado.calls import face, keep_own
-from cortado.device.memory import require
-from cortado.errors import InputError, shown
+from cortado.device.threads import require
+from cortado.errors import InputError, quoted, shown
 from cortado.optimisation.search import (
     Iterate,
     Optimiser,
@@ -27,7 +27,6 @@ from cortado.optimisation.search import (
     require_names,
     require_positive,
 )
-from cortado.words import quoted
 
 MOST_TRIALS = 1_000
 """Most trials of an update; more are taken for a mistake, as each is a run."""

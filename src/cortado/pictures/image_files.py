@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.calls import public
-from cortado.device.memory import require
+from cortado.device.threads import require
 from cortado.errors import InputError, warn
 from cortado.files.disk import as_path, reason, regular_file, write_atomically
 from cortado.files.image_encoding import from_srgb, png, pyav

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic_core import PydanticCustomError
 
 from cortado.arrays import whole_number
-from cortado.device.warp_start import device_named, start_warp
+from cortado.device.modules import device_named, start_warp
 from cortado.discretise.shapes import Points, corners
 from cortado.errors import InputError, SceneError, shown
 from cortado.files.disk import as_path

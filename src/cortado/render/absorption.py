@@ -21,10 +21,10 @@ import numpy as np
 import warp as wp
 
 from cortado.device.launching import launch
-from cortado.device.memory import field_parts, picture_parts, require, sample_parts
 from cortado.device.modules import Kernels, kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_of
+from cortado.device.threads import field_parts, picture_parts, require, sample_parts
 from cortado.render.cameras import Camera, View, ViewTangent
 from cortado.render.colour_field import node_functions, nodes_type, rgba_type
 from cortado.render.rays import camera_tangent_type, camera_type, interpolation_functions, ray_functions

@@ -20,10 +20,10 @@ import warp as wp
 from cortado.device.cells import CellSort, cell_functions, cell_grid_type
 from cortado.device.grid import Grid
 from cortado.device.launching import launch
-from cortado.device.memory import field_parts, require
 from cortado.device.modules import Kernels, kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_of
+from cortado.device.threads import field_parts, require
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
 from cortado.errors import InputError

@@ -10,11 +10,11 @@ from pydantic import AfterValidator, TypeAdapter
 
 from cortado.arrays import as_numbers
 from cortado.calls import fixed, public
+from cortado.device.modules import start_warp
 from cortado.device.precision import Precision, precision_named
 from cortado.device.threads import WARP
-from cortado.device.warp_start import start_warp
 from cortado.discretise.smoothing import SmoothingKernel
-from cortado.errors import InputError, shown
+from cortado.errors import InputError, counted, shown
 from cortado.particles.state import padded
 from cortado.render.absorption import RayMarcher
 from cortado.render.cameras import Perspective, TopView, View, ViewTangent, Volume, positive, vector
@@ -23,7 +23,6 @@ from cortado.scene.appearance import Render
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.scene import Scene
 from cortado.scene.tables import sentences
-from cortado.words import counted
 
 
 @dataclass(frozen=True)

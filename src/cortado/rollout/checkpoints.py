@@ -1,9 +1,11 @@
 """States that a run keeps on its way forward, so that another way may lead back, and one that it goes on from.
 
+If a run loses a particle, they say where it was lost, for the error.
+
 Protocols say what is computed of states while they are on the device: beside each step, and behind each chunk.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from math import isqrt
@@ -11,9 +13,11 @@ from typing import Protocol
 
 import numpy as np
 
-from cortado.errors import InputError
+from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Parameters, State, StateSeries
 from cortado.rollout.step_sizes import StepSizes
+from cortado.solvers.containment import Lost, shut_in
+from cortado.solvers.solver import Solver
 
 MEMORY_BUDGET = 8 * 2**30
 """Bytes of memory for checkpoints; a run that needs more keeps fewer states and recomputes the others."""
@@ -124,3 +128,31 @@ class ChunkReader(Protocol):
     def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
         """Read the states at which steps ``step`` to ``end`` began, the ``first`` and those ``later``; the next chunk
         overwrites them."""
+
+
+AROUND = 6.0
+"""Distance, in spacings, around a lost particle's last position within which causes are sought."""
+
+
+def diverged(solver: Solver, member: int, lost: Lost, known: Sequence[State], advice: str) -> DivergedError:
+    """Return the error for a scene of a batch that lost a particle, given at least two states up to the failed step,
+    and advice."""
+    containment, particles = solver.containment, solver.layout.particles
+    spacing, d = containment.walled.spacing, containment.walled.dimension
+    own = slice(member * particles, (member + 1) * particles)
+    first, was, after = (known[k].positions.numpy()[own, :d] for k in (0, -2, -1))
+    if not np.isfinite(was[lost.particle]).all():
+        where = "had been lost in steps before these"
+        return DivergedError(lost.step + 1, lost.particle, "begin that scene anew", where, lost.others)
+    position, places = after[lost.particle], np.concatenate([first, was])
+    if not lost.others:
+        places = places[np.linalg.norm(places - was[lost.particle], axis=1) < AROUND * spacing]
+    if narrow := shut_in(containment, member, places):
+        advice = f"{narrow}, or {advice}"
+    return DivergedError(
+        step=lost.step + 1,
+        particle=lost.particle,
+        advice=f"{advice}, or float64 for fluid that flies that far" if containment.is_imprecise(position) else advice,
+        where=containment.where(position),
+        others=lost.others,
+    )

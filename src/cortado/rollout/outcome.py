@@ -4,10 +4,10 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from cortado.errors import counted
 from cortado.rollout.rollout import Rollout
 from cortado.scene.scene import Scene
 from cortado.sph.viscous_stress import Solve
-from cortado.words import counted
 
 TORN = 0.015
 """Divergence, times the step, above which a warning is given. Vortices, water at rest, and dams within the longest step

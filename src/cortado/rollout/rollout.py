@@ -16,14 +16,20 @@ import warp as wp
 
 from cortado.calls import Staying
 from cortado.device.launching import CapturedGraph
-from cortado.device.memory import require, step_parts, within
 from cortado.device.modules import compile_ahead, compile_ahead_adjoint
 from cortado.device.reduction import add
-from cortado.device.threads import WARP, Turn, in_turn
+from cortado.device.threads import WARP, Turn, in_turn, require, step_parts, within
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Parameters, State, StateSeries
-from cortado.rollout.checkpoints import MEMORY_BUDGET, Beside, Checkpoints, ChunkReader, Progress, checkpoint_interval
-from cortado.rollout.divergence import diverged
+from cortado.rollout.checkpoints import (
+    MEMORY_BUDGET,
+    Beside,
+    Checkpoints,
+    ChunkReader,
+    Progress,
+    checkpoint_interval,
+    diverged,
+)
 from cortado.rollout.step_sizes import StepSizes
 from cortado.scene.restart import Clock, Origin
 from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepLog, StepTangent

@@ -12,9 +12,8 @@ import warp as wp
 
 from cortado.arrays import check_steps, require_methods
 from cortado.calls import Staying
-from cortado.device.memory import require
-from cortado.device.threads import Turn, in_turn
-from cortado.errors import InputError, shown, warn
+from cortado.device.threads import Turn, in_turn, require
+from cortado.errors import InputError, counted, shown, sized, warn
 from cortado.particles.state import Parameters, State
 from cortado.rollout.device_states import (
     DeviceRows,
@@ -34,7 +33,6 @@ from cortado.rollout.run_checks import check_directions
 from cortado.rollout.scene_parameters import Simulated
 from cortado.scene.parameter_values import Arrays, Values
 from cortado.solvers.solver import Solver
-from cortado.words import counted, sized
 
 KEPT = 4
 """Number of different step counts for which a simulation keeps arrays and graphs."""

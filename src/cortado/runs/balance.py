@@ -7,8 +7,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.errors import counted
 from cortado.scene.scene import Scene
-from cortado.words import counted
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.errors import InputError, shown, warn
+from cortado.errors import InputError, counted, shown, warn
 from cortado.files import vtkhdf
 from cortado.lazy import on_top
 from cortado.scene.appearance import Picture
@@ -33,7 +33,6 @@ from cortado.scene.parameters import QUANTITIES
 from cortado.scene.restart import Origin
 from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
-from cortado.words import counted
 
 SAME = 1e-9
 """Part of the time between frames by which a state may come before a frame is due, as times are rounded."""

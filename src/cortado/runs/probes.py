@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cortado.calls import fixed
 from cortado.discretise.shapes import Points, corners, grid, in_space
-from cortado.errors import InputError, shown, warn
+from cortado.errors import InputError, point_in_words, shown, warn
 from cortado.runs.body_motion import BodyMotion
 from cortado.runs.particle_sums import (
     ACROSS,
@@ -32,7 +32,6 @@ from cortado.runs.spring_loads import SpringForce
 from cortado.runs.wave_gauge import WaveGauge
 from cortado.scene.parameters import load_name
 from cortado.scene.scene import Scene
-from cortado.words import point_in_words
 
 
 @fixed

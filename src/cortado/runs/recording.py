@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.errors import DivergedError, InputError
+from cortado.errors import DivergedError, InputError, counted
 from cortado.particles.state import Entry, State, StateSeries
 from cortado.rollout.checkpoints import Beside
 from cortado.rollout.rollout import Rollout
@@ -29,7 +29,6 @@ from cortado.scene.parameter_values import Arrays
 from cortado.scene.parameters import Axis
 from cortado.scene.restart import Clock
 from cortado.scene.scene import Scene
-from cortado.words import counted
 
 
 class FrameChoice(Protocol):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.calls import public
-from cortado.errors import InputError, shown
+from cortado.errors import InputError, counted, shown
 from cortado.files import vtkhdf
 from cortado.files.disk import as_path
 from cortado.files.image_encoding import ShadedPicture
@@ -32,7 +32,6 @@ from cortado.runs.sensor import Readings
 from cortado.scene.parameters import QUANTITIES, check_quantity
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.scene import Scene
-from cortado.words import counted
 
 
 @dataclass(frozen=True, eq=False)

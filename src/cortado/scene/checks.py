@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from pydantic_core import PydanticCustomError
 
-from cortado.device.memory import sampling_parts, shortage
+from cortado.device.threads import sampling_parts, shortage
 from cortado.discretise.mesh_files import read_mesh
 from cortado.discretise.room import TOLERANCE
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.solid import Solid
-from cortado.errors import InputError, Words, shown
+from cortado.errors import InputError, Words, point_in_words, shown
 from cortado.scene.drain_tables import check_drains
 from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
@@ -32,7 +32,6 @@ from cortado.scene.solids import SolidTable
 from cortado.scene.springs import check_springs
 from cortado.scene.stability import chosen_limits
 from cortado.scene.tables import MISSING, FieldPath, field_error, field_name
-from cortado.words import point_in_words
 
 DEEPEST = 0.25
 """In spacings: depth to which bodies may begin in walls and in each other."""

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.calls import FixedDict
-from cortado.errors import InputError, shown
-from cortado.words import ShortRepr
+from cortado.errors import InputError, ShortRepr, shown
 
 
 @dataclass(frozen=True)

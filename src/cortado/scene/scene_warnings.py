@@ -8,6 +8,7 @@ import numpy as np
 
 from cortado.discretise.room import Room
 from cortado.discretise.solid_walls import surface_feet
+from cortado.errors import point_in_words
 from cortado.scene.appearance import Keyframes, Picture
 from cortado.scene.courses import Steady
 from cortado.scene.fluids import PointsFluid
@@ -18,7 +19,6 @@ from cortado.scene.solids import SolidTable, thick
 from cortado.scene.solvers import what_suits
 from cortado.scene.stability import fluid_lengths
 from cortado.scene.tables import FieldPath, Table, field_error, field_name
-from cortado.words import point_in_words
 
 OF_DIFFUSION = ("free_energy", "strength", "mobility_form", "interface_width")
 OF_ITERATIONS = (

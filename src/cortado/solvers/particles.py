@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from cortado.calls import Staying
 from cortado.device.launching import KernelLauncher
-from cortado.device.memory import gradient_parts
-from cortado.device.threads import Turn
+from cortado.device.threads import Turn, gradient_parts
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SKIN
 from cortado.errors import MissingDerivativeError

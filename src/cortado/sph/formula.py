@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.device.modules import c_stderr_to
 from cortado.device.precision import Precision
-from cortado.device.warp_start import c_stderr_to
 from cortado.errors import InputError
 from cortado.particles.state import Layout, Parameters, components
 from cortado.scene.parameters import Axis, Parameter

@@ -16,6 +16,7 @@ from cortado.errors import (
     DivergedError,
     InputError,
     SceneError,
+    counted,
     shown,
     unwarned,
     warn,
@@ -25,13 +26,11 @@ from cortado.files.terminal import keeping, track, untracked
 from cortado.optimisation.dataset_files import PARTS, DatasetFolder, metadata
 from cortado.optimisation.datasets import KINDS, MORE_FLUID, DatasetTable, DatasetTables, Sample, bounds_of, one_run
 from cortado.runs.run_folder import differences, read_json
-from cortado.scene.scene import Scene, files_named, load_scene
+from cortado.scene.scene import Scene, files_named, load_scene, overrides_of, read_toml
 from cortado.scene.tables import MISSING
 from cortado.scene.tables import sentences as in_sentences
-from cortado.scene.toml import overrides_of, read_toml
 from cortado.simulation import Simulation
 from cortado.version import __version__
-from cortado.words import counted
 
 ASKED = "dataset.json"
 """The file with the choices of a data set, by which the same command goes on with it, and another one does not. The

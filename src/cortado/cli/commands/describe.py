@@ -16,9 +16,9 @@ import warp as wp
 
 from cortado.arrays import check_steps
 from cortado.certificate import Certificate, certify
-from cortado.device.memory import frame_parts, gradient_parts, simulation_parts, step_parts
+from cortado.device.threads import frame_parts, gradient_parts, simulation_parts, step_parts
 from cortado.discretise.shapes import EXCESS
-from cortado.errors import ComputationError, DivergedError, InputError, shown
+from cortado.errors import ComputationError, DivergedError, InputError, counted, point_in_words, shown
 from cortado.files.disk import make_folder
 from cortado.files.terminal import tell, timed_note
 from cortado.losses import CentreOfMass, FinalPositions, Image, Loss
@@ -34,13 +34,11 @@ from cortado.rollout.step_bounds import ROOM, scheduled_bounds
 from cortado.runs.frames import Pace
 from cortado.runs.recording import FrameChoice
 from cortado.scene.appearance import Picture
-from cortado.scene.scene import Scene, load_scene, vector
+from cortado.scene.scene import Scene, load_scene, overrides_of, read_toml
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
-from cortado.scene.toml import overrides_of, read_toml
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 from cortado.watching import Watch
-from cortado.words import counted
 
 MANY = 1_000_000
 """Number of particles that is announced before they are made, as that takes some seconds or minutes."""
@@ -346,7 +344,7 @@ def _size(found: dict[str, Any]) -> str:
     masses = ", ".join(found["mass_in_words"])
     layer = " in a layer of 1 m" if found["dimension"] == 2 else ""
     container = f", in a container of {held} m" if held else ""
-    gravity = vector(found["gravity_m_s2"])
+    gravity = point_in_words(found["gravity_m_s2"])
     return f"fluid in {fluid} m{container}; {masses}{layer}; gravity {gravity} m/s2"
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.errors import ComputationError
+from cortado.errors import ComputationError, counted
 from cortado.files.disk import locked
 from cortado.files.terminal import announce, track
 from cortado.optimisation.fitting.figures import profile_figure, residual_figure, video_figures
@@ -15,7 +15,6 @@ from cortado.optimisation.inverse.solved_task import FitTask, load_fit
 from cortado.pictures.pages import Section, write_report
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.scene import scene_in_words
-from cortado.words import counted
 
 COUNTED = (
     "The last column is what the error would be if every number that was measured were independent of all others: it "

@@ -20,7 +20,7 @@ from cortado.cli.commands.optimise_report import (
     worst_in_words,
 )
 from cortado.cli.commands.options import HERE, Where
-from cortado.errors import ComputationError, DivergedError, InputError
+from cortado.errors import ComputationError, DivergedError, InputError, counted
 from cortado.executors import Executor
 from cortado.files.disk import locked
 from cortado.files.terminal import announce, keeping, say, track
@@ -37,7 +37,6 @@ from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.pictures.film import lacking
 from cortado.pictures.pages import Section, write_report
 from cortado.runs.run_folder import TO_RESUME, RunFolder
-from cortado.words import counted
 
 LITTLE = 2.0
 """Factor by which a loss must be smaller for a search to have come to something."""

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from cortado.cli.commands.run_report import RunSummary, write_run_report
-from cortado.device.memory import frame_parts, require
 from cortado.device.modules import compile_ahead
+from cortado.device.threads import frame_parts, require
 from cortado.errors import DivergedError, InputError, warn
 from cortado.files.disk import locked
 from cortado.files.terminal import announce, keeping, track

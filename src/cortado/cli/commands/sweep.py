@@ -10,16 +10,14 @@ from cortado.cli.arguments import ALL_FRAMES, FrameOptions, steps_or_time
 from cortado.cli.commands.optimise import optimise_task, search_settings
 from cortado.cli.commands.options import HERE, Where, require_shared
 from cortado.cli.commands.run import RunRequest, run_scene, run_settings
-from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, unwarned, warn
+from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, counted, unwarned, warn
 from cortado.files.disk import locked
 from cortado.files.terminal import Interrupted, keeping, track, untracked
 from cortado.optimisation.inverse.task_files import load_task
 from cortado.optimisation.sweep import NAME, Combination, combinations, failed, write_table
 from cortado.runs.recording import FrameChoice
 from cortado.runs.run_folder import RunFolder
-from cortado.scene.scene import load_scene
-from cortado.scene.toml import read_toml
-from cortado.words import counted
+from cortado.scene.scene import load_scene, read_toml
 
 SAME_TIME = 1e-9
 """Relative difference below which times are equal."""

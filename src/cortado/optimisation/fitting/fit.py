@@ -10,7 +10,7 @@ import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number, require_function, require_table, whole_number
 from cortado.calls import public
-from cortado.errors import ComputationError, DivergedError, InputError, shown
+from cortado.errors import ComputationError, DivergedError, InputError, counted, shown
 from cortado.lazy import on_top
 from cortado.optimisation.fitting.certainty import Certainty, FittedPart, counted_covariance, noise_of, spread
 from cortado.optimisation.fitting.doubts import dear_causes, doubts_of
@@ -19,7 +19,6 @@ from cortado.optimisation.fitting.gauss_newton import TINY, least, misfit, other
 from cortado.optimisation.fitting.least_squares import Coordinates, LeastSquares, Linearised, Weighting
 from cortado.scene.parameter_values import UNITS
 from cortado.scene.parameters import Range
-from cortado.words import counted
 
 ALIKE = 0.9
 """Two numbers whose estimates are correlated by more are not told apart."""

@@ -41,9 +41,8 @@ from cortado.runs.probes import sensors_of
 from cortado.scene.appearance import Picture
 from cortado.scene.parameter_values import Arrays, Tilt
 from cortado.scene.parameters import Axis
-from cortado.scene.scene import Scene, scene_from_dict
+from cortado.scene.scene import Scene, read_toml, scene_from_dict
 from cortado.scene.tables import MISSING, Table
-from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 
 MOST_CURVES = 12

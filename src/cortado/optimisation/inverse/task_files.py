@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.errors import DivergedError, InputError, SceneError, Words
+from cortado.errors import DivergedError, InputError, SceneError, Words, counted
 from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
 from cortado.optimisation.inverse.task_tables import DISTANCES, RANDOM, OptimiseTable, ProblemTable, TaskTables
 from cortado.optimisation.transforms import Bijector, Logarithm, Softmax, TimeInterpolation, Transformed
@@ -18,13 +18,11 @@ from cortado.render.renderer import Renderer, scene_renderer
 from cortado.scene.fluid_particles import fluid_particles
 from cortado.scene.parameter_values import SUM_TOLERANCE, Arrays, Known, is_too_small
 from cortado.scene.parameters import Axis, Parameter, Range, Role, offered
-from cortado.scene.scene import Scene, scene_from_dict
+from cortado.scene.scene import Scene, read_toml, scene_from_dict
 from cortado.scene.shape_tables import CylinderContainer
 from cortado.scene.tables import MISSING, Table, sentences
-from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 from cortado.solvers.build import known_in
-from cortado.words import counted
 
 _ALGORITHMS = {
     "adam": "Adam",

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 import warp as wp
 
-from cortado.errors import CortadoWarning, DivergedError, InputError
+from cortado.errors import CortadoWarning, DivergedError, InputError, counted
 from cortado.particles.state import Entry, State
 from cortado.rollout.device_states import DeviceRows, DeviceState, DeviceStates
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
@@ -24,7 +24,6 @@ from cortado.rollout.run_checks import check_clock, origin_of, shapes_of_fields
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.simulation import Simulation
-from cortado.words import counted
 
 STATE, PARAMETER = "state ", "parameter "
 """What the names of fields of a state, and of parameters, begin with among those of a layer's arrays: so they do not

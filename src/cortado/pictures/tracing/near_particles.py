@@ -14,8 +14,7 @@ from cortado.device.launching import BandLauncher
 from cortado.device.modules import kernel_module
 from cortado.device.precision import FLOAT32
 from cortado.discretise.shapes import Points
-from cortado.errors import ComputationError
-from cortado.words import counted
+from cortado.errors import ComputationError, counted
 
 Ints, Ints2d = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 Floats, Floats2d = wp.array(dtype=wp.float32), wp.array2d(dtype=wp.float32)
