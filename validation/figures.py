@@ -1,5 +1,7 @@
 """Redraw the comparisons of tests/test_validation.py: ``python validation/figures.py OUT`` writes PNGs (1 minute).
 
+It prints the rows of `validation/README.md` that they give, which ``--write`` keeps (see `measured_rows.py`).
+
 ``python validation/figures.py --containment`` instead prints what happens in a dam break with 8,000 particles.
 """
 
@@ -10,6 +12,7 @@ import time
 from pathlib import Path
 
 import matplotlib
+import measured_rows as rows
 import numpy as np
 
 matplotlib.use("Agg")
@@ -22,9 +25,11 @@ import test_validation as validation
 from cortado import Simulation
 
 KERNELS = {"cubic_spline": 2.0, "wendland_c2": 2.6, "wendland_c4": 3.0}
+ROWS = ("front_theory", "front_koshizuka", "poiseuille_pcisph", "vortices_pcisph", "contained")
+"""Of `measured.csv`, which `main` prints."""
 
 
-def column(folder: Path) -> None:
+def column(folder: Path) -> rows.Figures:
     """Water at rest: pressure over height, and where it is wrong."""
     figure, axes = plt.subplots(2, 3, figsize=(12, 9), layout="constrained")
     for (kernel, support), (above, below) in zip(KERNELS.items(), axes.T, strict=True):
@@ -41,11 +46,13 @@ def column(folder: Path) -> None:
         below.set(aspect="equal", xlabel="x / H", ylabel="y / H")
     figure.colorbar(points, ax=axes[1], label="error / (rho g H)")
     _save(figure, folder / "column_at_rest.png")
+    return {}
 
 
-def front(folder: Path) -> None:
+def front(folder: Path) -> rows.Figures:
     """Dam break: the front, that of potential flow, and the measured ones with their lags taken off."""
     exact = potential_flow.dam_break(2.75)[:, :2]
+    theory, delayed = [], {}
     figure, (left, right) = plt.subplots(1, 2, figsize=(12, 5), layout="constrained")
     cases = (
         (left, validation.KOSHIZUKA_OKA, "Koshizuka and Oka 1996", 9, 4.0, 3.15),
@@ -62,15 +69,19 @@ def front(folder: Path) -> None:
             seen = (exact[:, 0] > 0.2) & (exact[:, 0] < 2.7)
             away = np.interp(exact[seen, 0], result.times, result.places) / exact[seen, 1] - 1.0
             print(f"    from potential flow {np.abs(away).max():.3f}")
+            if axis is left:
+                theory.append(100.0 * float(np.abs(away).max()))
+                delayed[across] = 100.0 * float(errors[1])
         axis.plot(*exact.T, "k--", label="potential flow")
         axis.plot(*measured.T, "ko", label="measured")
         axis.plot(measured[:, 0] - lag, measured[:, 1], "kx", label=f"measured, a lag of {lag:.2f} taken off")
         axis.set(xlabel="t sqrt(2 g / L)", ylabel="front / L", title=title)
         axis.legend()
     _save(figure, folder / "dam_break_front.png")
+    return {"front_theory": theory, "front_koshizuka": [delayed[20]]}
 
 
-def channel(folder: Path) -> None:
+def channel(folder: Path) -> rows.Figures:
     """Poiseuille flow: profiles, and the error over the number of particles across."""
     table = validation.published(validation.MORRIS)
     times = np.where(np.isfinite(table[:, 0]), table[:, 0], validation.STEADY)
@@ -100,9 +111,10 @@ def channel(folder: Path) -> None:
     right.set(xlabel="particles across", ylabel="greatest error at L / 2 and L / 4, over the greatest u")
     right.legend()
     _save(figure, folder / "poiseuille.png")
+    return {"poiseuille_pcisph": [100.0 * float(error.max()) for error in errors[:2]]}
 
 
-def vortices(folder: Path) -> None:
+def vortices(folder: Path) -> rows.Figures:
     """Taylor-Green: the energy, until a fifth is left."""
     figure, axes = plt.subplots(1, 2, figsize=(12, 5), layout="constrained", sharey=True)
     cases = (
@@ -110,6 +122,7 @@ def vortices(folder: Path) -> None:
         (axes[0], 10.0, ((20, 0.0, "cubic_spline"),)),
         (axes[1], 50.0, ((20, 0.01, "cubic_spline"), (20, 0.01, "wendland_c4"))),
     )
+    found = []
     with tempfile.TemporaryDirectory() as scratch:
         for axis, reynolds, runs in cases:
             for across, room, kernel in runs:
@@ -117,6 +130,7 @@ def vortices(folder: Path) -> None:
                     Path(scratch), across, reynolds, room, kernel, KERNELS[kernel], until=reynolds / 100.0
                 )
                 error = validation.taylor_green_error(times, energies, reynolds)
+                found.append(100.0 * error)
                 label = f"{across} x {across}, {kernel}, room {100 * room:g} %"
                 print(f"vortices, Re {reynolds:g}, {label}: {error:.4f}")
                 axis.plot(times, energies, label=label)
@@ -126,9 +140,10 @@ def vortices(folder: Path) -> None:
         axis.plot(times, validation.exact_energies(times, reynolds), "k--", label="exp(-16 pi^2 t / Re)")
         axis.legend()
     _save(figure, folder / "taylor_green.png")
+    return {"vortices_pcisph": found[:3]}
 
 
-def contain(particles: int = 8000, steps: int = 2000) -> None:
+def contain(particles: int = 8000, steps: int = 2000) -> rows.Figures:
     """Print how many particles a dam break loses, and its greatest average density error after the first 10 steps."""
     scene = containment.box(particles)
     simulation = Simulation(scene)
@@ -151,6 +166,7 @@ def contain(particles: int = 8000, steps: int = 2000) -> None:
         f"nearest {nearest / scene.discretisation.spacing:.3f} spacings from a wall; "
         f"density error {average:.5f} on average, {greatest:.4f} at most"
     )
+    return {"contained": [outside, nearest / scene.discretisation.spacing]}
 
 
 def _save(figure, path: Path) -> None:
@@ -164,13 +180,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, nargs="?", help="where the PNGs go")
     parser.add_argument("--containment", action="store_true", help="print the long dam break's figures")
+    rows.Printer.add_to(parser)
     arguments = parser.parse_args()
+    printer = rows.Printer(arguments)
     if arguments.containment:
-        contain()
+        printer.rows(contain())
     if arguments.folder:
         arguments.folder.mkdir(parents=True, exist_ok=True)
         for draw in column, front, channel, vortices:
-            draw(arguments.folder)
+            printer.rows(draw(arguments.folder))
     elif not arguments.containment:
         parser.error("a folder or --containment is needed")
 

@@ -1,6 +1,7 @@
 """Redraw the comparisons of tests/test_validation_mixture.py, and the long runs of coarsening that it leaves out.
 
 ``python validation/mixture.py`` writes PNGs to runs/validation (10 minutes on two free cores, most of it coarsening).
+It prints the rows of `validation/README.md` that they give too, which ``--write`` keeps (see `measured_rows.py`).
 """
 
 import argparse
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
+import measured_rows as rows
 import numpy as np
 
 matplotlib.use("Agg")
@@ -22,6 +24,8 @@ from cortado.files.terminal import track
 
 COLOURS = np.array([to_rgb(name) for name in ("#20364b", "#f0e2c4", "#b5523b", "#5b8a5a")])
 """Of pure phases."""
+ROWS = ("growth_fastest", "growth_others", "interface", "mixing", "coarsening")
+"""Of `measured.csv`, which `main` prints."""
 
 
 # ---- closed forms ----------------------------------------------------------------------------------------------------
@@ -32,7 +36,7 @@ INTERFACES = WAVELENGTHS[:3]
 """The last would take 70,000 substeps."""
 
 
-def closed_forms(folder: Path) -> None:
+def closed_forms(folder: Path) -> rows.Figures:
     """Growth rates, an interface and the decay of a wave: above each against its closed form, below its error."""
     with track(2 * len(WAVELENGTHS) + len(INTERFACES), "closed forms") as advance:
 
@@ -58,6 +62,12 @@ def closed_forms(folder: Path) -> None:
         axis.minorticks_off()
         axis.legend()
     _save(figure, folder / "mixture_closed_forms.png")
+    return {
+        "growth_fastest": (100.0 * (rates[:, -1] - 1.0)).tolist(),
+        "growth_others": (100.0 * (rates[0, :-1] - 1.0)).tolist(),
+        "interface": [100.0 * one.error for one in interfaces],
+        "mixing": [_decay_error(*runs[0]) for runs in decays[1:]],
+    }
 
 
 def _growth(axes: np.ndarray, rates: np.ndarray) -> None:
@@ -108,7 +118,7 @@ def _decay(axes: np.ndarray, decays: list) -> None:
     above, below = axes
     errors = []
     for wavelength, runs, mark in zip(WAVELENGTHS, decays, "^so+", strict=True):
-        errors.append([100.0 * (variance[-1] / np.exp(-times[-1]) - 1.0) for times, variance in runs])
+        errors.append([_decay_error(times, variance) for times, variance in runs])
         times, variance = runs[1]
         above.semilogy(times[::40], variance[::40], mark, label=f"{wavelength} particles in the wave")
         print(f"decay, {wavelength} particles: error {errors[-1][0]:.2f} %, in short substeps {errors[-1][1]:.2f} %")
@@ -121,6 +131,11 @@ def _decay(axes: np.ndarray, decays: list) -> None:
     below.loglog(WAVELENGTHS, errors[0], "o-", label="the engine's substeps")
     below.loglog(WAVELENGTHS, errors[1], "s-", label="short substeps: of the lattice alone")
     below.set(xlabel="particles in the wave", ylabel="error of the variance after one e-fold [%]")
+
+
+def _decay_error(times: np.ndarray, variance: np.ndarray) -> float:
+    """[%] of the last variance."""
+    return 100.0 * float(variance[-1] / np.exp(-times[-1]) - 1.0)
 
 
 # ---- coarsening ------------------------------------------------------------------------------------------------------
@@ -148,7 +163,7 @@ def coarsening_runs(device: str) -> Runs:
     return results
 
 
-def coarsening(folder: Path, results: Runs) -> None:
+def coarsening(folder: Path, results: Runs) -> rows.Figures:
     """The distance between interfaces over time, with its exponents, and what the mixtures look like."""
     figure = plt.figure(figsize=(13, 13), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(1.0, 1.45))
@@ -164,6 +179,8 @@ def coarsening(folder: Path, results: Runs) -> None:
             axis.set(xticks=[], yticks=[], title=f"{form}, {times[number]:.0f} eps^2")
     below.colorbar(shown, ax=rows, label="c", orientation="horizontal", shrink=0.3, aspect=30)
     _save(figure, folder / "mixture_coarsening.png")
+    window = RUNS["constant"]["windows"][0]
+    return {"coarsening": [float(np.mean([one.exponent(*window) for one in results["constant"]]))]}
 
 
 def _exponents(axis: plt.Axes, form: str, seeds: list[validation.Coarsening]) -> None:
@@ -229,11 +246,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/validation"), help="where the PNGs go")
     parser.add_argument("--device", default="cpu", help="where the coarsening runs, such as cuda:0")
+    rows.Printer.add_to(parser)
     arguments = parser.parse_args()
+    printer = rows.Printer(arguments)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    closed_forms(arguments.out)
+    printer.rows(closed_forms(arguments.out))
     phases(arguments.out)
-    coarsening(arguments.out, coarsening_runs(arguments.device))
+    printer.rows(coarsening(arguments.out, coarsening_runs(arguments.device)))
 
 
 if __name__ == "__main__":

@@ -1,18 +1,19 @@
 """How near is the projection to flows that are known? ``python validation/projection.py [--device cuda] [--only jet]``
-prints a line for each case of `validation/README.md` and more, some of which take minutes on one core."""
+prints a line for each case, some of which take minutes on one core, and the rows of `validation/README.md` that they
+give; ``--write`` keeps these (see `measured_rows.py`)."""
 
 import argparse
 import sys
-import time
-import warnings
 from collections.abc import Callable
+from functools import partial
 from itertools import product
 from pathlib import Path
 
+import measured_rows as rows
 import numpy as np
+from measured_rows import Measure
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from cortado.errors import CortadoWarning
 from falling_jets import falling_jet
 from oscillating_drops import C2, C4, CUBIC
 from projected_flows import dam_break, elliptical_drop, hung_block, kolmogorov, rotating_patch, shut_box, taylor_green
@@ -97,18 +98,64 @@ CASES: dict[str, Case] = {
 }
 
 
+def percent(values: object) -> list[float]:
+    return (100.0 * np.ravel(values)).tolist()
+
+
+def films(deep: int, *slopes: str) -> Measure:
+    return Measure(tuple(f"film {deep} deep, slope {slope}:" for slope in slopes), lambda found: [f[0] for f in found])
+
+
+def channels(name: str, figure: str) -> Measure:
+    return Measure((f"{name}, 20 across",), lambda found: [one[figure] for one in found])
+
+
+def waves(figure: str) -> Measure:
+    """Each wave with 24 and 48 particles in the depth."""
+    kinds = ("2 depths long, periodic", "4 depths long, periodic", "4 depths long, between walls")
+    cases = tuple(f"standing wave, {deep} deep, {kind}" for kind in kinds for deep in (24, 48))
+    return Measure(cases, lambda found: [getattr(one, figure) for one in found])
+
+
+STILL = tuple(f"water at rest, {deep} deep, wendland_c2, after {s} s" for s in (2.5, 10.0) for deep in (20, 40))
+JETS = tuple(f"jet, {name}, {n} across, 0 Pa s" for name in ("slot", "round") for n in (7, 14))
+DAM = ("dam break",)
+ROWS = {
+    "vortices": Measure(("vortices 32, 46",), lambda found: percent(np.transpose(found[0]))),
+    "vortices_thick": Measure(("vortices 32, Re 10",), lambda found: percent(found[0][0])),
+    "wave": Measure(("wave of shear",), percent),
+    "square": Measure(("square that turns",), lambda found: [one[0] for one in found[0]]),
+    "ellipse": Measure(("ellipse 36",), lambda found: percent(found[0] - 1.0)),
+    "ball": Measure(("ball drawn out",), lambda found: percent(found[0] - 1.0)),
+    "jet_slot": Measure(JETS[:2], lambda found: np.ravel([one[0] for one in found])),
+    "jet_round": Measure(JETS[2:], lambda found: np.ravel([one[0] for one in found])),
+    "jet_honey": Measure(("jet, slot, 7 across, 5 Pa s",), lambda found: found[0][0]),
+    "jets_whole": Measure(("jet, ",), lambda found: [f([one[1] for one in found]) for f in (min, max)]),
+    "film": films(16, "0.1", "0.01", "0.001", "0.0003"),
+    "film_deeper": films(32, "0.1", "0.01", "0.001"),
+    "block": Measure(("block",), lambda found: found),
+    "dam_energy": Measure(DAM, lambda found: [one[0] for one in found[0]]),
+    "dam_compression": Measure(DAM, lambda found: percent([one[1] for one in found[0]])),
+    "standing_frequency": waves("frequency"),
+    "standing_damping": waves("damping"),
+    "rest_speed": Measure(STILL, lambda found: [one.speed for one in found]),
+    "rest_pressure": Measure(STILL[:2], lambda found: percent([one.pressure for one in found])),
+    "rest_space": Measure(("water at rest in space",), lambda found: [found[0].speed, *percent(found[0].pressure)]),
+    "layers": Measure(("layers",), lambda found: found),
+    "poiseuille": channels("Poiseuille", "flow"),
+    "couette": channels("Couette", "slope"),
+}
+"""Of `measured.csv`, from what cases found."""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cpu", help="as Warp names it")
     parser.add_argument("--only", default="", help="cases whose names begin so")
+    rows.Printer.add_to(parser)
     given = parser.parse_args()
-    warnings.simplefilter("ignore", CortadoWarning)
     np.set_printoptions(precision=4, suppress=True)
-    chosen = {name: case for name, case in CASES.items() if name.startswith(given.only)}
-    for number, (name, case) in enumerate(chosen.items(), 1):
-        begun = time.perf_counter()
-        found = case(given.device)
-        print(f"[{number}/{len(chosen)}] {name}: {found} ({time.perf_counter() - begun:.0f} s)", flush=True)
+    rows.run_cases({name: partial(case, given.device) for name, case in CASES.items()}, ROWS, given)
 
 
 if __name__ == "__main__":

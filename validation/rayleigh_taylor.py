@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import matplotlib
+import measured_rows as rows
 import numpy as np
 
 matplotlib.use("Agg")
@@ -24,6 +25,8 @@ KERNELS = (
 )
 TIMES = (0.0, 2.0, 3.0, 4.4)
 """Of the pictures [s]."""
+ROWS = ("rayleigh_taylor",)
+"""Of `measured.csv`, which `main` prints, and keeps with ``--write``."""
 
 
 def reported(label: str, growth: validation.Growth) -> validation.Growth:
@@ -38,7 +41,7 @@ def reported(label: str, growth: validation.Growth) -> validation.Growth:
     return growth
 
 
-def growth(folder: Path) -> None:
+def growth(folder: Path) -> rows.Figures:
     """Amplitudes by resolution, wave number and viscosity; rates by kernel."""
     figure, axes = plt.subplots(1, 3, figsize=(15, 5), layout="constrained")
     cases = (
@@ -47,10 +50,12 @@ def growth(folder: Path) -> None:
         (axes[1], 1, 0.02, (32,)),
         (axes[1], 1, 0.3, (32,)),
     )
+    errors = []
     for axis, waves, damping, resolutions in cases:
         for across in resolutions:
             label = f"k = {waves} x 2 pi, nu k² = {damping:g} of the rate, {across // waves} per wave"
             result = reported(label, validation.rayleigh_taylor(across, waves, damping=damping))
+            errors += [100.0 * result.error] if axis is axes[0] else []
             time = result.times * result.mode.inviscid
             axis.semilogy(time, result.amplitudes, label=f"{label} ({100.0 * result.error:+.1f} %)")
         theory = result.amplitudes[0] * np.exp(result.mode.growth * result.times)
@@ -63,6 +68,7 @@ def growth(folder: Path) -> None:
     figure.savefig(folder / "rayleigh_taylor_growth.png", dpi=100)
     plt.close(figure)
     print(folder / "rayleigh_taylor_growth.png")
+    return {"rayleigh_taylor": errors}
 
 
 def kernels(axis: plt.Axes) -> None:
@@ -117,10 +123,12 @@ def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/validation"), help="where the PNGs go")
-    folder = parser.parse_args().out
+    rows.Printer.add_to(parser)
+    given = parser.parse_args()
+    folder = given.out
     folder.mkdir(parents=True, exist_ok=True)
     pictures(folder)
-    growth(folder)
+    rows.Printer(given).rows(growth(folder))
 
 
 if __name__ == "__main__":

@@ -1,18 +1,19 @@
 """How near are flows beside solids to what is known, and do solids hold water? ``python validation/solids.py [--only
-cavity] [--device cuda:0]`` prints what each case found; 7 minutes on one core for the cavity at a Reynolds number of
+cavity] [--device cuda:0]`` prints what each case found and the rows of `validation/README.md` that they give, which
+``--write`` keeps (see `measured_rows.py`); 7 minutes on one core for the cavity at a Reynolds number of
 400, half an hour where velocities follow."""
 
 import argparse
 import csv
 import sys
-import time
-import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import measured_rows as rows
 import numpy as np
+from measured_rows import Measure
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from loads import LOADS
@@ -20,7 +21,6 @@ from piston_waves import piston
 
 from baffles import held, sloshed
 from cortado import Scene, Simulation
-from cortado.errors import CortadoWarning
 from floating_bodies import added_mass, disc_in_a_round_tank, floating_box, settling_disc, stopping_cylinder
 from held_water import MESHES, cup_turned, meshes, stirred
 
@@ -128,16 +128,52 @@ def cases(device: str) -> dict[str, Callable[[], object]]:
     }
 
 
+def values(*names: str) -> Callable[[list[dict[str, float]]], list[float]]:
+    """What each case found by these names."""
+    return lambda found: [one[name] for one in found for name in names]
+
+
+def _per_cent(found: list[dict[str, float]]) -> list[float]:
+    return [100.0 * one[name] for one in found for name in ("u", "v")]
+
+
+BODIES = (
+    "torus",
+    "200,000 triangles",
+    "bodies that overlap",
+    "a torus that crosses itself",
+    "a sheet one spacing thick",
+)
+TEN = "added-mass, a sphere 8 across, 20 deep, 2 iterations, 10 steps"
+ROWS = {
+    "cavity": Measure(("cavity, Re 100, 50 x 50",), _per_cent),
+    "cavity_400": Measure(("cavity, Re 400, 50 x 50, velocities follow",), _per_cent),
+    "stirred": Measure(("stirred",), values("deepest")),
+    "cup": Measure(("cup-turned",), values("through its wall", "poured", "still in it")),
+    "meshes": Measure(
+        tuple(f"meshes, 500 steps, {name}" for name in BODIES),
+        lambda found: [*(max(one["deepest"], 0.0) for one in found), max(one["energy"] for one in found)],
+    ),
+    "piston": Measure(("piston, kd = 1.5, 20 deep",), values("over theory")),
+    "plunged_box": Measure(("plunged-box, 24",), values("upwards", "sideways")),
+    "taylor_couette": Measure(("taylor-couette, 40 across",), values("inner", "outer")),
+    "turning_cup": Measure(("turning-cup",), values("rise")),
+    "floating_box": Measure(("floating-box",), values("draft over the exact one")),
+    "added_mass": Measure(
+        (TEN, TEN.replace("2 iterations, 10 steps", "16 iterations")),
+        values(*(f"at {density} kg/m3" for density in (500, 3000, 8000))),
+    ),
+}
+"""Of `measured.csv`, from what cases found."""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="cases whose names begin so")
     parser.add_argument("--device", default="cpu", help="of the cavity and the piston")
+    rows.Printer.add_to(parser)
     given = parser.parse_args()
-    warnings.simplefilter("ignore", CortadoWarning)
-    for name, case in cases(given.device).items():
-        if name.startswith(given.only):
-            begun = time.perf_counter()
-            print(f"{name}: {case()} ({time.perf_counter() - begun:.0f} s)", flush=True)
+    rows.run_cases(cases(given.device), ROWS, given)
 
 
 if __name__ == "__main__":

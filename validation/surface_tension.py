@@ -5,14 +5,19 @@ Numbers are over the exact ones: frequency and damping of the mode 2, the deriva
 the surface tension by the tangent of two periods, and the pressure in the second half over (d - 1) sigma / R. The rest
 is the root mean square of what a damped oscillation leaves, over the first stretch; the drift is the greatest speed of
 the drop as a whole over the greatest root mean square of speeds.
+
+It prints the rows of `validation/README.md` that they give too, which ``--write`` keeps (see `measured_rows.py`).
 """
 
 import argparse
+import math
 import sys
 import time
 import warnings
 from itertools import product
 from pathlib import Path
+
+import measured_rows as rows
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from cortado.errors import CortadoWarning
@@ -21,24 +26,30 @@ from oscillating_drops import C2, C4, CUBIC, PCISPH, Drop, disc_of_lattice, pack
 KERNELS = {"C4, 3": C4, "C2, 2.6": C2}
 TURNS = (0.0, 45.0)
 PARTICLES = {"of a lattice": disc_of_lattice, "packed": packed_disc}
+ROWS = ("drop_frequency", "drop_damping")
+"""Of `measured.csv`, which `main` prints with 48 particles across."""
 
 
-def row(name: str, slope: bool = False, **options) -> None:
+def row(name: str, slope: bool = False, **options) -> tuple[float, float, float]:
+    """Print a row; its frequency, damping and derivative."""
     begun = time.perf_counter()
     drop = Drop(slope=slope, **options)
     frequency, damping, rest = drop.fit()
-    derivative = f"{drop.frequency_slope():.3f}" if slope else ""
+    derivative = drop.frequency_slope() if slope else math.nan
     late = f"{drop.pressure[len(drop.time) // 2 :].mean():.3f}" if drop.pressure.any() else ""
     drift = drop.drift.max() / drop.speed.max()
-    numbers = f"{frequency:.3f} | {damping:.3f} | {derivative} | {late} | {rest:.3f} | {drift:.0e}"
+    numbers = f"{frequency:.3f} | {damping:.3f} | {derivative:.3f} | {late} | {rest:.3f} | {drift:.0e}"
     print(f"| {name} | {numbers} | {time.perf_counter() - begun:.0f} s |", flush=True)
+    return frequency, damping, derivative
 
 
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--across", type=int, nargs="*", default=[24, 48], help="particles across a drop in the plane")
-    across = parser.parse_args().across
+    rows.Printer.add_to(parser)
+    given = parser.parse_args()
+    across, found = given.across, {}
     warnings.simplefilter("ignore", CortadoWarning)  # of forms and kernels that are compared
     print("| drop | frequency | damping | d omega / d sigma | pressure | rest | drift | time |\n|" + 8 * "---|")
     for number, (kernel, discretisation), (kind, particles), turned in product(
@@ -46,7 +57,11 @@ def main() -> None:
     ):
         name = f"{number} across, {kernel}, {kind}, turned by {turned:g}"
         options = {"discretisation": discretisation, "particles": particles, "turned": turned}
-        row(name, slope=True, across=number, **options)
+        found[number, kernel, kind, turned] = row(name, slope=True, across=number, **options)
+    if 48 in across:
+        packed, cut = ([found[48, "C4, 3", kind, turned] for turned in TURNS] for kind in ("packed", "of a lattice"))
+        figures = {"drop_frequency": [one[k] for k in (0, 2) for one in packed]}
+        rows.Printer(given).rows(figures | {"drop_damping": [one[1] for one in (*packed, *cut)]})
     row("24 across, C4, stirred", across=24, turned=20.0, jitter=0.1, discretisation=C4)
     for support in (2.0, 2.6):
         row(f"24 across, cubic, {support:g}", across=24, discretisation={**CUBIC, "support": support})

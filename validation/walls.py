@@ -1,12 +1,14 @@
 """Do walls do work? A dam break's energy and water at rest with the viscosity of water, for three kernels.
 
-``python validation/walls.py`` prints what `validation/README.md` tells under "Walls", but for what others
-measured: about 20 minutes.
+``python validation/walls.py`` prints tables and the rows of `validation/README.md` that they give, which ``--write``
+keeps (see `measured_rows.py`): about 20 minutes.
 """
 
+import argparse
 from collections.abc import Iterator
 from typing import Any
 
+import measured_rows as rows
 import numpy as np
 
 from cortado.discretise.smoothing import lattice_offsets, smoothing_kernel
@@ -15,6 +17,8 @@ from cortado.simulation import Simulation
 
 GRAVITY = 9.81
 KERNELS = (("cubic_spline", 2.0), ("wendland_c2", 2.6), ("wendland_c4", 3.0))
+ROWS = ("walls_work", "walls_rest")
+"""Of `measured.csv`."""
 
 
 def scene(kernel: str, support: float, spacing: float, viscosity: float, **tables: Any) -> Scene:
@@ -107,8 +111,9 @@ def column_slopes(kernel: str, support: float, dimension: int) -> np.ndarray:
     return np.linalg.solve(t[np.abs(np.subtract.outer(np.arange(40), np.arange(40)))], np.ones(40))
 
 
-def lines() -> Iterator[str]:
+def lines(printer: rows.Printer) -> Iterator[str]:
     """The tables, a line at a time."""
+    greatest, speeds = [], {}
     yield "slopes of the pressure, over rho g, that the layers of the rest lattice beside a vertical wall need"
     for dimension in (2, 3):
         for kernel, support in KERNELS:
@@ -119,6 +124,7 @@ def lines() -> Iterator[str]:
         for round_walls in (False, True):
             for solver in ({"density_tolerance": 0.0001}, {"minimum_iterations": 20, "maximum_iterations": 20}):
                 energy = energies(dam_break(kernel, support, round_walls, **solver), 2400)
+                greatest.append(float(energy.max() / energy[0]))
                 yield f"{kernel} {'cup' if round_walls else 'box'} {solver}: {energy.max() / energy[0]:.5f}"
     energy = energies(dam_break("cubic_spline", 2.0, False, density_tolerance=0.01), 12000)
     yield f"energy after 6 s above that of a flat layer, over the first: {energy[-1] / energy[0] - 0.5:.4f}"
@@ -126,9 +132,13 @@ def lines() -> Iterator[str]:
     for dimension in (2, 3):
         for kernel, support in KERNELS:
             one, two, everywhere, near = at_rest(kernel, support, dimension)
+            speeds[dimension, kernel] = one
             yield f"{dimension}-D {kernel}: {one:.3f} {two:.3f} m/s; {everywhere:.1%} {near:.1%}"
+    printer.rows({"walls_work": [max(greatest)], "walls_rest": [speeds[2, "cubic_spline"]]})
 
 
 if __name__ == "__main__":
-    for line in lines():
+    parser = argparse.ArgumentParser(description=__doc__)
+    rows.Printer.add_to(parser)
+    for line in lines(rows.Printer(parser.parse_args())):
         print(line, flush=True)
