@@ -1,12 +1,13 @@
 """Functions that users call say in a sentence which arguments a call lacks, has that are none, or has of another kind.
 
 Objects that do not change once they are made (`fixed`), and objects that stay in their process (`Staying`), refuse in a
-sentence too.
+sentence too. Sentences and a ``repr`` show objects in a few words: how many, how large, never the numbers of an array.
 """
 
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
 from functools import cache, wraps
 from inspect import BoundArguments, Parameter, isclass, signature
 from numbers import Integral, Real
@@ -241,3 +242,40 @@ class Staying:
         name = type(self).__name__
         article = "An" if name[0] in "AEIOU" else "A"
         raise InputError(f"{article} {name} can be neither pickled nor copied, {self.instead}.")
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, ``1 phase`` or ``2 phases``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def quoted(names: Iterable[str]) -> str:
+    """Return names as a sentence shows them: ``'gravity', 'viscosity'``."""
+    return ", ".join(f"'{name}'" for name in names) or "none"
+
+
+def point_in_words(point: Iterable[float]) -> str:
+    """Write the coordinates of a point, in brackets."""
+    return f"({', '.join(f'{value:g}' for value in point)})"
+
+
+def sized(arrays: Mapping[str, Any]) -> str:
+    """Return names with the shapes of their arrays: ``gravity (3,), viscosity``."""
+    shapes = {name: getattr(value, "shape", ()) for name, value in arrays.items()}
+    return ", ".join(f"{name} {shape}" if shape else name for name, shape in shapes.items())
+
+
+class ShortRepr:
+    """A base of dataclasses (made with ``repr=False``) whose arrays are shown by their shapes."""
+
+    def __repr__(self) -> str:
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        shown = (f"{name}={_brief(value)}" for name, value in values.items())
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{name}: {_brief(entry)}' for name, entry in value.items())}}}"
+    shape = getattr(value, "shape", ())
+    return f"array {shape}" if shape else repr(value)

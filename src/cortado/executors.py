@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 from uuid import uuid4
 
 from cortado.arrays import require_arguments, require_function, require_whole
-from cortado.calls import face
+from cortado.calls import counted, face
 from cortado.device.modules import VISIBLE, visible_gpus
 from cortado.device.threads import CORES, usable_cores
 from cortado.device.worker_calls import Answer, Lacking, Payload, call, in_words, pickled
-from cortado.errors import ComputationError, InputError, counted, shown, warn
+from cortado.errors import ComputationError, InputError, shown, warn
 from cortado.files.terminal import Hold
 
 if TYPE_CHECKING:

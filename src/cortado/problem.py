@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import check_step_numbers, check_steps, require_arguments, require_function, whole_number
-from cortado.calls import Staying, fixed, public
+from cortado.calls import Staying, counted, fixed, public
 from cortado.code_words import code_words
 from cortado.device.threads import Turn, in_turn
-from cortado.errors import DivergedError, InputError, counted, warn
+from cortado.errors import DivergedError, InputError, warn
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
 from cortado.gradients.estimator import checked_reverse
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch

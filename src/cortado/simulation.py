@@ -11,13 +11,13 @@ from weakref import WeakSet
 import numpy as np
 
 from cortado.arrays import whole_number
-from cortado.calls import fixed, public
+from cortado.calls import counted, fixed, public
 from cortado.device.lanes import checked_lanes
 from cortado.device.modules import device_named, start_warp
 from cortado.device.precision import precision_named
 from cortado.device.threads import WARP, Turn, frame_parts, in_turn, require, simulation_parts, within
 from cortado.discretise.smoothing import circulation_factor
-from cortado.errors import InputError, counted, shown, unwarned, warn
+from cortado.errors import InputError, shown, unwarned, warn
 from cortado.files.image_encoding import ShadedPicture
 from cortado.lazy import on_top
 from cortado.particles.state import State

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import as_one_number, require_whole
-from cortado.calls import public
+from cortado.calls import counted, public
 from cortado.certificate.consistency import (
     Consistency,
     LossHistory,
@@ -34,7 +34,7 @@ from cortado.certificate.horizon import (
     horizon,
     scales,
 )
-from cortado.errors import DivergedError, InputError, counted, shown
+from cortado.errors import DivergedError, InputError, shown
 from cortado.gradients import AdjointNorms
 from cortado.gradients.estimator import NO_RUN
 from cortado.losses import FinalPositions

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from cortado.calls import ShortRepr
 from cortado.device.precision import FLOAT64
-from cortado.errors import DivergedError, ShortRepr
+from cortado.errors import DivergedError
 from cortado.gradients.estimator import NO_RUN
 from cortado.losses import (
     CentreOfMass,

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from cortado.calls import ShortRepr
 from cortado.certificate.consistency import LossHistory
-from cortado.errors import InputError, ShortRepr, shown
+from cortado.errors import InputError, shown
 from cortado.gradients import AdjointViscosity, EnsembleMean, Exact, GradientEstimator, Guided, RandomizedSmoothing
 from cortado.gradients.estimator import NO_RUN
 from cortado.problem import Problem

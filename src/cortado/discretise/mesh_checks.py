@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cortado.calls import counted
 from cortado.discretise.mesh import Mesh, TriangleTree
 from cortado.discretise.shapes import Numbers, Points, Which, whole_origin
-from cortado.errors import InputError, counted
+from cortado.errors import InputError
 
 SAME = 1e-6
 """Part of the length of a mesh: vertices that are no further apart are one where edges are open otherwise, as float32

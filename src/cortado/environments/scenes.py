@@ -13,12 +13,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from cortado.calls import counted
 from cortado.device.launching import launch
 from cortado.device.threads import WARP
 from cortado.environments.kernels import environment_kernels
 from cortado.environments.side_by_side import SideBySide, parts_of
 from cortado.environments.task import Task, checked_scene, split
-from cortado.errors import CortadoWarning, InputError, MassWarning, counted, shown
+from cortado.errors import CortadoWarning, InputError, MassWarning, shown
 from cortado.losses.loss import SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState

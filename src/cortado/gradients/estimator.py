@@ -9,7 +9,8 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number
-from cortado.errors import DivergedError, InputError, OutOfRangeError, counted, shown, sized
+from cortado.calls import counted, sized
+from cortado.errors import DivergedError, InputError, OutOfRangeError, shown
 from cortado.executors import Executor, OnResult
 from cortado.particles.state import Parameters, State
 from cortado.rollout.rollout import BackwardStep, Observer, Rollout

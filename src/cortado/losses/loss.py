@@ -8,11 +8,11 @@ from typing import Any, Protocol, overload, runtime_checkable
 import numpy as np
 
 from cortado.arrays import is_whole
-from cortado.calls import FixedDict, fixed
+from cortado.calls import FixedDict, counted, fixed
 from cortado.code_words import code_words
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.reduction import add
-from cortado.errors import InputError, counted, shown
+from cortado.errors import InputError, shown
 from cortado.particles.state import State
 from cortado.runs.quantity_values import Moment
 from cortado.scene.discrete_scene import Lattice

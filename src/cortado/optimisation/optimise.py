@@ -22,8 +22,8 @@ from cortado.arrays import (
     require_table,
     require_truth,
 )
-from cortado.calls import public
-from cortado.errors import InputError, counted, shown, sized, warn
+from cortado.calls import counted, public, sized
+from cortado.errors import InputError, shown, warn
 from cortado.executors import Executor, InProcess, OnResult, checked_executor
 from cortado.files.disk import as_path
 from cortado.gradients import Estimate, GradientEstimator

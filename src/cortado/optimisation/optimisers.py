@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import is_whole, require_at_most
-from cortado.calls import face, keep_own
+from cortado.calls import face, keep_own, quoted
 from cortado.device.threads import require
-from cortado.errors import InputError, quoted, shown
+from cortado.errors import InputError, shown
 from cortado.optimisation.search import (
     Iterate,
     Optimiser,

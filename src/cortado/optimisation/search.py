@@ -19,7 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cortado.arrays import as_number
-from cortado.errors import ComputationError, InputError, quoted, shown
+from cortado.calls import quoted
+from cortado.errors import ComputationError, InputError, shown
 from cortado.files.disk import parsed_json, sentences, write_atomically, write_fully
 from cortado.runs.run_folder import REPLAY_LOG
 

@@ -9,12 +9,12 @@ import warp as wp
 from pydantic import AfterValidator, TypeAdapter
 
 from cortado.arrays import as_numbers
-from cortado.calls import fixed, public
+from cortado.calls import counted, fixed, public
 from cortado.device.modules import start_warp
 from cortado.device.precision import Precision, precision_named
 from cortado.device.threads import WARP
 from cortado.discretise.smoothing import SmoothingKernel
-from cortado.errors import InputError, counted, shown
+from cortado.errors import InputError, shown
 from cortado.particles.state import padded
 from cortado.render.absorption import RayMarcher
 from cortado.render.cameras import Perspective, TopView, View, ViewTangent, Volume, positive, vector

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from cortado.errors import counted
+from cortado.calls import counted
 from cortado.rollout.rollout import Rollout
 from cortado.scene.scene import Scene
 from cortado.sph.viscous_stress import Solve

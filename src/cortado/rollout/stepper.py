@@ -11,9 +11,9 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import check_steps, require_methods
-from cortado.calls import Staying
+from cortado.calls import Staying, counted, sized
 from cortado.device.threads import Turn, in_turn, require
-from cortado.errors import InputError, counted, shown, sized, warn
+from cortado.errors import InputError, shown, warn
 from cortado.particles.state import Parameters, State
 from cortado.rollout.device_states import (
     DeviceRows,

@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.errors import counted
+from cortado.calls import counted
 from cortado.scene.scene import Scene
 
 

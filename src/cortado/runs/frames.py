@@ -12,7 +12,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.errors import InputError, counted, shown, warn
+from cortado.calls import counted
+from cortado.errors import InputError, shown, warn
 from cortado.files import vtkhdf
 from cortado.lazy import on_top
 from cortado.scene.appearance import Picture

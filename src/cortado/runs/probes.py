@@ -7,9 +7,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.calls import fixed
+from cortado.calls import fixed, point_in_words
 from cortado.discretise.shapes import Points, corners, grid, in_space
-from cortado.errors import InputError, point_in_words, shown, warn
+from cortado.errors import InputError, shown, warn
 from cortado.runs.body_motion import BodyMotion
 from cortado.runs.particle_sums import (
     ACROSS,

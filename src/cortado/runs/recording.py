@@ -14,7 +14,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.errors import DivergedError, InputError, counted
+from cortado.calls import counted
+from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Entry, State, StateSeries
 from cortado.rollout.checkpoints import Beside
 from cortado.rollout.rollout import Rollout

@@ -12,8 +12,8 @@ from typing import Any, Self, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.calls import public
-from cortado.errors import InputError, counted, shown
+from cortado.calls import counted, public
+from cortado.errors import InputError, shown
 from cortado.files import vtkhdf
 from cortado.files.disk import as_path
 from cortado.files.image_encoding import ShadedPicture

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 from pydantic_core import PydanticCustomError
 
+from cortado.calls import point_in_words
 from cortado.device.threads import sampling_parts, shortage
 from cortado.discretise.mesh_files import read_mesh
 from cortado.discretise.room import TOLERANCE
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.solid import Solid
-from cortado.errors import InputError, Words, point_in_words, shown
+from cortado.errors import InputError, Words, shown
 from cortado.scene.drain_tables import check_drains
 from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.calls import FixedDict
-from cortado.errors import InputError, ShortRepr, shown
+from cortado.calls import FixedDict, ShortRepr
+from cortado.errors import InputError, shown
 
 
 @dataclass(frozen=True)

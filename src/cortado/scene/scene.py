@@ -18,9 +18,9 @@ import numpy as np
 from pydantic import model_validator
 
 from cortado.arrays import as_one_number
-from cortado.calls import public
+from cortado.calls import counted, point_in_words, public
 from cortado.device.threads import require, sampling_parts
-from cortado.errors import LONGEST, InputError, SceneError, Words, counted, point_in_words, shown, warn
+from cortado.errors import LONGEST, InputError, SceneError, Words, shown, warn
 from cortado.files.disk import SCHEMA, as_path, content, reason
 from cortado.scene.checks import check_bounded, check_scene
 from cortado.scene.model import OTHER_TABLES, SceneTables

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from cortado.calls import point_in_words
 from cortado.discretise.room import Room
 from cortado.discretise.solid_walls import surface_feet
-from cortado.errors import point_in_words
 from cortado.scene.appearance import Keyframes, Picture
 from cortado.scene.courses import Steady
 from cortado.scene.fluids import PointsFluid

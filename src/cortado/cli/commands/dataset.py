@@ -9,6 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from cortado.calls import counted
 from cortado.cli.commands.options import HERE, Where, require_shared
 from cortado.errors import (
     ComputationError,
@@ -16,7 +17,6 @@ from cortado.errors import (
     DivergedError,
     InputError,
     SceneError,
-    counted,
     shown,
     unwarned,
     warn,

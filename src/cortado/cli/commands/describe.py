@@ -15,10 +15,11 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import check_steps
+from cortado.calls import counted, point_in_words
 from cortado.certificate import Certificate, certify
 from cortado.device.threads import frame_parts, gradient_parts, simulation_parts, step_parts
 from cortado.discretise.shapes import EXCESS
-from cortado.errors import ComputationError, DivergedError, InputError, counted, point_in_words, shown
+from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.files.disk import make_folder
 from cortado.files.terminal import tell, timed_note
 from cortado.losses import CentreOfMass, FinalPositions, Image, Loss

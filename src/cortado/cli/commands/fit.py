@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from cortado.errors import ComputationError, counted
+from cortado.calls import counted
+from cortado.errors import ComputationError
 from cortado.files.disk import locked
 from cortado.files.terminal import announce, track
 from cortado.optimisation.fitting.figures import profile_figure, residual_figure, video_figures

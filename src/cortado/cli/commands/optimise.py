@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cortado.calls import counted
 from cortado.cli.commands.optimise_report import (
     MOST_ERROR,
     Verdict,
@@ -20,7 +21,7 @@ from cortado.cli.commands.optimise_report import (
     worst_in_words,
 )
 from cortado.cli.commands.options import HERE, Where
-from cortado.errors import ComputationError, DivergedError, InputError, counted
+from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
 from cortado.files.disk import locked
 from cortado.files.terminal import announce, keeping, say, track

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from cortado.arrays import check_steps
+from cortado.calls import counted
 from cortado.cli.arguments import ALL_FRAMES, FrameOptions, steps_or_time
 from cortado.cli.commands.optimise import optimise_task, search_settings
 from cortado.cli.commands.options import HERE, Where, require_shared
 from cortado.cli.commands.run import RunRequest, run_scene, run_settings
-from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, counted, unwarned, warn
+from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, unwarned, warn
 from cortado.files.disk import locked
 from cortado.files.terminal import Interrupted, keeping, track, untracked
 from cortado.optimisation.inverse.task_files import load_task

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number, require_function, require_table, whole_number
-from cortado.calls import public
-from cortado.errors import ComputationError, DivergedError, InputError, counted, shown
+from cortado.calls import counted, public
+from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.lazy import on_top
 from cortado.optimisation.fitting.certainty import Certainty, FittedPart, counted_covariance, noise_of, spread
 from cortado.optimisation.fitting.doubts import dear_causes, doubts_of

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from cortado.errors import DivergedError, InputError, SceneError, Words, counted
+from cortado.calls import counted
+from cortado.errors import DivergedError, InputError, SceneError, Words
 from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
 from cortado.optimisation.inverse.task_tables import DISTANCES, RANDOM, OptimiseTable, ProblemTable, TaskTables
 from cortado.optimisation.transforms import Bijector, Logarithm, Softmax, TimeInterpolation, Transformed

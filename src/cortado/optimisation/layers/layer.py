@@ -16,7 +16,8 @@ from typing import Any, TypeVar
 import numpy as np
 import warp as wp
 
-from cortado.errors import CortadoWarning, DivergedError, InputError, counted
+from cortado.calls import counted
+from cortado.errors import CortadoWarning, DivergedError, InputError
 from cortado.particles.state import Entry, State
 from cortado.rollout.device_states import DeviceRows, DeviceState, DeviceStates
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.calls import counted
 from cortado.device.cells import CellSort
 from cortado.device.grid import Grid
 from cortado.device.launching import BandLauncher
 from cortado.device.modules import kernel_module
 from cortado.device.precision import FLOAT32
 from cortado.discretise.shapes import Points
-from cortado.errors import ComputationError, counted
+from cortado.errors import ComputationError
 
 Ints, Ints2d = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 Floats, Floats2d = wp.array(dtype=wp.float32), wp.array2d(dtype=wp.float32)
