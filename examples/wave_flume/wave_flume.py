@@ -16,6 +16,7 @@ Waves are compared with what was measured, and with linear theory of a flap that
 
 import argparse
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -31,8 +32,20 @@ BEACH = 2.3  # length of the beach [m]
 LOADS, MOTIONS = ("fy_n", "fz_n", "mx_nm"), ("sway_m", "heave_m", "roll_rad")
 BEGIN, END = 13.0, 22.0  # the time in which waves are compared [s]
 SECTION, BEAM, DRAUGHT, HIGH, BILGE, BREADTH = 7.0, 0.4, 0.2, 0.256, 0.0512, 0.586  # place and sizes of the section [m]
-GRAVITY_CENTRE, GYRATION, GAUGE = 0.108, 0.144, 0.33  # height over the keel, radius, height of the load cell [m]
-STIFFNESS, DAMPING, LINE = 60.0, 8.7, 20.0  # of what holds it [N/m], [N s/m]; lines so long that they stay level [m]
+GAUGE, LINE = 0.33, 20.0  # height of the load cell over the keel, lines so long that they stay level [m]
+
+
+@dataclass
+class Rig:
+    """The weights of a section that floats, and what holds it."""
+
+    gravity_centre: float  # height over the keel [m]
+    gyration: float  # radius [m]
+    stiffness: float  # of the springs across [N/m]
+    damping: float  # across and up [N s/m]
+
+
+TOLD = Rig(0.108, 0.144, 60.0, 8.7)  # by those who measured
 
 
 def beach(x, v, t, k, start, length):
@@ -56,21 +69,21 @@ def middle_of(corners):
     return [(area * (a + np.roll(a, -1))).sum() / (3.0 * area.sum()) for a in (x, y)]
 
 
-def section(moves):
-    """The section of the ship and the springs that hold it, for each metre of breadth."""
+def section(rig):
+    """The section of the ship, which is held without a rig, and its springs, for each metre of breadth."""
     own = {"name": "section", "shape": "polygon", "corners": hull()}
-    if not moves:
+    if rig is None:
         return {**own, "motion": "path", "velocity": [0.0, 0.0]}, []
-    centre, middle = [SECTION, DEPTH - DRAUGHT + GRAVITY_CENTRE], middle_of(hull())
+    centre, middle = [SECTION, DEPTH - DRAUGHT + rig.gravity_centre], middle_of(hull())
     mass = 1000.0 * (BEAM * DRAUGHT - (2.0 - 0.5 * np.pi) * BILGE**2)  # of the water that it displaces
-    own |= {"motion": "free", "mass": mass, "gyration_radius": GYRATION}
+    own |= {"motion": "free", "mass": mass, "gyration_radius": rig.gyration}
     own |= {"centre_of_mass": [a - b for a, b in zip(centre, middle, strict=True)]}
-    holds = {"solid": "section", "point": centre, "damping": DAMPING / BREADTH}
-    across = {**holds, "name": "across", "anchor": [SECTION + LINE, centre[1]], "stiffness": STIFFNESS / BREADTH}
+    holds = {"solid": "section", "point": centre, "damping": rig.damping / BREADTH}
+    across = {**holds, "name": "across", "anchor": [SECTION + LINE, centre[1]], "stiffness": rig.stiffness / BREADTH}
     return own, [across, {**holds, "name": "up", "anchor": [SECTION, centre[1] + LINE], "stiffness": 1e-3}]
 
 
-def flume(times, stroke, deep, long, has_section, moves):
+def flume(times, stroke, deep, long, has_section, rig):
     """A flume with ``deep`` particles in its depth; ``stroke`` (times,) is that of the flap at the surface [m]."""
     spacing, angle, arm = DEPTH / deep, -np.arctan2(stroke, DEPTH - HINGE), np.array([-0.1, 0.5 * (1.3 - HINGE - FOOT)])
     cos, sin = np.cos(angle), np.sin(angle)
@@ -78,7 +91,7 @@ def flume(times, stroke, deep, long, has_section, moves):
     flap = {"name": "flap", "shape": "box", "lower": [-0.2, HINGE - FOOT], "upper": [0.0, 1.3], "motion": "path"}
     sill = {"name": "sill", "shape": "box", "lower": [-0.4, -5.0 * spacing], "upper": [0.0, HINGE]}
     flap |= {"times": times.tolist(), "positions": ([0.0, HINGE] + turned).tolist(), "rotations": angle.tolist()}
-    ship, springs = section(moves) if has_section else (None, [])
+    ship, springs = section(rig) if has_section else (None, [])
     return cortado.Scene(
         name="wave flume",
         dimension=2,
@@ -92,16 +105,16 @@ def flume(times, stroke, deep, long, has_section, moves):
     )
 
 
-def simulated(times, stroke, places, asked, has_section=False, moves=False, often=None):
+def simulated(times, stroke, places, asked, has_section=False, rig=None, often=None):
     """The run of a flume by the stroke of its flap, with gauges at places, and with a frame every ``often`` [s]."""
     step = 0.1 / asked.deep
     force = cortado.forces.Body(beach, k=6.0, start=asked.long - BEACH, length=BEACH)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", cortado.CortadoWarning)  # the limit "solids" is of water that falls: none does
-        scene = flume(times, stroke, asked.deep, asked.long, has_section, moves)
+        scene = flume(times, stroke, asked.deep, asked.long, has_section, rig)
         simulation = cortado.Simulation(scene, device=asked.device, forces=[force])
         sensors = {f"{place:g}": WaveGauge([place, 0.0], radius=2.0 / asked.deep) for place in places}
-        sensors |= {"load": SolidLoad("section")} if has_section and not moves else {}
+        sensors |= {"load": SolidLoad("section")} if has_section and rig is None else {}
         frames = 10**9 if often is None else max(round(often / step), 1)
         return simulation.run(round(asked.end / step), record_every=frames, sensors=sensors)
 
@@ -188,7 +201,7 @@ def main():
     is_held, moves = "fz_n" in names, "heave_m" in names
 
     often = 0.04 if asked.film or moves else None
-    run = simulated(times, stroke, probes.values(), asked, is_held or moves, moves, often)
+    run = simulated(times, stroke, probes.values(), asked, is_held or moves, TOLD if moves else None, often)
     here = surface(run, times, probes.values())
     linear = theory(times, stroke, np.array(list(probes.values())))
 

@@ -1,0 +1,75 @@
+"""Linear theory of the flume by panels, and the section's numbers that are found with it from motions."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).parents[1] / "examples" / "wave_flume"
+
+
+@pytest.fixture(scope="module")
+def body():
+    """The names of `body.py`, with coarse panels, and a flume of them."""
+    before = dict(sys.modules)
+    sys.path.insert(0, str(FOLDER))
+    try:
+        names = runpy.run_path(str(FOLDER / "body.py"))
+    finally:
+        sys.path.remove(str(FOLDER))
+    theory = names["LinearFlume"].__init__.__globals__
+    theory.update(COARSE=0.08, FINE=0.05, HIGHEST=1.2)
+    names["flume"] = names["LinearFlume"]([3.0, 5.5, 5.6, 8.5])
+    for name in set(sys.modules) - set(before):
+        if name in ("panels", "wave_flume"):
+            del sys.modules[name]
+    return {**names, "theory": theory}
+
+
+def test_panels_send_the_waves_of_a_flap(body):
+    """Without a section the surface is that of the sum of modes, to what coarse panels can do."""
+    theory, times = body["theory"], np.arange(0.0, 20.0, 0.02)
+    flume = body["LinearFlume"]([3.0], has_section=False)
+    stroke = 0.01 * np.minimum(times / 4.0, 1.0) * np.sin(2.0 * np.pi * times / 1.2)
+    found = flume.series(flume.surfaces[:, 0, 0] * flume.spectrum(stroke), len(times))
+    exact = runpy.run_path(str(FOLDER / "wave_flume.py"))["theory"](times, stroke, np.array([3.0]))[:, 0]
+    late = times > 12.0
+    one, other = (theory["swing"](times[late], each[late], 1.2) for each in (found, exact))
+    assert abs(one / other) == pytest.approx(1.0, abs=0.02) and abs(np.angle(one / other)) < 0.15
+
+
+def test_radiation_keeps_energy(body):
+    """What a section loses to waves is symmetric in its motions (Newman 1977), and never negative."""
+    flume = body["flume"]
+    middle = np.argmin(np.abs(flume.rates - 2.0 * np.pi / 1.0))
+    around = flume.loads[middle, :, 1:]
+    assert abs(around[0, 2] - around[2, 0]) < 0.03 * abs(around[0, 2])
+    heave = np.imag(flume.loads[:, 1, 2] / flume.rates)[np.real(flume.rates) > 3.0]
+    assert (heave < 0.0).all()
+
+
+def test_dry_friction_takes_what_coulomb_says(body):
+    """A mass in nothing, at 1 m/s, slows by friction over mass, and then stays."""
+    step, mass = 0.02, 50.0
+    kick = np.full(600, step / mass)
+    force = body["theory"]["rubbed"](np.full(600, 1.0), kick, 10.0)
+    speed = 1.0 + np.cumsum(force) * step / mass
+    assert speed[200] == pytest.approx(1.0 - 201 * step * 10.0 / mass, abs=0.01) and abs(speed[-1]) < 0.01
+
+
+def test_bars_with_a_discrepancy_hold(body):
+    """With waves that last and that no number explains, bars of noise alone are too short, and these hold."""
+    times, random, missed, ratios = np.arange(0.0, 20.0, 0.02), np.random.default_rng(2), [], []
+    shapes = np.stack([np.sin(7.0 * times), np.cos(7.0 * times), np.sin(7.0 * times + 1.0)], axis=1)
+    names = body["fitted"].__globals__
+    names["moved"] = lambda flume, times, stroke, u: shapes * np.exp(u)
+    for _ in range(3):
+        slow = np.stack([np.convolve(random.normal(size=len(times) + 149), np.hanning(150), "valid") for _ in "abcdef"])
+        turning = (np.exp(7j * times) * (slow[:3] + 1j * slow[3:])).real.T
+        measured = shapes + 0.3 * turning / turning.std(axis=0)
+        _, found, bars, _ = body["fitted"](None, times, None, measured, 2.0 * np.pi / 7.0, np.zeros(3))
+        missed.append(np.abs(found) > 2.5 * bars[2])
+        ratios.append(bars[0] / bars[2])
+    assert np.mean(missed) < 0.15 and np.mean(ratios) < 0.6
