@@ -2,10 +2,9 @@
 how a body moves."""
 
 from cortado.calls import face
-from cortado.runs.body_motion import BodyMotion
+from cortado.runs.body_sensors import BodyMotion, SpringForce
 from cortado.runs.probes import FlowRate, PressureProbe, SolidLoad, WallForce
 from cortado.runs.sensor import Readings, Sensor
-from cortado.runs.spring_loads import SpringForce
 from cortado.runs.wave_gauge import WaveGauge
 
 __all__ = [

@@ -238,7 +238,7 @@ def fit(
         overwrite: Replace an earlier run in the same folder.
     """
     words, told = text_overrides(task, overrides), command_line()
-    from cortado.cli.commands.fit import fit_task
+    from cortado.cli.commands.optimise import fit_task
 
     return partial(fit_task, task, out, words, device, precision, overwrite, told)
 

@@ -23,7 +23,7 @@ import warp as wp
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.sheet import Sheet
-from cortado.discretise.sheet_kernels import face_functions, faces_on, faces_type
+from cortado.discretise.tree_kernels import face_functions, faces_on, faces_type
 from cortado.particles.mirrors import CONTAINER, reflections
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.neighbours import NeighbourSearch

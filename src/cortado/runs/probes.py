@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cortado.calls import fixed, point_in_words
 from cortado.discretise.shapes import Points, corners, grid, in_space
 from cortado.errors import InputError, shown, warn
-from cortado.runs.body_motion import BodyMotion
+from cortado.runs.body_sensors import BodyMotion, SpringForce
 from cortado.runs.particle_sums import (
     ACROSS,
     Around,
@@ -28,7 +28,6 @@ from cortado.runs.particle_sums import (
 )
 from cortado.runs.riding import Axes, Carrier, Ride, axes_of, named, ride_of, together
 from cortado.runs.sensor import Cut, Reading, SensedScene, Sensor, corner, direction, in_dimension, point, positive
-from cortado.runs.spring_loads import SpringForce
 from cortado.runs.wave_gauge import WaveGauge
 from cortado.scene.parameters import load_name
 from cortado.scene.scene import Scene

@@ -18,9 +18,9 @@ from cortado.device.threads import Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Fields, Parameters, State, padded
 from cortado.rollout.rollout import Rollout
+from cortado.runs.body_sensors import spring_loads
 from cortado.runs.particle_sums import in_the_scene
 from cortado.runs.quantity_formulas import SIX, Bars, QuantityFormula, formulas
-from cortado.runs.spring_loads import spring_loads
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.parameters import LOAD, QUANTITIES, check_quantity, is_load
 from cortado.scene.scene import Scene

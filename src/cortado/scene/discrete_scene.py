@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from cortado.discretise.packing import Packing
 from cortado.discretise.room import Domain, Region, Room
 from cortado.discretise.shapes import Points, Rows, check_crowding
-from cortado.discretise.sheet import Sheet
-from cortado.discretise.sheet_walls import sheet_points, sheet_weights
+from cortado.discretise.sheet import Sheet, sheet_points, sheet_weights
 from cortado.discretise.smoothing import (
     SmoothingKernel,
     lattice_laplacian_correction,

@@ -82,7 +82,7 @@ class HingeTable(Table):
 
 @dataclass(frozen=True)
 class Hold:
-    """How a free body is held. See `cortado.sph.held_bodies`."""
+    """How a free body is held. See `cortado.sph.moving_solids`."""
 
     moving: Three = (1.0, 1.0, 1.0)
     """1 along axes of space along which its middle may go, else 0."""

@@ -30,7 +30,7 @@ from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout, Parameters, padded, zeros
 from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart, given_to
-from cortado.sph.held_bodies import free_module
+from cortado.sph.moving_solids import free_module
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 STIFFNESS = 0.04

@@ -29,7 +29,7 @@ from cortado.particles.state import Layout, zeros
 from cortado.scene.motions import free
 from cortado.sph.free_solids import Changes, FreeBody
 from cortado.sph.friction_kernels import friction_kernels, lift_kernels, row_kernels
-from cortado.sph.held_bodies import move_kernels
+from cortado.sph.moving_solids import move_kernels
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
 Arrays = dict[str, wp.array]

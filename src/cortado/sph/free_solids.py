@@ -35,8 +35,7 @@ from cortado.particles.state import Entry, Layout, State, StateField
 from cortado.scene.links import Hold, inertia_about
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, rotation_name, velocity_name
 from cortado.scene.parameters import Axis
-from cortado.sph.held_bodies import free_module, hold_functions, hold_numbers
-from cortado.sph.moving_solids import rotations
+from cortado.sph.moving_solids import free_module, hold_functions, hold_numbers, rotations
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 
 

@@ -31,8 +31,8 @@ from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
-from cortado.sph.held_bodies import free_module, hold_functions
 from cortado.sph.moment_functions import cross_terms_function, moment_functions
+from cortado.sph.moving_solids import free_module, hold_functions
 from cortado.sph.stress_forces import contact_functions
 from cortado.sph.stress_kernels import fluidity_function, traction_function
 
@@ -219,8 +219,8 @@ def lift_kernels(precision: Precision) -> Kernels:
 @cache
 def row_kernels(precision: Precision) -> SimpleNamespace:
     """Make the kernels of a body's rows in a solve, with a thread for each scene, of momenta, six numbers each.
-    ``rise`` are the velocities by those in r, of a body that may be held (`cortado.sph.held_bodies`), and V and W those
-    by p.
+    ``rise`` are the velocities by those in r, of a body that may be held (`cortado.sph.moving_solids`), and V and W
+    those by p.
 
     `Rows` of `cortado.sph.moment_functions` need ``lift``, ``begin``, ``multiply``, ``descend`` and ``turn``. ``give``
     adds the impulse by the solution to the momenta that a body gets. ``lengthen`` adds to the tangent of a load by that

@@ -9,7 +9,7 @@ impulses y, the body's density rho and its volume K in those of a particle,
 
 is the transpose of what its velocity adds to the divergence, - gamma_i . (V + W x r_i), of which that with the velocity
 (V_0, W_0) of its walls is counted with those of all walls. Linear momentum is kept to round-off. A body that is held
-has less than 1 / (rho K) and R' I^-1 R'^T in their place (`cortado.sph.held_bodies`).
+has less than 1 / (rho K) and R' I^-1 R'^T in their place (`cortado.sph.moving_solids`).
 
 The particles around a light body all move it. The diagonal a_i of the iteration gets |gamma_i| sum_j |gamma_j| / (rho
 K) + lambda |r_i x gamma_i| sum_j |r_j x gamma_j| / rho, with lambda the largest eigenvalue of I^-1. Divided by it the
@@ -29,7 +29,7 @@ from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
 from cortado.solvers.projection.names import types_by_name
 from cortado.solvers.projection.wall_sums import normal_part
-from cortado.sph.held_bodies import free_module, move_kernels
+from cortado.sph.moving_solids import free_module, move_kernels
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class MotionKernels:
     """Kernels that move rigid bodies by pressures and gravity, with their tangents and adjoints."""
 
     move: Kernels
-    """The kernels of `cortado.sph.held_bodies.move_kernels`, by the sums of y gamma and y r x gamma."""
+    """The kernels of `cortado.sph.moving_solids.move_kernels`, by the sums of y gamma and y r x gamma."""
     carry: Kernels
     """The drift of walls by the velocity changes, particles' shares of whose adjoints are written."""
 

@@ -29,9 +29,9 @@ from cortado.solvers.projection.coarse_pressure import (
     length_kernels,
 )
 from cortado.solvers.projection.coarse_push import coarse_push_kernels, residual_kernels
-from cortado.solvers.projection.faces import FaceShares
 from cortado.solvers.projection.lattice import SPACING
 from cortado.solvers.projection.sums import velocity_kernels
+from cortado.solvers.projection.wall_sums import FaceShares
 from cortado.sph.moment_functions import matrix_type, round_off, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 

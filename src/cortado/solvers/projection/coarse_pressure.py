@@ -31,7 +31,7 @@ rho, which take (G y)_i = gamma_i . (V + W x r_i) from the divergence of particl
     B^T B,   B_I = (F_I / sqrt(rho K), S R'^T T_I / sqrt(rho)),   S S = I^-1,
 
 with F_I and T_I of y = phi_I c, to the matrix A: three rows for a body in the plane and six in space. Of a body that is
-held it is what is left of them (`cortado.sph.held_bodies`).
+held it is what is left of them (`cortado.sph.moving_solids`).
 """
 
 from dataclasses import dataclass
@@ -51,8 +51,8 @@ from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTange
 from cortado.solvers.projection.coarse_nodes import ALONE, hat_functions, node_functions
 from cortado.solvers.projection.names import types_by_name, weights_type
 from cortado.solvers.projection.pressure import clamp_functions
-from cortado.sph.held_bodies import hold_functions
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
+from cortado.sph.moving_solids import hold_functions
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 

@@ -22,7 +22,7 @@ import warp as wp
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels, kernel_module
 from cortado.device.precision import Precision, TypesByName
-from cortado.discretise.sheet_kernels import face_functions
+from cortado.discretise.tree_kernels import face_functions
 from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import neighbourhood_type
 from cortado.particles.sheets import Sheets, sheet_functions, sheets_type

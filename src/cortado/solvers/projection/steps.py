@@ -1,7 +1,7 @@
 """A step of the projection: pressures that make velocities free of divergence, a shift, and the repair of density.
 
 `ProjectionSteps.step` overwrites its iterates; `ProjectionSteps.replay` keeps them all, for
-`cortado.solvers.projection.derivatives`.
+`cortado.solvers.projection.solver`.
 
 Besides the repairs of density a step moves particles in three ways (`moving_kernels`): by the velocity x + dt v, by the
 shift delta, and by velocities that follow both.
