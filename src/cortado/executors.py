@@ -59,7 +59,9 @@ class Executor(ABC):
 
 @dataclass(frozen=True)
 class InProcess(Executor):
-    """An executor that computes one item after the other in this process."""
+    """An executor that computes one item after the other in this process.
+    Example: ``results = cortado.evaluate(problem, points, executor=cortado.executors.InProcess())``
+    """
 
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
@@ -111,6 +113,7 @@ class Distributed(Executor):
     What a lost worker was computing is computed again by another one. Results arrive in the order of the items, with
     the bits that they have in one process, and errors are raised here as they were there. A worker computes one item
     at a time, and keeps the last functions that it was sent, with their problems.
+    Example: ``workers = cortado.executors.Distributed("tcp://10.0.0.1:8786")``
     """
 
     def __init__(self, scheduler: "str | distributed.Client", patience: float = 60.0):
@@ -386,6 +389,8 @@ def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Di
     shared out among them. On GPUs each process sees one, as "cuda:0". A script that uses them must begin under
     ``if __name__ == "__main__":``, as every process imports it. Raises `InputError` for more processes than there are
     GPUs, or than four for each core, and 64.
+
+    Example: ``with cortado.executors.local_workers() as workers: ...``
     """
     import dask
 

@@ -159,7 +159,14 @@ class Problem:
     - with forces of one's own, ``simulation.forces``, their parameters, such as ``drag.k``.
 
     What is not given is the scene's, as its schedule changes it. n counts fluid particles in the order in which the
-    scene lists them.
+    scene lists them. Methods take a table of them, ``parameters``, and as ``gradient`` or ``estimator`` an object of
+    `cortado.gradients`, which is `cortado.gradients.Exact` if left out.
+
+    Example::
+
+        problem = cortado.Problem(simulation, 100, cortado.losses.CentreOfMass([1.0, 0.2]))
+        value, gradient = problem.value_and_gradient({"gravity": [0.0, -9.81]})  # gradient["gravity"]: (2,)
+        slope = problem.tangent({"gravity": [0.0, -9.81]}, {"gravity": [1.0, 0.0]})
     """
 
     def __init__(
@@ -218,7 +225,7 @@ class Problem:
 
     @in_turn
     def run(self, parameters: Values, record_every: int = 1) -> Any:
-        """Return the whole trajectory under these parameters; see `Simulation.run`."""
+        """Return the whole trajectory under these parameters, a frame every ``record_every`` steps."""
         self._space.begin(self._rollout, self._checked(parameters), states=self._states)
         return self.simulation.collect(self._rollout, record_every)
 
@@ -301,7 +308,8 @@ class Problem:
     def several_tangents(
         self, parameters: Values, each: Iterable[tuple[Values, Observer]], steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """Run once in forward mode along several directions, each with an observer of its own; see `tangents`."""
+        """Run once in forward mode along several directions, each with an observer of its own, and return the states
+        after some ``steps``; see `tangents`."""
         values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
         for directions, observe in each:
             require_arguments("observe", observe, OBSERVED)
@@ -314,8 +322,8 @@ class Problem:
 
     @in_turn
     def along(self, end: Any, quantities: Iterable[str], dot: Arrays, parameters: Values, directions: Values) -> Arrays:
-        """Return tangents of quantities of a state of the last run under these parameters, by name, along ``dot``, the
-        state's own tangent by fields, and ``directions`` of the parameters."""
+        """Return tangents of quantities of ``end``, a state of the last run, by name, along ``dot``, the state's own
+        tangent by fields, and ``directions`` of the parameters."""
         names = list(quantities)
         if not names:
             return {}

@@ -68,6 +68,12 @@ class Simulation(Stepping):
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
 
     Threads that use it take turns, and other processes can have it, pickled or by a fork: see `docs/processes.md`.
+
+    Example::
+
+        simulation = cortado.Simulation("dam.toml", device="cpu", precision="float64")
+        trajectory = simulation.run(steps=100, record_every=10)
+        state = simulation.step(simulation.state(), {"gravity": [0.0, -9.81]}, steps=5)
     """
 
     @WARP
@@ -187,8 +193,8 @@ class Simulation(Stepping):
         time: float | None = None,
     ) -> Trajectory:
         """Run from the scene's first state and return the frames, the first and the last state included; of a batch a
-        `TrajectoryBatch`. ``time`` [s], in the place of ``steps``: as many steps as it takes, the last of which ends
-        then or later.
+        `TrajectoryBatch`. A frame is kept every ``record_every`` steps. ``time`` [s], in the place of ``steps``: as
+        many steps as it takes, the last of which ends then or later.
 
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity, its schedule included; so
         does any other parameter of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same
@@ -218,7 +224,8 @@ class Simulation(Stepping):
         record: Sequence[str] = (),
         sensors: Mapping[str, Sensor] | None = None,
     ) -> Trajectory:
-        """Run a rollout forward and return its frames; warns and raises as `run`."""
+        """Run a rollout forward and return its frames. ``record_every``, ``record`` and ``sensors`` are those of `run`,
+        which warns and raises in the same way."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         expected = expected_frames(rollout, record_every)
@@ -269,7 +276,8 @@ class Simulation(Stepping):
         state: RestartState | Sequence[RestartState] | None = None,
         time: float | None = None,
     ) -> Rollout:
-        """Return a rollout that is ready to go forward from the scene's first state; see `run` for its arguments."""
+        """Return a rollout that is ready to go forward from the scene's first state, or from ``state``, by so many
+        ``steps`` or for a ``time`` [s], with ``controls`` as of `run`."""
         rollout = Rollout(self.solver, steps_of_run(self, steps, time, {} if controls is None else controls))
         self._begin(rollout, controls, state, time)
         return rollout
@@ -360,8 +368,8 @@ class Simulation(Stepping):
         return image
 
     def film(self, trajectory: Trajectory, path: str | Path, **settings: Any) -> Film:
-        """Write a film of a run on the simulation's device; see `Trajectory.film`. It also computes the quantity of
-        ``colour`` where it was not recorded, such as the pressure."""
+        """Write a film of a ``trajectory`` to a ``path`` on the simulation's device; for ``settings`` see
+        `Trajectory.film`. It also computes the quantity of ``colour`` that was not recorded, such as the pressure."""
         film: Film = on_top("simulation_film")(self, trajectory, path, settings)
         return film
 
@@ -381,7 +389,7 @@ class Simulation(Stepping):
         return Simulation(*self._made_of(precision, None))
 
     def replaced(self, *overrides: str) -> "Simulation":
-        """Return a simulation of this scene with other values, on the same device: see `Scene.replaced`."""
+        """Return a simulation of this scene with the ``overrides`` of `Scene.replaced`, on the same device."""
         _, *others = self._made_of(self.precision.name, self.batch)
         return Simulation(self.scene.replaced(*overrides), *others)
 
@@ -402,8 +410,9 @@ class Simulation(Stepping):
     def substeps(
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
     ) -> int:
-        """Return the number of explicit diffusion substeps per time step that is stable under these parameters; raises
-        `InputError` where there would be more than `cortado.sph.free_energy.MOST_SUBSTEPS`."""
+        """Return the number of explicit diffusion substeps per ``time_step`` [s] that is stable with a ``mobility``
+        [m2/s], an ``interface_width`` [m] and a ``rest_density`` (phases,) [kg/m3]; raises `InputError` where there
+        would be more than `cortado.sph.free_energy.MOST_SUBSTEPS`."""
         if len(self.scene.phase) == 1:
             return 0
         numbers = (float(time_step), float(mobility), float(interface_width), rest_density)

@@ -190,6 +190,11 @@ def certify(
     Where a copy of the run loses a particle, moved or in float64, the answers are those of the steps before, and
     `Certificate.beyond` says so. Raises `InputError` for arguments that do not fit, `DivergedError` where the problem
     itself diverges.
+
+    Example::
+
+        certificate = cortado.certify("examples/recover_gravity_small.toml", steps=20)
+        assert certificate.right
     """
     require_whole("seed", seed, 0)
     if not 0.0 < as_one_number("perturbation", perturbation) < 1.0:

@@ -51,6 +51,13 @@ def estimate(
     """Return the loss of a problem and its gradient by an estimator, `Exact` by default.
 
     Raises `InputError` where what is given is no estimator, or does not return the gradient of every parameter.
+
+    ``parameters`` by name; ``observe`` is given the number and the state of each step.
+
+    Example::
+
+        found = cortado.gradients.estimate(problem, {"gravity": [0.0, -9.81]})
+        print(found.loss, found.gradient["gravity"])
     """
     require_methods("problem", problem, ("value",), "a cortado.Problem")
     require_function("observe", observe, *OBSERVED)

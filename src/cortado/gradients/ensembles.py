@@ -216,6 +216,11 @@ class RandomizedSmoothing(Ensemble):
     Runs that diverge: their differences are left out, up to a quarter of all, and the sum over the others of the sample
     is scaled by N over their number. So the mean keeps its size, and has no bias from this as long as no direction
     diverges more often than others.
+
+    ``position_noise``: how far first positions are moved, in spacings; ``seed`` of the random numbers; ``executor``:
+    where the members run.
+
+    Example: ``estimate = problem.estimate(parameters, cortado.gradients.RandomizedSmoothing(0.5))``
     """
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
@@ -266,6 +271,11 @@ class EnsembleMean(Ensemble):
 
     Samples that diverge: they are left out with the other one of their antithetic pair, up to a quarter of all pairs,
     so that what remains is as symmetric about the parameters as before. Half a pair would shift the mean to its side.
+
+    ``spread``: by name or for all, how far parameters are moved, in their units; ``position_noise``: how far first
+    positions are, in spacings; ``seed`` of the random numbers; ``executor``: where the members run.
+
+    Example: ``estimate = problem.estimate(parameters, cortado.gradients.EnsembleMean(0.5, samples=8))``
     """
 
     samples: int = 4
@@ -347,6 +357,11 @@ class Guided(Ensemble):
     Runs that diverge: those of the surrogate count as in `EnsembleMean`. A sample of the differences is left out as a
     whole, up to a quarter of them, so that all D_k are means over the same samples. With fewer than 4 none can be left
     out.
+
+    ``spread``: by name or for all, how far parameters are moved, in their units; ``position_noise``: how far first
+    positions are, in spacings; ``seed`` of the random numbers; ``executor``: where the members run.
+
+    Example: ``estimate = problem.estimate(parameters, cortado.gradients.Guided(0.5, parts=4))``
     """
 
     samples: int = 4

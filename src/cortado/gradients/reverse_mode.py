@@ -173,6 +173,8 @@ class Exact(AdjointEstimator):
     Formula: the transposed derivative of the step. Bias: none; but where neighbouring trajectories diverge it grows as
     fast as they do, by a constant factor a step. Cost: every step is computed once more forward, and the backward step
     has about twice the neighbour sums of a forward one.
+
+    Example: ``value, gradient = problem.value_and_gradient(parameters, cortado.gradients.Exact())``
     """
 
     batches = True
@@ -187,6 +189,8 @@ class Tape(AdjointEstimator):
 
     It is slower than `Exact`, with atomics on a GPU, and is kept to check it. Only for scenes with the solver
     ``"pcisph"``; others say so.
+
+    Example: ``value, gradient = problem.value_and_gradient(parameters, cortado.gradients.Tape())``
     """
 
     batches = True
@@ -278,6 +282,8 @@ class AdjointViscosity(AdjointEstimator):
     Sources: Smagorinsky (1963) for a viscosity by the strain rate. Wang and Zaki (2026, arXiv 2606.25399) for an eddy
     viscosity of the adjoint of turbulence. Ke, You and Wang (2026, arXiv 2602.14016) precondition the adjoint by its
     spectrum instead.
+
+    Example: ``value, gradient = problem.value_and_gradient(parameters, cortado.gradients.AdjointViscosity())``
     """
 
     coefficient: float = 2.0

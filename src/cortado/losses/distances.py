@@ -52,7 +52,10 @@ def matching_kernels(precision: Precision) -> tuple[Any, Any]:
 
 @fixed
 class FinalPositions:
-    """A loss: the mean over particles of the squared distance to their targets [m2]."""
+    """A loss: the mean over particles of the squared distance to their targets [m2].
+
+    Example: ``loss = cortado.losses.FinalPositions(trajectory[-1].positions)``
+    """
 
     def __init__(self, target: np.ndarray):
         """Set the ``target`` positions (n, d) [m], in the scene's order."""
@@ -109,7 +112,10 @@ class FinalPositions:
 
 @fixed
 class CentreOfMass:
-    """A loss: the squared distance of the centre of mass to a target [m2]."""
+    """A loss: the squared distance of the centre of mass to a target [m2].
+
+    Example: ``problem = cortado.Problem(simulation, 100, cortado.losses.CentreOfMass([1.0, 0.2]))``
+    """
 
     def __init__(self, target: Any, masses: np.ndarray | None = None):
         """Set the ``target`` (d,) [m], and the particles' ``masses`` (n,) in any unit, None where all are equal."""
@@ -132,7 +138,10 @@ class CentreOfMass:
 
 @fixed
 class CentreOfMassAlong:
-    """A loss: the centre of mass along a direction [m], whose gradient is that of the centre of mass itself."""
+    """A loss: the centre of mass along a direction [m], whose gradient is that of the centre of mass itself.
+
+    Example: ``problem = cortado.Problem(simulation, 100, cortado.losses.CentreOfMassAlong([1.0, 0.0]))``
+    """
 
     def __init__(self, direction: Any, masses: np.ndarray | None = None):
         """Set the ``direction`` (d,) [-], and ``masses`` as for `CentreOfMass`."""
@@ -187,7 +196,10 @@ def _checksum(*parts: Any) -> str:
 @fixed
 class SolidPose:
     """A loss of a moving solid, ``|x - x*|^2 + l^2 (3 - tr R*^T R)`` [m2]. To its middle's squared distance from a
-    target it adds, for small angles off a target rotation, the squared angle times l^2."""
+    target it adds, for small angles off a target rotation, the squared angle times l^2.
+
+    Example: ``loss = cortado.losses.SolidPose("raft", position=[0.8, 0.3], rotation=0.0)``
+    """
 
     def __init__(self, name: str, position: Any = None, rotation: Any = None, length: float = 1.0):
         """Set the ``name`` of the solid; targets ``position`` (d,) of its middle [m] and ``rotation`` [rad], a vector
@@ -247,7 +259,13 @@ class Pictures(Protocol):
 
 @fixed
 class Image:
-    """A loss: the distance of the picture of a state from a target picture."""
+    """A loss: the distance of the picture of a state from a target picture.
+
+    Example::
+
+        renderer = simulation.renderer(resolution=(64, 64))
+        loss = cortado.losses.Image(renderer, target, cortado.image_losses.Pyramid())
+    """
 
     def __init__(self, renderer: Pictures, target: np.ndarray, distance: ImageLoss | None = None):
         """Set the ``target`` picture (rows, columns, 3), linear RGB from 0 to 1; ``distance``:
@@ -301,7 +319,13 @@ SAME = 1e-6
 
 @fixed
 class SensorMatch:
-    """A loss: the weighted sum of squared differences between a sensor's reading and a target, over squared scales."""
+    """A loss: the weighted sum of squared differences between a sensor's reading and a target, over squared scales.
+
+    Example::
+
+        gauge = cortado.sensors.WaveGauge([0.5, 0.0])
+        loss = cortado.losses.SensorMatch(gauge, [0.31])  # m, at the end
+    """
 
     def __init__(self, sensor: Sensor, target: Any, weight: float = 1.0, scale: Any = 1.0):
         """Set the ``target`` (k,), a number for each column of the sensor, NaN for one that does not count; the
@@ -337,6 +361,8 @@ class Series(Frames):
 
     The series is interpolated linearly to the times of the steps; steps before its first and after its last time do not
     count.
+
+    Example: ``loss = cortado.losses.Series(gauge, times, heights, time_step=0.002)``
     """
 
     def __init__(self, sensor: Sensor, times: Any, values: Any, time_step: float, every: int = 1, scale: Any = 1.0):

@@ -207,7 +207,10 @@ class Loss(Protocol):
 
 @fixed
 class Frames:
-    """A sum of losses of several states of a run, by the number of steps before each."""
+    """A sum of losses of several states of a run, by the number of steps before each.
+
+    Example: ``loss = cortado.losses.Frames({50: cortado.losses.CentreOfMass([0.4, 0.2]), 100: last})``
+    """
 
     def __init__(self, losses: Mapping[int, Loss]):
         """Set ``losses`` {number of steps: loss}; 0 is the first state."""
@@ -228,7 +231,10 @@ class Frames:
 
 
 def fingerprint(loss: Any) -> str:
-    """Return a text that tells losses apart: the loss's ``fingerprint``, the code of a function, or the type."""
+    """Return a text that tells losses apart: the loss's ``fingerprint``, the code of a function, or the type.
+
+    Example: ``print(cortado.losses.fingerprint(cortado.losses.CentreOfMass([1.0, 0.2])))``
+    """
     return getattr(loss, "fingerprint", code_words(loss) if callable(loss) else type(loss).__qualname__)
 
 

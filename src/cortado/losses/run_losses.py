@@ -41,6 +41,13 @@ class Recorded:
     ``function(positions, velocities, loss)`` launches kernels that add to ``loss``, an array (1,) of the precision of
     the (n,) vectors it is given. Mind Warp's rules for kernels that loop: a sum that is used non-linearly belongs
     into a function of its own.
+
+    Example::
+
+        def heights(positions, velocities, loss):
+            wp.launch(add_heights, dim=positions.shape, inputs=[positions], outputs=[loss])
+
+        problem = cortado.Problem(simulation, 100, cortado.losses.Recorded(heights))
     """
 
     def __init__(self, function: WarpFunction):

@@ -213,6 +213,11 @@ def evaluate(
 
     Raises the error of the first point that has another one; and that of the first point where no point has a run,
     unless they are given a loss.
+
+    Example::
+
+        points = [{"gravity": [0.0, -g]} for g in (9.0, 9.5, 10.0)]
+        losses = [found.loss for found in cortado.evaluate(problem, points)]
     """
     require_function("on_result", on_result, "the number of a point", "its Estimate")
     require_methods("problem", problem, ("value",), "a cortado.Problem")
@@ -283,6 +288,11 @@ def optimise(
     Raises InputError for a start, bounds or settings that do not fit, and for a checkpoint of another run. Raises
     DivergedError if the start diverges, or a step that was halved ten times. Raises ComputationError where such a step
     has a parameter out of range, or if the loss or gradient is not finite. What came before is in the checkpoint.
+
+    Example::
+
+        result = cortado.optimise(problem, {"gravity": [0.0, -9.0]}, "lbfgs", iterations=10)
+        print(result.parameters["gravity"], result.message)
     """
     if checkpoint is not None:
         checkpoint = as_path("checkpoint", checkpoint)

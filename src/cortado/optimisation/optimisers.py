@@ -51,6 +51,11 @@ class Adam:
 
     Source: D. P. Kingma and J. Ba, "Adam: a method for stochastic optimization", ICLR 2015, Algorithm 1.
     Raises InputError for settings out of range.
+
+    ``learning_rate``: by name or for all, in the units of the parameters; ``beta1`` and ``beta2``: memory of the two
+    means; ``epsilon``: added to the root.
+
+    Example: ``found = cortado.optimise(problem, start, cortado.optimisers.Adam(0.1), iterations=50)``
     """
 
     learning_rate: PerParameter
@@ -102,6 +107,8 @@ class GradientDescent:
     Source: B. T. Polyak, "Some methods of speeding up the convergence of iteration methods", USSR
     Computational Mathematics and Mathematical Physics 4(5), 1964; plain gradient descent with momentum 0.
     Raises InputError for settings out of range.
+
+    Example: ``found = cortado.optimise(problem, start, cortado.optimisers.GradientDescent(0.01), iterations=50)``
     """
 
     learning_rate: PerParameter
@@ -147,6 +154,11 @@ class LBFGS:
     Source: R. H. Byrd, P. Lu, J. Nocedal and C. Zhu, SIAM Journal on Scientific Computing 16(5), 1995, as in
     `scipy.optimize.minimize(method="L-BFGS-B")`.
     Raises InputError for settings out of range.
+
+    ``memory``: of how many updates the curvature is estimated; ``tolerance``: of the greatest component of the scaled
+    gradient, below which the search has converged.
+
+    Example: ``found = cortado.optimise(problem, start, cortado.optimisers.LBFGS(scale=0.5), iterations=20)``
     """
 
     memory: int = 10
@@ -285,6 +297,8 @@ class LineSearch:
     iterations are made.
 
     Raises InputError for settings out of range.
+
+    Example: ``found = cortado.optimise(problem, start, cortado.optimisers.LineSearch(scale=0.5), iterations=20)``
     """
 
     scale: PerParameter = 1.0

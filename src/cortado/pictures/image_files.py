@@ -67,6 +67,8 @@ def heart(
             is the background. None: coffee everywhere.
         size: of the shape, relative to the cup or, without one, to the shorter side of the picture.
         milk, coffee, background: red, green and blue, linear, from 0 to 1.
+
+    Example: ``target = cortado.pictures.heart((128, 128), cup=0.9)  # (128, 128, 3)``
     """
     return _drawn(_in_heart, resolution, cup, size, (milk, coffee, background))
 
@@ -84,13 +86,17 @@ def rosetta(
     """Draw a rosetta: layers of milk like the leaves of a fern, drawn together by a stem, a small heart on top.
 
     The arguments are those of `heart`.
+
+    ``resolution``, ``cup``, ``size``, ``coffee`` and ``background`` too.
+
+    Example: ``target = cortado.pictures.rosetta((128, 128), cup=0.9)  # (128, 128, 3)``
     """
     return _drawn(_in_rosetta, resolution, cup, size, (milk, coffee, background))
 
 
 @public
 def read_picture(path: str | Path, resolution: Resolution | None = None) -> Picture:
-    """Read the picture of a file of one of `FORMATS`, transparent parts on white.
+    """Read the picture at a ``path``, a file of one of `FORMATS`, transparent parts on white.
 
     Args:
         resolution: columns and rows wanted: the largest part in the middle with their proportions is resampled,
@@ -98,6 +104,8 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
 
     Raises:
         InputError: there is no such file, no picture in it, or one of too many pixels.
+
+    Example: ``target = cortado.pictures.read_picture("target.png", (64, 48))  # (48, 64, 3)``
     """
     shape = None if resolution is None else _columns_and_rows(resolution)
     picture = open_picture(path, MOST_PIXELS_KEPT if resolution is None else MOST_PIXELS)
@@ -172,6 +180,8 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
     Raises:
         InputError: another shape, whole numbers, values that are not finite or up to 255, a name that does not end in
             .png, or a file that cannot be written.
+
+    Example: ``cortado.pictures.write_picture("last.png", simulation.renderer().render(trajectory[-1]))``
     """
     if Path(as_path("path", path)).suffix.lower() != ".png":
         raise InputError(f"path is {str(path)!r}, but must be the name of a PNG file, such as picture.png.")

@@ -62,6 +62,8 @@ def film_side_by_side(
         SceneError: settings that do not fit.
         InputError: no runs or more than nine, some in 2-D and some in 3-D, a run without frames or a scene, a package
             that is missing, or what ``colour`` names was not recorded and cannot be computed.
+
+    Example: ``cortado.film_side_by_side({"thin": first, "thick": second}, "both.mp4")``
     """
     each = _trajectories(runs)
     if scenes is not None and len(scenes) != len(each):

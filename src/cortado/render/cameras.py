@@ -102,7 +102,16 @@ class Camera:
 @public
 @dataclass(frozen=True)
 class Orthographic(Camera):
-    """A camera with parallel rays."""
+    """A camera with parallel rays.
+
+    It stands at ``position`` (3,) [m] and looks at ``look_at`` [m], with ``up`` above; it sees a ``width`` [m], from
+    ``near`` to ``far`` [m] away, in ``resolution`` (columns, rows).
+
+    Example::
+
+        camera = cortado.render.Orthographic((0.0, 1.0, 3.0), (0.0, 0.2, 0.0), (0.0, 1.0, 0.0), width=1.5)
+        renderer = simulation.renderer(view="volume", camera=camera)
+    """
 
     width: float
     """Width of the region that the picture shows [m]."""
@@ -119,7 +128,16 @@ class Orthographic(Camera):
 @public
 @dataclass(frozen=True)
 class Perspective(Camera):
-    """A camera with rays from one point."""
+    """A camera with rays from one point.
+
+    It stands at ``position`` (3,) [m] and looks at ``look_at`` [m], with ``up`` above; ``field_of_view`` is across
+    [degrees]. It sees from ``near`` to ``far`` [m] away, in ``resolution`` (columns, rows).
+
+    Example::
+
+        camera = cortado.render.Perspective((0.0, 1.0, 3.0), (0.0, 0.2, 0.0), (0.0, 1.0, 0.0), 40.0)
+        renderer = simulation.renderer(view="volume", camera=camera)
+    """
 
     field_of_view: float
     """Angle that the width of the picture spans [degree]."""

@@ -407,8 +407,9 @@ class Stepping:
         steps: int = 1,
         gradient: ReverseEstimator | None = None,
     ) -> tuple[dict[str, Any], Arrays]:
-        """Return the adjoints of ``state`` and of ``parameters`` from that of the state after ``steps`` steps (reverse
-        mode); see `Stepper.vjp`, which takes the steps once for several adjoints."""
+        """Return the adjoints of ``state`` and of ``parameters`` from ``state_bar``, that of the state after ``steps``
+        steps, by the estimator ``gradient`` (reverse mode); see `Stepper.vjp`, which takes the steps once for several
+        adjoints."""
         stepper = self.stepper(check_steps(steps))
         return stepper.vjp(stepper.step(state, parameters)[1], state_bar, gradient)
 
@@ -420,8 +421,8 @@ class Stepping:
         parameter_dots: Values | None = None,
         steps: int = 1,
     ) -> dict[str, Any]:
-        """Return the tangent of the state after ``steps`` steps, given tangents of ``state`` and of any parameters
-        (forward mode); see `Stepper.jvp`."""
+        """Return the tangent of the state after ``steps`` steps, given ``state_dot`` and ``parameter_dots``, those of
+        ``state`` and of any ``parameters`` (forward mode); see `Stepper.jvp`."""
         stepper = self.stepper(check_steps(steps))
         residual = stepper.step(state, parameters, along=parameter_dots or ())[1]
         return stepper.jvp(residual, state_dot, parameter_dots)

@@ -87,7 +87,10 @@ def spring_loads(solver: ParticleSolver) -> dict[str, QuantityFormula]:
 @fixed
 class SpringForce(Summed):
     """A sensor of the force with which a spring pulls, less than 0 where it pushes, and of its length, as the state has
-    them. The part of a damper follows from the velocities of both ends in the step that begins there."""
+    them. The part of a damper follows from the velocities of both ends in the step that begins there.
+
+    Example: ``run = simulation.run(100, sensors={"line": cortado.sensors.SpringForce("line")})``
+    """
 
     def __init__(self, spring: str):
         """Take the name of a ``spring`` in the scene."""
@@ -113,7 +116,10 @@ class BodyMotion(Summed):
     """A sensor of a free body: the position of its middle, its rotation, and how fast it goes and turns.
 
     The rotation is the angle in the plane and the rotation vector in space, of at most half a turn: at a half turn it
-    jumps by a whole one, where its derivative goes on."""
+    jumps by a whole one, where its derivative goes on.
+
+    Example: ``run = simulation.run(100, sensors={"raft": cortado.sensors.BodyMotion("raft")})``
+    """
 
     def __init__(self, solid: str):
         """Take the name of a ``solid`` of the scene that moves freely."""

@@ -40,6 +40,7 @@ class PressureProbe(Summed):
     p = sum_i p_i w_i / sum_i w_i,   w_i = w(r_i / radius).
 
     Here r_i is a particle's distance from the point. Without fluid within the radius it is 0.
+    Example: ``run = simulation.run(100, sensors={"wall": cortado.sensors.PressureProbe([0.79, 0.05])})``
     """
 
     def __init__(self, position: Any, radius: float | None = None, on: str | None = None):
@@ -82,6 +83,7 @@ class FlowRate(Summed):
     Q = sum_i V (v_i . normal) w_i,   w_i = w(r_i / reach) with the integral 1,
 
     where r_i is a particle's distance from the plane and V its volume, spacing^d.
+    Example: ``gate = cortado.sensors.FlowRate([0.5, 0.2], normal=[1.0, 0.0])``
     """
 
     def __init__(self, position: Any, normal: Any, reach: float | None = None):
@@ -128,6 +130,7 @@ class WallForce(LoadSensor):
     over the particles of a region, where f_i is the quantity "wall_force". Walls push the fluid with -F. The border of
     a region is a jump: let it run where particles do not push in the direction that is looked at, as half-way between
     two walls.
+    Example: ``run = simulation.run(100, sensors={"force": cortado.sensors.WallForce()})``
     """
 
     def __init__(
@@ -196,6 +199,7 @@ class SolidLoad(LoadSensor):
     by pressure and, without slip, by viscosity. This is in the step that begins at the state. The point c is the middle
     of the solid at the end of that step, where its walls are too. So the solid gets the momentum that the fluid loses
     to it. Contact, gravity and buoyancy in air are not in it, nor forces of one's own between fluid and walls.
+    Example: ``run = simulation.run(100, sensors={"load": cortado.sensors.SolidLoad("pillar")})``
     """
 
     def __init__(self, solid: str, axes: Axes = "world"):

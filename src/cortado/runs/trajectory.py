@@ -103,6 +103,13 @@ class Trajectory:
 
     Raises:
         InputError: arrays whose shapes do not belong together.
+
+    Example::
+
+        trajectory = simulation.run(steps=100, record_every=10)
+        print(trajectory[-1].positions.shape)  # (n, d)
+        trajectory.save("run.vtkhdf")
+        again = cortado.Trajectory.load("run.vtkhdf")
     """
 
     times: NDArray[Any]
@@ -188,8 +195,8 @@ class Trajectory:
         return Frame(self.positions[place], self.velocities[place], fractions, float(self.times[place]), own, others)
 
     def quantity(self, name: str) -> NDArray[Any]:
-        """Return a quantity (frames, n) or (frames, n, k) of the particles, one that was recorded or the speed, or a
-        field of the states, which may have other axes behind the first. For any other use
+        """Return by ``name`` a quantity (frames, n) or (frames, n, k) of the particles, one that was recorded or the
+        speed, or a field of the states, which may have other axes behind the first. For any other use
         `Simulation.quantity`.
 
         Raises:
@@ -290,7 +297,7 @@ class Trajectory:
             self.write_frames(writer)
 
     def write_frames(self, writer: vtkhdf.TrajectoryWriter) -> None:
-        """Write all frames to a file that has room for them."""
+        """Write all frames by a ``writer`` whose file has room for them."""
         for k, step in enumerate(self.steps):
             recorded = {name: array[k] for name, array in self.quantities.items()}
             frame = {name: array[k] for name, array in fields_of(self).items()}
@@ -330,7 +337,8 @@ class Trajectory:
         self, k: int = -1, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
     ) -> ShadedPicture:
         """Draw a shaded picture of frame k, (rows, columns, 3), linear from 0 to 1, which a notebook shows. The camera
-        is where it sees the fluid in every frame. Arguments and errors as of `film`."""
+        is where it sees the fluid in every frame. The arguments
+        ``scene``, ``device`` and ``settings`` and the errors are those of `film`."""
         image: ShadedPicture = on_top("trajectory_picture")(self, k, scene, device, settings)
         return image
 
@@ -361,7 +369,8 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file written by `save` or by `TrajectoryWriter`, whose writer may be dead or still at work.
+        """Read the file at a ``path``, written by `save` or by `TrajectoryWriter`, whose writer may be dead or still at
+        work.
 
         Raises:
             InputError: the file is missing, damaged, or none of Cortado's trajectories.

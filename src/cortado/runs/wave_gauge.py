@@ -296,6 +296,11 @@ class WaveGauge(Summed):
     is the level of the surface. Fluid that is in the air counts too, as if it lay on
     the rest, also on a solid with air below. What is behind the sides of a container that stand along ``up`` is none of
     the column.
+
+    Example::
+
+        run = simulation.run(100, sensors={"gauge": cortado.sensors.WaveGauge([0.4, 0.0])})
+        print(run.sensors["gauge"]["height"])  # (101,) m
     """
 
     def __init__(

@@ -183,6 +183,8 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
 
     Raises:
         SceneError: in one sentence, with the file, the field, what was found and what was wanted.
+
+    Example: ``scene = cortado.load_scene("dam.toml", ["solver.time_step=0.001"])``
     """
     return scene_from_dict(read_toml(path, overrides, OTHER_TABLES), os.fspath(path))
 

@@ -50,7 +50,10 @@ from cortado.sph.viscous_stress import ViscousStress, stress_of
 
 class OverTime:
     """A parameter of a force that changes while a scene runs: linear between the times, constant before the first and
-    after the last. Its row of a step is that at the middle of the step; a search may have a row for each step."""
+    after the last. Its row of a step is that at the middle of the step; a search may have a row for each step.
+
+    Example: ``k = cortado.forces.OverTime([0.0, 0.5], [2.0, 8.0])``
+    """
 
     def __init__(self, times: Any, values: Any):
         """Take ``times`` (k,) [s], each greater than the one before, and ``values`` (k,) or (k, d) at these times."""
@@ -301,7 +304,15 @@ class Body(OwnForce):
     """A force on each particle: ``function(x, v, t, ...)`` returns its acceleration [m/s2], as gravity is one, from the
     position [m], the velocity [m/s] and the time [s] of the particle. Time may be left out. After it come, by their
     names, what else it takes: ``density`` [kg/m3], ``mass_fractions`` [-], ``shear_rate`` [1/s], ``velocity_gradient``
-    [1/s]."""
+    [1/s].
+
+    Example::
+
+        def drag(x, v, k):
+            return -k * v
+
+        simulation = cortado.Simulation("dam.toml", forces=[cortado.forces.Body(drag, k=2.0)])
+    """
 
     kind = "Body"
 
@@ -350,7 +361,15 @@ class Pair(OwnForce):
     """A force between neighbours: ``function(x_ij, v_ij, t, ...)`` returns the force [N], in 2-D per metre, on a
     particle from a neighbour, from how far [m] and how fast [m/s] the particle is from it. Time may be left out. It is
     weighted with W(x_ij) / W(0), which is 1 at no distance and 0 at the support. Momentum is kept where
-    f(-x, -v) = -f(x, v). Walls exert none."""
+    f(-x, -v) = -f(x, v). Walls exert none.
+
+    Example::
+
+        def pull(x, v, k):
+            return -k * x
+
+        simulation = cortado.Simulation("dam.toml", forces=[cortado.forces.Pair(pull, k=1e-3)])
+    """
 
     kind = "Pair"
 
@@ -361,7 +380,15 @@ class Pair(OwnForce):
 class Rheology(OwnFunction):
     """A law of viscosity: ``function(shear_rate, viscosity, ...)`` returns the viscosity [Pa s] at a shear rate
     sqrt(2 D : D) [1/s]. Here ``viscosity`` [Pa s] is that of the phase and D the symmetric velocity gradient. It takes
-    the place of the viscous force of a scene, whose viscosity is "stress"."""
+    the place of the viscous force of a scene, whose viscosity is "stress".
+
+    Example::
+
+        def cross(shear_rate, viscosity, time):
+            return viscosity / (1.0 + time * shear_rate)
+
+        simulation = cortado.Simulation("dam.toml", forces=[cortado.forces.Rheology(cross, time=0.4)])
+    """
 
     kind = "Rheology"
     replaces = "cortado.sph.viscosity"

@@ -28,7 +28,13 @@ ROOM = 16
 
 @fixed
 class Experiment:
-    """A simulation of an experiment, and what was measured of it, by names of one's own."""
+    """A simulation of an experiment, and what was measured of it, by names of one's own.
+
+    Example::
+
+        experiment = cortado.measured.Experiment(simulation, {"camera": video})
+        fit = cortado.fit(experiment, {"viscosity": 0.1})
+    """
 
     def __init__(
         self,

@@ -95,7 +95,13 @@ class Tried:
 @public
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Parameters that were fitted to experiments, with their error bars."""
+    """Parameters that were fitted to experiments, with their error bars.
+
+    Example::
+
+        fit = cortado.fit(experiment, {"viscosity": 0.1})
+        print(fit.intervals(0.95)["viscosity"])
+    """
 
     coordinates: Coordinates = field(repr=False)
     u: np.ndarray = field(repr=False)
@@ -164,8 +170,9 @@ class Fit:
         return tuple((labels[i], labels[j], float(found[i, j])) for i, j in pairs if abs(found[i, j]) > ALIKE)
 
     def intervals(self, confidence: float = 0.95) -> dict[str, tuple[Any, Any]]:
-        """Return by name the lower and the upper end of an interval that contains the true value with this probability,
-        if the model is right; positive numbers have an interval of their logarithm. Raises `InputError`."""
+        """Return by name the lower and the upper end of an interval that contains the true value with the probability
+        ``confidence``, if the model is right; positive numbers have an interval of their logarithm. Raises
+        `InputError`."""
         if not 0.0 < as_one_number("confidence", confidence) < 1.0:
             raise InputError(f"confidence is {shown(confidence)}, but must be between 0 and 1.")
         from scipy.stats import t as student
@@ -176,8 +183,9 @@ class Fit:
         return {name: (lower[name], upper[name]) for name in lower}
 
     def profile(self, label: str, points: int = 7, reach: float = 2.5) -> Profile:
-        """Compute the sum of squares over values of one number, with all others fitted anew at each; where it is no
-        parabola, the intervals are only rough. ``reach`` in standard errors to both sides. Raises `InputError`."""
+        """Compute the sum of squares over ``points`` values of the number ``label``, all others fitted anew at each;
+        where it is no parabola, the intervals are only rough. ``reach`` in standard errors to both sides. Raises
+        `InputError`."""
         if label not in self.labels or self.problem is None or self.at is None:
             raise InputError(f"label is {shown(label)}, but must be one of {', '.join(self.labels)}.")
         k, weights = self.labels.index(label), [part.weighting for part in self.parts]
@@ -229,7 +237,7 @@ class Fit:
         return -0.5 * (squares - self.sum_of_squares)
 
     def numbers(self, confidence: float = 0.95) -> list["FittedNumber"]:
-        """Return the numbers that were searched, with the intervals of `intervals`."""
+        """Return the numbers that were searched, with the `intervals` of a ``confidence``."""
         ends = self.intervals(confidence)
         free = self.coordinates.free
         lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
@@ -238,7 +246,7 @@ class Fit:
         return [FittedNumber(label, *map(float, rest)) for label, *rest in each]
 
     def lines(self, confidence: float = 0.95) -> list[str]:
-        """Return a line for each number: its value, its standard error, and its interval."""
+        """Return a line for each number: its value, its standard error, and its interval of a ``confidence``."""
         return [
             f"{one.words} ({100 * confidence:g} % between {one.lower:.4g} and {one.upper:.4g})"
             for one in self.numbers(confidence)
@@ -326,6 +334,11 @@ def fit(
         InputError: a start, bounds or experiments that do not fit.
         DivergedError: the run at the start diverges.
         ComputationError: what was measured does not tell some of the parameters.
+
+    Example::
+
+        fit = cortado.fit(experiment, {"viscosity": 0.1}, bounds={"viscosity": (0.01, 1.0)})
+        print(fit.parameters["viscosity"])
     """
     each = [experiments] if isinstance(experiments, Experiment) else experiments
     if not isinstance(each, list | tuple) or not all(isinstance(one, Experiment) for one in each):

@@ -165,7 +165,10 @@ def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np
 
 @fixed
 class Video:
-    """An observation of a fit: the frames of a video, compared with pictures of the simulation."""
+    """An observation of a fit: the frames of a video, compared with pictures of the simulation.
+
+    Example: ``video = cortado.measured.Video(simulation.renderer(resolution=(64, 64)), times, frames)``
+    """
 
     unit = "of light"
 
@@ -238,7 +241,10 @@ class Video:
 
 @fixed
 class SensorSeries:
-    """An observation of a fit: the numbers that a sensor measured over time."""
+    """An observation of a fit: the numbers that a sensor measured over time.
+
+    Example: ``series = cortado.measured.SensorSeries(gauge, times, heights, dimension=2, noise=0.001)``
+    """
 
     def __init__(
         self,
@@ -297,6 +303,8 @@ class Tracks:
     with the weights of Wendland (1995) at the start, which add up to 1 within the support radius. Along a periodic axis
     images of particles count like themselves at the start, and paths go on beyond the end of the period: a tracer that
     has gone around once is a period further.
+
+    Example: ``tracks = cortado.measured.Tracks(simulation, first, times, positions, noise=0.001)``
     """
 
     unit = "m"

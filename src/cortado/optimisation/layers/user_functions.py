@@ -112,6 +112,10 @@ def state(
     that a given state is of. Returns positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases),
     reference_density (n,), time () [s], and what else a solver carries; of a batch with a first axis for the scenes.
     Raises `InputError` for what does not fit.
+
+    ``simulation`` is whose state it is.
+
+    Example: ``first = state(simulation)  # first["positions"]: (n, d)``
     """
     layer = steps_layer(simulation, 1)
     with layer.turn:
@@ -122,7 +126,12 @@ def state(
 def restart_state(
     bridge: Bridge, simulation: Simulation, given: Table, parameters: Values | None = None
 ) -> RestartState | tuple[RestartState, ...]:
-    """Return a state of arrays as restart states, which `Simulation.run`, files and other processes take."""
+    """Return a state of arrays as restart states, which `Simulation.run`, files and other processes take.
+
+    ``simulation`` is whose state ``given`` is; ``parameters`` are those of the run so far, where it depends on them.
+
+    Example: ``run = simulation.run(100, state=restart_state(simulation, end))``
+    """
     layer = steps_layer(simulation, 1)
     arrays = {name: bridge.numbers(f"state {name}", value) for name, value in table_of("state", given).items()}
     check_state({name: array.shape for name, array in arrays.items()}, layer.states.shapes)
@@ -149,6 +158,10 @@ def step(
     `cortado gradients check` certifies, some hundred steps; beyond ten e-folds of growth a chain warns. A call costs
     1.4 ms beside its steps on a CPU, 3.4 with its way back: see `docs/layers.md`. Raises `InputError` for what does not
     fit, and `DivergedError` when a particle is lost.
+
+    ``simulation`` is whose steps these are.
+
+    Example: ``end = step(simulation, state(simulation), {"viscosity": 0.1}, steps=5)``
     """
     return part(_applied(bridge, steps_layer(simulation, steps, gradient), given, parameters), STATE)
 
@@ -163,7 +176,12 @@ def rollout(
     gradient: AdjointEstimator | None = None,
 ) -> dict[str, Any]:
     """Return the states after every ``record_every`` of ``steps`` steps, the first one included, along a first axis
-    (frames, ...); see `step`."""
+    (frames, ...); see `step`.
+
+    The arguments besides are those of `step`: ``simulation``, ``given``, ``parameters`` and ``gradient``.
+
+    Example: ``states = rollout(simulation, state(simulation), steps=20, record_every=5)  # ["positions"]: (5, n, d)``
+    """
     steps, every = whole_number("steps", steps, 1), whole_number("record_every", record_every, 1)
     if steps % every:
         raise InputError(f"record_every is {every}, but must divide the {steps} steps.")
@@ -194,6 +212,11 @@ def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None =
 
     With a state the problem begins there. Reverse mode has the gradient that the estimator ``gradient`` gives,
     `gradients.Exact` by default, with the bits of `Problem.value_and_gradient`.
+
+    Example::
+
+        loss = value(problem)
+        print(loss({"gravity": gravity}))
     """
     layer = Value(problem, gradient)
 
@@ -210,6 +233,13 @@ def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Calla
 
     It returns (k,), a number for each column of the sensor, or the quantity (n,) or (n, d). Parameters are those of the
     step that begins at the state: the pressure is that step's. Raises `InputError` for a simulation that is a batch.
+
+    ``what`` is the sensor or the name.
+
+    Example::
+
+        pressure = measure(simulation, "pressure")
+        print(pressure(state(simulation)))  # (n,) Pa
     """
     if not isinstance(simulation, Simulation):
         raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
@@ -228,6 +258,8 @@ def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any =
     ``positions`` (n, d) [m], ``fractions`` (n, phases), which may be left out with one phase, and ``colours``
     (phases, 3), those of the renderer if left out. It passes through the host, and has derivatives in reverse mode
     only. Raises `InputError` for what does not fit.
+
+    Example: ``image = picture(simulation.renderer(resolution=(64, 48)), end["positions"])  # (48, 64, 3)``
     """
     layer = getattr(renderer, "_layer", None) or Picture(renderer)
     renderer.__dict__["_layer"] = layer
@@ -399,5 +431,12 @@ def smoothed(
     loops, whose sizes `gradients.Guided` corrects by differences of the loss. Loops run as batches, by `jax.vmap` in
     programs that are compiled, or by `torch.vmap`. They begin at ``state``, the scene's first one if left out. Raises
     `InputError` for what does not fit, and within a program that is compiled.
+
+    ``simulation`` is what the loop controls.
+
+    Example::
+
+        loss = smoothed(simulation, loop, cortado.gradients.Guided(0.1))
+        print(loss(weights))
     """
     return Smoothed(bridge, estimator, Loop(bridge, simulation, loss, state))
