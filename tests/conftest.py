@@ -12,7 +12,7 @@ import pytest
 import warp as wp
 from matplotlib.image import imsave
 
-from compiling_notice import without_compiling
+from compiling_notice import FLAGS, without_compiling
 from cortado.cli import main
 from cortado.cli.subcommands import CORTADO
 from cortado.device.threads import CORES, usable_cores
@@ -24,8 +24,7 @@ collect_ignore = ["test_reference.py", "test_reference_projection.py", "test_stu
 collect_ignore += ["test_study_figures.py", "test_study_growth.py"]
 collect_ignore = collect_ignore if WITHOUT_ENGINE else []
 
-wp.config.cpu_compiler_flags = "-march=native"
-"""LLVM's own limits of inlining: kernels compile in two thirds of the time, and long gradients take a fifth more."""
+wp.config.cpu_compiler_flags = FLAGS
 gc.set_threshold(100_000, 20, 20)
 """Launches make so many small objects that looking for those in circles takes a tenth of the tests' time otherwise."""
 

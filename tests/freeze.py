@@ -39,13 +39,16 @@ import numpy as np
 import warp as wp
 
 import cortado
+from compiling_notice import FLAGS
 from cortado import Problem, Scene, Simulation, forces, gradients, load_scene
 from cortado.certificate.horizon import directions, everything, scales
 from cortado.cli import main
 from cortado.cli.subcommands import CORTADO, new_scene, templates
 from cortado.optimisation.inverse.task_tables import file_schema
 from cortado.scene.parameters import Role
-from scenes import jet, plane, plane_of_three, scene, two_layers
+from scenes import jet, scene, two_layers
+from scenes import plane as in_the_plane
+from scenes import plane_of_three as of_three
 from test_examples import FILES
 from test_free_bodies import RAFT
 from test_free_bodies import plane as with_bodies
@@ -95,6 +98,10 @@ Table = dict[str, Any]
 
 def drag(x, v, t, k):
     return -k * v
+
+
+CUBIC = {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"}
+plane, plane_of_three = (partial(make, discretisation=CUBIC) for make in (in_the_plane, of_three))
 
 
 def own() -> Iterator[tuple[str, Make, Table]]:
@@ -181,7 +188,7 @@ def digest(array: Any) -> str:
 
 def digests(row: str, precision: str) -> dict[str, str]:
     """Of one row, by the names of the quantities."""
-    wp.config.cpu_compiler_flags = "-march=native"  # as the tests have it: kernels are compiled once
+    wp.config.cpu_compiler_flags = FLAGS
     make, options = ROWS[row]
     batch, estimator = options.get("batch"), options.get("estimator", gradients.Exact())
     with warnings.catch_warnings():

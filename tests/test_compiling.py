@@ -103,7 +103,7 @@ print(float(simulation.run(2)[-1].positions.sum()).hex(), flush=True)
 if child == 0:
     raise SystemExit
 assert os.waitpid(child, 0)[1] == 0
-cortado.Simulation(simulation.scene, precision="float64").run(1)
+cortado.Problem(simulation, 1, cortado.losses.FinalPositions(simulation.positions)).value({})
 """
 FALLING = ["forces.pressure=false", "forces.viscosity=none"]
 """Without sums over neighbours, which take long to compile."""

@@ -55,12 +55,12 @@ def gone_on(envs, actions):
     return [[np.asarray(part).tobytes() for part in envs.step(action)[:4]] for action in actions]
 
 
-@pytest.mark.parametrize("name", ["Carry", "Latte", "Raft", "Timed"])
+@pytest.mark.parametrize("name", ["Latte", "Raft", "Timed"])
 def test_batches_that_are_saved_copied_and_pickled_go_on_with_the_same_bits(batches, name):
     """Beyond the end of an episode, so that their generators draw the next one: with a nozzle, a body that floats, and
     a block on a path of its own."""
     envs = batches(name)
-    actions = actions_of(envs, 8)
+    actions = actions_of(envs, 6)
     envs.reset(seed=3)
     gone_on(envs, actions[:2])
     state = envs.save()
@@ -173,18 +173,18 @@ def test_batches_that_are_cut_for_the_cores_have_the_bits_of_single_ones(name, m
     """Also where a scene diverged, and in the episode after it."""
     monkeypatch.setattr(scenes, "parts_of", lambda simulation: 1)
     task = MADE[name]() if name in MADE else name
-    whole = make_vec(task, 5, max_episode_steps=4)
-    monkeypatch.setattr(scenes, "parts_of", lambda simulation: 3)
-    cut = make_vec(task, 5, max_episode_steps=4)
-    actions = actions_of(cut, 7)
+    whole = make_vec(task, 3, max_episode_steps=4)
+    monkeypatch.setattr(scenes, "parts_of", lambda simulation: 2)
+    cut = make_vec(task, 3, max_episode_steps=4)
+    actions = actions_of(cut, 6)
     for envs in (whole, cut):
         envs.reset(seed=3)
         fields = envs.scenes.state.arrays.copy()
         velocities = fields.numpy(2)["velocities"]
-        velocities[3, 0, 0] = 1e6
+        velocities[1, 0, 0] = 1e6
         fields.set({"velocities": velocities})
         envs.scenes.state = replace(envs.scenes.state, arrays=fields)
-    assert len(cut.scenes._steps.steppers) == 3 and gone_on(cut, actions) == gone_on(whole, actions)
+    assert len(cut.scenes._steps.steppers) == 2 and gone_on(cut, actions) == gone_on(whole, actions)
     assert pickle.loads(pickle.dumps(cut)).scenes.state["positions"].shape == cut.scenes.state["positions"].shape
 
 
@@ -202,7 +202,7 @@ def test_a_batch_is_cut_where_it_is_too_large_for_a_graph_and_too_small_for_a_la
 
 
 # ---- planning --------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("name", ["Carry", "Latte", "Raft", "Timed"])
+@pytest.mark.parametrize("name", ["Latte", "Raft", "Timed"])
 def test_a_twin_begins_where_a_state_is(name):
     """Its loss is minus the rewards from there on, and its gradient that of differences."""
     env = FluidEnv(MADE[name]() if name in MADE else name, precision="float64")

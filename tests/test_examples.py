@@ -13,14 +13,13 @@ from pathlib import Path
 import matplotlib.pyplot
 import numpy as np
 import pytest
-import warp as wp
 
 import cortado.cli.commands.describe
 import cortado.cli.commands.optimise
 import cortado.cli.commands.run
 import cortado.cli.commands.sweep
 import cortado.cli.subcommands
-from compiling_notice import without_compiling
+from compiling_notice import SAME_FLAGS, without_compiling
 from cortado import CortadoWarning, load_scene
 from cortado.cli import main
 from cortado.cli.subcommands import new_scene, templates
@@ -62,10 +61,6 @@ def run(path: Path, folder: Path) -> subprocess.CompletedProcess:
     environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"}
     command = [sys.executable, str(path)]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=240)
-
-
-SAME_FLAGS = f"import warp as wp; wp.config.cpu_compiler_flags = {wp.config.cpu_compiler_flags!r}\n"
-"""First line of an example, so that its kernels are those of the tests."""
 
 
 def test_there_are_ten_short_ones():

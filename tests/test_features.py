@@ -33,7 +33,7 @@ from test_moving_solids import ROTOR
 from test_moving_solids import plane as beside
 from test_moving_solids import space as in_space
 from test_own_functions import FORCES
-from test_projection import C2, CASES, SOLVER, begun
+from test_projection import CASES, SOLVER, begun
 from test_rheology import KINDS
 from test_rheology import thick as yielding
 from test_springs import ACROSS, TAUT, TURNED_BY, moored
@@ -146,9 +146,7 @@ FEATURES = {
     "surface tension of two fluids": Feature(lambda: tense(two_layers)),
     "surface tension in space": Feature(lambda: tense(scene)),
     "surface tension by curvature": Feature(lambda: tense(plane, solver=SOLVER), has_tape=False),
-    "surface tension by curvature in space": Feature(
-        lambda: tense(scene, solver=SOLVER, discretisation=C2), has_tape=False
-    ),
+    "surface tension by curvature in space": Feature(lambda: tense(scene, solver=SOLVER), has_tape=False),
     "surface tension by curvature alone": Feature(lambda: tense(plane, solver=SOLVER, pressure=False)),
     "surface tension by curvature with a wide support": Feature(
         lambda: tense(plane, solver=SOLVER, discretisation=C4), has_tape=False

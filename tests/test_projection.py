@@ -19,18 +19,17 @@ from scenes import box, plane, plane_of_three, scene, thrown
 SOLVER = {"kind": "projection", "time_step": 0.002}
 PERIODIC = box([0.0, 0.0], [0.4, 0.8], periodic=[True, False])
 FOLLOW = {**SOLVER, "velocities_follow": True}
-C2 = {"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"}
 CASES = {
     "plane": lambda: plane(solver=SOLVER),
     "space": lambda: scene(solver=SOLVER),
-    "periodic": lambda: plane(solver=SOLVER, container=PERIODIC, discretisation=C2),
+    "periodic": lambda: plane(solver=SOLVER, container=PERIODIC),
     "three phases": lambda: plane_of_three(solver=SOLVER, mixture={"mobility": 0.0}),
     "velocities follow": lambda: plane(solver=FOLLOW),
     "velocities follow in space": lambda: scene(solver=FOLLOW),
     "hurled": lambda: plane(solver=SOLVER),
     "hurled in space": lambda: scene(solver=SOLVER),
 }
-HURLED = {"hurled": 16.0, "hurled in space": 8.0}
+HURLED = {"hurled": 24.0, "hurled in space": 16.0}
 """How many times as fast as in other cases fluid is thrown: walls throw it back."""
 
 
@@ -164,7 +163,7 @@ def test_a_divergence_that_is_left_is_told():
     assert allowed.diagnostics["divergence"].max() < 0.05 * run.diagnostics["divergence"].max()
 
 
-MET = {**SOLVER, "tolerance": 3e-4, "maximum_iterations": 40}
+MET = {**SOLVER, "tolerance": 1e-3, "maximum_iterations": 40}
 
 
 def test_iterations_go_on_to_a_tolerance():
@@ -173,7 +172,7 @@ def test_iterations_go_on_to_a_tolerance():
     given = thrown(simulation)
     run, fixed = simulation.run(8, given), Simulation(plane(solver=SOLVER), precision="float64").run(8, given)
     left, counts = run.diagnostics["divergence"], run.iterations
-    assert fixed.diagnostics["divergence"].max() > 3e-4 >= left.max() and run.converged.all()
+    assert fixed.diagnostics["divergence"].max() > 1e-3 >= left.max() and run.converged.all()
     assert counts.min() >= 2 and len(set(counts)) > 1
     rest = simulation.run(4, state=run[:5].last_state)
     np.testing.assert_array_equal(rest.iterations, counts[4:])

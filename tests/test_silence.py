@@ -13,11 +13,12 @@ from bad_tasks import TINY_SCENE
 from compiling_notice import COMPILING, UNOPTIMISED
 from cortado import InputError, Simulation
 from cortado.device.modules import installed_driver, start_warp, why_no_gpu
+from test_compiling import ONE_PHASE
 
 FIRST = f"""{UNOPTIMISED}
 BEFORE
 import cortado
-simulation = cortado.Simulation("docs/figures/dam_break_plane.toml")
+simulation = cortado.Simulation(cortado.load_scene("docs/figures/dam_break_plane.toml", {ONE_PHASE}))
 simulation.run(2)
 print("level", wp.config.log_level)
 """
@@ -69,8 +70,9 @@ def test_a_level_that_was_chosen_is_kept(compiled, level, greets):
 def test_the_command_line_says_the_same(compiled, tmp_path):
     """A kernel of another viscosity is among those that it needs, at first."""
     folder, _ = compiled
-    words = ["run", "docs/figures/dam_break_plane.toml", "--set", "forces.viscosity=stress", "--steps", "2"]
-    options = [*words, "--no-pictures", "--overwrite", "--out", str(tmp_path)]
+    changes = [word for one in (*ONE_PHASE, "forces.viscosity=stress") for word in ("--set", one)]
+    options = ["run", "docs/figures/dam_break_plane.toml", *changes, "--steps", "2", "--no-pictures"]
+    options += ["--overwrite", "--out", str(tmp_path)]
     program = UNOPTIMISED + "import runpy; runpy.run_module('cortado', run_name='__main__')"
     errors = [said(folder, program=program, options=options)[1] for _ in range(2)]
     assert COMPILING.fullmatch(errors[0]) and errors[1] == ""
