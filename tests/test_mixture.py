@@ -260,7 +260,7 @@ MISTAKES = {
     "viscosity has shape (), but must be (2,)": {"viscosity": 1.0},
     "rest_density has shape (3,), but must be (2,)": {"rest_density": [1.0, 2.0, 3.0]},
     "mass_fractions has shape (125,), but must be (125, 2)": {"mass_fractions": np.ones(125)},
-    "mass_fractions of particle 7 add up to 1.1, but must to 1": {"mass_fractions": wrong_fractions()},
+    "mass_fractions of particle 7 add up to 1.1, but must add up to 1": {"mass_fractions": wrong_fractions()},
     "mobility is -0.1, but must be at least 0": {"mobility": -0.1},
     "mobility has shape (2,), but must be ()": {"mobility": [0.1, 0.1]},
     "interface_width is 0.0, but must be greater than 0": {"interface_width": 0.0},

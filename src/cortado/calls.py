@@ -168,7 +168,7 @@ _OWN = "_made_with"
 
 def fixed(made: type[T]) -> type[T]:
     """Make the public attributes of a class's objects stay as the constructor sets them; no others may be added. A
-    class derived from it may have further attributes of its own, and an object methods of its own.
+    derived class may add attributes, and an object may be given methods.
 
     Raises `InputError` where one is set or deleted, and where the class is called with other arguments than it takes.
     """

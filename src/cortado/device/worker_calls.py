@@ -120,7 +120,8 @@ def _function(payload: Payload) -> Callable[[Any], Any]:
     """Return the function of a payload, unpickled unless it is kept."""
     if payload.versions != versions():
         raise InputError(
-            f"A worker has {versions()}, but must have {payload.versions}, as the process that asks, for the same bits."
+            f"A worker has {versions()}, but must have {payload.versions}, as the process that asks it has: else bits "
+            "would differ."
         )
     if payload.digest not in _functions:
         assert payload.content is not None

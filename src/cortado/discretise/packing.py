@@ -185,7 +185,8 @@ class Linearised:
 
 class Relaxation:
     """The least squares for the places of particles, the first n of the points around, of which some are ``free`` (n,)
-    to move. Those that stay (n,) do not see air. Pairs are listed once, as no particle moves further than it looks."""
+    to move. Those that stay (n,) do not see air. Pairs of neighbours are listed once for all iterations: no particle
+    moves so far that it gets others."""
 
     def __init__(self, around: PointsAround, stays: Which, free: Which):
         starts, ends, listed = around.lists(around.points[: len(free)], stays)

@@ -149,7 +149,7 @@ class LBFGS:
     is then about a quarter as long, and the approximate Hessian knows nothing of it.
 
     Its sums over components are BLAS's: beyond some 10^4 components their last bits, and with them resuming
-    bit for bit, depend on the number of BLAS threads. A resumed run that comes out otherwise is refused.
+    bit for bit, depend on the number of BLAS threads. A resumed run with other bits is refused.
 
     Source: R. H. Byrd, P. Lu, J. Nocedal and C. Zhu, SIAM Journal on Scientific Computing 16(5), 1995, as in
     `scipy.optimize.minimize(method="L-BFGS-B")`.
@@ -290,8 +290,8 @@ class LineSearch:
 
     over lengths s at even ratios from ``shortest`` to 1. P projects onto the bounds. The reach r is 1 at first, and
     then `GROWTH` times the length that was best, at most 1. Where no trial lowers the loss, at the bottom of a dent or
-    of the valley, an update still takes the best one, and the reach is 1 again, by which the search leaves dents. So
-    the last iterate need not be the best. Where every trial diverges, x stays, the momentum is dropped, and the reach
+    of the valley, an update still takes the best one and sets the reach to 1, so that the search leaves dents. So the
+    last iterate need not be the best. Where every trial diverges, x stays, the momentum is dropped, and the reach
     is ``shortest`` times what it was. Where the gradient of the best one diverges, as that of an ensemble may, x moves
     a part of the way, and the reach is that part of what it would be. There is no test of convergence: all the
     iterations are made.

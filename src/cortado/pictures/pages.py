@@ -229,9 +229,9 @@ def film_page(film: Film) -> str:
 def result_page(
     found: object, message: str, problem: Any, start: Mapping[str, Any], best: Mapping[str, Any], losses: Any
 ) -> str:
-    """Return HTML of the result of a search from a start to the best parameters, with its end and all its losses. Of a
-    `Problem`, or of one in other coordinates, two runs are made to see their ends; there is no picture of runs that
-    diverge."""
+    """Return HTML of the result of a search from a start to the best parameters, with its end and all its losses. For a
+    `Problem`, also in other coordinates, it shows pictures of two runs, with the first and with the best parameters,
+    unless they diverge."""
     if hasattr(problem, "coordinates"):
         problem, (start, best) = problem.problem, [problem.parameters(u) for u in (start, best)]
     is_ours = isinstance(problem, Problem) and problem.simulation.batch is None

@@ -134,8 +134,8 @@ class ParameterSpace:
         left out.
 
         ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
-        diffusion even where it is 0. ``states`` replace the scene's first one, with their fields or ``arrays``; those
-        with arrays are checked as `check_restarts` does.
+        diffusion even where it is 0. ``states`` replace the scene's first state. Their fields come from them or from
+        ``arrays``; those that come from arrays are checked by `check_restarts`.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         if arrays is not None and self._goes_on(rollout, values, varied, states):

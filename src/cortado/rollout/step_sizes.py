@@ -3,9 +3,9 @@ which steps of the projection that were chosen are taken again, shorter.
 
 Taken again are steps that press fluid together, or lose a particle. Between walls that face one another, nearer than a
 spacing, a pressure that is right on one side of the middle is wrong on the other. A particle that a step takes too far
-goes to and fro there, and then through a wall. No shorter step mends what was compressed before it, nor what repairs do
-by themselves: then a step stays as long as it was. The state before a step alone decides, so that a run that goes on
-has the steps of one that did not stop.
+goes to and fro there, and then through a wall. A step keeps its length where a shorter one does not help, as fluid was
+compressed before it, or repairs compress it. The state before a step alone decides, so that a run that goes on has the
+steps of one that did not stop.
 """
 
 from collections.abc import Sequence

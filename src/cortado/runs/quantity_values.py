@@ -364,8 +364,7 @@ class QuantityEvaluator:
 
 def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
     """Return the values of parameters for all steps of a rollout, and one row of those over time, in arrays of their
-    own. After the last step they are those of it, but paths of solids go on as far as they went in it: else solids
-    would stop."""
+    own. After the last step its values hold on; paths of solids are continued, as solids would stop otherwise."""
     found = {}
     for name, value in values.items():
         shares = _shares_of_rows(rollout, name, row, value) or {}
@@ -396,8 +395,8 @@ def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> d
 
 
 class Recorder:
-    """A computation of quantities of the states of a rollout in the arrays of another solver of the same scene, as the
-    rollout's own are at work."""
+    """A computation of quantities of a rollout's states. It has a solver of its own for the same scene, as the arrays
+    of the rollout's solver are in use."""
 
     def __init__(
         self, rollout: Rollout, names: Iterable[str], evaluator: Callable[[], QuantityEvaluator], dimension: int

@@ -267,7 +267,7 @@ def _check_range(name: str, array: np.ndarray, allowed: Range, what: str) -> Non
         worst = np.unravel_index(np.abs(totals - 1.0).argmax(), totals.shape)
         if abs(totals[worst] - 1.0) > SUM_TOLERANCE:
             place = f"particle {worst[-1]}" + (f" of scene {worst[0]}" if totals.ndim > 1 else "")
-            raise OutOfRangeError(f"{what} {name} of {place} add up to {totals[worst]:g}, but must to 1.")
+            raise OutOfRangeError(f"{what} {name} of {place} add up to {totals[worst]:g}, but must add up to 1.")
 
 
 def stacked(tables: Sequence[Arrays]) -> Arrays:

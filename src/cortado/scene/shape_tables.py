@@ -227,8 +227,8 @@ class Container(Table):
         """Return places where fluid may rest less than ``reach`` [m] from a wall."""
 
     def shortened(self, spacing: float, support: float) -> "tuple[Container, Callable[[Points], Points]]":
-        """Return a container whose walls beside fluid of a spacing and a support [m] have this one's weights, and which
-        may be found sooner. A function from places (b, d) [m] of walls gives the wall with each one's weight."""
+        """Return a shorter container whose walls have the weights of this one for a spacing and a support [m], and a
+        function that maps places (b, d) [m] on this one's walls to places of equal weight on that one's."""
         return self, lambda points: points
 
     @abstractmethod

@@ -205,8 +205,8 @@ class Contact:
         return {name: wp.zeros(self.all, dtype=kind, device=self.layout.device) for name, kind in kinds.items()}
 
     def poses(self, each: Sequence[Named]) -> Named:
-        """Return the pose and scale of the other solid, and tangents, by the names that kernels have for them; ``each``
-        are those of all solids that move."""
+        """Return pose, scale and tangents of the other solid under the names of kernel arguments, out of those of all
+        moving solids, ``each``."""
         against = self.touching.against
         other = resting_pose(self.layout) if against < 0 else each[against]
         return {f"other_{name}": array for name, array in other.items()}

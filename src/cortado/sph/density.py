@@ -8,7 +8,7 @@ Pajarola 2008): the density of a heavy fluid is not smeared into a light one.
 `Density` measures it in a step, with derivatives; a solver that measures more of the same neighbours at once has a
 subclass of its own.
 
-The sums over walls by which walls act on a particle in one term of a step are, for the pressure,
+For the pressure, walls act on a particle by the sums
 
 g_i = sum_b w_b G_ib,   g_i' = sum_b w_b H_ib x_ib' + w_b' G_ib.
 

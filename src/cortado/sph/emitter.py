@@ -6,8 +6,8 @@ u - l > 0 upstream, where l grows by w dt in each step, w = Q / A:
     x = q_n + o - s e,   v = (q_n - q_(n-1)) / dt + w e
 
 q_n is where the opening is after step n (it rests before the first), e its direction, Q the flow rate and A its area.
-Position and velocity do not jump when a particle becomes free. Particles in reserve, further upstream than the column
-is long, are elsewhere, by a constant vector, until they join its end.
+Position and velocity do not jump when a particle becomes free. Particles in reserve are further upstream than the
+column is long. They wait elsewhere, displaced by a constant vector, until they join its end.
 """
 
 from dataclasses import dataclass

@@ -16,11 +16,12 @@ change of u makes a pressure in a step, so that the next one is not cold. Free b
 by.
 
 eps makes e small at nodes that few particles touch. So does h^2 / 100, which is next to nothing in fluid and beside
-walls that close it. A particle that has a wall beside it and no fluid gives the nodes around it one equation alone. The
-rest, left open, would take solves hundreds of iterations, in dams that have run out. Everything goes between nodes and
-particles in two ways: `spread` sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i over the particles of the
-cells around a node, in their order, and `at` gives E = sum_I phi_I e_I, its gradient G and its mixed second derivatives
-at a particle. With w = (N G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 / 100) / m.
+walls that close it. Where a particle has a wall beside it and no fluid, the nodes around it have a single equation
+between them. Without these terms, solves would take hundreds of iterations there, as in dams that have run out.
+Everything goes between nodes and particles in two ways: `spread` sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i +
+e_I o_i over the particles of the cells around a node, in their order, and `at` gives E = sum_I phi_I e_I, its gradient
+G and its mixed second derivatives at a particle. With w = (N G + h E) / m, A e is `spread` of s = h . w, t = N^T w and
+o = (eps + h^2 / 100) / m.
 
 With free bodies on the grid a light body gives way from the first step on. Pressure impulses y give a body the momenta
 F = sum_i y_i gamma_i and T = sum_i y_i r_i x gamma_i

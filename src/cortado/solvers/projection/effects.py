@@ -320,7 +320,8 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
 
 @cache
 def image_share(precision: Precision, dimension: int, module: Any) -> tuple[Any, Any]:
-    """Make the Warp functions of an image's share h, by its part in the density and nu of walls, and of its slope."""
+    """Make two Warp functions: the share h of an image, given its part of the density and the nu of walls, and the
+    derivatives of h."""
     real, smoothstep = precision.real, moment_functions(precision, dimension).smoothstep
     away = away_function(precision)
     first, last, least, apart = (wp.constant(real(value)) for value in (*EVEN, LEAST, APART))

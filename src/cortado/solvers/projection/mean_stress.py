@@ -83,7 +83,8 @@ class MeanStress:
         return np.array(found.numpy())
 
     def adjoint(self, context: StepContext, bar: Adjoints, around: tuple[Named, ...], at: Named) -> None:
-        """Add to the adjoints of k, of particles and of ``around`` from that of the stress, ``q_bar`` in ``at``."""
+        """Take the adjoint of the stress, ``q_bar`` in ``at``, and add what follows to the adjoints of k, particles and
+        ``around``."""
         (own, pairs), reach_bar = self._kernels.adjoint, self._arrays["reach_bar"]
         context.launch(own, *bar.named, at, self._totals(context, *around), reach_bar=reach_bar)
         context.launch(pairs, *bar.named, *around, at)
