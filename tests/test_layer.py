@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from cortado import InputError, Simulation, gradients
+from cortado.optimisation.layers.layer import named_states
 from finite_differences import central_difference
 from layered import POINT, STIFF, matched, same_bits, scheduled, shear, sheared
-from scenes import jet, two_layers
+from scenes import jet, plane, two_layers
 
 
 def of_jax(jax):
@@ -152,6 +153,19 @@ def test_chained_steps_and_rollouts_have_the_bits_of_one_run(lib, made, precisio
     again = lib.layer.restart_state(simulation, state)
     same_bits(again.fields, last.fields)
     np.testing.assert_array_equal(simulation.run(3, state=again).positions[-1], simulation.run(15).positions[-1])
+
+
+def test_a_state_that_steps_led_to_is_not_judged_again(lib, monkeypatch):
+    simulation, judged = Simulation(plane(solver={"kind": "projection", "time_step": 0.002}), precision="float64"), []
+    space = named_states(simulation)._space
+    check = space.check_restarts
+    monkeypatch.setattr(space, "check_restarts", lambda *given: judged.append(given) or check(*given))
+    state = lib.layer.state(simulation)
+    for _ in range(3):
+        state = lib.layer.step(simulation, state, {"gravity": lib.array([0.4, -9.0])})
+    assert len(judged) <= 1
+    lib.layer.step(simulation, {**state, "velocities": 0.9 * state["velocities"]})
+    assert len(judged) == 1
 
 
 def test_a_rollout_gives_each_segment_its_rows_and_is_differentiated(lib, simulation):

@@ -349,7 +349,7 @@ class NamedStates:
 
     def _judged(self, arrays: State, clocks: list[Clock], parameters: Arrays) -> tuple[Origin, ...]:
         """Check a state's scenes, and return the origins of their particles."""
-        known = self._known.get(_checksum(arrays)) if self._simulation.device.is_cpu else None
+        known = self._known.get(self._checksum(arrays)) if self._simulation.device.is_cpu else None
         if known is not None:
             return known
         own = {name: parameters[name] for name in ("rest_density",) if name in parameters}
@@ -365,9 +365,17 @@ class NamedStates:
 
     def _remember(self, arrays: State, origins: tuple[Origin, ...]) -> None:
         if self._simulation.device.is_cpu:
-            self._known[_checksum(arrays)] = origins
+            self._known[self._checksum(arrays)] = origins
             while len(self._known) > MOST_KNOWN:
                 self._known.popitem(last=False)
+
+    def _checksum(self, arrays: State) -> bytes:
+        """Return the checksum of the numbers that other programs hold of a state: in 2-D no third component, whose 0
+        may have a sign."""
+        found = blake2b(digest_size=16)
+        for name in arrays.names:
+            found.update(np.ascontiguousarray(self._narrow(name, arrays.numbers(name).numpy())).data)
+        return found.digest()
 
 
 def check_state(given: Shapes, wanted: Shapes) -> None:
@@ -386,13 +394,6 @@ def named_states(simulation: Simulation) -> NamedStates:
     found: NamedStates = simulation.__dict__.get("_named_states") or NamedStates(simulation)
     simulation.__dict__["_named_states"] = found
     return found
-
-
-def _checksum(arrays: State) -> bytes:
-    found = blake2b(digest_size=16)
-    for array in arrays.arrays():
-        found.update(array.numpy().data)
-    return found.digest()
 
 
 class LayerParameters:
