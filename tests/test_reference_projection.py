@@ -11,16 +11,16 @@ from cortado.reference import Terms
 from cortado.scene.discrete_scene import discretise, mirrors_of
 from cortado.solvers.projection.lattice import coarse_grid
 from reference_projection import Projection
-from scenes import box, plane, scene
-from test_projection import C2, CASES, HURLED, PERIODIC, SOLVER, begun, thrown
+from scenes import C2, box, plane, scene
+from test_projection import CASES, HURLED, PERIODIC, SOLVER, begun, thrown
 from test_reference import C4, distance, gradients_agree, target_of
 
 CUBIC = {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"}
 SCENES = {
     "plane": plane(solver=SOLVER),
     "space": scene(solver=SOLVER),
-    "periodic": plane(solver=SOLVER, container=PERIODIC, discretisation=C2, forces={"gravity": [1.0, -9.81]}),
-    "stress, no slip": plane(solver=SOLVER, container=box([0.0, 0.0], [0.7, 0.8], slip="no"), discretisation=C2),
+    "periodic": plane(solver=SOLVER, container=PERIODIC, forces={"gravity": [1.0, -9.81]}),
+    "stress, no slip": plane(solver=SOLVER, container=box([0.0, 0.0], [0.7, 0.8], slip="no")),
     "wendland_c4": plane(solver={**SOLVER, "iterations": 7, "repairs": 1}, discretisation=C4),
     "free space": plane(solver=SOLVER, container={"shape": "none"}, forces={"gravity": [0.0, 0.0]}),
 }
