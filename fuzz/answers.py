@@ -68,10 +68,10 @@ def trajectory_complaints(scene: Scene, trajectory: Trajectory) -> list[str]:
 def _waiting(scene: Scene, points: np.ndarray, others: Mapping[str, np.ndarray]) -> np.ndarray:
     """(n,) whether a particle of the nozzle has not come out yet, or by less than a spacing, or is in a drain."""
     waiting = ~is_out(scene, others, len(points))
-    if scene.emitter is not None:
+    if scene.emitter:
         spacing = scene.discretisation.spacing
-        along = (points - scene.emitter.outlet) @ np.array(scene.emitter.direction)
-        held = len(scene.emitter.particles(spacing))
+        along = (points - scene.emitter[0].outlet) @ np.array(scene.emitter[0].direction)
+        held = len(scene.emitter[0].particles(spacing))
         waiting[-held:] |= along[-held:] < spacing
     return waiting
 

@@ -19,7 +19,7 @@ def is_large(file: Path, overrides: Sequence[str], steps: int) -> bool:
     except CortadoError:
         return False
     spacing = scene.discretisation.spacing
-    bodies = [*scene.fluid, *([scene.emitter] if scene.emitter else [])]
+    bodies = [*scene.fluid, *scene.emitter]
     particles = sum(body.count(spacing) for body in bodies) + scene.container.wall_count(spacing)
     pixels = scene.render.resolution[0] * scene.render.resolution[1] if scene.render else 0
     runs = 1

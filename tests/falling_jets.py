@@ -34,7 +34,7 @@ def falling_jet(across, dimension, viscosity=0.0, solver=PROJECTION, device="cpu
         *(spacing, dimension, "float32", C2),
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": viscosity}],
         fluid=[],
-        emitter=jet,
+        emitter=[jet],
         forces={"gravity": list(-GRAVITY * down)},
         solver={**solver, "time_step": time / steps},
         device=device,

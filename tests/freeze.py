@@ -197,8 +197,8 @@ def digests(row: str, precision: str) -> dict[str, str]:
         problem = Problem(simulation, STEPS, Weighted())
         values = everything(problem, {})
         values = {name: value for name, value in values.items() if simulation.known[name].role is not Role.LOSS}
-        if simulation.scene.solver.chooses and "nozzle_path" in values:
-            values["nozzle_path"] = values["nozzle_path"][0]  # the only form that it may have there
+        if simulation.scene.solver.chooses and "nozzle.path" in values:
+            values["nozzle.path"] = values["nozzle.path"][0]  # the only form that it may have there
         sizes = scales(problem, values)
         along = {name: directions({name: values[name]}, sizes, _random(name))[name] for name in values}
         for name in ("initial_positions", "initial_velocities"):

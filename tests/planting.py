@@ -297,8 +297,8 @@ def case(scene, loss: str, precision: str = "float64"):
         free = solid.motion == "free"
         begun = np.reshape(solid.rotation, angles) if free and solid.rotation else 0.0 if free else 0.3
         point[f"{solid.name}.rotation"] = begun + (0.001 if free else 0.1) * random.standard_normal(angles)
-    if scene.emitter is not None:
-        point["nozzle_path"] = scene.emitter.outlet + 0.1 * spacing * random.standard_normal((STEPS, shape[1]))
+    if scene.emitter:
+        point["nozzle.path"] = scene.emitter[0].outlet + 0.1 * spacing * random.standard_normal((STEPS, shape[1]))
     target = simulation.positions + 0.1 * random.standard_normal(shape)
     if loss == "positions":
         made = losses.FinalPositions(target)

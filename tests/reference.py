@@ -146,18 +146,17 @@ class SurfaceTension:
 class Emitter:
     """The end of steps of a scene with an emitter, whose last particles are led until they have left its nozzle."""
 
-    def __init__(self, upstream, offsets, direction, area, column, reserve, path):
-        """``upstream`` (m,) of the opening, ``offsets`` (m, d) from the axis; ``path`` (steps, d) of the opening.
-        Further upstream than ``column`` they are off by ``reserve`` (d,)."""
-        self.upstream, self.offsets, self.direction, self.area, self.path = upstream, offsets, direction, area, path
-        self.column, self.reserve = column, reserve
+    def __init__(self, sample, direction, area, path):
+        """``sample`` of particles, of which none is in reserve; ``path`` (steps, d) of the opening."""
+        self.upstream, self.offsets = sample.upstream, sample.offsets
+        self.direction, self.area, self.path = direction, area, path
 
     def lead(self, n, x, v, flow_rate, time_step):
         """Positions and velocities (particles, d) after step n, counted from 0, given those of free particles."""
         speed = flow_rate / self.area
         left = (self.upstream - speed * time_step * (n + 1))[:, None]
         turn = self.path[n] - self.path[max(n - 1, 0)]
-        place = self.path[n] + self.offsets - left * self.direction + (left.real > self.column) * self.reserve
+        place = self.path[n] + self.offsets - left * self.direction
         first, led = len(x) - len(left), left.real > 0
         x = np.concatenate([x[:first], np.where(led, place, x[first:])])
         return x, np.concatenate([v[:first], np.where(led, turn / time_step + speed * self.direction, v[first:])])

@@ -151,12 +151,12 @@ def plane_of_three(**changes: Any) -> Scene:
     return plane(**{"name": "plane of three", "phase": phases, "fluid": blocks, "mixture": mixture, **changes})
 
 
-def jet(**changes: Any) -> Scene:
-    """In the plane: 3 particles abreast shot into a pool of 48."""
-    slot = {"phase": "water", "outlet": [0.3, 0.26], "radius": 0.075, "length": 0.3, "flow_rate": 0.3}
+def jet(path: Any = None, **changes: Any) -> Scene:
+    """In the plane: 3 particles abreast shot into a pool of 48, from a nozzle that may move along a path."""
+    slot = {"phase": "water", "outlet": [0.3, 0.26], "radius": 0.075, "length": 0.3, "flow_rate": 0.3, "path": path}
     pool = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.2], "phase": "water"}
     room = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8]}
-    return plane(**{"name": "jet", "fluid": [pool], "container": room, "emitter": slot, **changes})
+    return plane(**{"name": "jet", "fluid": [pool], "container": room, "emitter": [slot], **changes})
 
 
 def pour(**changes: Any) -> Scene:
@@ -167,7 +167,7 @@ def pour(**changes: Any) -> Scene:
     room = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.25, 0.5, 0.25]}
     phases = [scene().phase[0].model_dump(), OIL]
     tables = {"name": "pour", "phase": phases, "fluid": [pool], "container": room, "mixture": MIXING}
-    return scene(**{**tables, "emitter": nozzle, **changes})
+    return scene(**{**tables, "emitter": [nozzle], **changes})
 
 
 def scatter(positions: np.ndarray, spacing: float) -> None:

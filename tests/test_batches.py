@@ -39,10 +39,10 @@ CASES: dict[str, tuple[Any, dict[str, Any], dict[str, Any]]] = {
         {"viscosity": RANDOM.uniform(0.1, 1.0, (3, 2)), "rest_density": RANDOM.uniform(900.0, 1500.0, (3, 2))},
         {"mobility": 0.1, "interface_width": 0.04},
     ),
-    "jet": (scenes.jet, {"flow_rate": RANDOM.uniform(0.2, 0.4, 3)}, {"time_step": 0.002}),
+    "jet": (scenes.jet, {"nozzle.flow_rate": RANDOM.uniform(0.2, 0.4, (3, STEPS))}, {"time_step": 0.002}),
     "pour": (
         scenes.pour,
-        {"nozzle_path": np.array([0.09, 0.17, 0.12]) + RANDOM.uniform(-0.02, 0.02, (3, STEPS, 3))},
+        {"nozzle.path": np.array([0.09, 0.17, 0.12]) + RANDOM.uniform(-0.02, 0.02, (3, STEPS, 3))},
         {"gravity": np.tile([0.0, -9.0, 0.0], (STEPS, 1))},
     ),
     "tilt": (scenes.scene, {"tilt": RANDOM.uniform(-20.0, 20.0, (3, STEPS, 2))}, {}),

@@ -272,7 +272,7 @@ def test_without_steps_nothing_is_claimed():
     [
         ({"parameters": ["gravitas"]}, "parameter 'gravitas' is unknown, but must be one of gravity, "),
         ({"parameters": []}, "parameters is empty, but must have at least one of gravity, "),
-        ({"parameters": ["nozzle_path"]}, "parameter 'nozzle_path' is unknown"),
+        ({"parameters": ["nozzle.path"]}, "parameter 'nozzle.path' is unknown"),
         ({"parameters": {"gravity": [1.0, 2.0, 3.0]}}, r"parameter gravity has shape \(3,\), but must be"),
         ({"steps": 4}, "steps is 4, but must be left out, as the problem has 3 steps."),
         ({"perturbation": 0.0}, "perturbation is 0.0, but must be greater than 0 and less than 1."),

@@ -180,7 +180,7 @@ def test_what_goes_over_the_rim_of_an_open_cup_may_fall_on():
 def test_what_waits_in_a_nozzle_passes_walls_with_it():
     """The column reaches from the opening at 0.26 m to 0.56 m, below a lid at 0.8 m; then the nozzle is drawn up."""
     path = np.column_stack([np.full(30, 0.3), np.linspace(0.26, 0.7, 30)])
-    trajectory = Simulation(jet(), precision="float64").run(30, {"nozzle_path": path})
+    trajectory = Simulation(jet(), precision="float64").run(30, {"nozzle.path": path})
     assert (trajectory.positions[0, :, 1] < 0.8).all() and trajectory.positions[-1, :, 1].max() > 0.83
 
 

@@ -89,7 +89,7 @@ def test_a_cup_always_arrives_and_a_nozzle_stays_in_its_reach():
     assert np.abs(path[0]).max() < 1e-3 and np.ptp(path[:, 0]) > 0.1
     chosen = task("latte", "small")
     for u in (np.ones(25), -np.ones(25), np.random.default_rng(0).choice([-1.0, 1.0], 25)):
-        path = chosen.controls.parameters(u)["nozzle_path"]
+        path = chosen.controls.parameters(u)["nozzle.path"]
         assert np.abs(path[:, 0]).max() <= 0.6 * chosen.cup
         assert np.ptp(path[:, 1]) == 0.0
 

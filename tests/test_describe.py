@@ -138,7 +138,7 @@ def test_phases_and_an_emitter_are_told(capsys):
 
 def test_an_emitter_has_fluid_for_the_run_or_runs_dry(capsys):
     asked = ["describe", str(Path(cortado.__file__).parent / "cli/templates/jet.toml"), "--time", "2"]
-    main([*asked, "--set", "emitter.duration=1.5"])
+    main([*asked, "--set", "emitter[0].volume=0.225"])
     assert "runs dry at 1.5" in (told := capsys.readouterr().out) and "before the end of the run at 2 s" in told
     main(asked)
     assert "has fluid for 2.6" in capsys.readouterr().out
@@ -147,10 +147,10 @@ def test_an_emitter_has_fluid_for_the_run_or_runs_dry(capsys):
 def test_an_opening_that_is_no_whole_number_of_cells_is_told(capsys):
     """The flow rate is kept, and the speed is not that of the opening."""
     template = str(Path(cortado.__file__).parent / "cli/templates/jet.toml")
-    asked = ["describe", template, "--time", "0.01", "--set", "emitter.flow_rate=0.12"]
+    asked = ["describe", template, "--time", "0.01", "--set", "emitter[0].flow_rate=0.12"]
     main(asked)
-    assert "at 1.2 m/s" in (told := capsys.readouterr().out) and "opening" not in told
-    main([*asked, "--set", "emitter.radius=0.0575"])
+    assert "of nozzle at 1.2 m/s" in (told := capsys.readouterr().out) and "opening" not in told
+    main([*asked, "--set", "emitter[0].radius=0.0575"])
     told = capsys.readouterr().out
     assert "at 1.2 m/s, through 0.1 m of cells, where an opening of 0.115 m was asked for" in told
 

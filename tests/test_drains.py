@@ -10,6 +10,7 @@ from cortado import Scene, SceneError, Simulation
 from cortado.pictures.film import is_out, shown_places
 from cortado.runs.balance import Balance
 from cortado.scene.drain_tables import open_sphere
+from cortado.scene.emitter_table import samples, waits
 from scenes import jet, plane, scene
 
 SPACING = 0.025
@@ -23,6 +24,14 @@ def emptied(d, made=None, **keys):
     sink = {**HOLE, "position": [0.22, 0.02, 0.13][:d], "radius": 0.05, "flow_rate": [0.05, 0.01][d - 2]}
     box = {**OVER, "lower": [*OVER["lower"], 0.0][:d]}
     return (made or (plane if d == 2 else scene))(drain=[sink, box], solver=SOLVER, **keys)
+
+
+def recirculating(**keys):
+    """A jet into a pool, and beside it a slot out of which comes again what a box took of the pool."""
+    slot = {"name": "slot", "phase": "water", "outlet": [0.15, 0.5], "sides": [0.1], "length": 0.1, "fed_by": ["lid"]}
+    slot |= {"times": [0.0, 0.1], "flow_rates": [0.7, 0.6]}
+    lid = {"shape": "box", "name": "lid", "lower": [0.4, 0.12]}
+    return jet(**{"emitter": [*jet().emitter, slot], "drain": [lid], "solver": SOLVER, **keys})
 
 
 def tank(depth=0.5, time_step=1e-3, **keys):
@@ -113,7 +122,7 @@ def test_a_level_stays_where_it_is_with_a_tap_and_a_drain():
     """For ten seconds, in which more comes and goes than the tank holds, within a particle."""
     tap = {"phase": "water", "outlet": [0.2, 0.55], "radius": 0.05, "flow_rate": 0.05}
     sink = {**HOLE, "position": [0.8, 0.0], "flow_rate": 0.05}
-    filled = tank(0.4, emitter=tap, drain=[sink])
+    filled = tank(0.4, emitter=[tap], drain=[sink])
     simulation = Simulation(filled.lasting(10.0))
     run = simulation.run(10_000, record_every=500)
     for frame in run:
@@ -154,6 +163,50 @@ def test_the_balance_is_right_to_a_particle():
     balance = Balance.of(simulation.scene, run[0].others, run[-1].others)
     assert balance.first + balance.came - sum(balance.went.values()) == balance.last
     assert balance.first == simulation.free_particles and balance.came > 20 and balance.went["hole"] > 20
+
+
+def test_what_drains_took_comes_out_again_in_line_behind_the_layers_before():
+    """As much as is there; none is lost, and none is in two places."""
+    simulation = Simulation(recirculating().lasting(0.12), precision="float64")
+    made, count, run = simulation.scene, simulation.particles, simulation.run(60)
+    slot, (name, first, sample) = made.emitter[1], samples(made, count)[1]
+    flown = [slot.passed(time) / slot.area(made.discretisation.spacing) for time in run.times]
+    np.testing.assert_allclose(run.others["slot.emitted"][:, 0], flown, rtol=0.01)
+    serials = set()
+    for frame in run:
+        others, balance = frame.others, Balance.of(made, run[0].others, frame.others)
+        taken, waiting = others["drained"] > 0, waits(made, others, count)
+        assert balance.last + (taken | waiting).sum() == count
+        led = waiting & ~taken & (others["slot.again"] > 0)
+        line = sample.in_line(name, first, others, count)[led, None] - others["slot.emitted"]
+        numbers = others["slot.again"][led].astype(int)
+        place = slot.outlet + sample.offsets[(numbers - 1) % len(sample.offsets)] + line * [0.0, 1.0]
+        np.testing.assert_allclose(frame.positions[led], place, rtol=0, atol=1e-12)
+        serials |= set(numbers.tolist())
+    assert min(serials) == len(sample.upstream) + 1 and len(serials) > 12 and balance.went["lid"] > 12
+
+
+@pytest.mark.parametrize(
+    ("emitters", "key", "words"),
+    [
+        ([{"fed_by": ["lid"]}, {"name": "b", "fed_by": ["lid"]}], "emitter[1].fed_by", "feed no other emitter"),
+        ([{"fed_by": ["ld"]}], "emitter[0].fed_by", "of ['lid']"),
+        ([{}, {}], "emitter[1].name", "another name"),
+        ([{"name": "a/b"}], "emitter[0].name", 'without "/"'),
+        ([{"radius": None}], "emitter[0].radius", "or sides in its place"),
+        ([{"sides": [0.1]}], "emitter[0].radius", "left out, as there are sides"),
+        ([{"radius": None, "sides": [0.1, 0.1]}], "emitter[0].sides", "a list of 1"),
+        ([{"radius": None, "sides": [2.0]}], "emitter[0].sides", "so small"),
+        ([{"flow_rates": [0.1, 0.1]}], "emitter[0].times", "missing"),
+    ],
+)
+def test_a_wrong_emitter_is_told_in_a_sentence(emitters, key, words):
+    tap = {"phase": "water", "outlet": [0.2, 0.8], "radius": 0.05, "flow_rate": 0.05}
+    made = [{**{k: v for k, v in tap.items() if k not in one or one[k] is not None}, **one} for one in emitters]
+    lid = {"shape": "box", "name": "lid", "lower": [0.5, 0.6]}
+    with pytest.raises(SceneError) as error:
+        tank(emitter=[{k: v for k, v in one.items() if v is not None} for one in made], drain=[lid])
+    assert str(error.value).startswith(key) and words in str(error.value)
 
 
 def test_a_jet_out_of_a_slot_contracts():

@@ -15,7 +15,7 @@ STEPS = 30
 
 MAKERS = {"jet": jet, "pour": pour}
 scenes = pytest.mark.parametrize("name", MAKERS)
-SIZES = {"nozzle_path": 0.01, "flow_rate": 0.1, "time_step": 1e-4}
+SIZES = {"nozzle.path": 0.01, "nozzle.flow_rate": 0.1, "time_step": 1e-4}
 """Size of a direction of each parameter; of the flow rate relative to it."""
 DISTURBED = {"gravity": 1.0, "initial_positions": 0.01, "initial_velocities": 0.1}
 
@@ -29,26 +29,26 @@ def problem_of(name):
 def point_of(problem, over_time=True):
     simulation, random = problem.simulation, np.random.default_rng(3)
     own = simulation.parameters()
-    path, time = own["nozzle_path"] + 0.003, np.arange(STEPS)[:, None] / STEPS
+    path, time = own["nozzle.path"] + 0.003, np.arange(STEPS)[:, None] / STEPS
     if over_time:  # from its place at rest
-        path = own["nozzle_path"] + 0.02 * np.sin(time * np.arange(2.0, 2.0 + len(own["nozzle_path"])))
+        path = own["nozzle.path"] + 0.02 * np.sin(time * np.arange(2.0, 2.0 + len(own["nozzle.path"])))
     x = own["initial_positions"]
-    own |= {"nozzle_path": path, "initial_positions": x + 0.001 * random.standard_normal(x.shape)}
+    own |= {"nozzle.path": path, "initial_positions": x + 0.001 * random.standard_normal(x.shape)}
     own["initial_velocities"] = own["initial_velocities"] + 0.1 * random.standard_normal(x.shape)
-    names = ("nozzle_path", "flow_rate", "time_step", "gravity", "initial_positions", "initial_velocities")
+    names = ("nozzle.path", "nozzle.flow_rate", "time_step", "gravity", "initial_positions", "initial_velocities")
     return {name: own[name] for name in names}
 
 
 def direction_of(name, value):
     direction = np.random.default_rng(4).standard_normal(value.shape)
-    size = {**SIZES, **DISTURBED}[name] * (value if name == "flow_rate" else 1.0)
+    size = {**SIZES, **DISTURBED}[name] * (value if name == "nozzle.flow_rate" else 1.0)
     return size * direction / np.linalg.norm(direction)
 
 
 def released(problem, point, frames):
     """(m,) distance before the opening [m] after a number of steps; negative once let go."""
     nozzle = nozzle_of(problem.simulation)
-    return nozzle.upstream - float(point["flow_rate"]) / nozzle.area * frames * float(point["time_step"])
+    return nozzle.sample.upstream - float(point["nozzle.flow_rate"]) / nozzle.area * frames * float(point["time_step"])
 
 
 @scenes
@@ -63,7 +63,7 @@ def test_some_particles_are_let_go_none_near_a_step(name):
 
 
 @scenes
-@pytest.mark.parametrize("key", ["nozzle_path", "all"])
+@pytest.mark.parametrize("key", ["nozzle.path", "all"])
 def test_gradient_equals_tangent_and_differences(name, key):
     """Of a path that has a row for each step; a place at rest is in tests/test_features.py."""
     problem = problem_of(name)
@@ -78,10 +78,10 @@ def test_gradient_equals_tangent_and_differences(name, key):
 def test_a_place_at_rest_has_the_gradient_of_a_path_summed_up(name):
     problem = problem_of(name)
     point = point_of(problem, over_time=False)
-    rows = {**point, "nozzle_path": np.tile(point["nozzle_path"], (STEPS, 1))}
+    rows = {**point, "nozzle.path": np.tile(point["nozzle.path"], (STEPS, 1))}
     (loss, whole), (same, parts) = problem.value_and_gradient(point), problem.value_and_gradient(rows)
-    assert loss == same and np.ptp(parts["nozzle_path"], axis=0).max() > 0.0
-    np.testing.assert_allclose(parts["nozzle_path"].sum(axis=0), whole["nozzle_path"], rtol=1e-9)
+    assert loss == same and np.ptp(parts["nozzle.path"], axis=0).max() > 0.0
+    np.testing.assert_allclose(parts["nozzle.path"].sum(axis=0), whole["nozzle.path"], rtol=1e-9)
 
 
 @scenes
@@ -90,13 +90,13 @@ def test_led_particles_follow_the_formula(name):
     point, simulation = point_of(problem), problem.simulation
     trajectory = problem.run(point)
     nozzle, dt = nozzle_of(simulation), float(point["time_step"])
-    speed, path = float(point["flow_rate"]) / nozzle.area, point["nozzle_path"]
-    assert speed == pytest.approx(simulation.scene.emitter.speed(simulation.scene.discretisation.spacing))
+    speed, path = float(point["nozzle.flow_rate"]) / nozzle.area, point["nozzle.path"]
+    assert speed == pytest.approx(simulation.scene.emitter[0].speed(simulation.scene.discretisation.spacing))
     for n in range(1, STEPS + 1):
         left = released(problem, point, n)
         led = left > 0.0
         x, v = trajectory.positions[n][nozzle.first :], trajectory.velocities[n][nozzle.first :]
-        place = path[n - 1] + nozzle.offsets - left[:, None] * nozzle.direction
+        place = path[n - 1] + nozzle.sample.offsets - left[:, None] * nozzle.direction
         before = path[max(n - 2, 0)]
         np.testing.assert_allclose(x[led], place[led], rtol=0, atol=1e-14)
         wanted = (path[n - 1] - before) / dt + speed * nozzle.direction
@@ -106,9 +106,9 @@ def test_led_particles_follow_the_formula(name):
 @scenes
 def test_particles_are_let_go_without_a_jump(name):
     """High above the pool they go on with the velocity that they were led with, but for one step of small forces."""
-    low = MAKERS[name]().emitter.model_dump()
+    low = MAKERS[name]().emitter[0].model_dump()
     high = {**low, "outlet": [*low["outlet"][:1], 0.45, *low["outlet"][2:]]}
-    simulation = Simulation(MAKERS[name](emitter=high, container={"shape": "none"}), precision="float64")
+    simulation = Simulation(MAKERS[name](emitter=[high], container={"shape": "none"}), precision="float64")
     problem = Problem(simulation, STEPS, Weighed(simulation))
     point = {key: value for key, value in simulation.parameters().items() if key in SIZES}
     trajectory = problem.run(point)
@@ -129,12 +129,12 @@ def test_particles_are_let_go_without_a_jump(name):
 def test_without_forces_the_column_goes_straight_on(direction):
     nozzle = {"phase": "water", "outlet": [0.1, 0.6, 0.2], "radius": 0.06, "length": 0.2, "flow_rate": 0.01}
     made = scene(
-        emitter={**nozzle, "direction": direction},
+        emitter=[{**nozzle, "direction": direction}],
         container={"shape": "none"},
         forces={"gravity": [0.0, 0.0, 0.0], "viscosity": "none", "pressure": False},
     )
     simulation = Simulation(made, precision="float64")
-    sample, emitter = made.emitter.sample(0.05), nozzle_of(simulation)
+    sample, emitter = made.emitter[0].sample(0.05), nozzle_of(simulation)
     trajectory = simulation.run(40)
     unit = np.array(direction) / np.linalg.norm(direction)
     travelled = sample.speed * trajectory.times[:, None, None] * unit
@@ -147,39 +147,42 @@ def test_without_forces_the_column_goes_straight_on(direction):
 
 def supplied(**emitter):
     """A slower jet with two layers in line, which are out after 0.15 s, or with other keys."""
-    return jet(emitter={**jet().emitter.model_dump(exclude={"duration"}), "length": 0.1, "flow_rate": 0.1, **emitter})
+    return jet(emitter=[{**jet().emitter[0].model_dump(), "length": 0.1, "flow_rate": 0.1, **emitter}])
 
 
 def test_a_reserve_joins_the_column_for_as_long_as_the_run_goes():
     dry, time = supplied(), 0.252
     made = dry.lasting(time)
     assert made.lasting(2.0) is made and dry.lasting(0.15) is dry
-    sample, spacing = made.emitter.sample(0.05), 0.05
-    came = made.emitter.flow_rate * time / spacing**2
-    with pytest.warns(CortadoWarning, match=r"runs dry at 0.15 s of a run to 0.252 s, .*: scene.lasting\(0.252\) has"):
+    sample, spacing = made.emitter[0].sample(0.05), 0.05
+    came = made.emitter[0].flow_rate * time / spacing**2
+    with pytest.warns(
+        CortadoWarning, match=r"nozzle runs dry at 0.15 s of a run to 0.252 s, .*: scene.lasting\(0.252\)"
+    ):
         Simulation(dry, precision="float64").run(time=time)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         simulation = Simulation(made, precision="float64")
         trajectory = simulation.run(time=time)
-    gone = sample.upstream <= float(trajectory.others["emitted"][-1, 0]) * (1.0 + 1e-9)
+    gone = sample.upstream <= float(trajectory.others["nozzle.emitted"][-1, 0]) * (1.0 + 1e-9)
     assert came - sample.layer <= gone.sum() <= came and len(gone) >= came + 2 * sample.layer
     led = trajectory.positions[:, nozzle_of(simulation).first :]
     line = sample.upstream - sample.speed * trajectory.times[:, None]
-    place = np.add(made.emitter.outlet, sample.offsets) - line[..., None] * np.array(made.emitter.direction)
-    place += (line > sample.column)[..., None] * nozzle_of(simulation).reserve
+    place = np.add(made.emitter[0].outlet, sample.offsets) - line[..., None] * np.array(made.emitter[0].direction)
+    aside = nozzle_of(simulation).places[nozzle_of(simulation).first :]
+    place = np.where((line > sample.column + 1e-9)[..., None], aside, place)
     np.testing.assert_allclose(led[line > 1e-9], place[line > 1e-9], rtol=0, atol=1e-12)
     waiting = led[line > sample.column + 1e-9]
     assert (np.abs(waiting - 0.5 * np.array(made.container.upper)) > 0.5 * np.array(made.container.upper)).all()
 
 
 def test_a_run_says_when_its_emitter_runs_dry():
-    """One with a duration, and one along a period, which leaves no place for a reserve."""
-    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8], "periodic": [True, False]}
-    slot = {**supplied().emitter.model_dump(), "direction": [1.0, 0.0]}
-    for made, name in ((supplied(duration=0.2), "duration"), (jet(emitter=slot, fluid=[], container=room), "length")):
+    """One with a volume, and one where all axes are periodic, which leaves no place for a reserve."""
+    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8], "periodic": [True, True]}
+    slot = {**supplied().emitter[0].model_dump(), "direction": [1.0, 0.0]}
+    for made, name in ((supplied(volume=0.02), "volume"), (jet(emitter=[slot], fluid=[], container=room), "length")):
         assert made.lasting(1.0) is made
-        with pytest.warns(CortadoWarning, match=f"runs dry at .*: a longer emitter.{name} gives it more"):
+        with pytest.warns(CortadoWarning, match=f"runs dry at .*: a larger emitter\\[0\\].{name} gives it more"):
             Simulation(made, precision="float64").run(time=0.252)
 
 
@@ -193,11 +196,11 @@ def test_a_run_goes_on_with_the_reserve_of_the_run_before():
 
 
 MISTAKES = {
-    "parameter nozzle_path has shape (3,), but must be (2,) or (30, 2) in m": {"nozzle_path": [0.1, 0.2, 0.3]},
-    "parameter nozzle_path has shape (4, 2), but must be": {"nozzle_path": np.zeros((4, 2))},
-    "parameter nozzle_path has a value that is not finite": {"nozzle_path": [np.nan, 0.2]},
-    "parameter flow_rate has shape (1,), but must be ()": {"flow_rate": [0.1]},
-    "parameter flow_rate is 0.0, but must be greater than 0": {"flow_rate": 0.0},
+    "parameter nozzle.path has shape (3,), but must be (2,) or (30, 2) in m": {"nozzle.path": [0.1, 0.2, 0.3]},
+    "parameter nozzle.path has shape (4, 2), but must be": {"nozzle.path": np.zeros((4, 2))},
+    "parameter nozzle.path has a value that is not finite": {"nozzle.path": [np.nan, 0.2]},
+    "parameter nozzle.flow_rate has shape (1,), but must be () or (30,)": {"nozzle.flow_rate": [0.1]},
+    "parameter nozzle.flow_rate is -0.1, but must be at least 0": {"nozzle.flow_rate": -0.1},
 }
 
 
@@ -210,14 +213,14 @@ def test_a_mistake_is_a_sentence(words):
 
 
 @pytest.mark.parametrize(
-    "value", [{"nozzle_path": [0.1, 0.2]}, {"flow_rate": 0.1}], ids=lambda value: next(iter(value))
+    "value", [{"nozzle.path": [0.1, 0.2]}, {"nozzle.flow_rate": 0.1}], ids=lambda value: next(iter(value))
 )
 def test_without_an_emitter_its_parameters_are_a_sentence(value):
     simulation = Simulation(plane(), precision="float64")
     problem = Problem(simulation, 2, losses.FinalPositions(simulation.positions))
     gravity = {"gravity": [0.0, -9.81]}
     for use in (problem.value, lambda own: problem.tangent(gravity, own), lambda own: simulation.run(2, controls=own)):
-        with pytest.raises(InputError, match=r"must be left out, as the scene has no emitter\."):
+        with pytest.raises(InputError, match="nozzle"):
             use(value)
     assert value.keys().isdisjoint(simulation.parameters())
 
@@ -228,28 +231,27 @@ def test_a_column_in_a_wall_is_named_where_the_pressure_does_not_converge():
     water = [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}]
     tables = {"discretisation": {"spacing": 0.01}, "phase": water, "solver": {"kind": "pcisph", "time_step": 0.001}}
     tables |= {"fluid": [], "container": box([0.0, 0.0], [0.5, 0.4])}
-    with pytest.warns(CortadoWarning, match=r"did not converge.*Shorten emitter\.length"):
-        Simulation(plane(**tables, emitter={**nozzle, "length": 0.3})).run(3)
+    with pytest.warns(CortadoWarning, match=r"did not converge.*Shorten emitter\[0\]\.length"):
+        Simulation(plane(**tables, emitter=[{**nozzle, "length": 0.3}])).run(3)
     with warnings.catch_warnings():
         warnings.simplefilter("error", CortadoWarning)
-        Simulation(plane(**tables, emitter={**nozzle, "length": 0.1})).run(3)
+        Simulation(plane(**tables, emitter=[{**nozzle, "length": 0.1}])).run(3)
 
 
 def test_a_column_is_jittered_along_its_opening_with_the_projection_alone_or_as_it_is_given():
     lattice, projected = (pour(**solver) for solver in ({}, {"solver": {"kind": "projection", "time_step": 0.002}}))
     spacing = lattice.discretisation.spacing
-    assert (lattice.emitter.jitter, projected.emitter.jitter) == (0.0, 0.05)
-    known, found = (one.emitter.sample(spacing) for one in (lattice, projected))
+    assert (lattice.emitter[0].jitter, projected.emitter[0].jitter) == (0.0, 0.05)
+    known, found = (one.emitter[0].sample(spacing) for one in (lattice, projected))
     np.testing.assert_array_equal(found.upstream, known.upstream)
     moved = found.offsets - known.offsets
-    np.testing.assert_allclose(moved @ np.array(lattice.emitter.direction), 0.0, atol=1e-15)
+    np.testing.assert_allclose(moved @ np.array(lattice.emitter[0].direction), 0.0, atol=1e-15)
     assert 0.03 * spacing < np.linalg.norm(moved, axis=1).max() <= 0.05 * np.sqrt(2.0) * spacing
-    np.testing.assert_array_equal(projected.emitter.sample(spacing).positions, found.positions)
-    lower, upper = projected.emitter.extent(spacing)
+    np.testing.assert_array_equal(projected.emitter[0].sample(spacing).positions, found.positions)
+    lower, upper = projected.emitter[0].extent(spacing)
     assert (lower <= found.positions + 1e-12).all() and (found.positions <= upper + 1e-12).all()
     assert Scene.from_json(projected.to_json()) == projected
-    assert "jitter" in projected.computed_json() and "jitter" not in lattice.computed_json()
     solver = {"kind": "projection", "time_step": 0.002}
-    nozzle = pour().emitter.model_dump(exclude={"jitter"})
-    assert pour(solver=solver, emitter={**nozzle, "jitter": 0.0}).emitter.jitter == 0.0
-    assert pour(emitter={**nozzle, "jitter": 0.1}).emitter.jitter == 0.1
+    nozzle = pour().emitter[0].model_dump(exclude={"jitter"})
+    assert pour(solver=solver, emitter=[{**nozzle, "jitter": 0.0}]).emitter[0].jitter == 0.0
+    assert pour(emitter=[{**nozzle, "jitter": 0.1}]).emitter[0].jitter == 0.1

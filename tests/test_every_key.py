@@ -113,6 +113,7 @@ DRAINS = [
     {"shape": "box", "name": "b", "lower": [0.3, 0.3], "upper": [0.36, 0.36]},
     {"shape": "plane", "name": "c", "position": [0.0, 0.201], "direction": [-1.0, 1.0]},
 ]
+TOLD = {"volume": 0.5, "path": MOVED, "sides": [0.15], "times": [0.0, 0.02], "flow_rates": [0.3, 0.1]}
 BASES = {
     "pcisph": lambda: jet(
         phase=[{**WATER, "rheology": LAW, "colour": [0.1, 0.2, 0.3]}],
@@ -124,9 +125,9 @@ BASES = {
     "projection": lambda: jet(
         container=ROOM,
         solid=[SHEET],
-        emitter={**jet().emitter.model_dump(), "duration": 0.5},
+        emitter=[{**jet().emitter[0].model_dump(exclude={"flow_rate", "radius"}), **TOLD}],
         solver={"kind": "projection", "tolerance": 3e-5, "time_step": 0.001, "velocities_follow": True},
-        schedule={"tilt": {"times": [0.0, 1.0], "values": [[5.0], [20.0]]}, "nozzle_path": MOVED},
+        schedule={"tilt": {"times": [0.0, 1.0], "values": [[5.0], [20.0]]}},
     ),
     "chosen": lambda: jet(
         phase=[{**WATER, "rheology": {"kind": "power_law", "flow_index": 0.6, "least_shear_rate": 0.1}}],
@@ -186,10 +187,11 @@ BASES = {
 }
 ASIDE = {
     ("BoxDrain", "name"): "what the balance calls it",
+    ("EmitterTable", "name"): "what parameters call it",
+    ("EmitterTable", "fed_by"): "only where drains take fluid: tests/test_drains.py",
+    ("FlowTable", "file"): "in place of flow_rates: tests/test_drains.py",
     ("PlaneDrain", "name"): "what the balance calls it",
     ("SinkDrain", "name"): "what parameters call it",
-    ("SinkDrain", "file"): "in place of flow_rates: tests/test_drains.py",
-    ("SinkDrain", "flow_rate"): "in place of flow_rates: tests/test_drains.py",
     ("Picture", "colour"): "what is computed colours: tests/test_films.py",
     ("SceneTables", "name"): "titles",
     ("SheetSolid", "file"): "in place of corners: tests/test_sheets.py",
@@ -282,7 +284,7 @@ KEYFRAMES = {"kind": "keyframes", "times": [0.0, 1.0], "cameras": [[1.0, 1.0, 1.
 
 
 def path(**keys):
-    return plane(solid=[{**BELT, "motion": "path", **keys}], fluid=[], emitter=jet().emitter)
+    return plane(solid=[{**BELT, "motion": "path", **keys}], fluid=[], emitter=list(jet().emitter))
 
 
 REFUSED = {
@@ -310,7 +312,7 @@ WARNED = {
     "mixture.strength": lambda: two_layers(mixture={"strength": 2.0, "mobility": 0.0}),
     "container.slip": lambda: plane(container={**TANK, "slip": "no"}, forces={"viscosity": "none"}),
     "solver.iterations": lambda: plane(solver={**PROJECTION, "iterations": 5}, forces={"pressure": False}),
-    "emitter.length": lambda: jet(emitter={**jet().emitter.model_dump(), "length": 1.0, "duration": 0.05}),
+    "emitter[0].length": lambda: jet(emitter=[{**jet().emitter[0].model_dump(), "length": 1.0, "volume": 0.015}]),
     "solid[0].centre": lambda: plane(solid=[{**BALL, "position": [0.5, 0.7]}]),
     "discretisation.jitter": lambda: jet(discretisation={"spacing": 0.05, "jitter": 0.1}, fluid=[]),
     "phase[0].rheology.regularisation": lambda: plane(phase=[{**MUD_PHASE, "rheology": STIFF}], **MUD),

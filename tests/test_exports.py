@@ -293,9 +293,9 @@ def test_usd_moves_late_states_to_whole_time_codes(tmp_path, capsys):
 
 def test_fluid_that_waits_in_an_emitter_is_not_exported(tmp_path, capsys):
     nozzle = {"phase": "water", "outlet": [0.0, 0.4, 0.1], "direction": [1.0, 0.0, 0.0], "radius": 0.08, "length": 0.5}
-    made = {**scene().model_dump(exclude_none=True), "solid": [], "emitter": {**nozzle, "flow_rate": 0.02}}
+    made = {**scene().model_dump(exclude_none=True), "solid": [], "emitter": [{**nozzle, "flow_rate": 0.02}]}
     made = scene_from_dict({**made, "fluid": made["fluid"][:1], "phase": PHASES[:1]})
-    sample, still = made.emitter.sample(SPACING), lattice()[:64]
+    sample, still = made.emitter[0].sample(SPACING), lattice()[:64]
     emitted = np.array([[0.0], [0.21], [0.52]])
     flown = sample.positions + emitted[..., None] * np.array([1.0, 0.0, 0.0])
     positions = np.concatenate([np.tile(still, (3, 1, 1)), flown], axis=1).astype(np.float32)
@@ -305,7 +305,7 @@ def test_fluid_that_waits_in_an_emitter_is_not_exported(tmp_path, capsys):
         positions=positions,
         velocities=np.zeros_like(positions),
         diagnostics={"converged": np.ones(2, dtype=bool)},
-        others={"emitted": emitted, "outlet": np.tile(np.array(nozzle["outlet"]), (3, 1, 1))},
+        others={"nozzle.emitted": emitted, "nozzle.outlet": np.tile(np.array(nozzle["outlet"]), (3, 1, 1))},
     )
     run.export(tmp_path / "ply", to="ply", scene=made)
     for k in range(3):

@@ -20,7 +20,7 @@ from own_forces import Breeze
 from remembering_force import Memory
 from scenes import MIXING, Weighed, box, jet, plane, plane_of_three, pour, scene, splash, two_layers
 from test_body_masses import KEEL, KEELS, massive
-from test_drains import OVER, emptied
+from test_drains import OVER, emptied, recirculating
 from test_emitter import supplied
 from test_faces import flume
 from test_free_bodies import BRICK, RAFT, SHEAR_THINNING, rough, touching, touching_across, touching_in_space
@@ -139,8 +139,9 @@ FEATURES = {
     "a sink and a box": Feature(lambda: emptied(2), has_tape=False),
     "a sink and a box in space": Feature(lambda: emptied(3), has_tape=False),
     "a jet over a sink": Feature(lambda: emptied(2, jet, forces={"gravity": [0.7, -9.81]}), has_tape=False),
+    "a drain that feeds a slot": Feature(lambda: recirculating(forces={"gravity": [0.7, -9.81]}), has_tape=False),
     "a box with PCISPH": Feature(lambda: plane(drain=[OVER]), has_tape=True),
-    "a jet with a reserve": Feature(lambda: supplied(duration=0.4, flow_rate=0.3)),
+    "a jet with a reserve": Feature(lambda: supplied(volume=0.12, flow_rate=0.3)),
     "a nozzle over a pool": Feature(pour),
     "surface tension": Feature(lambda: tense(plane)),
     "surface tension of two fluids": Feature(lambda: tense(two_layers)),
@@ -185,7 +186,7 @@ def point_of(name: str, simulation: Simulation) -> dict[str, Any]:
     """All parameters of a scene, of particles that are off the lattice, move, and mix a little."""
     point = {key: np.array(value) for key, value in simulation.parameters().items() if key != "colours"}
     c = point["mass_fractions"]
-    if simulation.scene.emitter is None:
+    if not simulation.scene.emitter:
         point |= begun(FEATURES[name].case, simulation)
     if c.shape[1] > 1:
         point["mass_fractions"] = 0.8 * c + 0.2 * np.random.default_rng(3).dirichlet(np.ones(c.shape[1]), len(c))
@@ -253,7 +254,7 @@ def test_float32_is_near_float64(name):
 
 def own_rows(point: dict[str, Any]) -> dict[str, Any]:
     """Gravity and numbers of a point for two scenes, but those that may have rows or that diffusion is cut by."""
-    others = ("mobility", "interface_width", "gust.k", "spring.damping", ".torque", "hole.flow_rate")
+    others = ("mobility", "interface_width", "gust.k", "spring.damping", ".torque", ".flow_rate")
     names = [key for key, one in point.items() if np.ndim(one) == 0 and not key.endswith((".turn", *others))]
     numbers = {key: point[key] * np.array([1.0, 0.98]) for key in names}
     return {**numbers, "gravity": np.stack([point["gravity"], 0.8 * point["gravity"]])[:, None]}

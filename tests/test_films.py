@@ -213,7 +213,7 @@ def test_a_plan_shows_where_an_emitter_shoots_and_how_large_a_scene_is(make):
     free = simulation.positions[: simulation.free_particles]
     image = plan(made, free, np.tile([0.1, 0.3, 0.8], (len(free), 1)))
     stage = painter(made, simulation.positions).stage
-    emitter = made.emitter
+    (emitter,) = made.emitter
     column, row = stage.on_screen(np.array([np.add(emitter.outlet, np.multiply(0.03, emitter.direction))]))[0].round()
     around = image[int(row) - 6 : int(row) + 7, int(column) - 6 : int(column) + 7].reshape(-1, 3)
     assert np.abs(around - MOVING).max(axis=1).min() < 0.2
@@ -224,8 +224,8 @@ def test_a_plan_shows_where_an_emitter_shoots_and_how_large_a_scene_is(make):
 
 
 def test_a_plan_without_a_container_shows_all_of_the_arrow():
-    table = jet().emitter.model_dump()
-    made = jet(emitter=table, fluid=[], container={"shape": "none"}, picture={"width": 320, "height": 180})
+    table = jet().emitter[0].model_dump()
+    made = jet(emitter=[table], fluid=[], container={"shape": "none"}, picture={"width": 320, "height": 180})
     image = plan(made, np.zeros((0, 2)), np.zeros((0, 3)))
     rows = np.flatnonzero((np.abs(image - MOVING).max(axis=2) < 0.2).any(axis=1))
     assert np.ptp(rows) > 0.5 * 180 and rows[-1] < 179  # the opening is wider than it is high

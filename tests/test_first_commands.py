@@ -101,7 +101,7 @@ def test_a_template_is_a_scene_that_says_how_it_is_run(cortado_command, template
     assert (code, err) == (0, "") and out.endswith(f"Run it: cortado run a/mine.toml{told[2]}\n")
     VALIDATOR.validate(tomllib.loads(text))
     scene = cortado.load_scene("a/mine.toml")
-    bodies = [*scene.fluid, *([scene.emitter] if scene.emitter else [])]
+    bodies = [*scene.fluid, *scene.emitter]
     count = sum(len(body.particles(scene.discretisation.spacing)) for body in bodies)
     assert count == pytest.approx(int(told[1].replace(",", "")), rel=0.1), "but for those where solids are"
     assert ("open at the top" in text) is (getattr(scene.container, "lid", True) is False)

@@ -131,7 +131,7 @@ def test_a_nozzle_may_hold_its_particles_outside():
     tables = bases.scenes()["jet"]
     tables["container"] |= {"lid": True, "height": 0.055}
     scene = scene_from_dict(tables)
-    waiting = scene.emitter.particles(scene.discretisation.spacing)
+    waiting = scene.emitter[0].particles(scene.discretisation.spacing)
     assert not scene.container.contains(waiting, 0.0).all()
     fluid = np.tile([[0.0, 0.02, 0.0]], (len(waiting), 1))
     held = trajectory_of(np.concatenate([fluid, waiting]), at=np.zeros(3))

@@ -226,20 +226,20 @@ def test_tilts_and_nozzles_have_their_columns_and_a_ramp_begins_at_the_outlet(tm
     assert plane(schedule={"tilt": {"file": lean}}).schedule.courses["tilt"].values[-1] == pytest.approx(30.0)
     both = written(tmp_path / "s.csv", [0.0, 1.0], [0.0, 9.0], [0.0, 4.0], head="time [s],tilt_z [deg],tilt_x [deg]")
     assert scene(schedule={"tilt": {"file": both}}).schedule.courses["tilt"].values[-1].tolist() == [4.0, 9.0]
-    outlet = np.array(jet().emitter.outlet)
+    outlet = np.array(jet().emitter[0].outlet)
     places = outlet + np.array([[0.0, 0.0], [0.05, 0.0]])
     file = written(tmp_path / "n.csv", [0.0, 0.1], *1e3 * places.T, head="time [s],x [mm],y [mm]")
-    course = jet(schedule={"nozzle_path": {"file": file, "ramp": 0.1}}).schedule.courses["nozzle_path"]
+    course = jet(path={"file": file, "ramp": 0.1}).emitter[0].path.knots
     np.testing.assert_allclose(course.at(np.array([0.0, 0.05, 0.1])), [outlet, outlet + [0.0125, 0.0], places[1]])
 
 
 def test_a_spline_that_leaves_the_container_between_its_times_is_refused():
-    outlet = np.array(jet().emitter.outlet)
+    outlet = np.array(jet().emitter[0].outlet)
     values = [outlet, outlet + [0.22, 0.0], outlet + [0.22, 0.0], outlet]
     table = {"times": [0.0, 0.2, 0.4, 0.6], "values": np.array(values).tolist()}
-    jet(schedule={"nozzle_path": table})
+    jet(path=table)
     with pytest.raises(SceneError, match="where all of the opening is inside the container"):
-        jet(schedule={"nozzle_path": {**table, "interpolation": "spline"}})
+        jet(path={**table, "interpolation": "spline"})
 
 
 # ---- runs --------------------------------------------------------------------------------------------------------

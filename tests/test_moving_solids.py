@@ -198,7 +198,7 @@ def test_what_turns_and_a_nozzle_bound_the_steps_that_are_chosen():
     angles = np.interp(run.times, RESTING["times"], [0.0, 0.0, 1.0])
     assert np.diff(angles).max() * np.hypot(0.1, 0.1) == pytest.approx(0.2 * 0.05, rel=1e-4)
     course = {"times": [0.05, 0.051], "values": [[0.3, 0.26], [0.4, 0.26]]}
-    shooting = jet(solver={"kind": "pcisph", "time_step": "auto"}, schedule={"nozzle_path": course})
+    shooting = jet(solver={"kind": "pcisph", "time_step": "auto"}, path=course)
     run = Simulation(shooting).run(time=0.06)
     ways = np.diff(np.interp(run.times, course["times"], [0.3, 0.4]))
     assert ways.max() == pytest.approx(0.2 * jet().discretisation.spacing, rel=1e-4)

@@ -37,7 +37,7 @@ def test_the_docstring_of_a_problem_names_every_parameter():
 def test_every_parameter_of_steps_is_on_the_device():
     found = Simulation(plane_of_three()).solver.new_parameters(7)
     assert found.names == names(Role.RUN)
-    shapes = {"gravity": (1, 7), "nozzle_path": (1, 7), "rest_density": (1, 3), "viscosity": (1, 3)}
+    shapes = {"gravity": (1, 7), "rest_density": (1, 3), "viscosity": (1, 3)}
     assert {name: found[name].shape for name in found.names} == {name: shapes.get(name, (1,)) for name in found.names}
 
 
@@ -102,7 +102,7 @@ def test_a_part_that_forgets_its_shares_is_an_error():
     solver = Simulation(plane_of_three()).solver
     bar = solver.adjoint(2).bar
     known = {name for group in bar.named for name in group}
-    assert {"x_bar", "gravity_bar", "viscosity_bar", "time_step_bar"} <= known and "flow_rate_bar" not in known
+    assert {"x_bar", "gravity_bar", "viscosity_bar", "time_step_bar"} <= known and "surface_tension_bar" not in known
 
 
 class Tensor:

@@ -113,7 +113,7 @@ def small(viscosity: str, **changes):
     """24 particles in a pool and a few in a nozzle, in the plane."""
     forces = {"gravity": [1.0, -9.81], "viscosity": viscosity}
     tables = {"fluid": [POOL], "container": ROOM, "phase": PHASES, "solver": SOLVER, "forces": forces}
-    return plane(**{**tables, "emitter": NOZZLE, **changes})
+    return plane(**{**tables, "emitter": [NOZZLE], **changes})
 
 
 CAMERA = {"view": "volume", "resolution": [9, 8], "position": [0.7, 0.35, 0.8], "look_at": [0.15, 0.08, 0.15]}
@@ -143,7 +143,7 @@ def block(phase, **tables):
 
 def one(viscosity, phase, **changes):
     """The small pool of one phase, without a nozzle."""
-    return small(viscosity, phase=[phase], fluid=[{**POOL, "phase": phase["name"]}], emitter=None, **changes)
+    return small(viscosity, phase=[phase], fluid=[{**POOL, "phase": phase["name"]}], emitter=[], **changes)
 
 
 def open_air(**tables):

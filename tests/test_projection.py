@@ -127,7 +127,7 @@ def resting(**solver):
 def test_a_column_behind_a_wall_has_no_image_in_it():
     """A jet comes out of it a spacing from the wall, and would meet the image of what follows, at 0.4 of its speed."""
     nozzle = {"outlet": [0.02, 0.5], "direction": [1.0, 0.0], "radius": 0.08, "length": 0.3, "flow_rate": 0.16}
-    tables = {"fluid": [], "emitter": {"phase": "water", **nozzle}, "forces": {"gravity": [0.0, 0.0]}}
+    tables = {"fluid": [], "emitter": [{"phase": "water", **nozzle}], "forces": {"gravity": [0.0, 0.0]}}
     made = filled([0.0, 0.0], [1.0, 1.0], 0.02, solver={"time_step": 0.001}, **tables)
     run = Simulation(made).run(200, record_every=200)
     out = run.positions[-1][:, 0] > 0.04

@@ -38,7 +38,7 @@ def problem_of(make, name, steps=6, precision="float64", seed=0):
         "rest_density": np.array(density if len(density) > 1 else density[0]),
         "time_step": np.array(0.0021),
     }
-    if simulation.scene.emitter is not None:
+    if simulation.scene.emitter:
         del point["initial_positions"], point["initial_velocities"]
     sizes = {"gravity": 1.0, "initial_velocities": 0.1, "initial_positions": 1e-3, "rest_density": 3.0}
     along = {name: sizes.get(name, 1e-5) * random.normal(size=value.shape) for name, value in point.items()}

@@ -23,8 +23,8 @@ def controls_of(simulation):
     steps, d = FIRST + REST, simulation.dimension
     sway = 0.01 * np.sin(0.3 * np.arange(steps))[:, None] * np.eye(d)[0]
     controls = {"gravity": np.array(simulation.scene.forces.gravity) + 100.0 * sway}
-    if simulation.scene.emitter is not None:
-        controls["nozzle_path"] = np.array(simulation.scene.emitter.outlet) + sway
+    if simulation.scene.emitter:
+        controls["nozzle.path"] = np.array(simulation.scene.emitter[0].outlet) + sway
     return controls
 
 
@@ -69,8 +69,12 @@ def test_states_that_do_not_fit_are_refused():
         (other(reference_density=np.zeros(n)), {}, "state reference_density must be greater than 0"),
         (other(mass_fractions=np.full((n, 2), [2.0, -1.0])), {}, f"{wrong} 2, -1"),
         (other(mass_fractions=np.full((n, 2), [0.9, 0.2])), {}, f"{wrong} 0.9, 0.2"),
-        (other(emitted=np.array([np.nan])), {}, "state emitted has a value that is not finite"),
-        (emitterless, {}, "state has positions, .*, but must have positions, .*, outlet, emitted in this scene"),
+        (other(**{"nozzle.emitted": np.array([np.nan])}), {}, "state nozzle.emitted has a value that is not finite"),
+        (
+            emitterless,
+            {},
+            "state has positions, .*, but must have positions, .*, nozzle.outlet, nozzle.emitted in this",
+        ),
         (simulation.initial, {}, "must be a RestartState"),
         (state, {"initial_velocities": state["velocities"]}, "must be left out with a state"),
     ]:
@@ -83,7 +87,7 @@ def test_an_emitter_goes_on_with_another_flow():
     simulation = Simulation(jet(), precision="float64")
     given = simulation.parameters()
     first = simulation.run(4)
-    faster = {"flow_rate": 1.5 * given["flow_rate"], "time_step": 0.5 * given["time_step"]}
+    faster = {"nozzle.flow_rate": 1.5 * given["nozzle.flow_rate"], "time_step": 0.5 * given["time_step"]}
     later = simulation.run(1, faster, state=first.last_state)
     waiting = slice(simulation.particles - 3, None)
     moved = later.positions[1, waiting] - first.positions[-1, waiting]
@@ -95,9 +99,9 @@ def test_an_emitter_goes_on_with_another_flow():
 def test_a_run_goes_on_from_a_frame_on_the_way():
     """Also where a nozzle is moved, whose outlets are kept frame by frame."""
     simulation = Simulation(jet())
-    path = simulation.parameters()["nozzle_path"] + np.linspace(0.0, 0.02, 6)[:, None]
-    whole = simulation.run(6, {"nozzle_path": path})
-    again = simulation.run(3, {"nozzle_path": path[3:]}, state=whole[:4].last_state)
+    path = simulation.parameters()["nozzle.path"] + np.linspace(0.0, 0.02, 6)[:, None]
+    whole = simulation.run(6, {"nozzle.path": path})
+    again = simulation.run(3, {"nozzle.path": path[3:]}, state=whole[:4].last_state)
     np.testing.assert_array_equal(again.positions, whole[3:].positions)
     with pytest.raises(InputError, match=r"^The trajectory has no frame"):
         _ = whole[7:].last_state

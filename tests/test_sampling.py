@@ -267,7 +267,7 @@ def test_a_first_lattice_can_be_jittered(tmp_path):
     """Particles of bodies alone, not points of a file or those in a nozzle; the same in every run."""
     points = tmp_path / "points.npy"
     np.save(points, [[0.9, 0.1], [0.9, 0.3]])
-    nozzle = 'emitter={phase="oil", outlet=[0.7, 1.0], radius=0.1, length=0.2, flow_rate=0.01}'
+    nozzle = 'emitter=[{phase="oil", outlet=[0.7, 1.0], radius=0.1, length=0.2, flow_rate=0.01}]'
     fluid = [box([0.0, 0.0], [0.5, 0.5]), {"shape": "points", "file": str(points)}]
     even = scene_of(2, fluid).replaced(nozzle)
     stirred = even.replaced("discretisation.jitter=0.2")

@@ -77,7 +77,7 @@ def test_what_is_left_out_has_a_default():
     assert scene.forces.gravity == (0.0, -9.81) and scene.container.shape == "none"
     assert scene.fluid[0].velocity == (0.0, 0.0)
     assert (scene.solver.minimum_iterations, scene.solver.maximum_iterations) == (3, 50)
-    assert scene.emitter is None and scene.render is None and scene.mixture == MixtureTable()
+    assert not scene.emitter and scene.render is None and scene.mixture == MixtureTable()
     assert scene.discretisation == DiscretisationTable(spacing=0.1, support=2.0, kernel="cubic_spline")
 
 

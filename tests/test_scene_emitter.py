@@ -26,7 +26,7 @@ def space(**emitter) -> Scene:
         discretisation={"spacing": SPACING},
         phase=[{"name": name, "rest_density": 1000, "viscosity": 0.0} for name in ("water", "oil")],
         fluid=[block],
-        emitter=NOZZLE | emitter,
+        emitter=[NOZZLE | emitter],
         solver={"kind": "pcisph", "time_step": 1e-4},
     )
 
@@ -34,9 +34,9 @@ def space(**emitter) -> Scene:
 @pytest.mark.parametrize("direction", [[0, -1, 0], [1, 0, 0], [0, 0, 3], [1, -2, 0.5], [-1, -1, -1]])
 def test_a_column_is_a_lattice_along_its_axis(direction):
     scene = space(direction=direction)
-    assert np.linalg.norm(scene.emitter.direction) == pytest.approx(1.0, rel=1e-15)
+    assert np.linalg.norm(scene.emitter[0].direction) == pytest.approx(1.0, rel=1e-15)
     assert Scene.from_json(scene.to_json()) == scene
-    sample = scene.emitter.sample(SPACING)
+    sample = scene.emitter[0].sample(SPACING)
     unit = np.array(direction) / np.linalg.norm(direction)
     from_outlet = sample.positions - NOZZLE["outlet"]
     np.testing.assert_allclose(-from_outlet @ unit, sample.upstream, atol=1e-14)
@@ -52,7 +52,7 @@ def test_a_column_is_a_lattice_along_its_axis(direction):
 
 
 def test_across_a_direction_along_an_axis_are_the_others():
-    sample = space().emitter.sample(SPACING)
+    sample = space().emitter[0].sample(SPACING)
     cells = SPACING * (np.arange(4) - 1.5)
     wanted = [(x, 0.0, z) for x in cells for z in cells if np.hypot(x, z) <= NOZZLE["radius"]]
     np.testing.assert_allclose(sample.offsets[: sample.layer], wanted, atol=1e-15)
@@ -77,12 +77,12 @@ def test_a_disc_has_a_particle_at_least(radius, count):
 
 @pytest.mark.parametrize("length, layers", [(0.026, 1), (0.05, 1), (0.075, 1), (0.076, 2), (0.3, 6), (0.33, 7)])
 def test_a_layer_counts_if_its_middle_is_within_the_length(length, layers):
-    assert space(length=length).emitter.sample(SPACING).upstream[-1] == pytest.approx(SPACING * (layers - 0.5))
+    assert space(length=length).emitter[0].sample(SPACING).upstream[-1] == pytest.approx(SPACING * (layers - 0.5))
 
 
-@pytest.mark.parametrize("scene, spacing", [(space(), SPACING), (Scene(**plane(emitter=SLOT)), 0.1)])
+@pytest.mark.parametrize("scene, spacing", [(space(), SPACING), (Scene(**plane(emitter=[SLOT])), 0.1)])
 def test_the_volume_that_comes_out_is_exact(scene, spacing):
-    emitter, cell = scene.emitter, spacing**scene.dimension
+    (emitter,), cell = scene.emitter, spacing**scene.dimension
     sample = emitter.sample(spacing)
     duration = len(sample.upstream) // sample.layer * spacing / sample.speed
     assert len(sample.upstream) * cell == pytest.approx(emitter.flow_rate * duration, rel=1e-14)
@@ -94,7 +94,7 @@ def test_the_volume_that_comes_out_is_exact(scene, spacing):
 
 
 def test_in_the_plane_the_cross_section_is_a_line():
-    emitter = Scene(**plane(emitter=SLOT)).emitter
+    (emitter,) = Scene(**plane(emitter=[SLOT])).emitter
     sample = emitter.sample(0.1)
     assert emitter.direction == (0.0, -1.0)
     assert (sample.layer, sample.positions.shape, sample.offsets.shape) == (5, (35, 2), (35, 2))
@@ -105,26 +105,27 @@ def test_in_the_plane_the_cross_section_is_a_line():
 def test_emitted_particles_come_last():
     scene = space(direction=[1, -2, 0.5])
     sample = fluid_particles(scene)
-    assert sample.emitter is not None and sample.emitted == slice(32, 32 + len(sample.emitter.upstream))
-    np.testing.assert_array_equal(sample.positions[sample.emitted], sample.emitter.positions)
-    np.testing.assert_array_equal(sample.velocities[sample.emitted], sample.emitter.velocities)
+    ((name, first, own),) = sample.emitters
+    assert (name, first) == ("nozzle", 32) and sample.emitted == slice(32, 32 + len(own.upstream))
+    np.testing.assert_array_equal(sample.positions[sample.emitted], own.positions)
+    np.testing.assert_array_equal(sample.velocities[sample.emitted], own.velocities)
     np.testing.assert_array_equal(sample.velocities[:32], np.tile([1.0, 0.0, 0.0], (32, 1)))
     assert set(sample.phase[:32]) == {1} and set(sample.phase[sample.emitted]) == {0}
     assert len(sample.phase) == len(sample.velocities) == len(sample.positions)
     without = fluid_particles(Scene(**plane()))
-    assert without.emitter is None and len(without.positions[without.emitted]) == 0
+    assert not without.emitters and len(without.positions[without.emitted]) == 0
 
 
 def test_a_column_may_be_outside_upstream_but_not_beside():
     room = {"shape": "box", "lower": [0, 0, 0], "upper": [0.3, 0.6, 0.4]}
     inside = Scene(**(space().model_dump() | {"container": room}))
     assert fluid_particles(inside).positions[:, 1].max() > 0.8
-    with pytest.raises(SceneError, match=r"emitter\.radius is 0\.12, but must be so small that the opening is inside"):
+    with pytest.raises(SceneError, match=r"emitter\[0\]\.radius is 0\.12, but must be so small that the opening is"):
         Scene(**(space(outlet=[0.05, 0.6, 0.2]).model_dump() | {"container": room}))
 
 
 def test_a_column_and_a_fluid_are_told_apart():
-    with pytest.raises(SceneError, match=r"^emitter is overlapping fluid\[0\] at"):
+    with pytest.raises(SceneError, match=r"^emitter\[0\] is overlapping fluid\[0\] at"):
         space(outlet=[0.1, 0.05, 0.1])
     space(outlet=[0.1, 0.1, 0.1])
 
@@ -132,15 +133,15 @@ def test_a_column_and_a_fluid_are_told_apart():
 def test_an_emitter_counts_for_the_stability_limit():
     still = {"gravity": [0.0, 0.0], "viscosity": "none"}
     fast = SLOT | {"flow_rate": 2.0}
-    assert stability_limit(Scene(**plane(emitter=fast, forces=still))) == pytest.approx(0.4 * 0.2 / 4.0)
+    assert stability_limit(Scene(**plane(emitter=[fast], forces=still))) == pytest.approx(0.4 * 0.2 / 4.0)
     fall = np.sqrt(2 * 9.81 * 2.0)  # from the outlet to the foot of the fluid
-    assert stability_limit(Scene(**plane(emitter=fast))) == pytest.approx(0.4 * 0.2 / (4.0 + fall))
+    assert stability_limit(Scene(**plane(emitter=[fast]))) == pytest.approx(0.4 * 0.2 / (4.0 + fall))
     honey = [{"name": "water", "rest_density": 1000, "viscosity": 0.0}]
     honey += [{"name": "honey", "rest_density": 1400, "viscosity": 1e5}]
     with pytest.warns(CortadoWarning, match="limit of stability"):
-        scene = Scene(**plane(emitter=SLOT | {"phase": "honey"}, phase=honey, forces={"viscosity": "pairwise"}))
+        scene = Scene(**plane(emitter=[SLOT | {"phase": "honey"}], phase=honey, forces={"viscosity": "pairwise"}))
         thick = [honey[0], honey[1] | {"viscosity": 2e5}]
-        thicker = Scene(**plane(emitter=SLOT | {"phase": "honey"}, phase=thick, forces={"viscosity": "pairwise"}))
+        thicker = Scene(**plane(emitter=[SLOT | {"phase": "honey"}], phase=thick, forces={"viscosity": "pairwise"}))
     assert stability_limit(scene) == pytest.approx(2.0 * stability_limit(thicker))
     assert stability_limit(scene) < 0.06 * 0.2**2 * 1000 / 1e5
 
@@ -151,7 +152,7 @@ def alone(**tables) -> dict:
         "dimension": 2,
         "discretisation": {"spacing": SPACING},
         "phase": [{"name": "water", "rest_density": 1000, "viscosity": 0.1}],
-        "emitter": SLOT | {"flow_rate": 0.5, "outlet": [0.5, 1.5]},
+        "emitter": [SLOT | {"flow_rate": 0.5, "outlet": [0.5, 1.5]}],
         "container": {"shape": "box", "lower": [0, 0], "upper": [1, 2]},
         "solver": {"kind": "pcisph", "time_step": 0.004},
         **tables,
@@ -171,13 +172,13 @@ def test_a_scene_may_be_filled_by_its_emitter_alone(container):
     moved = np.linalg.norm(last - column, axis=1)
     assert (last[:, 1] < 1.5).sum() == 20 and moved.min() == pytest.approx(0.12)
     problem = Problem(simulation, 30, losses.FinalPositions(column))
-    at = {"flow_rate": np.array(0.51)}
+    at = {"nozzle.flow_rate": np.array(0.51)}
     _, gradient = problem.value_and_gradient(at)
-    difference = central_difference(problem.value, at, {"flow_rate": 1.0}, 1e-6)
-    assert gradient["flow_rate"] == pytest.approx(difference, rel=1e-5)
+    difference = central_difference(problem.value, at, {"nozzle.flow_rate": 1.0}, 1e-6)
+    assert gradient["nozzle.flow_rate"] == pytest.approx(difference, rel=1e-5)
 
 
 @pytest.mark.parametrize("fluid", [{}, {"fluid": []}])
 def test_without_an_emitter_there_must_be_fluid(fluid):
     with pytest.raises(SceneError, match=r"fluid is (missing|empty), but must be a list of at least one table"):
-        Scene(**alone(emitter=None, **fluid))
+        Scene(**alone(emitter=[], **fluid))

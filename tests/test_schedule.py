@@ -24,14 +24,14 @@ LEAN = {"times": [0.0, 0.02, 0.03], "values": [[0.0], [40.0], [-20.0]]}
 
 def nozzle(made, **changes):
     """A path that begins at the outlet of the scene's emitter."""
-    outlet = np.array(made.emitter.outlet)
+    outlet = np.array(made.emitter[0].outlet)
     values = [outlet, outlet + [0.03, 0.0], outlet - [0.02, 0.0]]
     return {"times": [0.005, 0.02, 0.04], "values": [row.tolist() for row in values], **changes}
 
 
 def jetting(**schedule):
     made = jet()
-    return jet(schedule={"nozzle_path": nozzle(made), **schedule})
+    return jet(path=nozzle(made), schedule=schedule)
 
 
 # ---- the course itself -------------------------------------------------------------------------------------------
@@ -63,7 +63,6 @@ def test_a_course_is_linear_between_its_times_and_constant_beyond():
         ({"tilt": {"times": [0.0], "values": [[0.0, 1.0]]}}, "schedule.tilt.values[0] is [0.0, 1.0]"),
         ({"gravty": SWAY}, "schedule.gravty is not a key of [schedule]; did you mean gravity?"),
         ({"viscosity": SWAY}, "schedule.viscosity is not a key of [schedule]"),
-        ({"nozzle_path": SWAY}, "schedule.nozzle_path is given, but must be left out, as the scene has no emitter"),
     ],
 )
 def test_what_is_wrong_is_a_sentence(schedule, words):
@@ -76,11 +75,11 @@ def test_a_nozzle_begins_at_its_outlet_and_stays_inside_and_a_tilt_needs_a_gravi
     made = jet()
     first, *others = nozzle(made)["values"]
     for values, words in [
-        ([[0.0, 0.0], *others], r"nozzle_path\.values\[0\] is .* but must be emitter\.outlet"),
-        ([first, [9.0, 9.0], first], r"nozzle_path\.values\[1\] is \[9\.0, 9\.0\], but must be where all of the ope"),
+        ([[0.0, 0.0], *others], r"path\.values\[0\] is .* but must be emitter\[0\]\.outlet"),
+        ([first, [9.0, 9.0], first], r"path\.values\[1\] is \[9\.0, 9\.0\], but must be where all of the ope"),
     ]:
         with pytest.raises(SceneError, match=words):
-            jet(schedule={"nozzle_path": nozzle(made, values=values)})
+            jet(path=nozzle(made, values=values))
     with pytest.raises(SceneError, match=r"schedule\.tilt is given, but must be left out, as the scene has no gravity"):
         plane(forces={"gravity": [0.0, 0.0]}, schedule={"tilt": LEAN})
 
@@ -88,7 +87,7 @@ def test_a_nozzle_begins_at_its_outlet_and_stays_inside_and_a_tilt_needs_a_gravi
 def test_a_scene_with_a_schedule_is_written_and_read():
     made = jetting(gravity=SWAY)
     assert Scene.from_json(made.to_json()) == made
-    assert made.schedule.courses.keys() == {"gravity", "nozzle_path"} and plane().schedule.courses == {}
+    assert made.schedule.courses.keys() == {"gravity"} and plane().schedule.courses == {}
 
 
 def test_the_limit_of_stability_is_that_of_the_strongest_gravity():
@@ -150,7 +149,7 @@ def test_a_nozzle_is_where_its_path_is_at_the_end_of_each_step():
     made = jetting()
     trajectory = Simulation(made, precision="float64").run(STEPS)
     wanted = Course(**nozzle(made)).knots.at(trajectory.times)
-    np.testing.assert_allclose(trajectory.others["outlet"][:, 0], wanted, rtol=1e-12)
+    np.testing.assert_allclose(trajectory.others["nozzle.outlet"][:, 0], wanted, rtol=1e-12)
     assert np.ptp(wanted, axis=0).max() > 0.02
 
 
@@ -160,7 +159,7 @@ def test_a_restart_goes_on_with_the_schedule(precision):
     whole = simulation.run(STEPS)
     rest = simulation.run(STEPS - 5, state=simulation.run(5).last_state)
     assert rest.positions.tobytes() == whole.positions[5:].tobytes()
-    assert rest.others["outlet"].tobytes() == whole.others["outlet"][5:].tobytes()
+    assert rest.others["nozzle.outlet"].tobytes() == whole.others["nozzle.outlet"][5:].tobytes()
 
 
 def test_scenes_of_a_batch_go_on_each_at_its_own_time():

@@ -189,7 +189,7 @@ def test_the_flow_of_an_emitter_is_its_flow_rate():
     """Where the jet goes through a plane in free fall."""
     outlet = {"phase": "water", "outlet": [0.3, 0.9], "radius": 0.075, "length": 0.5, "flow_rate": 0.3}
     room = {"shape": "box", "lower": [0.0, -3.0], "upper": [0.6, 1.6]}
-    made = jet(emitter=outlet, fluid=[], container=room, forces={"gravity": [0.0, 0.0]}, solver={"time_step": 0.001})
+    made = jet(emitter=[outlet], fluid=[], container=room, forces={"gravity": [0.0, 0.0]}, solver={"time_step": 0.001})
     sensors = {"jet": FlowRate([0.0, 0.7], [0.0, -1.0], 0.1)}
     read = cortado.Simulation(made).run(200, record_every=200, sensors=sensors).sensors["jet"]
     assert read["flow_rate"][-20:].mean() == pytest.approx(0.3, rel=0.01)

@@ -60,7 +60,7 @@ SCENES = {
     "mixture": lambda: plane(ROTOR, **BOTH, mixture={"interface_width": 0.06, "mobility": 1e-3}),
     "tension": lambda: plane(ROTOR, forces={"surface_tension": 2.0}),
     "tension, pcisph": lambda: plane(ROTOR, solver=PCISPH, forces={"surface_tension": 2.0}),
-    "emitter": lambda: plane(ROTOR, emitter=SPOUT),
+    "emitter": lambda: plane(ROTOR, emitter=[SPOUT]),
 }
 
 

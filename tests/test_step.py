@@ -19,7 +19,7 @@ ONE = {"rest_density": 1000.0, "viscosity": 5.0, "time_step": 0.0021}
 """Parameters of the fluids."""
 SEVERAL = {"rest_density": [1000.0, 1800.0, 1300.0], "viscosity": [5.0, 0.4, 20.0], "time_step": 0.0021}
 RATES = {"rest_density": 10.0, "viscosity": 0.3, "time_step": 1e-4, "mobility": 0.01, "interface_width": 0.003}
-RATES |= {"nozzle_path": 0.01, "flow_rate": 0.01}
+RATES |= {"nozzle.path": 0.01, "nozzle.flow_rate": 0.01}
 """Sizes of directions; 1 for the others."""
 
 
@@ -79,9 +79,9 @@ def point_of(simulation, seed=0):
     if simulation.scene.forces.surface_tension:
         point["surface_tension"] = simulation.scene.forces.surface_tension
     if nozzle := nozzle_of(simulation):
-        outlet = simulation.parameters()["nozzle_path"]
-        point["nozzle_path"] = outlet + 0.01 * random.standard_normal((STEPS, len(outlet)))
-        point["flow_rate"] = 0.6 * nozzle.area * simulation.scene.discretisation.spacing / point["time_step"]
+        outlet = simulation.parameters()["nozzle.path"]
+        point["nozzle.path"] = outlet + 0.01 * random.standard_normal((STEPS, len(outlet)))
+        point["nozzle.flow_rate"] = 0.6 * nozzle.area * simulation.scene.discretisation.spacing / point["time_step"]
     return {name: np.asarray(value, dtype=np.float64) for name, value in point.items()}
 
 
@@ -105,7 +105,7 @@ def twins_steps(simulation, substeps):
 
     def steps(gravity, initial_positions, initial_velocities, rest_density, time_step, viscosity=1.0, **others):
         x, v = initial_positions, initial_velocities
-        tension, emitter = tension_twin(simulation), emitter_twin(simulation, others.get("nozzle_path"))
+        tension, emitter = tension_twin(simulation), emitter_twin(simulation, others.get("nozzle.path"))
         c = others.get("mass_fractions", np.ones((len(x), 1)))
         mass = reference.blend(c, rest_density, viscosity)[0]
         for n in range(STEPS):
@@ -115,7 +115,7 @@ def twins_steps(simulation, substeps):
             pull = gravity + (tension.acceleration(x, mass, others["surface_tension"]) if tension else 0.0)
             x, v = slow.step(x, v, pull, lattice.volume * mass, rho_0, mu, time_step, iterations)
             if emitter:
-                x, v = emitter.lead(n, x, v, others["flow_rate"], time_step)
+                x, v = emitter.lead(n, x, v, others["nozzle.flow_rate"], time_step)
         return np.concatenate([x, v, c], axis=1)
 
     return steps

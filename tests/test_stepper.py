@@ -21,7 +21,7 @@ def scheduled() -> Scene:
 
 
 def moving_jet() -> Scene:
-    return jet(schedule={"nozzle_path": PATH})
+    return jet(path=PATH)
 
 
 HONEY = [{"name": "water", "rest_density": 1000.0, "viscosity": 0.6}]
@@ -65,10 +65,10 @@ def test_parameters_of_steps_are_those_of_the_steps_to_come():
     gravity = np.array([0.0, -9.81]) + np.sin(np.arange(20))[:, None]
     path = np.array([0.3, 0.26]) + 0.002 * np.sin(0.2 * np.arange(20))[:, None]
     start = {"initial_velocities": 0.1 * np.random.default_rng(0).standard_normal((simulation.particles, 2))}
-    whole = simulation.run(20, {"gravity": gravity, "nozzle_path": path, **start})
-    state = simulation.state({"nozzle_path": path[0], **start})
+    whole = simulation.run(20, {"gravity": gravity, "nozzle.path": path, **start})
+    state = simulation.state({"nozzle.path": path[0], **start})
     for k in (0, 10):
-        state = simulation.step(state, {"gravity": gravity[k : k + 10], "nozzle_path": path[k : k + 10]}, steps=10)
+        state = simulation.step(state, {"gravity": gravity[k : k + 10], "nozzle.path": path[k : k + 10]}, steps=10)
     assert_same_state(state, whole.last_state)
 
 
@@ -227,8 +227,8 @@ def differentiated(simulation):
     sway = np.sin(0.1 * np.arange(steps))[:, None] * np.eye(simulation.dimension)[0]
     found = {"gravity": np.array(simulation.scene.forces.gravity) + sway}
     found["viscosity"] = np.asarray(simulation.parameters()["viscosity"]) * 1.1
-    if simulation.scene.emitter is not None:
-        found["nozzle_path"] = np.array(simulation.scene.emitter.outlet) + 0.002 * sway
+    if simulation.scene.emitter:
+        found["nozzle.path"] = np.array(simulation.scene.emitter[0].outlet) + 0.002 * sway
     return found
 
 
@@ -265,8 +265,8 @@ def test_segments_chained_by_vjp_have_the_bits_of_one_run(name, precision):
     for parameter, value in parameters.items():
         if np.ndim(value) == 2:
             found = np.concatenate([part[parameter] for part in parts])
-            if parameter == "nozzle_path":  # where a run begins that is given a path
-                found[0] += bar["outlet"][0]
+            if parameter == "nozzle.path":  # where a run begins that is given a path
+                found[0] += bar["nozzle.outlet"][0]
             assert found.tobytes() == gradient[parameter].tobytes(), parameter
         else:
             found = sum(part[parameter] for part in parts)
@@ -408,20 +408,22 @@ def test_a_problem_with_a_state_is_copied_batched_and_told_from_others():
     simulation = Simulation(jet(), precision="float64")
     state = simulation.step(simulation.state(), steps=12)
     problem = Problem(simulation, 6, Weighted(), state=state)
-    point = {"flow_rate": 0.25}
+    point = {"nozzle.flow_rate": 0.25}
     loss, gradient = problem.value_and_gradient(point)
     again = pickle.loads(pickle.dumps(problem))
     assert again.value(point) == loss and again.fingerprint == problem.fingerprint
     assert problem.fingerprint != Problem(simulation, 6, Weighted()).fingerprint
-    together = problem.together([point, {"flow_rate": 0.3}], gradients.Exact())
-    assert together[0].loss == loss and together[0].gradient["flow_rate"] == gradient["flow_rate"]
-    assert together[1].loss == problem.value({"flow_rate": 0.3})
-    assert problem.tangent(point, {"flow_rate": 1.0}) == pytest.approx(float(gradient["flow_rate"]), rel=1e-10)
+    together = problem.together([point, {"nozzle.flow_rate": 0.3}], gradients.Exact())
+    assert together[0].loss == loss and together[0].gradient["nozzle.flow_rate"] == gradient["nozzle.flow_rate"]
+    assert together[1].loss == problem.value({"nozzle.flow_rate": 0.3})
+    assert problem.tangent(point, {"nozzle.flow_rate": 1.0}) == pytest.approx(
+        float(gradient["nozzle.flow_rate"]), rel=1e-10
+    )
     with pytest.raises(InputError, match="must begin as its scene does to be certified"):
         certify(problem, point)
-    path = {"nozzle_path": np.array(state["outlet"]) + np.zeros((6, 2))}
+    path = {"nozzle.path": np.array(state["nozzle.outlet"]) + np.zeros((6, 2))}
     bars = problem.value_and_gradient(path)[1]
-    assert problem.tangent(path, {"nozzle_path": np.ones((6, 2))}) == pytest.approx(bars["nozzle_path"].sum())
+    assert problem.tangent(path, {"nozzle.path": np.ones((6, 2))}) == pytest.approx(bars["nozzle.path"].sum())
     for parameters in ({"initial_velocities": simulation.velocities}, {"rest_density": 900.0}):
         with pytest.raises(InputError, match="state"):
             problem.value(parameters)

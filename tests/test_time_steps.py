@@ -26,8 +26,14 @@ PRECISIONS = ["float32", "float64"]
 COURSES = {
     "gravity": (plane, {"times": [0.0, 0.1], "values": [[0.0, -9.81], [4.0, -9.0]]}),
     "tilt": (plane, {"times": [0.0, 0.1], "values": [[0.0], [15.0]]}),
-    "nozzle_path": (jet, {"times": [0.0, 0.1], "values": [[0.3, 0.26], [0.33, 0.26]]}),
+    "nozzle.path": (jet, {"times": [0.0, 0.1], "values": [[0.3, 0.26], [0.33, 0.26]]}),
 }
+
+
+def changing(name, **changes):
+    """A scene in which a parameter changes over time."""
+    maker, course = COURSES[name]
+    return maker(**({"path": course} if maker is jet else {"schedule": {name: course}}), **changes)
 
 
 def drop(solver, **changes):
@@ -156,8 +162,8 @@ def test_a_run_that_goes_on_has_the_bits_of_one_that_did_not_stop(kind, precisio
 
 @pytest.mark.parametrize("made", ["plane", "layers", "jet", *COURSES])
 def test_a_scene_of_a_batch_has_the_bits_of_its_single_run(made):
-    maker, course = COURSES.get(made, ({"plane": drop, "layers": two_layers, "jet": jet}.get(made), None))
-    scene = maker(solver=CHOSEN, **({"schedule": {made: course}} if course else {}))
+    makers = {"plane": drop, "layers": two_layers, "jet": jet}
+    scene = makers[made](solver=CHOSEN) if made in makers else changing(made, solver=CHOSEN)
     values = np.outer([0.05, 0.1], np.ones(len(scene.phase))).squeeze()
     single = Simulation(scene)
     for value, found in zip(values, Simulation(scene, batch=2).run(STEPS, {"viscosity": values}), strict=True):
@@ -171,14 +177,14 @@ def test_a_scene_of_a_batch_has_the_bits_of_its_single_run(made):
 
 @pytest.mark.parametrize("name", COURSES)
 def test_a_schedule_is_read_at_the_true_times(name):
-    maker, course = COURSES[name]
-    scene = maker(solver=CHOSEN, schedule={name: course})
+    scene, maker = changing(name, solver=CHOSEN), COURSES[name][0]
+    course = scene.emitter[0].path.knots if scene.emitter else scene.schedule.courses[name]
     run = Simulation(scene, precision="float64").run(STEPS)
     fixed = Simulation(maker(solver={"kind": "pcisph", "time_step": 0.001}), precision="float64")
     state = fixed.state()
     for time, size in zip(run.times, sizes_of(run), strict=False):
-        at = time + (1.0 if name == "nozzle_path" else 0.5) * size
-        state = fixed.step(state, {name: scene.schedule.courses[name].at(np.array([at]))[0], "time_step": size})
+        at = time + (1.0 if name == "nozzle.path" else 0.5) * size
+        state = fixed.step(state, {name: course.at(np.array([at]))[0], "time_step": size})
     assert state["positions"].tobytes() == run.positions[-1].tobytes()
 
 
@@ -307,14 +313,14 @@ def test_what_cannot_be_is_said_in_a_sentence(tmp_path):
     simulation, still = Simulation(drop(CHOSEN)), {"gravity": [0.0, 0.0], "viscosity": "none"}
     held = "time_step is given, but must be left out, as the scene chooses its time steps, .* hold them constant"
     series = cortado.losses.Series(PressureProbe([0.3, 0.1]), [0.0, 0.1], [0.0, 1.0], 0.001)
-    path, one_place = {"nozzle_path": np.tile(jet().emitter.outlet, (3, 1))}, "one place where time steps are chosen"
+    path, one_place = {"nozzle.path": np.tile(jet().emitter[0].outlet, (3, 1))}, "one place where time steps are chosen"
     for call, what in [
         (lambda: simulation.run(3, {"time_step": 0.001}), held),
         (lambda: simulation.jvp(simulation.state(), {}, {}, {"time_step": 1.0}), held),
         (lambda: cortado.Problem(simulation, 3, Spread()).tangent({}, {"time_step": 1.0}), held),
         (lambda: cortado.Problem(simulation, 90, series), "loss is a Series of steps of 0.001 s"),
         (lambda: cortado.certify(simulation, ["viscosity"], steps=3), "seconds for a certificate"),
-        (lambda: Simulation(jet(solver=CHOSEN)).run(3, path), f"nozzle_path has a row for each .* must be {one_place}"),
+        (lambda: Simulation(jet(solver=CHOSEN)).run(3, path), f"nozzle.path has a row for each .* must be {one_place}"),
         (lambda: simulation.run(), "steps is left out, but must be given where no time"),
         (lambda: simulation.run(3, time=1.0), "time is given, but must be left out, as steps says"),
         (lambda: simulation.run(time=-1.0), "time is -1, but must be a number of seconds greater than 0"),
@@ -481,7 +487,7 @@ def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter():
 def test_what_waits_in_a_wall_is_no_reason_to_shorten_steps():
     """The column of the nozzle reaches through a side of the container, whose wall particles press on it."""
     slot = {"phase": "water", "outlet": [0.15, 0.45], "direction": [1.0, 0.0], "radius": 0.075, "length": 0.5}
-    scene = jet(emitter={**slot, "flow_rate": 0.05}, solver={"kind": "projection", **CHOSEN})
+    scene = jet(emitter=[{**slot, "flow_rate": 0.05}], solver={"kind": "projection", **CHOSEN})
     run = Simulation(scene, precision="float64").run(12)
     assert np.median(run.diagnostics["greatest_density_errors"]) > 0.5
     assert (sizes_of(run)[1:] > 0.6 * sizes_of(run)[:-1]).all()
@@ -585,7 +591,7 @@ FALLS = {
     "rests": (0.3, {}, {}),
     "reaches beneath the floor": (0.4, {"lower": [0.5, -0.1]}, {}),
     "stays where it is": (0.3, {"motion": "path", "velocity": [0.0, 0.0]}, {}),
-    "beneath an outlet": (0.6, {}, {"emitter": OUTLET}),
+    "beneath an outlet": (0.6, {}, {"emitter": [OUTLET]}),
     "moves": (0.8, {"motion": "path", "velocity": [0.0, 0.1]}, {}),
     "is free": (0.8, {"motion": "free", "density": 900.0}, {}),
     "conveys": (0.8, {"surface_velocity": [0.0, 1.0]}, {}),

@@ -22,7 +22,7 @@ from remembering_force import Memory, U
 viser = pytest.importorskip("viser")
 PORT = 18310
 NOZZLE = """
-emitter = {phase = "water", outlet = [0.3, 0.55], radius = 0.05, length = 0.2, flow_rate = 0.05}
+emitter = [{phase = "water", outlet = [0.3, 0.55], radius = 0.05, length = 0.2, flow_rate = 0.05}]
 """
 
 
@@ -89,9 +89,9 @@ def test_a_nozzle_follows_its_sliders(scene):
     scene.write_text(NOZZLE + TINY_SCENE)
     with window(scene, PORT + 2) as shown:
         shown.tick()
-        shown.nozzle[0].value = 0.4
+        shown.nozzles["nozzle"][0].value = 0.4
         shown.tick()
-        np.testing.assert_allclose(np.ravel(shown._state["outlet"])[:2], [0.4, 0.55], atol=1e-6)
+        np.testing.assert_allclose(np.ravel(shown._state["nozzle.outlet"])[:2], [0.4, 0.55], atol=1e-6)
 
 
 def coloured(shown, name: str) -> np.ndarray:

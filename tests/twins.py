@@ -67,8 +67,7 @@ def tension_twin(simulation):
 def emitter_twin(simulation, path):
     """The slow twin of its emitter, whose opening goes along a path (steps, d); None without."""
     nozzle = nozzle_of(simulation)
-    names = ("upstream", "offsets", "direction", "area", "column", "reserve")
-    return nozzle and reference.Emitter(*(getattr(nozzle, name) for name in names), path)
+    return nozzle and reference.Emitter(nozzle.sample, nozzle.direction, nozzle.area, path)
 
 
 def nozzle_of(simulation):

@@ -68,7 +68,7 @@ class Flow:
             forces={"gravity": [0.0, -9.81], "viscosity": "pairwise"},
             solver={"kind": "pcisph", "time_step": 0.001, "minimum_iterations": 4, "maximum_iterations": 4},
             render={"view": "plane", "resolution": [24, 36]},
-            **({} if self.nozzle is None else {"emitter": self.nozzle}),
+            **({} if self.nozzle is None else {"emitter": [self.nozzle]}),
         )
 
 

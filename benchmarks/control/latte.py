@@ -106,12 +106,11 @@ class Latte(Task):
                 cup,
                 phase=[{**one, "viscosity": VISCOSITY} for one in (COFFEE, MILK)],
                 fluid=[{**pool, "phase": "coffee"}],
-                emitter={**jet, "flow_rate": flow_rate},
+                emitter=[{**jet, "flow_rate": flow_rate}],
                 render=render,
             )
 
-        emitter = poured(area).emitter
-        assert emitter is not None
+        (emitter,) = poured(area).emitter
         return poured(area * self.speed / emitter.speed(self.spacing))
 
     @cached_property
@@ -125,7 +124,7 @@ class Latte(Task):
         hats = np.maximum(1.0 - np.abs(times[:, None] - 1.0 - j), 0.0)
         matrix = REACH * self.cup * np.einsum("sk,da->sdka", hats @ response, np.eye(self.dimension)[:, axes])
         base = np.tile(self.outlet, (self.steps, 1))
-        return Controls({"nozzle_path": Affine(base, matrix.reshape(self.steps, self.dimension, -1))})
+        return Controls({"nozzle.path": Affine(base, matrix.reshape(self.steps, self.dimension, -1))})
 
     @cached_property
     def baseline(self) -> np.ndarray:
@@ -164,8 +163,7 @@ class Latte(Task):
         """FluidLab's loss at some steps, by their number."""
         steps = np.linspace(0, self.steps, FRAMES + 1).astype(int)[1:].tolist()
         states = self._hidden(simulation, steps)
-        emitter = simulation.scene.emitter
-        assert emitter is not None
+        (emitter,) = simulation.scene.emitter
         upstream, n = emitter.sample(self.spacing).upstream, simulation.particles
         return {
             step: MilkDistance(

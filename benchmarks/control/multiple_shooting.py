@@ -40,7 +40,7 @@ class MultipleShooting:
 
     def search(self, objective: Objective, seed: int) -> None:
         """Raises `InputError` for tasks with a nozzle."""
-        if objective.task.scene.emitter is not None:
+        if objective.task.scene.emitter:
             raise InputError("multiple shooting needs all particles in each segment, but here a nozzle pours them.")
         rates = {"controls": 0.1, "positions": self.learning_rate, "velocities": self.learning_rate}
         try:

@@ -108,7 +108,7 @@ class VelocityModes:
     parameter: str = "initial_velocities"
 
     def fits(self, simulation: Simulation) -> bool:
-        return simulation.scene.emitter is None
+        return not simulation.scene.emitter
 
     def spread(self, simulation: Simulation) -> float:
         return 0.1
@@ -130,10 +130,10 @@ class NozzlePath:
     """The path of a nozzle, interpolated between knots at even times: u (knots, d) [m]."""
 
     knots: int = 4
-    parameter: str = "nozzle_path"
+    parameter: str = "nozzle.path"
 
     def fits(self, simulation: Simulation) -> bool:
-        return simulation.scene.emitter is not None
+        return bool(simulation.scene.emitter)
 
     def spread(self, simulation: Simulation) -> float:
         return 0.5 * simulation.scene.discretisation.spacing
@@ -142,8 +142,7 @@ class NozzlePath:
         return TimeInterpolation(steps, self.knots)
 
     def drawn(self, simulation: Simulation, steps: int, random: np.random.Generator) -> np.ndarray:
-        emitter = simulation.scene.emitter
-        assert emitter is not None
+        (emitter,) = simulation.scene.emitter
         noise = random.standard_normal((self.knots, simulation.dimension))
         return np.asarray(emitter.outlet) + SCATTER * self.spread(simulation) * noise
 

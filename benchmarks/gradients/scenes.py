@@ -56,7 +56,7 @@ def jet() -> dict[str, Any]:
         **dam(0.025, (24, 12)),
         "phase": [*dam(0.025, (1, 1))["phase"], PAINT],
         "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 1.0]},
-        "emitter": {"phase": "paint", "outlet": [0.3, 0.4], "radius": 0.05, "length": 0.5, "flow_rate": 0.1},
+        "emitter": [{"phase": "paint", "outlet": [0.3, 0.4], "radius": 0.05, "length": 0.5, "flow_rate": 0.1}],
         "mixture": {"mobility": 1e-3, "interface_width": 0.05},
     }
 

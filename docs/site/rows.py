@@ -124,7 +124,8 @@ def _kind(value: Schema) -> str:
 
 
 def _plural(items: Schema) -> str:
-    return {"number": "numbers", "integer": "whole numbers", "boolean": "times `true` or `false`"}[items["type"]]
+    words = {"number": "numbers", "integer": "whole numbers", "boolean": "times `true` or `false`", "string": "names"}
+    return words[items["type"]]
 
 
 def _range(number: Schema) -> str:

@@ -44,7 +44,7 @@ LINKS = {
     "discretisation": ("[table](#particles-discretisation)", "How the fluid is cut into particles."),
     "phase": ("[tables](#materials-phase)", "The materials: in this order the components of mass fractions."),
     "fluid": ("[tables](#bodies-of-fluid-fluid)", "The bodies of fluid; particles come in this order."),
-    "emitter": ("[table](#a-jet-emitter)", "An opening out of which fluid comes; its particles come after all others."),
+    "emitter": ("[tables](#emitters-emitter)", "Openings out of which fluid comes; their particles come last."),
     "drain": ("[tables](#drains-drain)", "What takes particles out of the fluid."),
     "container": ("[table](#walls-container)", "What holds the fluid."),
     "solid": ("[tables](#solids-solid)", "What fluid flows around or is held by, besides the container."),
@@ -156,15 +156,21 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         ),
     ),
     (
-        "## A jet: `[emitter]`",
-        "A column of particles waits behind an opening and comes out of it with one speed. With an emitter a scene may "
-        "leave out `[[fluid]]`. The parameter `nozzle_path` moves the opening.",
+        "## Emitters: `[[emitter]]`",
+        "A column of particles waits behind each opening and comes out of it with one speed. With an emitter a scene "
+        "may leave out `[[fluid]]` ([taps and drains](taps_and_drains.md)).",
         (
             (
                 "EmitterTable",
                 "",
-                '[emitter]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\ndirection = [0.0, -1.0, 0.0]\nradius = 0.1\n'
+                '[[emitter]]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\ndirection = [0.0, -1.0, 0.0]\nradius = 0.1\n'
                 "length = 0.2\nflow_rate = 0.02",
+            ),
+            (
+                "Course_emitter_path",
+                "### An emitter that moves",
+                '[[emitter]]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\nsides = [0.2, 0.1]\nflow_rate = 0.02\n\n'
+                "[emitter.path]\ntimes = [0.0, 0.5]\nvalues = [[0.75, 0.7, 0.25], [0.65, 0.7, 0.25]]",
             ),
         ),
     ),
@@ -325,13 +331,6 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "Course_tilt",
                 "### A tilt over time: `[schedule.tilt]`",
                 "[schedule.tilt]\ntimes = [0.0, 0.5]\nvalues = [[0.0, 0.0], [20.0, 0.0]]",
-            ),
-            (
-                "Course_nozzle_path",
-                "### A jet that moves: `[schedule.nozzle_path]`",
-                '[emitter]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\nradius = 0.1\nlength = 0.2\n'
-                "flow_rate = 0.02\n\n[schedule.nozzle_path]\ntimes = [0.0, 0.5]\n"
-                "values = [[0.75, 0.7, 0.25], [0.65, 0.7, 0.25]]",
             ),
         ),
     ),

@@ -152,8 +152,8 @@ class Problem:
     - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d);
     - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3], a number, with several phases (phases,);
     - with several phases the first ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];
-    - with an emitter ``nozzle_path`` (d,) or (steps, d), where its opening is after each step [m], and ``flow_rate``
-      [m3 / s];
+    - with emitters ``NAME.path`` (d,) or (steps, d), where an opening is after each step [m], and of these and of
+      sinks ``NAME.flow_rate``, a number or (steps,) [m3 / s];
     - in a scene with surface tension ``surface_tension`` [N / m];
     - with a loss of images ``colours`` (phases, 3);
     - with forces of one's own, ``simulation.forces``, their parameters, such as ``drag.k``.

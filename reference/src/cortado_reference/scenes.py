@@ -27,7 +27,7 @@ def check_scene(scene: Scene) -> None:
         raise InputError("solver.velocities_follow is true, but must be left out for the reference engine.")
     if getattr(scene.solver, "tolerance", None) is not None:
         raise InputError("solver.tolerance is given, but must be left out for the reference engine.")
-    if len(scene.phase) > 1 or scene.emitter is not None:
+    if len(scene.phase) > 1 or scene.emitter:
         raise InputError("scene has several phases or an emitter, but must have neither for the reference engine.")
     unknown = [p.name for p in BY_NAME.values() if p.is_optional and p.present(scene)]
     if unknown:

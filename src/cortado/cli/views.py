@@ -28,6 +28,7 @@ from cortado.rollout.rollout import Rollout
 from cortado.runs.frames import posed, sized, solid_motions
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
+from cortado.scene.emitter_table import EmitterTable, path_name
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene, load_scene
 from cortado.scene.stability import longest_step
@@ -320,15 +321,17 @@ class LiveView:
         reset = gui.add_button("Begin again")
         self._told = gui.add_markdown("")
         self.gravity = self._sliders("Gravity", "m/s²", scene.forces.gravity, self._most_gravity())
-        outlet = () if scene.emitter is None else scene.emitter.outlet
-        self.nozzle = self._sliders("Nozzle", "m", outlet, self._reach())
+        self.nozzles = {
+            emitter.name: self._sliders(emitter.name.capitalize(), "m", emitter.outlet, self._reach(emitter))
+            for emitter in scene.emitter
+        }
         self._wish_to_begin = False
         reset.on_click(lambda _: setattr(self, "_wish_to_begin", True))
         self.window.look_at(simulation.positions)
         self._begin()
 
     def tick(self) -> None:
-        """Take a few steps, with gravity and the nozzle as the sliders are now; none while it stands still."""
+        """Take a few steps, with gravity and nozzles as the sliders are now; none while it stands still."""
         if self._wish_to_begin:
             self._begin()
         if not self.running.value:
@@ -349,9 +352,11 @@ class LiveView:
     def _begin(self) -> None:
         """Show the first state, with the sliders where the scene has them."""
         self._wish_to_begin = False
-        self._nozzle = None if self.simulation.scene.emitter is None else np.array(self.simulation.scene.emitter.outlet)
-        for sliders, values in ((self.gravity, self.simulation.scene.forces.gravity), (self.nozzle, self._nozzle)):
-            for slider, value in zip(sliders, () if values is None else values, strict=False):
+        scene = self.simulation.scene
+        self._outlets = {emitter.name: np.array(emitter.outlet) for emitter in scene.emitter}
+        moved = [(self.nozzles[name], outlet) for name, outlet in self._outlets.items()]
+        for sliders, values in ((self.gravity, scene.forces.gravity), *moved):
+            for slider, value in zip(sliders, values, strict=False):
                 slider.value = float(value)
         first = self.simulation.rollout(1)
         frame = {**self.simulation.frame(first.initial), **self.simulation.constants(first)}
@@ -362,8 +367,7 @@ class LiveView:
         self._told.content = f"t = {state.clock.time:.4g} s"
         colours = colours_of(self.simulation.scene, state.fields.get("mass_fractions"), self.simulation.particles)
         controls = {"gravity": self._gravity()}
-        if self._nozzle is not None:
-            controls["nozzle_path"] = self._nozzle
+        controls |= {path_name(name): outlet for name, outlet in self._outlets.items()}
         quantities = quantities_of(state["velocities"], lambda: self.simulation, state, controls)
         quantities |= own_fields(state.fields, self.simulation.particles)
         scene, fields = self.simulation.scene, {name: np.asarray(field)[None] for name, field in state.fields.items()}
@@ -375,14 +379,14 @@ class LiveView:
         return np.array([slider.value for slider in self.gravity])
 
     def _controls(self) -> dict[str, np.ndarray]:
-        """Return the controls of the next steps: gravity, and a path of the nozzle from where it is to where it shall
+        """Return the controls of the next steps: gravity, and a path of each nozzle from where it is to where it shall
         be."""
         controls = {"gravity": self._gravity()}
-        if self._nozzle is not None:
-            wished = np.array([slider.value for slider in self.nozzle])
-            share = np.arange(1, self.steps + 1)[:, None] / self.steps
-            controls["nozzle_path"] = self._nozzle + share * (wished - self._nozzle)
-            self._nozzle = wished
+        share = np.arange(1, self.steps + 1)[:, None] / self.steps
+        for name, sliders in self.nozzles.items():
+            wished = np.array([slider.value for slider in sliders])
+            controls[path_name(name)] = self._outlets[name] + share * (wished - self._outlets[name])
+            self._outlets[name] = wished
         return controls
 
     def _sliders(self, title: str, unit: str, values: Any, ends: Any) -> list[Any]:
@@ -399,18 +403,15 @@ class LiveView:
         most = LEAN * (float(np.linalg.norm(gravity)) or 9.81) * np.ones(len(gravity))
         return np.stack([-most, most])
 
-    def _reach(self) -> np.ndarray:
+    def _reach(self, emitter: EmitterTable) -> np.ndarray:
         """Return the ends of the places where a nozzle may be: above the container, at its height."""
-        scene = self.simulation.scene
-        if scene.emitter is None:
-            return np.zeros((2, 0))
-        outlet, ends = np.array(scene.emitter.outlet), scene.container.extent()
+        outlet, ends, half = np.array(emitter.outlet), self.simulation.scene.container.extent(), 0.5 * emitter.width
         if ends is None:
-            return outlet + np.array([[-1.0], [1.0]]) * scene.emitter.length
-        inner = np.array([[1.0], [-1.0]]) * scene.emitter.radius + np.array(ends)
+            return outlet + np.array([[-20.0], [20.0]]) * half
+        inner = np.array([[1.0], [-1.0]]) * half + np.array(ends)
         reach = np.stack([np.minimum(inner[0], outlet), np.maximum(inner[1], outlet)])
-        axis = int(np.abs(scene.emitter.direction).argmax())
-        reach[:, axis] = outlet[axis] + np.array([-0.5, 0.5]) * scene.emitter.radius
+        axis = int(np.abs(emitter.direction).argmax())
+        reach[:, axis] = outlet[axis] + np.array([-0.5, 0.5]) * half
         return reach
 
 

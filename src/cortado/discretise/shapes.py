@@ -127,15 +127,14 @@ def block_about(centre: ArrayLike, half: ArrayLike, spacing: float) -> Block:
     return Block(first, counts, np.full(len(first), spacing))
 
 
-def disc_cells(radius: float, spacing: float, dimension: int) -> Points:
-    """Return the cells (dimension,) of the lattice around a disc about the origin, as floats, at least one each."""
-    return np.full(dimension, np.maximum(whole_cells(np.array(2.0 * radius), spacing), 1.0))
+def lattice(counts: Points, spacing: float) -> Points:
+    """Return a lattice (n, d) [m] that is symmetric about the origin, with so many points (d,) along each axis."""
+    return Block(-0.5 * (counts - 1.0) * spacing, counts, np.full(len(counts), spacing)).points()
 
 
 def disc(radius: float, spacing: float, dimension: int) -> Points:
     """Return a symmetric lattice (n, dimension) [m] in a disc about the origin, or on a line: at least one point."""
-    counts = disc_cells(radius, spacing, dimension)
-    points = Block(-0.5 * (counts - 1.0) * spacing, counts, np.full(dimension, spacing)).points()
+    points = lattice(np.full(dimension, np.maximum(whole_cells(np.array(2.0 * radius), spacing), 1.0)), spacing)
     return points[np.linalg.norm(points, axis=1) <= radius]
 
 

@@ -141,7 +141,7 @@ class Latte(Task):
     """Height of the nozzle above the floor [m]."""
     reach, lag, pouring = 0.6 * radius, 0.03, 25
     """How far the nozzle can be sent [m], how it follows [s], and for how many steps of the environment it pours."""
-    actuators = (Position("nozzle_path", (0.0, height), (0,), (reach,), lag=lag),)
+    actuators = (Position("nozzle.path", (0.0, height), (0,), (reach,), lag=lag),)
 
     @property
     def scene(self) -> Scene:
@@ -150,7 +150,7 @@ class Latte(Task):
             container=box([-self.radius, 0.0], [self.radius, 2.5 * self.depth]),
             phase=[{**one, "viscosity": 0.3} for one in (COFFEE, MILK)],
             fluid=[box([-self.radius, 0.0], [self.radius, self.depth], phase="coffee")],
-            emitter={**jet, "length": self.column, "flow_rate": self.speed * 2.0 * self.opening},
+            emitter=[{**jet, "length": self.column, "flow_rate": self.speed * 2.0 * self.opening}],
         )
 
     @property
@@ -179,8 +179,7 @@ def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]
     with warnings.catch_warnings():  # of the milk, which is out before the end
         warnings.simplefilter("ignore", CortadoWarning)
         run = simulation.run(steps, {nozzle.parameter: path}, record_every=task.substeps)
-    emitter = simulation.scene.emitter
-    assert emitter is not None
+    (emitter,) = simulation.scene.emitter
     sample, first = emitter.sample(task.spacing), simulation.free_particles
     weights = np.zeros((task.horizon, simulation.particles))
     poured = sample.upstream < sample.speed * run.times[1:, None]

@@ -32,6 +32,7 @@ from cortado.pictures.tracing.steady import WINDOW
 from cortado.runs.frames import Film, Pace, SolidMotions, posed, sized, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.appearance import Moment, Picture, View
+from cortado.scene.emitter_table import emitted_name, outlet_name, samples, waits
 from cortado.scene.parameters import sizes
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
@@ -271,23 +272,23 @@ class ShownRun:
 
 
 def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles that have left the emitter and are in no drain, given the ``emitted`` [m] and
-    ``drained`` of `Frame.others`. Where there is no other fluid, the layer that comes first is out from the start."""
-    found = np.ones(particles, dtype=bool)
-    if scene.emitter is not None and "emitted" in others:
-        upstream = scene.emitter.sample(scene.discretisation.spacing).upstream
-        least = upstream.min() if len(upstream) == particles else 0.0
-        found[particles - len(upstream) :] = upstream <= max(float(np.ravel(others["emitted"])[0]), least)
+    """Return a mask (n,) of the particles that have left emitters and are in no drain, given `Frame.others`. Where
+    there is no fluid yet, the layers that come first are out from the start."""
+    found = ~waits(scene, others, particles)
+    for _, first, sample in () if found.any() else samples(scene, particles):
+        found[first : first + sample.layer] = True
     return found & (np.ravel(others["drained"]) == 0.0) if "drained" in others else found
 
 
 def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
     """Return places (frames, n, d) [m] of particles in pictures; those that wait in an emitter are at its opening, and
     those that a drain took in its middle."""
-    places, others = trajectory.positions, trajectory.others
-    if scene.emitter is not None and "outlet" in others:
-        out = [is_out(scene, {"emitted": frame.others["emitted"]}, trajectory.particles) for frame in trajectory]
-        places = places if np.all(out) else np.where(np.array(out)[..., None], places, others["outlet"])
+    places, others, count = trajectory.positions, trajectory.others, trajectory.particles
+    for name, first, sample in samples(scene, count):
+        if outlet_name(name) in others:
+            waiting = np.array([sample.waits(name, first, frame.others, count) for frame in trajectory])
+            waiting &= ~np.array([is_out(scene, frame.others, count) for frame in trajectory])
+            places = np.where(waiting[..., None], others[outlet_name(name)], places) if waiting.any() else places
     for number, drain in enumerate(scene.drain, 1):
         places = np.where((others["drained"] == number)[..., None], drain.middle(scene.dimension), places)
     return places
@@ -299,13 +300,16 @@ def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
 
 
 def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """Return the times (frames, n) [s] since particles left the emitter, between frames as if its speed were even; of
+    """Return the times (frames, n) [s] since particles left an emitter, between frames as if its speed were even; of
     others the time since the run began, and 0 of those that wait."""
-    since = np.tile(trajectory.times[0], trajectory.particles).astype(np.float64)
-    if scene.emitter is not None and "emitted" in trajectory.others:
-        upstream = scene.emitter.sample(scene.discretisation.spacing).upstream
-        came = np.asarray(trajectory.others["emitted"], dtype=np.float64).reshape(len(trajectory), -1)[:, 0]
-        since[len(since) - len(upstream) :] = np.interp(upstream, came, trajectory.times, right=np.inf)
+    since, count = np.full(trajectory.positions.shape[:2], float(trajectory.times[0])), trajectory.particles
+    for name, first, sample in samples(scene, count):
+        if emitted_name(name) in trajectory.others:
+            came = np.asarray(trajectory.others[emitted_name(name)], dtype=np.float64).reshape(len(trajectory), -1)[
+                :, 0
+            ]
+            line = np.array([sample.in_line(name, first, frame.others, count) for frame in trajectory])
+            since = np.where(line > 0.0, np.interp(line, came, trajectory.times, right=np.inf), since)
     return np.maximum(trajectory.times[:, None] - since, 0.0)
 
 

@@ -21,6 +21,7 @@ from cortado.pictures.tracing.near_particles import mixed
 from cortado.pictures.tracing.space import SpacePainter
 from cortado.scene.appearance import Picture
 from cortado.scene.courses import Knots
+from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.motions import courses
 from cortado.scene.parameters import QUANTITIES
 from cortado.scene.scene import Scene
@@ -74,15 +75,15 @@ def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colo
 
 def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") -> Points:
     """Draw a picture (rows, columns, 3), linear, of a scene before it is run. It has particles at positions (n, d) [m]
-    as spheres with colours (n, 3), and paths of solids and of an emitter's opening, with an arrow. Along each axis a
+    as spheres with colours (n, 3), and paths of solids and of emitters' openings, with arrows. Along each axis a
     line is as long as the whole, and says how long."""
     look = (scene.picture or Picture()).model_copy(update={"surface": "spheres", "colour": "phase"})
     scene = scene.model_copy(update={"picture": look})
     spacing, paths = scene.discretisation.spacing, _paths(scene)
-    if scene.emitter is not None:
-        opening = scene.emitter.opening(spacing)
+    for emitter in scene.emitter:
+        opening = emitter.opening(spacing)
         paths += [opening] if scene.dimension == 2 else []
-        paths.append(_arrow(scene, np.concatenate([positions, opening])))
+        paths.append(_arrow(scene, emitter, np.concatenate([positions, opening])))
         shown = opening if scene.dimension == 3 or not len(positions) else opening[:0]
         positions = np.concatenate([positions, shown])
         colours = np.concatenate([colours, np.tile(MOVING, (len(shown), 1))])
@@ -97,10 +98,9 @@ def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") 
 
 
 def _paths(scene: Scene) -> list[Points]:
-    """Return the paths (k, d) [m] of solids' middles, and that of an emitter's opening."""
+    """Return the paths (k, d) [m] of solids' middles, and those of emitters' openings."""
     found = [places for table in scene.solid if (places := _places(table)) is not None]
-    course = scene.schedule.courses.get("nozzle_path")
-    return found if course is None else [*found, course.seen]
+    return found + [emitter.path.knots.seen for emitter in scene.emitter if emitter.path is not None]
 
 
 def _places(table: SolidTable) -> Points | None:
@@ -121,13 +121,12 @@ def _poses(scene: Scene) -> list[Scene]:
     return found
 
 
-def _arrow(scene: Scene, positions: Points) -> Points:
+def _arrow(scene: Scene, emitter: EmitterTable, positions: Points) -> Points:
     """Return an arrow (5, d) [m], line and head in one stroke, out of the opening of an emitter and at least as long as
     the opening is wide. Without a container its size comes from positions (n, d) [m]."""
-    assert scene.emitter is not None
-    start, direction = np.array(scene.emitter.outlet), np.array(scene.emitter.direction)
+    start, direction = np.array(emitter.outlet), np.array(emitter.direction)
     size = np.ptp(scene.container.extent() or positions, axis=0).max()
-    length = max(ARROW * float(size), 2.0 * scene.emitter.radius)
+    length = max(ARROW * float(size), emitter.width)
     tip = start + length * direction
     aside = np.eye(len(start))[int(np.abs(direction).argmin())]
     aside = aside - (aside @ direction) * direction

@@ -1,4 +1,4 @@
-"""What to say of a run: that its pressure did not converge, that its emitter runs dry, or that a batch lost scenes."""
+"""What to say of a run: that its pressure did not converge, that an emitter runs dry, or that a batch lost scenes."""
 
 from collections.abc import Iterator, Mapping
 
@@ -6,6 +6,8 @@ import numpy as np
 
 from cortado.calls import counted
 from cortado.rollout.rollout import Rollout
+from cortado.scene.drain_tables import flow_name
+from cortado.scene.emitter_table import emitted_name
 from cortado.scene.scene import Scene
 from cortado.sph.viscous_stress import Solve
 
@@ -46,12 +48,13 @@ def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
 def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
     """Return a warning that says how many steps ended with pressure above the tolerance, and what to try."""
     advice = "try a smaller time step, more iterations or a larger tolerance."
-    spacing, emitter = scene.discretisation.spacing, scene.emitter
-    if emitter is not None and not scene.container.contains(emitter.particles(spacing), -0.25 * spacing).all():
-        advice = (
-            "the column that waits in the emitter is not all inside the container, whose walls press on it. Shorten "
-            "emitter.length, or make the container larger."
-        )
+    spacing = scene.discretisation.spacing
+    for index, emitter in enumerate(scene.emitter):
+        if not scene.container.contains(emitter.particles(spacing), -0.25 * spacing).all():
+            advice = (
+                f"the column that waits in emitter[{index}] is not all inside the container, whose walls press on it. "
+                f"Shorten emitter[{index}].length, or make the container larger."
+            )
     return f"the pressure did not converge in {np.count_nonzero(~converged)} of {converged.size} steps: {advice}"
 
 
@@ -73,19 +76,21 @@ def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> 
 
 
 def dry_sentence(scene: Scene, rollout: Rollout) -> str | None:
-    """Return a warning that an emitter runs out of fluid before the run ends, else None. With chosen steps, the end is
-    known only after the run."""
-    emitter, spacing, clock = scene.emitter, scene.discretisation.spacing, rollout.clocks[0]
-    if emitter is None:
-        return None
-    flow_rate, size = float(np.max(rollout.parameters["flow_rate"].numpy())), float(rollout.time_steps.max())
-    end = clock.after(rollout.taken if scene.solver.chooses else rollout.steps, size).time
-    emitted = float(np.max(rollout.initial["emitted"].numpy()))
-    speed = max(emitter.speed(spacing) * flow_rate / emitter.flow_rate, 1e-30)
-    left = max(emitter.supply(spacing) * spacing - emitted, 0.0) / speed
-    if clock.time + left >= end * (1.0 - SAME):
-        return None
-    advice = f"scene.lasting({end:.4g}) has more in reserve, as has a scene with emitter.duration"
-    if emitter.duration is not None or scene.lasting(end) is scene:
-        advice = f"a longer emitter.{'length' if emitter.duration is None else 'duration'} gives it more"
-    return f"the emitter runs dry at {clock.time + left:.4g} s of a run to {end:.4g} s, as all of it is out: {advice}."
+    """Return a warning on the first emitter that runs out of fluid before the run ends, else None. With chosen steps,
+    the end is known only after the run."""
+    spacing, clock = scene.discretisation.spacing, rollout.clocks[0]
+    taken = rollout.taken if scene.solver.chooses else rollout.steps
+    times = clock.times(np.arange(taken + 1), float(rollout.time_steps.max()))
+    for index, emitter in enumerate(scene.emitter):
+        flow = np.max(rollout.parameters[flow_name(emitter.name)].numpy(), axis=0)[:taken]
+        begun = float(np.max(rollout.initial[emitted_name(emitter.name)].numpy()))
+        lengths = begun + np.cumsum(np.append(0.0, flow * np.diff(times))) / emitter.area(spacing)
+        supply, end = emitter.supply(spacing) * spacing, times[-1]
+        if emitter.fed_by or lengths[-1] * (1.0 - SAME) <= supply:
+            continue
+        advice = f"scene.lasting({end:.4g}) has more in reserve, as has a scene with emitter[{index}].volume"
+        if emitter.volume is not None or scene.lasting(end) is scene:
+            advice = f"a larger emitter[{index}].{'length' if emitter.volume is None else 'volume'} gives it more"
+        dry = np.interp(supply, lengths, times)
+        return f"{emitter.name} runs dry at {dry:.4g} s of a run to {end:.4g} s, as all of it is out: {advice}."
+    return None

@@ -18,6 +18,7 @@ from cortado.rollout.scene_parameters import DENSITY, Simulated
 from cortado.rollout.step_bounds import Travel, moved_by
 from cortado.scene.checks import NEAREST
 from cortado.scene.discrete_scene import WHOLE
+from cortado.scene.emitter_table import path_name, waits
 from cortado.scene.motions import displacement_name, position_name, scale_name, told
 from cortado.scene.parameter_values import Arrays, Known
 from cortado.scene.parameters import Changing, Range
@@ -42,8 +43,8 @@ def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
 
 
 def check_places(values: Arrays, scene: Scene, free: int) -> None:
-    """Raise `InputError` where fluid starts outside the container, or the emitter's opening is. Only the first ``free``
-    particles are checked, as others wait in the emitter."""
+    """Raise `InputError` where fluid starts outside the container, or an emitter's opening is. Only the first ``free``
+    particles are checked, as others wait in emitters."""
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
@@ -59,19 +60,21 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
                 f"parameter initial_positions has all particles within {room:.3g} {unit}, but must leave them about "
                 f"the {needed:.3g} {unit} that their fluid fills."
             )
-    if scene.solver.chooses and np.ndim(values.get("nozzle_path", 0.0)) == 2:
-        raise InputError(
-            "parameter nozzle_path has a row for each step, but must be one place where time steps are chosen: move "
-            "the nozzle by the table [schedule], whose times do not depend on the steps."
-        )
-    if "nozzle_path" in values and scene.emitter is not None:
-        path, opening = np.atleast_2d(values["nozzle_path"]), scene.emitter.opening(spacing) - scene.emitter.outlet
-        places = (path[:, None] + opening).reshape(-1, scene.dimension)
-        for step in outside(scene.room, places, spacing)[:1] // len(opening):
+    for emitter in scene.emitter:
+        name = path_name(emitter.name)
+        if scene.solver.chooses and np.ndim(values.get(name, 0.0)) == 2:
             raise InputError(
-                f"parameter nozzle_path is at {place_in_words(path[step])} in step {step + 1}, but must be where all "
-                "of the opening is inside the container."
+                f"parameter {name} has a row for each step, but must be one place where time steps are chosen: move "
+                "the emitter by its table path, whose times do not depend on the steps."
             )
+        if name in values:
+            path, opening = np.atleast_2d(values[name]), emitter.opening(spacing) - emitter.outlet
+            places = (path[:, None] + opening).reshape(-1, scene.dimension)
+            for step in outside(scene.room, places, spacing)[:1] // len(opening):
+                raise InputError(
+                    f"parameter {name} is at {place_in_words(path[step])} in step {step + 1}, but must be where all "
+                    "of the opening is inside the container."
+                )
 
 
 def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
@@ -225,7 +228,7 @@ def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
         support=cut.support,
         kernel=cut.kernel,
         periods=tuple(map(float, scene.periods[1])),
-        waiting=len(simulation.positions) - simulation.free_particles,
+        waiting=tuple(len(emitter.sample(cut.spacing).upstream) for emitter in scene.emitter),
         rest_density=tuple(map(float, rest_density)),
         solver=simulation.carried_by,
     )
@@ -295,7 +298,8 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
     _check_densities(fields[DENSITY], fields["mass_fractions"], np.array(origin.rest_density))
     held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
     drained, spacing = fields.get("drained", np.zeros(len(positions))), scene.discretisation.spacing
-    free = np.flatnonzero(drained[: simulation.free_particles] == 0.0)
+    in_fluid = (drained == 0.0) & ~waits(scene, fields, len(positions))
+    free = np.flatnonzero(in_fluid[: simulation.free_particles])
     for index in outside(scene.resting_room, positions[free], spacing)[:1] if held else ():  # moving ones are elsewhere
         particle = free[index]
         place = place_in_words(positions[particle])
@@ -340,7 +344,7 @@ WORDS = {
     "support": "a support of {} spacings",
     "kernel": "the kernel {}",
     "periods": "periods of {} m",
-    "waiting": "{} particles in the emitter",
+    "waiting": "{} particles in emitters",
     "rest_density": "a rest density of {} kg/m3",
     "solver": "what {} carries from step to step",
 }

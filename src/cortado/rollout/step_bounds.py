@@ -14,6 +14,7 @@ from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters, Simulated
 from cortado.rollout.step_sizes import GROWTH, ChosenSteps
 from cortado.scene.courses import Knots, fastest
+from cortado.scene.emitter_table import path_name
 from cortado.scene.model import SceneTables
 from cortado.scene.motions import displacement_name, reach, told, turn_name
 from cortado.scene.parameter_values import Arrays, Tilt, stacked
@@ -63,8 +64,9 @@ def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0
 
 
 def moved_by(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> dict[str, Moved]:
-    """Return the courses that move the nozzle and each solid, by a phrase for each, under these values."""
-    found: dict[str, Moved] = {"the nozzle": [(1.0, courses.get("nozzle_path"))]}
+    """Return the courses that move each emitter and solid, by a phrase for each, under these values."""
+    names = [emitter.name for emitter in scene.emitter]
+    found: dict[str, Moved] = {f"the emitter {name!r}": [(1.0, courses.get(path_name(name)))] for name in names}
     for solid in told(scene.solid):
         shift, turn = (courses.get(name(solid.name)) for name in (displacement_name, turn_name))
         found[f"the solid {solid.name!r}"] = [(1.0, shift), (reach(solid, values), turn)]

@@ -263,7 +263,7 @@ def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_
 
     nowhere, ends = np.zeros(len(points), dtype=bool), scene.container.extent()
     solids = [table.solid() for table in scene.solid if not table.moves]
-    if ends is None or not solids or scene.emitter is not None or any(scene.periods[1]):
+    if ends is None or not solids or scene.emitter or any(scene.periods[1]):
         return nowhere
     lower, upper = np.array(ends, dtype=np.float64)
     counts = np.maximum(np.ceil((upper - lower) / (0.5 * scene.discretisation.spacing)), 1.0)

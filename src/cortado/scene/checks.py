@@ -15,7 +15,7 @@ from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.solid import Solid
 from cortado.errors import InputError, Words, shown
 from cortado.scene.drain_tables import check_drains
-from cortado.scene.emitter_table import EmitterTable
+from cortado.scene.emitter_table import EmitterTable, check_fed
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
 from cortado.scene.links import check_hinges
 from cortado.scene.model import MixtureTable, SceneTables
@@ -197,7 +197,7 @@ def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
 def check_scene(scene: SceneTables) -> None:
     """Run all checks of a scene, those that guard others first."""
     spacing = scene.discretisation.spacing
-    if not scene.fluid and scene.emitter is None:
+    if not (scene.fluid or scene.emitter):
         found = Words("empty") if "fluid" in scene.model_fields_set else MISSING
         raise field_error(("fluid",), found, "a list of at least one table, as there is no emitter")
     _check_phases(scene)
@@ -207,10 +207,10 @@ def check_scene(scene: SceneTables) -> None:
         if fluid.count(spacing) == 0.0:
             wanted = f"at least one spacing, {spacing:g} m, wide along every axis"
             raise field_error(("fluid", index), Words("too thin to hold a particle"), wanted)
-    emitter = scene.emitter
-    if emitter is not None and emitter.length is not None and emitter.layers(spacing) == 0.0:
-        wanted = f"greater than half a spacing, {0.5 * spacing:g} m, for the column to hold a layer of particles"
-        raise field_error(("emitter", "length"), emitter.length, wanted)
+    for index, emitter in enumerate(scene.emitter):
+        if emitter.length is not None and emitter.layers(spacing) == 0.0:
+            wanted = f"greater than half a spacing, {0.5 * spacing:g} m, for the column to hold a layer of particles"
+            raise field_error(("emitter", index, "length"), emitter.length, wanted)
     for path, body in _bodies(scene):
         _check_near(path, body.extent(spacing), spacing)
     check_length(scene.container, spacing, scene.discretisation.support_radius)
@@ -224,6 +224,7 @@ def check_scene(scene: SceneTables) -> None:
     check_springs(scene.spring, scene.hinge, scene.solid)
     check_free(scene)
     check_drains(scene)
+    check_fed(scene)
     check_sheets(scene)
     _check_names(scene)
     _check_sensors(scene)
@@ -232,8 +233,8 @@ def check_scene(scene: SceneTables) -> None:
         if isinstance(fluid, PointsFluid):
             _check_free(scene, ("fluid", index), fluid.points())
         check_distinct(("fluid", index), fluid, spacing)
-    if scene.emitter is not None:
-        _check_outlet(scene, scene.emitter)
+    for index, emitter in enumerate(scene.emitter):
+        _check_outlet(scene, ("emitter", index), emitter)
     check_overlaps(_bodies(scene), scene.periods[1], spacing)
     _check_schedule(scene)
 
@@ -248,12 +249,12 @@ def check_bounded(scene: SceneTables) -> None:
 def _bodies(scene: SceneTables) -> list[tuple[FieldPath, FluidBody]]:
     """Return all bodies with particles, in their order, each with its path in the scene."""
     fluids: list[tuple[FieldPath, FluidBody]] = [(("fluid", index), fluid) for index, fluid in enumerate(scene.fluid)]
-    return fluids if scene.emitter is None else [*fluids, (("emitter",), scene.emitter)]
+    return [*fluids, *((("emitter", index), emitter) for index, emitter in enumerate(scene.emitter))]
 
 
 def _check_names(scene: SceneTables) -> None:
     """Check that names, which begin those of arrays in files of runs, are no paths."""
-    for key in ("solid", "drain", "spring", "hinge", "sensor"):
+    for key in ("solid", "emitter", "drain", "spring", "hinge", "sensor"):
         for index, table in enumerate(getattr(scene, key)):
             if "/" in (table.name or ""):
                 raise field_error((key, index, "name"), table.name, 'without "/"')
@@ -388,36 +389,47 @@ def _outside(index: int, place: Points) -> PydanticCustomError:
     return field_error(("fluid", index), found, "inside the container")
 
 
-def _check_outlet(scene: SceneTables, emitter: EmitterTable) -> None:
-    """Check that the opening is inside, and that fluid comes in through it; upstream of it the column may be outside.
+def _check_outlet(scene: SceneTables, path: FieldPath, emitter: EmitterTable) -> None:
+    """Check that the opening is inside, also along its path, and that fluid comes in through it. Upstream of it the
+    column may be outside, but along a periodic axis, where what is outside comes in again on the other side.
 
-    Along a periodic axis it may not: what is outside there comes in again on the other side.
+    Containers are convex: if the opening is inside at two times it is in between.
     """
     spacing, lengths = scene.discretisation.spacing, scene.periods[1]
     tolerance, outlet, opening = 1e-6 * spacing, np.array(emitter.outlet), emitter.opening(spacing)
     if not scene.container.contains(outlet[None], tolerance).all():
-        raise field_error(("emitter", "outlet"), emitter.outlet, "inside the container")
+        raise field_error((*path, "outlet"), emitter.outlet, "inside the container")
     outside = ~scene.container.contains(opening, tolerance)
-    _check_free(scene, ("emitter",), opening)
+    _check_free(scene, path, opening)
     if outside.any():
         wanted = f"so small that the opening is inside the container, also at {point_in_words(opening[outside][0])}"
-        raise field_error(("emitter", "radius"), emitter.radius, wanted)
+        size = "radius" if emitter.sides is None else "sides"
+        raise field_error((*path, size), getattr(emitter, size), wanted)
     ahead = outlet + np.where(lengths > 0.0, 0.0, spacing * np.array(emitter.direction))
     if not scene.container.contains(ahead[None], tolerance).all():
-        raise field_error(("emitter", "direction"), emitter.direction, "into the container, where the outlet is")
+        raise field_error((*path, "direction"), emitter.direction, "into the container, where the outlet is")
+    if (lengths > 0.0).all() and emitter.supply(spacing) > emitter.layers(spacing):
+        wanted = "left out, as no axis is without a period, along which a reserve could be put aside"
+        raise field_error((*path, "volume"), emitter.volume, wanted)
+    for index, place in enumerate(() if emitter.path is None else emitter.path.knots.seen):
+        key = (*path, "path", "values", index)
+        if index == 0 and np.abs(place - outlet).max() > tolerance:
+            wanted = f"{field_name((*path, 'outlet'))}, {shown(emitter.outlet)}, where the opening is at the start"
+            raise field_error(key, place.tolist(), wanted)
+        if not scene.region.contains(place + opening - outlet, tolerance).all():
+            raise field_error(key, place.tolist(), "where all of the opening is inside the container")
     ends, (lower, upper) = scene.container.extent(), emitter.extent(spacing)
     if ends is None:
         return
     out = (lengths > 0.0) & ((lower < ends[0] - tolerance) | (upper > ends[1] + tolerance))
     if out.any():
         found = Words(f"partly outside along axis {int(np.argmax(out))}, which is periodic")
-        raise field_error(("emitter",), found, "inside the container along that axis")
+        raise field_error(path, found, "inside the container along that axis")
 
 
 def _check_schedule(scene: SceneTables) -> None:
-    """Check that scheduled things exist, and that the opening of an emitter begins where it is and stays inside.
-    Containers are convex: if it is inside at two times it is in between."""
-    courses, spacing = scene.schedule.courses, scene.discretisation.spacing
+    """Check that scheduled things exist."""
+    courses = scene.schedule.courses
     for name in courses:
         if not BY_NAME[name].present(scene):
             raise field_error(("schedule", name), Words("given"), f"left out, as the scene {BY_NAME[name].absent}")
@@ -430,14 +442,3 @@ def _check_schedule(scene: SceneTables) -> None:
     ):
         wanted = f"left out, or {shown(first)}, with which schedule.gravity begins, as that acts in its place"
         raise field_error(("forces", "gravity"), scene.forces.gravity, wanted)
-    path = courses.get("nozzle_path")
-    if path is None or scene.emitter is None:
-        return
-    if np.abs(path.values[0] - scene.emitter.outlet).max() > 1e-6 * spacing:
-        wanted = f"emitter.outlet, {shown(scene.emitter.outlet)}, where the opening is at the start"
-        raise field_error(("schedule", "nozzle_path", "values", 0), path.values[0].tolist(), wanted)
-    opening = scene.emitter.opening(spacing) - np.array(scene.emitter.outlet)
-    for index, place in enumerate(path.seen):
-        if not scene.region.contains(place + opening, 1e-6 * spacing).all():
-            wanted = "where all of the opening is inside the container"
-            raise field_error(("schedule", "nozzle_path", "values", index), place.tolist(), wanted)

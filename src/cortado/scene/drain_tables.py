@@ -1,6 +1,5 @@
 """Drains, which take particles out of the fluid: their tables, and the parameters of those that suck."""
 
-from dataclasses import replace
 from itertools import pairwise
 from math import inf
 from typing import Annotated, Any, Literal, Self
@@ -76,20 +75,23 @@ class PlaneDrain(Table):
         return np.array(self.position)
 
 
-class SinkDrain(Table):
-    """A sink, to which fluid flows from all sides with a given flow rate."""
+def flow_name(name: str) -> str:
+    """Return the name of the parameter of the flow rate of an emitter or a sink."""
+    return f"{name}.flow_rate"
 
-    shape: Literal["sink"]
-    """Which drain it is."""
+
+def count_name(drain: str) -> str:
+    """Return the name of the field of a state that is the number of particles which a drain has taken."""
+    return f"{drain}.count"
+
+
+class FlowTable(Table):
+    """A flow rate, by a number, over time or in a file."""
+
     name: Text
-    """Name of the drain, with which those of its parameters begin."""
-    position: Vector[Length]
-    """(d,) its middle [m], in the fluid or on a wall."""
-    radius: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Distance from the middle at which particles are taken [m]; two and a half spacings if left out. In a shell of
-    three spacings around it fluid flows as the flow rate says, and comes to that in another three."""
+    """Name with which that of the parameter begins."""
     flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)] | None = None
-    """Volume, in 2-D area, that it takes in a second [m3/s (m2/s in 2-D)]."""
+    """Volume, in 2-D area, that flows in a second [m3/s (m2/s in 2-D)]."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of `flow_rates`, from 0 on, each greater than the one before [s]; between them flow rates go in
     straight lines."""
@@ -135,19 +137,69 @@ class SinkDrain(Table):
         given = {"file": None, "times": tuple(times.tolist()), "flow_rates": tuple(rates.tolist())}
         return self.model_copy(update=given).in_dimension(dimension, path)
 
-    def middle(self, dimension: int) -> Points:
-        """Return the position (d,) [m]."""
-        return np.array(self.position)
-
     @property
     def course(self) -> Knots | None:
         """Return the flow rate over time; None where it is steady."""
         return None if self.times is None else Knots(np.array(self.times), np.array(self.flow_rates))
 
     @property
+    def begun(self) -> float:
+        """Return the flow rate at the start [m3/s (m2/s in 2-D)]."""
+        return (self.flow_rates or (self.flow_rate or 0.0,))[0]
+
+    @property
     def greatest(self) -> float:
         """Return the greatest flow rate [m3/s (m2/s in 2-D)]."""
         return max(self.flow_rates or (self.flow_rate or 0.0,))
+
+    def _at(self, times: Points) -> Points:
+        return np.full(len(times), self.begun) if self.course is None else self.course.at(times)
+
+    def passed(self, time: float) -> float:
+        """Return the volume, in 2-D area, that flows until a time [s]."""
+        times = np.append(np.clip(self.times or 0.0, 0.0, time), time)
+        return float(np.trapezoid(self._at(times), times))
+
+    def time_for(self, volume: float) -> float:
+        """Return the time [s] until which a volume, in 2-D area, flows; infinite where it never does."""
+        last = float((self.times or (0.0,))[-1])
+        times = np.union1d(self.times or 0.0, np.linspace(0.0, last, 1025))
+        flows = self._at(times)
+        volumes = np.concatenate([[0.0], np.cumsum(0.5 * (flows[1:] + flows[:-1]) * np.diff(times))])
+        if volume > volumes[-1]:
+            return last + float((volume - volumes[-1]) / flows[-1]) if flows[-1] > 0.0 else inf
+        return float(np.interp(volume, volumes, times))
+
+    def flow_parameter(self, dimension: int) -> Parameter:
+        """Return the parameter of the flow rate."""
+        return Parameter(
+            flow_name(self.name),
+            "m³/s" if dimension == 3 else "m²/s",
+            f"volume, in 2-D area, that flows through {self.name} in a second of each step",
+            Axis.STEP,
+            lambda source: np.array(self.begun),
+            range=Range.NOT_NEGATIVE,
+            change=lambda source, value: np.full(np.shape(value), max(self.greatest, float(np.max(value)))),
+            course=self.course,
+        )
+
+
+class SinkDrain(FlowTable):
+    """A sink, to which fluid flows from all sides with a given flow rate."""
+
+    shape: Literal["sink"]
+    """Which drain it is."""
+    name: Text
+    """Name of the drain."""
+    position: Vector[Length]
+    """(d,) its middle [m], in the fluid or on a wall."""
+    radius: Annotated[float, quantity("m", gt=0.0)] | None = None
+    """Distance from the middle at which particles are taken [m]; two and a half spacings if left out. In a shell of
+    three spacings around it fluid flows as the flow rate says, and comes to that in another three."""
+
+    def middle(self, dimension: int) -> Points:
+        """Return the position (d,) [m]."""
+        return np.array(self.position)
 
     def inner(self, spacing: float) -> float:
         """Return the distance at which particles are taken [m]."""
@@ -202,7 +254,7 @@ def sink_limit(scene: Any, values: Any) -> float:
     longest, spacing = inf, scene.discretisation.spacing
     for drain in scene.drain:
         if isinstance(drain, SinkDrain):
-            flow = float(np.max(values.get(f"{drain.name}.flow_rate", drain.greatest)))
+            flow = float(np.max(values.get(flow_name(drain.name), drain.greatest)))
             sphere = open_sphere(scene.resting_room, np.array(drain.position), drain.inner(spacing))
             if flow > 0.0:
                 area = max(sphere, 1e-3) * drain.inner(spacing) ** (scene.dimension - 1)
@@ -215,32 +267,20 @@ def drain_parameters(scene: Any) -> list[Parameter]:
     found = []
     for drain in scene.drain:
         if isinstance(drain, SinkDrain):
-            found += _of_sink(drain, "m³/s" if scene.dimension == 3 else "m²/s", scene.discretisation.spacing)
+            found += [drain.flow_parameter(scene.dimension), _place(drain, scene.discretisation.spacing)]
     return found
 
 
-def _of_sink(sink: SinkDrain, unit: str, spacing: float) -> list[Parameter]:
-    course, place = sink.course, np.array(sink.position)
-    begun = float(sink.flow_rate or 0.0 if course is None else course.values[0])
-    flow = Parameter(
-        f"{sink.name}.flow_rate",
-        unit,
-        f"volume that the drain {sink.name} takes in a second of each step",
-        Axis.STEP,
-        lambda source: np.array(begun),
-        range=Range.NOT_NEGATIVE,
-        change=lambda source, value: np.full(np.shape(value), max(sink.greatest, float(np.max(value)))),
-    )
-    position = Parameter(
+def _place(sink: SinkDrain, spacing: float) -> Parameter:
+    return Parameter(
         f"{sink.name}.position",
         "m",
         f"middle of the drain {sink.name}",
         Axis.SCALAR,
-        lambda source: place,
+        lambda source: np.array(sink.position),
         components=lambda dimension, phases: dimension,
         change=lambda source, value: spacing,
     )
-    return [replace(flow, course=course), position]
 
 
 DIRECTIONS = 1024

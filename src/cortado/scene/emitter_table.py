@@ -1,15 +1,22 @@
-"""An emitter: a column of particles that waits upstream of an opening, and comes out of it with one speed."""
+"""Emitters: columns of particles that wait upstream of an opening, and come out of it with one speed; with their
+parameters."""
 
 import math
-from dataclasses import dataclass
-from typing import Annotated, Self
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import field_validator
 
-from cortado.discretise.shapes import ROUND_OFF, Points, across, disc, disc_cells
+from cortado.discretise.shapes import ROUND_OFF, Points, across, disc, lattice, whole_cells
+from cortado.errors import Words, shown
+from cortado.scene.drain_tables import FlowTable
 from cortado.scene.fluids import FluidBody
-from cortado.scene.tables import GREATEST, Length, Vector, field_error, quantity
+from cortado.scene.motions import course_table
+from cortado.scene.parameters import Axis, Parameter
+from cortado.scene.tables import GREATEST, MISSING, FieldPath, Length, Text, Vector, field_error, quantity
 
 
 @dataclass(frozen=True)
@@ -25,34 +32,95 @@ class EmitterSample:
     velocities: Points
     """(m, d) [m/s]"""
     speed: float
-    """[m/s]"""
+    """At the start [m/s]."""
     layer: int
     """Particles in a layer; m is a multiple of it."""
     column: float
     """Length of the column that waits in line [m]; what is further upstream is in reserve."""
 
+    def in_line(self, name: str, first: int, others: Any, particles: int) -> Points:
+        """Return how far each of a number of particles was upstream of the opening when the run began, or would have
+        been if it is given out again [m], from further fields of a state; 0 of one that is no part of this emitter,
+        whose own begin at ``first``."""
+        found = np.zeros(particles)
+        found[first : first + len(self.upstream)] = self.upstream
+        if (again := others.get(again_name(name))) is None:
+            return found
+        joined = (np.floor((np.ravel(again) - 1.0) / self.layer) + 0.5) * 2.0 * self.upstream[0]
+        return np.where(np.ravel(again) > 0.0, joined, found)
 
+    def waits(self, name: str, first: int, others: Any, particles: int) -> NDArray[np.bool_]:
+        """Return a mask (n,) of the particles that wait in the emitter, from the same."""
+        emitted = float(np.ravel(others[emitted_name(name)])[0])
+        return self.in_line(name, first, others, particles) > emitted
+
+
+OF_OPENINGS = ("emitted", "again", "drained", ".count")
+"""Endings of the names of fields of states that say which particles are in the fluid, and how many drains took."""
 COLUMN = 6.0
 """Length of the column where none is given, in spacings: fluid at the opening has others behind it, and they too."""
 
 
-class EmitterTable(FluidBody):
-    """An opening, a disc or in 2-D a line, out of which a column of fluid comes with one speed."""
+def path_name(emitter: str) -> str:
+    """Return the name of the parameter where the opening of an emitter is [m]."""
+    return f"{emitter}.path"
 
+
+def outlet_name(emitter: str) -> str:
+    """Return the name of the field of a state where the opening of an emitter is [m]."""
+    return f"{emitter}.outlet"
+
+
+def emitted_name(emitter: str) -> str:
+    """Return the name of the field of a state that is the length of the column which has left an emitter [m]."""
+    return f"{emitter}.emitted"
+
+
+def again_name(emitter: str) -> str:
+    """Return the name of the field of a state with the place in line, from 1 on, of each particle that an emitter gives
+    out again; 0 of others."""
+    return f"{emitter}.again"
+
+
+_PATH = Parameter(
+    "emitter_path",
+    "m",
+    "where the opening of an emitter is after each step",
+    Axis.STEP,
+    lambda source: np.zeros(source.scene.dimension),
+    components=lambda dimension, phases: dimension,
+    change=lambda source, value: source.scene.discretisation.spacing,
+    moment=1.0,
+)
+OutletPath: Any = course_table(_PATH)
+"""The table of the places of an emitter's opening over time."""
+
+
+class EmitterTable(FluidBody, FlowTable):
+    """An opening, round or rectangular, in 2-D a line, out of which a column of fluid comes with one speed."""
+
+    name: Text = "nozzle"
+    """Name of the emitter, with which those of its parameters begin."""
     outlet: Vector[Length]
     """(d,) Middle of the opening [m]."""
     direction: Vector[Annotated[float, quantity()]] = (0.0, -1.0, 0.0)
     """(d,) Direction of the flow; its length does not matter."""
-    radius: Annotated[float, quantity("m", gt=0.0)]
-    """Radius of the opening [m]. The cells of the lattice that it holds are what fluid comes through: its speed is the
-    flow rate over their area, which `describe` says."""
+    radius: Annotated[float, quantity("m", gt=0.0)] | None = None
+    """Radius of a round opening, in 2-D half the width [m]. The cells of the lattice that it holds are what fluid comes
+    through: its speed is the flow rate over their area, which `describe` says."""
+    sides: tuple[Annotated[float, quantity("m", gt=0.0)], ...] | None = None
+    """(d - 1,) Widths of a rectangular opening, in place of `radius` [m]: in 3-D along the two axes, in their order,
+    that the direction is least along."""
     length: Annotated[float, quantity("m", gt=0.0)] | None = None
     """Length of the column that waits upstream of the opening [m]; six spacings if left out."""
-    flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", gt=0.0)]
-    """Volume, in 2-D area, that comes out in a second [m3/s (m2/s in 2-D)]."""
-    duration: Annotated[float, quantity("s", gt=0.0)] | None = None
-    """For how long fluid comes out [s]. If left out, commands such as `cortado run` have enough for the run, and
-    `Simulation` has what is in the column (`Scene.lasting`)."""
+    volume: Annotated[float, quantity("m3 (m2 in 2-D)", gt=0.0)] | None = None
+    """Volume, in 2-D area, that comes out in all [m3 (m2 in 2-D)]. If left out, commands such as `cortado run` have
+    enough for the run, and `Simulation` has what is in the column (`Scene.lasting`)."""
+    fed_by: tuple[Text, ...] = ()
+    """Names of drains whose particles come out again: there are no others then but those of the column, and of a
+    `volume`. A drain feeds one emitter."""
+    path: OutletPath | None = None
+    """Where the middle of the opening is over time; it stays at `outlet` if left out."""
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
     """How far a particle is from its place in the lattice of its layer at most, along each axis of the opening and
     in spacings, the same in every run. With the solver "projection" 0.05 if left out, as a stream on a lattice is
@@ -67,33 +135,49 @@ class EmitterTable(FluidBody):
             raise field_error((), direction, "a vector that is not zero")
         return direction if abs(size - 1.0) < 1e-12 else tuple(value / size for value in direction)
 
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        if self.sides is None and self.radius is None:
+            raise field_error((*path, "radius"), MISSING, "given, or sides in its place")
+        if self.sides is not None and self.radius is not None:
+            raise field_error((*path, "radius"), self.radius, "left out, as there are sides")
+        if self.sides is not None and len(self.sides) != dimension - 1:
+            wanted = f"a list of {dimension - 1}, as the scene has {dimension} dimensions"
+            raise field_error((*path, "sides"), self.sides, wanted)
+        placed = super().in_dimension(dimension, path)
+        if self.path is None:
+            return placed
+        return placed.model_copy(update={"path": self.path.in_dimension(dimension, (*path, "path"))})
+
     def layers(self, spacing: float) -> float:
         """Return the number of layers of the column, with their middle within its length, or all if they are fewer: a
         whole number that may be larger than any array."""
         length = COLUMN * spacing if self.length is None else self.length
         within = float(max(math.ceil(length / spacing - 0.5 - ROUND_OFF), 0))
-        return within if self.duration is None else min(within, self.supply(spacing))
+        return within if self.volume is None or self.fed_by else min(within, self.supply(spacing))
 
     def supply(self, spacing: float) -> float:
         """Return the number of layers, with those in reserve."""
-        if self.duration is None:
-            return self.layers(spacing)
-        return float(max(math.ceil(self.duration * self.speed(spacing) / spacing - ROUND_OFF), 1))
+        given = 0.0 if self.volume is None else self.volume / (self.area(spacing) * spacing)
+        if self.volume is None or self.fed_by:
+            given += self.layers(spacing)
+        return float(max(math.ceil(given - ROUND_OFF), 1))
 
     def dry_after(self, spacing: float) -> float:
-        """Return the time when all fluid is out [s]."""
-        return self.supply(spacing) * spacing / self.speed(spacing)
+        """Return the time when all fluid is out [s], which may be infinite."""
+        return math.inf if self.fed_by else self.time_for(self.supply(spacing) * spacing * self.area(spacing))
 
     def lasting(self, time: float, spacing: float) -> Self:
-        """Return this table with a duration, if it has none and the column is out before a time [s]: the column is
-        whole then."""
-        if self.duration is not None or self.dry_after(spacing) >= time:
+        """Return this table with a volume, if it has none and the column is out before a time [s]: the column is whole
+        then."""
+        if self.volume is not None or self.dry_after(spacing) >= time:
             return self
-        return self.model_copy(update={"duration": time + self.dry_after(spacing)})
+        column = self.layers(spacing) * spacing * self.area(spacing)
+        return self.model_copy(update={"volume": self.passed(time) + column})
 
     def speed(self, spacing: float) -> float:
-        """Return the speed of the flow [m/s], with which the volume of its particles is that of the flow rate."""
-        return self.flow_rate / self.area(spacing)
+        """Return the greatest speed of the flow [m/s], with which the volume of its particles is that of the flow
+        rate."""
+        return self.greatest / self.area(spacing)
 
     def area(self, spacing: float) -> float:
         """Return the area of the cells that a layer of particles has across the flow [m2], in 2-D their width [m]."""
@@ -101,7 +185,14 @@ class EmitterTable(FluidBody):
 
     def asked_area(self) -> float:
         """Return the area of the opening [m2], in 2-D its width [m]."""
+        if self.radius is None:
+            return math.prod(self.sides or ())
         return 2.0 * self.radius if len(self.outlet) == 2 else float(np.pi * self.radius**2)
+
+    @property
+    def width(self) -> float:
+        """Return the greatest width of the opening [m]."""
+        return max(self.sides or (2.0 * (self.radius or 0.0),))
 
     def opening(self, spacing: float) -> Points:
         """Return a layer of particles, moved into the opening, (n, d) [m]."""
@@ -110,7 +201,7 @@ class EmitterTable(FluidBody):
     def sample(self, spacing: float) -> EmitterSample:
         """Return the particles on a lattice of the spacing [m], those in reserve in line behind the column."""
         cross_section = self._cross_section(spacing)
-        layers, speed = int(self.supply(spacing)), self.speed(spacing)
+        layers, speed = int(self.supply(spacing)), self.begun / self.area(spacing)
         upstream = np.repeat((np.arange(layers) + 0.5) * spacing, len(cross_section))
         moves = np.random.default_rng(0).uniform(-self.jitter, self.jitter, (len(upstream), len(self.outlet) - 1))
         offsets = np.tile(cross_section, (layers, 1)) + spacing * moves @ across(self.direction)
@@ -125,8 +216,7 @@ class EmitterTable(FluidBody):
         )
 
     def count(self, spacing: float) -> float:
-        cells = disc_cells(self.radius, spacing, len(self.outlet) - 1)
-        return float(np.prod(cells)) * self.supply(spacing)
+        return float(np.prod(self._cells(spacing))) * self.supply(spacing)
 
     def extent(self, spacing: float) -> tuple[Points, Points]:
         opening, direction = self.opening(spacing), np.array(self.direction)
@@ -140,6 +230,62 @@ class EmitterTable(FluidBody):
         sample = self.sample(spacing)
         return sample.positions[sample.upstream < sample.column]
 
+    def _cells(self, spacing: float) -> Points:
+        """Return the numbers of cells (d - 1,) across the opening, as floats, at least one each."""
+        sides = self.sides or (2.0 * (self.radius or 0.0),) * (len(self.outlet) - 1)
+        return np.maximum(whole_cells(np.array(sides), spacing), 1.0)
+
     def _cross_section(self, spacing: float) -> Points:
         """Return offsets (n, d) of the particles of a layer from the axis [m]."""
-        return disc(self.radius, spacing, len(self.outlet) - 1) @ across(self.direction)
+        size = len(self.outlet) - 1
+        points = lattice(self._cells(spacing), spacing) if self.radius is None else disc(self.radius, spacing, size)
+        return points @ across(self.direction)
+
+
+def emitter_parameters(scene: Any) -> list[Parameter]:
+    """Return the parameters of a scene's emitters."""
+    found = []
+    for emitter in scene.emitter:
+        outlet, course = np.array(emitter.outlet), None if emitter.path is None else emitter.path.knots
+        meaning, value = (
+            f"where the opening of the emitter {emitter.name} is after each step",
+            partial(_constant, outlet),
+        )
+        found.append(replace(_PATH, name=path_name(emitter.name), meaning=meaning, value=value, course=course))
+        found.append(emitter.flow_parameter(scene.dimension))
+    return found
+
+
+def _constant(value: Any, source: Any) -> Any:
+    return value
+
+
+def check_fed(scene: Any) -> None:
+    """Check that the drains which feed emitters are there, and that there is one phase alone."""
+    names, fed = [drain.name for drain in scene.drain], list[str]()
+    for index, emitter in enumerate(scene.emitter):
+        path = "emitter", index, "fed_by"
+        if emitter.fed_by and len(scene.phase) > 1:
+            raise field_error(path, Words("given"), "left out where there are several phases")
+        for name in emitter.fed_by:
+            if name not in names or name in fed:
+                raise field_error(path, name, f"drains that feed no other emitter, of {shown(names)}")
+            fed.append(name)
+
+
+def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:
+    """Return the name of each emitter of a scene, the number of its first particle, of ``count`` particles in all, and
+    its particles."""
+    made = [emitter.sample(scene.discretisation.spacing) for emitter in scene.emitter]
+    ends = count - np.cumsum([0, *(len(sample.upstream) for sample in made[::-1])])[::-1]
+    names = [emitter.name for emitter in scene.emitter]
+    return list(zip(names, ends[:-1].tolist(), made, strict=True))
+
+
+def waits(scene: Any, others: Any, particles: int) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the particles that wait in emitters, given further fields of a state."""
+    found = np.zeros(particles, dtype=bool)
+    for name, first, sample in samples(scene, particles):
+        if emitted_name(name) in others:
+            found |= sample.waits(name, first, others, particles)
+    return found

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cortado.discretise.room import Region, Room
 from cortado.discretise.shapes import EXCESS, Points, Which, apart, grid, pairs_within
 from cortado.errors import InputError
-from cortado.scene.emitter_table import EmitterSample
+from cortado.scene.emitter_table import EmitterSample, samples
 from cortado.scene.fluids import ALIGNED, Fluid, PointsFluid, RegionFluid
 from cortado.scene.scene import Scene
 
@@ -171,7 +171,7 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class FluidSample:
-    """Fluid particles, in the order in which the scene lists their fluids; those of the emitter come last."""
+    """Fluid particles, in the order in which the scene lists their fluids; those of emitters come last."""
 
     positions: Points
     """(n, d) [m]"""
@@ -180,7 +180,7 @@ class FluidSample:
     phase: NDArray[np.int64]
     """(n,) index into the scene's phases"""
     sizes: tuple[int, ...]
-    """Number of particles of each body of fluid, without those of the emitter."""
+    """Number of particles of each body of fluid, without those of emitters."""
     asked: tuple[float, ...]
     """Volume [m^d] that each of these is to hold, less the walls' part; of points the volume that they hold."""
     bodies: tuple[CutBody, ...]
@@ -189,8 +189,10 @@ class FluidSample:
     """(n,) true for a particle of one of these bodies."""
     is_placed: NDArray[np.bool_]
     """(n,) true for a particle with a given place: a point of a file, or one in a nozzle."""
-    emitter: EmitterSample | None
-    """The last of the particles once more, in the same order, as they are along the emitter; None without one."""
+    emitters: tuple[tuple[str, int, EmitterSample], ...]
+    """Name of each emitter, number of its first particle, and its particles as they are along it."""
+    places: Points
+    """(n, d) at which particles rest that are in reserve, or in a drain [m]"""
 
     def jittered(self, most: float) -> Points:
         """Return positions (n, d) [m] with coordinates changed by up to ``most`` [m], except placed ones."""
@@ -198,17 +200,19 @@ class FluidSample:
         return np.where(self.is_placed[:, None], self.positions, self.positions + moves)
 
     def some(self, kept: NDArray[np.int64]) -> "FluidSample":
-        """Return the sample of the particles with numbers (m,) in rising order, with all of the emitter among them."""
-        names = "positions", "velocities", "phase", "is_packed", "is_placed"
+        """Return the sample of the particles with numbers (m,) in rising order, with all of emitters among them."""
+        names = "positions", "velocities", "phase", "is_packed", "is_placed", "places"
         arrays = {name: getattr(self, name)[kept] for name in names}
         ends = np.searchsorted(kept, np.cumsum(self.sizes))
-        return replace(self, sizes=tuple(np.diff(ends, prepend=0).tolist()), **arrays)
+        gone = len(self.positions) - len(kept)
+        emitters = tuple((name, first - gone, sample) for name, first, sample in self.emitters)
+        return replace(self, sizes=tuple(np.diff(ends, prepend=0).tolist()), emitters=emitters, **arrays)
 
     @property
     def emitted(self) -> slice:
-        """Return the slice of the emitter's particles."""
+        """Return the slice of the emitters' particles."""
         count = len(self.positions)
-        return slice(count if self.emitter is None else count - len(self.emitter.upstream), count)
+        return slice(self.emitters[0][1] if self.emitters else count, count)
 
 
 def fluid_particles(scene: Scene) -> FluidSample:
@@ -229,15 +233,16 @@ def fluid_particles(scene: Scene) -> FluidSample:
     asked = [
         fluid.volume(spacing) if body is None else body.asked for fluid, body in zip(scene.fluid, bodies, strict=True)
     ]
-    emitted = None
-    if scene.emitter is not None:
-        emitted = scene.emitter.sample(spacing)
-        emitted.positions[emitted.upstream > emitted.column] += reserve_offset(scene)
-        positions.append(emitted.positions)
-        velocities.append(emitted.velocities)
-        phases.append(names.index(scene.emitter.phase))
+    count = sum(map(len, positions)) + sum(len(e.sample(spacing).upstream) for e in scene.emitter)
+    emitters, places = samples(scene, count), resting_places(scene, count)
+    for emitter, (_, first, sample) in zip(scene.emitter, emitters, strict=True):
+        waits = sample.upstream > sample.column
+        sample.positions[waits], sample.velocities[waits] = places[first:][: len(waits)][waits], 0.0
+        positions.append(sample.positions)
+        velocities.append(sample.velocities)
+        phases.append(names.index(emitter.phase))
         bodies.append(None)
-    sizes, nozzles = [len(x) for x in positions], len(positions) - len(scene.fluid)
+    sizes, nozzles = [len(x) for x in positions], len(scene.emitter)
     return FluidSample(
         positions=np.concatenate(positions),
         velocities=np.concatenate(velocities),
@@ -247,48 +252,27 @@ def fluid_particles(scene: Scene) -> FluidSample:
         bodies=tuple(body for body in bodies if body is not None),
         is_packed=np.repeat([body is not None for body in bodies], sizes),
         is_placed=np.repeat([*(isinstance(fluid, PointsFluid) for fluid in scene.fluid), *[True] * nozzles], sizes),
-        emitter=emitted,
+        emitters=tuple(emitters),
+        places=places,
     )
 
 
-def reserve_offset(scene: Scene) -> Points:
-    """Return the shift (d,) [m] from their place in line at which particles in reserve wait: along every axis without a
-    period beyond all else, upstream of the opening."""
-    lower, upper = _ends(scene)
-    size = float((upper - lower).max())
-    return 2.0 * (size + scene.discretisation.support_radius) * _aside(scene)
-
-
-def drained_places(scene: Scene, count: int) -> Points:
-    """Return places (count, d) [m] for particles that drains took: beyond all else, away from particles in reserve, and
-    too far from one another to touch. Along periods there are as many as these have room for."""
-    (lower, upper), (begin, lengths) = _ends(scene), scene.periods
-    away, pitch = (
-        2.0 * (float((upper - lower).max()) + scene.discretisation.support_radius),
-        2.0 * scene.discretisation.support_radius,
-    )
-    free = lengths == 0.0
-    slots = np.maximum(np.floor(lengths / pitch), 1.0)
-    slots[free] = np.ceil((count / slots[~free].prod()) ** (1.0 / max(free.sum(), 1)))
-    number = np.stack(np.unravel_index(np.arange(count), slots.astype(int)), axis=1)
-    start = np.where(_aside(scene) > 0.0, lower - away, upper + away)
-    return np.where(free, start - _aside(scene) * pitch * number, begin + pitch * (number + 0.5))
-
-
-def _ends(scene: Scene) -> tuple[Points, Points]:
-    """Return the corners (d,) of a box around container, fluid, solids and the opening of an emitter [m]."""
-    spacing = scene.discretisation.spacing
-    boxes = [fluid.extent(spacing) for fluid in scene.fluid] + [solid.body().extent() for solid in scene.solid]
-    boxes += [(np.array(scene.emitter.outlet),) * 2] if scene.emitter is not None else []
+def resting_places(scene: Scene, count: int) -> Points:
+    """Return places (count, d) [m] for particles in reserve and those that drains took: beyond all else, and too far
+    from one another to touch. Along periods there are as many as these have room for; none where all axes have one."""
+    spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
+    boxes = [body.extent(spacing) for body in (*scene.fluid, *scene.emitter)]
+    boxes += [solid.body().extent() for solid in scene.solid]
     boxes += [ends] if (ends := scene.container.extent()) is not None else []
-    corners = np.array(boxes).reshape(-1, scene.dimension)
-    return corners.min(axis=0), corners.max(axis=0)
-
-
-def _aside(scene: Scene) -> Points:
-    """Return where particles in reserve wait: 1 or -1 along each axis, 0 along a period."""
-    direction = np.zeros(scene.dimension) if scene.emitter is None else np.array(scene.emitter.direction)
-    return np.where(direction > 0.0, -1.0, 1.0) * (scene.periods[1] == 0.0)
+    corners, (begin, lengths), pitch = np.array(boxes).reshape(-1, scene.dimension), scene.periods, 2.0 * support
+    lower, upper, free = corners.min(axis=0), corners.max(axis=0), lengths == 0.0
+    if not free.any():
+        return np.full((count, scene.dimension), np.nan)
+    slots = np.maximum(np.floor(lengths / pitch), 1.0)
+    slots[free] = np.ceil((count / slots[~free].prod()) ** (1.0 / free.sum()))
+    number = np.stack(np.unravel_index(np.arange(count), slots.astype(int)), axis=1)
+    start = upper + 2.0 * (float((upper - lower).max()) + support)
+    return np.where(free, start + pitch * number, begin + pitch * (number + 0.5))
 
 
 def _why_none(body: CutBody | None, spacing: float) -> str:

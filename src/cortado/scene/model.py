@@ -228,6 +228,13 @@ Forces: Any = create_model("Forces", __base__=FixedForces, __module__=__name__, 
 """Which forces act: `FixedForces`, and the optional ones of the registry of parameters."""
 
 
+def _with(given: Any, chosen: Mapping[str, Any]) -> Any:
+    """Return a table with what is chosen for it, if it has nothing of that."""
+    if isinstance(given, Table) and not given.model_fields_set & set(chosen):
+        return given.model_copy(update=chosen)
+    return {**given, **chosen} if isinstance(given, Mapping) and not set(given) & set(chosen) else given
+
+
 class SceneTables(Table):
     """Everything that a simulation starts from, each table right in itself."""
 
@@ -242,8 +249,8 @@ class SceneTables(Table):
     """The materials: in this order the components of mass fractions."""
     fluid: tuple[AnyFluid, ...] = ()
     """The bodies of fluid; particles come in this order. With an emitter there may be none."""
-    emitter: EmitterTable | None = None
-    """An emitter, out of which fluid comes; its particles come after those of all fluids."""
+    emitter: tuple[EmitterTable, ...] = ()
+    """Emitters, out of which fluid comes; their particles come after those of all fluids."""
     drain: tuple[AnyDrain, ...] = ()
     """Drains, which take particles out of the fluid."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)
@@ -309,11 +316,10 @@ class SceneTables(Table):
             return data
         data = dict(data)
         for name, chosen in what_suits(data.get("solver"), data.get("container")):
-            given = data.get(name)
-            if isinstance(given, Table) and not given.model_fields_set & set(chosen):
-                data[name] = given.model_copy(update=chosen)
-            elif isinstance(given, Mapping) and not set(given) & set(chosen):
-                data[name] = {**given, **chosen}
+            if name in data:
+                given = data[name]
+                is_list = isinstance(given, (list, tuple))
+                data[name] = [_with(one, chosen) for one in given] if is_list else _with(given, chosen)
         return data
 
     @field_validator("picture")
@@ -322,13 +328,13 @@ class SceneTables(Table):
         given = table is not None and {"dimension", "solid"} <= set(info.data)
         return table.in_scene(info.data["dimension"], [one.name for one in info.data["solid"]]) if given else table
 
-    @field_validator("emitter", "container", "forces", "schedule", "render")
+    @field_validator("container", "forces", "schedule", "render")
     @classmethod
     def _resolve(cls, table: Any, info: ValidationInfo) -> Any:
         given = table is not None and "dimension" in info.data
         return table.in_dimension(info.data["dimension"]) if given else table
 
-    @field_validator("sensor", "solid", "hinge", "spring", "drain")
+    @field_validator("sensor", "solid", "hinge", "spring", "emitter", "drain")
     @classmethod
     def _resolve_named(cls, tables: Any, info: ValidationInfo) -> Any:
         for index, table in enumerate(tables):

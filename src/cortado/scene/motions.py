@@ -85,7 +85,7 @@ class Course(Table):
         return placed
 
 
-def _course_table(parameter: Parameter) -> type[Course]:
+def course_table(parameter: Parameter) -> type[Course]:
     """Make the table of one parameter over time, whose values have its unit."""
     unit = parameter.unit.replace("²", "2").replace("°", "degrees")
     row = Annotated[tuple[Annotated[float, quantity(unit)], ...], Field(min_length=1, max_length=3, fail_fast=True)]
@@ -106,7 +106,7 @@ def _columns(parameter: Parameter, unit: str, dimension: int) -> Columns:
 
 _OVER_TIME = [p for p in PARAMETERS if p.axis is Axis.STEP]
 _COURSES: dict[str, Any] = {
-    p.name: (_course_table(p) | None, Field(default=None, description=p.meaning)) for p in _OVER_TIME
+    p.name: (course_table(p) | None, Field(default=None, description=p.meaning)) for p in _OVER_TIME
 }
 
 

@@ -93,7 +93,7 @@ class Parameter:
     present: Callable[[Any], bool] = lambda scene: True
     """Tells whether a scene has it."""
     absent: str = ""
-    """Words about a scene that does not have it: "has no emitter"."""
+    """Words about a scene that does not have it: "has only one phase"."""
     force: str | None = None
     """The module whose ``force`` makes the force that reads it, in scenes that have it: see `cortado.sph.parts`."""
     is_optional: bool = False
@@ -157,10 +157,6 @@ def _diffuses(source: Source, values: Mapping[str, NDArray]) -> bool:
 
 def _of_phases(name: str) -> Callable[[Source], list[Any]]:
     return lambda source: [getattr(phase, name) for phase in source.scene.phase]
-
-
-def _has_emitter(scene: Any) -> bool:
-    return scene.emitter is not None
 
 
 def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
@@ -301,28 +297,6 @@ PARAMETERS = (
         acts=_diffuses,
         present=_has_several_phases,
         absent="has only one phase",
-    ),
-    Parameter(
-        "nozzle_path",
-        "m",
-        "where the opening of the emitter is after each step",
-        Axis.STEP,
-        lambda s: s.scene.emitter.outlet,
-        components=_vector,
-        change=_spacing,
-        moment=1.0,
-        present=_has_emitter,
-        absent="has no emitter",
-    ),
-    Parameter(
-        "flow_rate",
-        "m³/s",
-        "volume that the emitter gives in a second, in 2-D area",
-        Axis.SCALAR,
-        lambda s: s.scene.emitter.flow_rate,
-        range=Range.POSITIVE,
-        present=_has_emitter,
-        absent="has no emitter",
     ),
     Parameter(
         "colours",

@@ -66,8 +66,8 @@ class Origin:
     """Name of the smoothing kernel."""
     periods: tuple[float, ...]
     """(d,) lengths [m], 0 along an axis that is not periodic."""
-    waiting: int
-    """Number of particles, the last ones, that are an emitter's."""
+    waiting: tuple[int, ...]
+    """Number of particles, the last ones, of each emitter."""
     rest_density: tuple[float, ...]
     """(phases,) that the run had [kg/m3]."""
     solver: str | None = None
@@ -91,9 +91,9 @@ class RestartState(ShortRepr):
 
     fields: Mapping[str, NDArray]
     """By the names that the solver declares: positions [m] and velocities [m/s], (n, d); mass_fractions (n, phases);
-    reference_density (n,), the mass of a particle over its volume on the rest lattice [kg/m3]; with an emitter outlet
-    (1, d), where its opening is [m], and emitted (1,), the length of fluid that has left it [m]; and what else a solver
-    carries from step to step, of which PCISPH has nothing."""
+    reference_density (n,), the mass of a particle over its volume on the rest lattice [kg/m3]; of each emitter
+    NAME.outlet (1, d), where its opening is [m], and NAME.emitted (1,), the length of fluid that has left it [m]; and
+    what else a solver carries from step to step, of which PCISPH has nothing."""
     clock: Clock = field(default_factory=Clock)
     """Time of the state."""
     origin: Origin | None = None

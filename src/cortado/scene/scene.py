@@ -38,6 +38,10 @@ HEAVIEST = {2: 3e5, 3: 3e6}
 """By the dimension, the mass of fluid above which a scene warns [kg]: that of water 30 m x 10 m, and 10 m deep."""
 
 
+EMPTY = ("force", "solid", "hinge", "spring", "emitter", "drain")
+"""Lists of tables that do not count where there are none."""
+
+
 @public
 class Scene(SceneTables):
     """A scene, from which a simulation starts: `SceneTables` that fit each other."""
@@ -67,38 +71,35 @@ class Scene(SceneTables):
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
     def lasting(self, time: float | None = None, steps: int | None = None) -> "Scene":
-        """Return this scene with an emitter that has a reserve for a time [s], or for ``steps`` steps.
+        """Return this scene with emitters that have a reserve for a time [s], or for ``steps`` steps.
 
-        It is the scene as it is where that has no emitter, or one with a duration, and where the column suffices. So it
-        is where fluid flows along a periodic axis, which leaves no place for a reserve. Raises `InputError` for more
-        particles than memory holds.
+        It is the scene as it is where emitters have a volume, or drains that feed them, and where columns suffice. So
+        it is where all axes are periodic, which leaves no place for a reserve. Raises `InputError` for more particles
+        than memory holds.
         """
-        emitter, spacing = self.emitter, self.discretisation.spacing
-        lengths = self.periods[1]
+        spacing = self.discretisation.spacing
         if steps is not None:
             time = steps * longest_step(self)
-        if emitter is None or time is None or np.any((lengths > 0.0) & (np.array(emitter.direction) != 0.0)):
+        if not self.emitter or time is None or (self.periods[1] > 0.0).all():
             return self
         if not as_one_number("time", time) < np.inf:
             raise InputError(f"time is {time:g}, but must be a number of seconds greater than 0.")
-        lasting = emitter.lasting(time, spacing)
-        if lasting is emitter:
+        lasting = tuple(emitter.lasting(time, spacing) for emitter in self.emitter)
+        if all(new is old for new, old in zip(lasting, self.emitter, strict=True)):
             return self
-        require(sampling_parts(lasting.count(spacing), 0.0), "take less time, or give emitter.duration")
+        count = sum(emitter.count(spacing) for emitter in lasting)
+        require(sampling_parts(count, 0.0), "take less time, or give the volume of each emitter")
         return self.model_copy(update={"emitter": lasting})
 
     def going_on(self, state: RestartState) -> "Scene":
-        """Return this scene with an emitter that has as many particles as the run of a state."""
-        emitter, origin, spacing = self.emitter, state.origin, self.discretisation.spacing
-        if emitter is None or origin is None or emitter.duration is not None:
+        """Return this scene with emitters that have as many particles as the run of a state."""
+        origin, spacing, made = state.origin, self.discretisation.spacing, list(self.emitter)
+        if origin is None or len(origin.waiting) != len(made):
             return self
-        layers = origin.waiting / emitter.sample(spacing).layer
-        duration = layers * spacing / emitter.speed(spacing)
-        return (
-            self
-            if layers <= emitter.layers(spacing)
-            else self.model_copy(update={"emitter": emitter.model_copy(update={"duration": duration})})
-        )
+        for k, (emitter, count) in enumerate(zip(self.emitter, origin.waiting, strict=True)):
+            if emitter.volume is None and count > len(emitter.sample(spacing).upstream):
+                made[k] = emitter.model_copy(update={"volume": count * spacing**self.dimension})
+        return self.model_copy(update={"emitter": tuple(made)})
 
     def to_json(self) -> str:
         """Return the scene as JSON with all defaults but colours, which materials may have, to be read by
@@ -107,18 +108,15 @@ class Scene(SceneTables):
 
     def computed_json(self) -> str:
         """Return as JSON the part of the scene on which results depend. It has no [picture], [[sensor]] and materials.
-        It also leaves out an empty [[force]], [[solid]], [[hinge]], [[spring]] or [[drain]], a jitter of 0, keys of
-        chosen time steps where they are fixed, and options of the projection that are off."""
+        It also leaves out what is empty of [[force]], [[solid]], [[hinge]], [[spring]], [[emitter]] and [[drain]], a
+        jitter of 0, keys of chosen time steps where they are fixed, and options of the projection that are off."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
-        aside |= {name: True for name in ("force", "solid", "hinge", "spring", "drain") if not getattr(self, name)}
-        jittered = {"discretisation": self.discretisation.jitter, "emitter": self.emitter and self.emitter.jitter}
-        aside |= {name: {"jitter"} for name, jitter in jittered.items() if not jitter}
+        aside |= {name: True for name in EMPTY if not getattr(self, name)}
+        aside |= {} if self.discretisation.jitter else {"discretisation": {"jitter"}}
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
         off = set() if getattr(self.solver, "velocities_follow", True) else {"velocities_follow"}
         endless = {"tolerance", "maximum_iterations"} if getattr(self.solver, "tolerance", 0.0) is None else set()
         aside["solver"] = unused | off | endless
-        if self.emitter and self.emitter.duration is None:
-            aside["emitter"] = {*aside.get("emitter", ()), "duration"}
         aside |= {name: {"__all__": {"material"}} for name in ("phase", "solid") if name not in aside}
         aside["container"] = {"material", "colour"}
         return json.dumps(self.model_dump(mode="json", exclude=aside, context="colours"), indent=2)
@@ -213,6 +211,7 @@ def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
 def files_named(tables: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
     """Return the tables, among those that `Scene.to_json` wrote, that name a file, each with the key that does."""
     found = [*(tables.get("solid") or ()), *(tables.get("fluid") or ()), *(tables.get("schedule") or {}).values()]
+    found += [one["path"] for one in tables.get("emitter") or ()]
     return [(table, key) for table in found if table for key in ("file", "path") if table.get(key)]
 
 
@@ -221,7 +220,7 @@ def scene_in_words(scene: Scene, particles: int) -> str:
     phases = " and ".join(
         f"{phase.name} ({phase.rest_density:g} kg/m³, {phase.viscosity:g} Pa s)" for phase in scene.phase
     )
-    emitter = " of which an emitter gives some," if scene.emitter is not None else ""
+    emitter = f" of which {counted(len(scene.emitter), 'emitter')} give some," if scene.emitter else ""
     return (
         f"{counted(particles, 'particle')} of {phases} in {scene.dimension}-D,{emitter} "
         f"{scene.discretisation.spacing:g} m apart at rest, {_held(scene)}, "

@@ -103,13 +103,10 @@ def _turned_off(scene: SceneTables) -> Iterator[Idle]:
     suited = ("discretisation", {"jitter": cut.jitter}) in what_suits(scene.solver, scene.container)
     if all(isinstance(fluid, PointsFluid) for fluid in scene.fluid) and not suited:
         yield ("discretisation",), cut, ("jitter",), "points of files and an emitter's particles stay where they are"
-    emitter, spacing = scene.emitter, scene.discretisation.spacing
-    if (
-        emitter is not None
-        and emitter.length is not None
-        and emitter.layers(spacing) * spacing < emitter.length - spacing
-    ):
-        yield ("emitter",), emitter, ("length",), "duration is over before so much is out"
+    spacing = scene.discretisation.spacing
+    for index, emitter in enumerate(scene.emitter):
+        if emitter.length is not None and emitter.layers(spacing) * spacing < emitter.length - spacing:
+            yield ("emitter", index), emitter, ("length",), "the volume is less than so long a column has"
     for index, solid in enumerate(scene.solid):
         names = tuple(name for name in ("centre", "base") if any(getattr(solid, name, ())))
         if not np.allclose(solid.centroid(), solid.shape_about()[1]):

@@ -7,7 +7,7 @@ import numpy as np
 
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import pairwise_rate, smoothing_kernel, stress_rate
-from cortado.scene.drain_tables import sink_limit
+from cortado.scene.drain_tables import flow_name, sink_limit
 from cortado.scene.model import SceneTables
 from cortado.scene.motions import free, greatest_speed, moving, position_name, rotation_name, scale_name, told
 from cortado.scene.parameter_values import Arrays, Tilt
@@ -42,7 +42,7 @@ def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arra
 
 
 def _begins(scene: SceneTables, values: Arrays) -> list[tuple[Points, Points]]:
-    """Return the boxes around each body of fluid, each free body and the outlet: lower and upper, each (d,) [m]."""
+    """Return the boxes around each body of fluid, each free body and each outlet: lower and upper, each (d,) [m]."""
     spacing = scene.discretisation.spacing
     places = values.get("initial_positions")
     extents = [fluid.extent(spacing) for fluid in scene.fluid]
@@ -50,23 +50,20 @@ def _begins(scene: SceneTables, values: Arrays) -> list[tuple[Points, Points]]:
         extents = [(places.min(axis=0), places.max(axis=0))]
     boxes = [(lower - 0.5 * spacing, upper + 0.5 * spacing) for lower, upper in extents]
     boxes += [solid.extent() for solid in solids_of(tuple(free(scene.solid)))]
-    if scene.emitter is not None:
-        opening = scene.emitter.opening(spacing)
-        boxes.append((opening.min(axis=0), opening.max(axis=0)))
-    return boxes
+    openings = [emitter.opening(spacing) for emitter in scene.emitter]
+    return boxes + [(opening.min(axis=0), opening.max(axis=0)) for opening in openings]
 
 
 def _extent(scene: SceneTables) -> tuple[Points, Points]:
     """Return the box through which fluid may fall: lower and upper, each (d,) [m]."""
     lower, upper = _room(scene)
-    if scene.emitter is None:
-        return lower, upper
-    return np.minimum(lower, scene.emitter.outlet), np.maximum(upper, scene.emitter.outlet)
+    outlets = np.array([lower, upper, *(emitter.outlet for emitter in scene.emitter)])
+    return outlets.min(axis=0), outlets.max(axis=0)
 
 
 def _room(scene: SceneTables) -> tuple[Points, Points]:
     """Return the box of the container: lower and upper, each (d,) [m]. Without one it is the box around the fluids and
-    the solids, which fluid falls along, or around the outlet if there is only the emitter."""
+    the solids, which fluid falls along, or around the outlets if there are only emitters."""
     ends = scene.container.extent()
     if ends is not None:
         return ends
@@ -74,8 +71,8 @@ def _room(scene: SceneTables) -> tuple[Points, Points]:
     fluids = np.array([fluid.extent(scene.discretisation.spacing) for fluid in scene.fluid])
     boxes = [(lower - half, upper + half) for lower, upper in fluids]
     boxes += [solid.extent() for solid in solids_of(scene.solid)]
-    if scene.emitter is not None and not boxes:
-        boxes = [(np.array(scene.emitter.outlet), np.array(scene.emitter.outlet))]
+    if not boxes:
+        boxes = [(np.array(emitter.outlet), np.array(emitter.outlet)) for emitter in scene.emitter]
     lower, upper = np.swapaxes(boxes, 0, 1)
     return lower.min(axis=0), upper.max(axis=0)
 
@@ -250,16 +247,16 @@ def _gravity(scene: SceneTables) -> Points:
 
 
 def _first_speed(scene: SceneTables, values: Arrays) -> float:
-    """Return the largest speed with which fluid starts or comes out of the emitter [m/s]."""
+    """Return the largest speed with which fluid starts or comes out of an emitter [m/s]."""
     if "initial_velocities" in values:
         speed = float(np.linalg.norm(values["initial_velocities"], axis=1).max())
     else:
         spacing = scene.discretisation.spacing
         speed = max((fluid.greatest_speed(spacing) for fluid in scene.fluid), default=0.0)
-    if scene.emitter is None:
-        return speed
-    faster = float(values.get("flow_rate", scene.emitter.flow_rate)) / scene.emitter.flow_rate
-    return max(speed, faster * scene.emitter.speed(scene.discretisation.spacing))
+    for emitter in scene.emitter:
+        flow = float(np.max(values.get(flow_name(emitter.name), emitter.greatest)))
+        speed = max(speed, flow / emitter.area(scene.discretisation.spacing))
+    return speed
 
 
 def viscous_limit(scene: SceneTables, values: Arrays) -> float:
@@ -278,7 +275,7 @@ def _kinematic(scene: SceneTables, values: Arrays) -> float:
     meet; 0 without viscosity."""
     if scene.forces.viscosity == "none":
         return 0.0
-    names = {fluid.phase for fluid in scene.fluid} | ({scene.emitter.phase} if scene.emitter else set())
+    names = {body.phase for body in (*scene.fluid, *scene.emitter)}
     used = [k for k, phase in enumerate(scene.phase) if phase.name in names]
     densities = np.atleast_1d(values.get("rest_density", [phase.rest_density for phase in scene.phase]))
     viscosities = np.atleast_1d(values.get("viscosity", [phase.viscosity for phase in scene.phase]))

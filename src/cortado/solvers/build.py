@@ -26,7 +26,7 @@ from cortado.particles.sheets import Sheets
 from cortado.particles.state import Layout, padded
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
 from cortado.scene.drain_tables import drain_parameters
-from cortado.scene.fluid_particles import reserve_offset
+from cortado.scene.emitter_table import emitter_parameters
 from cortado.scene.links import Hold
 from cortado.scene.motions import mass_of_one, motion_parameters, moving, solid_frames, wall_numbers, weight_name
 from cortado.scene.parameter_values import REGISTRY, Known, checked_value
@@ -37,12 +37,11 @@ from cortado.scene.solids import SolidTable
 from cortado.scene.solvers import OWN, PackageSolver, SolverTable
 from cortado.scene.springs import ends_of, spring_parameters, turned_by
 from cortado.solvers.contacts import Contacts, Touching
-from cortado.solvers.drained import drained_of
+from cortado.solvers.drained import drained_of, nozzles_of
 from cortado.solvers.obstacles import FINE, ON, FlatFaces, NamedSolid, Obstacle, Walled, flat_faces, placed_sheets
 from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.solver import Solver
 from cortado.sph.drains import Drains
-from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, Diffusion, FreeEnergy
 from cortado.sph.free_solids import FreeSolids, FreeSolidsPart, FreeTable, Push
 from cortado.sph.mixture import Phases
@@ -102,6 +101,7 @@ def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
     own = [(parameter, "a solver") for parameter in getattr(solver, "parameters", ())]
     own += [(parameter, "a force") for maker in forces for parameter in maker.parameters]
     own += [(parameter, "a solid") for parameter in motion_parameters(scene.solid)]
+    own += [(parameter, "an emitter") for parameter in emitter_parameters(scene)]
     own += [(parameter, "a drain") for parameter in drain_parameters(scene)]
     return Known([*own, *((parameter, "a spring") for parameter in spring_parameters(scene))])
 
@@ -215,7 +215,7 @@ def known_in(scene: Scene) -> Known:
     """Return the parameters of a scene, with those of parts of packages and of moving solids; raise `InputError` where
     two have one name."""
     own = scene.force or any(phase.rheology for phase in scene.phase) or isinstance(scene.solver, PackageSolver)
-    if not (own or scene.drain or moving(scene.solid)):
+    if not (own or scene.emitter or scene.drain or moving(scene.solid)):
         return REGISTRY
     return known_of(forces_named(scene), solver_named(scene.solver), scene)
 
@@ -351,7 +351,7 @@ def _parts(
     layout: Layout,
 ) -> list[PartMaker]:
     """Make the parts of a solver that are no forces, in the order in which they end a step."""
-    found: list[PartMaker | None] = [_phases(scene, discretisation, free_energy), _nozzle(scene, discrete)]
+    found: list[PartMaker | None] = [_phases(scene, discretisation, free_energy), *nozzles_of(scene, discrete)]
     found.append(_free_solids(scene, discrete, search, layout))
     if tables := moving(scene.solid):  # this also writes the walls of free bodies
         numbers = {table.name: number for number, table in enumerate(tables) if table.motion != "free"}
@@ -406,22 +406,6 @@ def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnerg
         return Phases(1, None, 0.0)
     diffusion = Diffusion(discretisation, count, free_energy, MOBILITIES[mixture.mobility_form])
     return Phases(count, diffusion, mixture.strength)
-
-
-def _nozzle(scene: Scene, discrete: DiscreteScene) -> Nozzle | None:
-    """Make the part for the particles that wait in a nozzle; None for a scene without an emitter."""
-    fluid, sample = discrete.fluid, discrete.fluid.emitter
-    if scene.emitter is None or sample is None:
-        return None
-    return Nozzle(
-        first=fluid.emitted.start,
-        upstream=sample.upstream,
-        offsets=sample.offsets,
-        direction=np.array(scene.emitter.direction),
-        area=scene.emitter.flow_rate / sample.speed,
-        column=sample.column,
-        reserve=reserve_offset(scene),
-    )
 
 
 def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:

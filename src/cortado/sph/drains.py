@@ -43,7 +43,10 @@ from cortado.particles.state import (
     padded,
     to_device,
 )
+from cortado.scene.drain_tables import count_name
+from cortado.scene.emitter_table import again_name, emitted_name
 from cortado.scene.parameters import Axis
+from cortado.sph.emitter import Nozzle, nozzle_type, remaining_function
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 
 MEMORY = 0.98
@@ -79,7 +82,6 @@ class Mouth:
 class Pull:
     """How fluid flows to a sink."""
 
-    name: str
     shell: tuple[float, float]
     """r_1 and r_2 [m]"""
     sphere: float
@@ -97,8 +99,8 @@ class Drained:
     """Of those that suck, by their names."""
     places: Points
     """(n, d) [m]"""
-    upstream: Points
-    """(n,) distance from the opening of an emitter [m]; 0 of a particle that is none of its."""
+    nozzles: Sequence[Nozzle]
+    """In which particles wait that no drain takes."""
     periods: Points
     """(d,) [m], 0 along an axis that is not periodic"""
 
@@ -138,13 +140,16 @@ def nearest_function(precision: Precision, module: Any) -> Any:
 
 
 @cache
-def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Kernels]:
-    """Make the kernel that finds the particles which a drain takes, and those that park them, all in scene order."""
+def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels]:
+    """Make the kernels that find the particles which wait in a nozzle, and those which a drain takes; and those that
+    park them, all in scene order."""
     real, vector, mouth_of = precision.real, precision.vector, mouth_type(precision)
     module = kernel_module(f"drains_{'taped_' * taped}{precision.name}", taped)
     derivatives = kernel_module(f"drains_derivative_{precision.name}")
     nearest = nearest_function(precision, module)
-    typed = TypesByName(real, {mouth_of: "mouth", vector: "middle x v", wp.float64: "emitted"})
+    remaining, nozzle_of = remaining_function(precision), nozzle_type(precision)
+    doubles = {wp.float64: "emitted serial", nozzle_of: "nozzle"}
+    typed = TypesByName(real, {mouth_of: "mouth", vector: "middle x v", **doubles})
 
     @wp.func
     def contains(x: vector, middle: vector, m: mouth_of) -> bool:
@@ -156,22 +161,17 @@ def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Kernels]:
         below = y[0] < m.lower[0] or y[1] < m.lower[1] or y[2] < m.lower[2]
         return not below and y[0] <= m.upper[0] and y[1] <= m.upper[1] and y[2] <= m.upper[2]
 
-    @particle_kernel(module, "taken fresh", numbers=["mouth", "particles"])
+    @particle_kernel(module, "waits", numbers=["nozzle", "particles"])
     @typed
-    def take(
-        i: int,
-        member: int,
-        particles: int,
-        mouth,
-        middle,
-        emitted,
-        upstream: wp.array(dtype=real),
-        x_i,
-        taken_i,
-    ) -> tuple[real, real]:
-        found, fresh = taken_i, real(0.0)
-        waits = wp.float64(upstream[i - member * particles]) > emitted
-        if found == real(0.0) and not waits and contains(x_i, middle, mouth):
+    def wait(i: int, member: int, particles: int, nozzle, emitted, serial_i, waits_i) -> real:
+        in_line = remaining(i - member * particles, nozzle, serial_i, emitted) > real(0.0)
+        return wp.where(in_line, real(1.0), waits_i)
+
+    @particle_kernel(module, "taken fresh", numbers=["mouth"])
+    @typed
+    def take(i: int, mouth, middle, waits_i, x_i, taken_i) -> tuple[real, real]:
+        found, fresh = wp.where(waits_i > real(0.0), real(0.0), taken_i), real(0.0)
+        if found == real(0.0) and waits_i == real(0.0) and contains(x_i, middle, mouth):
             found = mouth.number
             fresh = real(1.0)
         return found, fresh
@@ -193,7 +193,7 @@ def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Kernels]:
 
         return hold
 
-    return take, Kernels(park, held("x_dot v_dot"), held("x_free_bar v_free_bar"))
+    return wait, take, Kernels(park, held("x_dot v_dot"), held("x_free_bar v_free_bar"))
 
 
 def _period(periods: Points, precision: Precision) -> dict[str, Any]:
@@ -213,10 +213,10 @@ def _mouth(one: Mouth, number: int, periods: Points, precision: Precision) -> An
 
 
 @cache
-def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Kernels, Kernels]:
-    """Make the kernel that counts how many particles a sink is behind; the kernels of the acceleration by a sink, after
-    that by all other forces; and those that read its flow rate in a step, and add to the adjoint of that. The first and
-    the last have a thread for each scene."""
+def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, Kernels]:
+    """Make the kernel that adds up how many particles a drain took, and that of how many a sink is behind; the kernels
+    of the acceleration by a sink, after that by all other forces; and those that read its flow rate in a step, and add
+    to the adjoint of that. All but those of the acceleration have a thread for each scene."""
     real, vector = precision.real, precision.vector
     modules = [kernel_module(f"sinks_{'taped_' * taped}{precision.name}", taped)]
     modules += [kernel_module(f"sinks_derivative_{precision.name}")] * 2
@@ -256,8 +256,13 @@ def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Kernels, Kerne
         precision, modules, make, ["acceleration"], {"acceleration": "acceleration_in"}, numbers=numbers
     )
     rows = wp.array2d(dtype=real)
-    of_scene = TypesByName(real, {wp.int32: "step", rows: "table", wp.float64: "behind"})
+    of_scene = TypesByName(real, {wp.int32: "step", rows: "table", wp.float64: "behind count"})
     most = wp.constant(wp.float64(MOST))
+
+    @wp.kernel(module=modules[0], enable_backward=False)
+    @of_scene.arrays
+    def tally(taken_sum, count):
+        count[wp.tid()] = count[wp.tid()] + wp.float64(taken_sum[wp.tid()])
 
     @wp.kernel(module=modules[0], enable_backward=False)
     @of_scene.arrays
@@ -277,10 +282,9 @@ def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Kernels, Kerne
     @wp.kernel(module=modules[1], enable_backward=False)
     @of_scene.arrays
     def add_to(step, table: rows, gain, total):
-        m = wp.tid()
-        table[m, step[m]] = table[m, step[m]] + gain[m] * total[m]
+        table[wp.tid(), step[wp.tid()]] = table[wp.tid(), step[wp.tid()]] + gain[wp.tid()] * total[wp.tid()]
 
-    return fall_behind, drives, Kernels(read, read, add_to)
+    return tally, fall_behind, drives, Kernels(read, read, add_to)
 
 
 class Drains(Part):
@@ -293,23 +297,25 @@ class Drains(Part):
         self.layout, precision, device, real = layout, layout.precision, layout.device, layout.precision.real
         self.free = layout.state((POSITIONS, VELOCITIES), taped)
         """Room for the end of a step if no particle were taken."""
-        self.take, self.parks = drain_kernels(precision, taped)
-        self.fall_behind, self.drive, self.flows = pull_kernels(precision, taped)
+        self.wait, self.take, self.parks = drain_kernels(precision, taped)
+        self.tally, self.fall_behind, self.drive, self.flows = pull_kernels(precision, taped)
         self.shares = tuple(f"{name}.position" for name in of.pulls)
-        self.fields = (DRAINED, *map(behind, of.pulls))
-        self.taken = layout.arrays(taken=real, fresh=real)
-        """(n,) by which drain each particle is taken in the step, or was before; and 1 for one taken by the last."""
+        counts = (StateField(count_name(one.name), "", Entry.DOUBLE, Axis.SCALAR) for one in of.mouths)
+        self.fields = (DRAINED, *map(behind, of.pulls), *counts)
+        self.taken = layout.arrays(taken=real, fresh=real, waits=real)
+        """(n,) by which drain each particle is taken in the step, or was before; 1 for one taken by the last; and 1 for
+        one that waits in a nozzle."""
         self.places = to_device(of.places, precision, device)
-        self._upstream = wp.array(of.upstream, dtype=real, device=device)
-        self._none = wp.zeros(layout.members, dtype=wp.float64, device=device)
+        self._nozzles = [(one, one.constants(layout)) for one in of.nozzles]
+        self._never = layout.arrays(serial=wp.float64)["serial"]
         self._mouths = [
             (one, _mouth(one, k, of.periods, precision), self._middle(one)) for k, one in enumerate(of.mouths)
         ]
         self._pulls = {name: self._pull(pull, of.periods) for name, pull in of.pulls.items()}
-        members = {"dtype": real, "device": device}
-        self._flow = {end: wp.zeros(layout.members, **members) for end in ("flow", "flow_dot")}
-        self._gains = {name: wp.zeros(layout.members, **members) for name in of.pulls}
-        self._behind = {name: wp.zeros(layout.members, dtype=wp.float64, device=device) for name in of.pulls}
+        self._flow = {end: wp.zeros(layout.members, dtype=real, device=device) for end in ("flow", "flow_dot")}
+        self._gains = {name: wp.zeros(layout.members, dtype=real, device=device) for name in of.pulls}
+        counted = [behind(name).name for name in of.pulls] + [count_name(one.name) for one in of.mouths]
+        self._counts = {name: wp.zeros(layout.members, dtype=wp.float64, device=device) for name in counted}
         self._between = [layout.arrays(a=precision.vector)["a"] for _ in of.pulls][1:]
         self._still = layout.arrays(kick=precision.vector)["kick"]
         self._found: list[tuple[str, wp.array, wp.array]] = []
@@ -338,14 +344,20 @@ class Drains(Part):
     def begin(self, step: StepContext, state: State) -> None:
         """Find the particles that are taken, by where they are as the step begins."""
         wp.copy(self.taken["taken"], state["drained"])
-        emitted = state["emitted"] if "emitted" in state.names else self._none
-        at = {"x": state.positions, "upstream": self._upstream, "emitted": emitted}
+        self.taken["waits"].zero_()
+        for nozzle, constants in self._nozzles:
+            serial = state[again_name(nozzle.name)] if nozzle.feeding.any() else self._never
+            own = {"nozzle": constants, "emitted": state[emitted_name(nozzle.name)], "serial": serial}
+            step.launch(self.wait, own, self.taken)
+        for name, count in self._counts.items():
+            wp.copy(count, state[name])
         for one, mouth, middle in self._mouths:
             place = step.parameters[middle] if isinstance(middle, str) else middle
-            step.launch(self.take, at, self.taken, mouth=mouth, middle=place)
+            step.launch(self.take, self.taken, x=state.positions, mouth=mouth, middle=place)
+            counted = {"taken_sum": self._sum(self.taken["fresh"]), "count": self._counts[count_name(one.name)]}
+            step.launch(self.tally, counted, threads=self.layout.members)
             if one.name in self._pulls:
-                wp.copy(self._behind[one.name], state[behind(one.name).name])
-                counted = {"taken_sum": self._sum(self.taken["fresh"]), "behind": self._behind[one.name]}
+                counted["behind"] = self._counts[behind(one.name).name]
                 step.launch(self.fall_behind, counted, self._of(step.parameters, one.name), threads=self.layout.members)
 
     def _of(self, parameters: Parameters, name: str) -> dict[str, Any]:
@@ -359,8 +371,8 @@ class Drains(Part):
         free = {"x_free": self.free.positions, "v_free": self.free.velocities, "places": self.places}
         step.launch(self.parks.forward, self.taken, free, x=moved.positions, v=moved.velocities)
         wp.copy(state["drained"], self.taken["taken"])
-        for name, count in self._behind.items():
-            wp.copy(state[behind(name).name], count)
+        for name, count in self._counts.items():
+            wp.copy(state[name], count)
 
     def new_tangent(self) -> "DrainsTangent":
         return DrainsTangent(self)

@@ -5,9 +5,13 @@ u - l > 0 upstream, where l grows by w dt in each step, w = Q / A:
 
     x = q_n + o - s e,   v = (q_n - q_(n-1)) / dt + w e
 
-q_n is where the opening is after step n (it rests before the first), e its direction, Q the flow rate and A its area.
-Position and velocity do not jump when a particle becomes free. Particles in reserve are further upstream than the
-column is long. They wait elsewhere, displaced by a constant vector, until they join its end.
+q_n is where the opening is after step n (it rests before the first), e its direction, Q the flow rate in the step and A
+its area. Position and velocity do not jump when a particle becomes free. Particles in reserve are further upstream
+than the column is long. They rest at places of their own until they join its end, which have no derivative.
+
+A nozzle that drains feed gives the particles out again that they took. Whenever the column has room for a layer at its
+end, as many of them join it as are there, with u from their places in line, which go on behind those of the first
+particles. Which ones join has no derivative, and what they were before has none.
 """
 
 from dataclasses import dataclass
@@ -20,7 +24,18 @@ import warp as wp
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import particle_kernel
-from cortado.particles.state import POSITIONS, VELOCITIES, Entry, Layout, Parameters, State, StateField, to_device
+from cortado.particles.state import (
+    POSITIONS,
+    VELOCITIES,
+    Entry,
+    Layout,
+    Parameters,
+    State,
+    StateField,
+    padded,
+    to_device,
+)
+from cortado.scene.emitter_table import EmitterSample, again_name, emitted_name, outlet_name, path_name
 from cortado.scene.parameters import Axis
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tangents
@@ -28,13 +43,16 @@ from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tange
 
 @cache
 def nozzle_type(precision: Precision) -> Any:
-    """Make the Warp struct of an emitter's constants; its arrays are of the particles of one scene from ``first``
-    on."""
+    """Make the Warp struct of an emitter's constants; its arrays are of its own particles, from ``first`` on."""
     real, vector = precision.real, precision.vector
 
     class Nozzle:
         first: wp.int32
         """Number of its first particle."""
+        count: wp.int32
+        """Number of its particles."""
+        layer: wp.int32
+        """Number of particles in a layer."""
         upstream: wp.array(dtype=real)
         """u [m]"""
         offsets: wp.array(dtype=vector)
@@ -43,8 +61,8 @@ def nozzle_type(precision: Precision) -> Any:
         """e"""
         column: real
         """Particles further upstream are in reserve [m]."""
-        reserve: vector
-        """Distance of particles in reserve from their place in line [m]."""
+        spacing: wp.float64
+        """Length of a layer [m]."""
         area: real
         """A [m^(d - 1)]"""
 
@@ -53,15 +71,34 @@ def nozzle_type(precision: Precision) -> Any:
 
 
 @cache
+def remaining_function(precision: Precision) -> Any:
+    """Make the Warp function of how far a particle is upstream of an opening, s [m]; 0 or less for one that is out, or
+    no part of the emitter. ``serial`` is its place in line, from 1 on, if it is given out again."""
+    real, nozzle_of = precision.real, nozzle_type(precision)
+
+    @wp.func
+    def remaining(p: int, nozzle: nozzle_of, serial: wp.float64, emitted: wp.float64) -> real:
+        if serial > wp.float64(0.0):
+            number = wp.floor((serial - wp.float64(1.0)) / wp.float64(nozzle.layer))
+            return real((number + wp.float64(0.5)) * nozzle.spacing - emitted)
+        if p < nozzle.first or p >= nozzle.first + nozzle.count:
+            return real(0.0)
+        return real(wp.float64(nozzle.upstream[p - nozzle.first]) - emitted)
+
+    return remaining
+
+
+@cache
 def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels]:
     """Make the kernels of the motion of the column of fluid in a step, with a thread for each scene, and those of
     particles at its end, in scene order. The adjoint of the motion takes sums of the adjoints of prescribed positions
     and velocities. Of each scene, (members,), ``outlet`` is q_n [m], ``drift`` the velocity of prescribed particles
-    [m/s], and ``emitted`` l at the end of the step [m]."""
+    [m/s], and ``emitted`` l at the end of the step [m]. ``path`` and ``flow`` have a row for each step."""
     real, vector, nozzle_of = precision.real, precision.vector, nozzle_type(precision)
     module, derivatives = integration_module(precision, True, taped), integration_module(precision, False)
-    numbers, path = ["nozzle", "particles"], wp.array2d(dtype=vector)
-    own = {nozzle_of: "nozzle", path: "nozzle_path", wp.int32: "step", wp.float64: "emitted"}
+    numbers, remaining = ["nozzle", "particles"], remaining_function(precision)
+    own = {nozzle_of: "nozzle", wp.array2d(dtype=vector): "path", wp.array2d(dtype=real): "flow"}
+    own |= {wp.int32: "step", wp.float64: "emitted serial"}
     typed = TypesByName(real, {vector: "outlet drift x v", **own})
 
     @wp.func
@@ -69,157 +106,257 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
         """Return w dt, how far the column of fluid moves in a step [m]."""
         return wp.float64(flow_rate) / wp.float64(area) * wp.float64(time_step)
 
-    @wp.func
-    def remaining(p: int, nozzle: nozzle_of, emitted: wp.float64) -> real:
-        """Return how far a particle is upstream of the opening, s [m]; 0 for one that is no part of the emitter."""
-        if p < nozzle.first:
-            return real(0.0)
-        return real(wp.float64(nozzle.upstream[p - nozzle.first]) - emitted)
-
     @particle_kernel(module, "outlet drift emitted", numbers=["nozzle"])
     @typed
     def begin(
-        i: int, nozzle, nozzle_path, step_i, flow_rate_i, time_step_i, outlet_in_i, emitted_in_i
+        i: int, nozzle, path, flow, step_i, time_step_i, outlet_in_i, emitted_in_i
     ) -> tuple[vector, vector, wp.float64]:
-        q = nozzle_path[i, step_i]
-        drift = (q - outlet_in_i) / time_step_i + (flow_rate_i / nozzle.area) * nozzle.direction
-        return q, drift, emitted_in_i + advance(flow_rate_i, nozzle.area, time_step_i)
+        q, flow_rate = path[i, step_i], flow[i, step_i]
+        drift = (q - outlet_in_i) / time_step_i + (flow_rate / nozzle.area) * nozzle.direction
+        return q, drift, emitted_in_i + advance(flow_rate, nozzle.area, time_step_i)
 
     @particle_kernel(derivatives, "outlet_dot drift_dot emitted_dot", numbers=["nozzle"])
     @typed
     def begin_tangent(
         i: int,
         nozzle,
-        nozzle_path_dot,
+        path_dot,
+        flow,
+        flow_dot,
         step_i,
-        flow_rate_i,
-        flow_rate_dot_i,
         time_step_i,
         time_step_dot_i,
         drift_i,
         outlet_in_dot_i,
         emitted_in_dot_i,
     ) -> tuple[vector, vector, wp.float64]:
-        q_dot, along = nozzle_path_dot[i, step_i], nozzle.direction / nozzle.area
-        turn = drift_i - flow_rate_i * along
-        drift_dot = (q_dot - outlet_in_dot_i - time_step_dot_i * turn) / time_step_i + flow_rate_dot_i * along
-        faster = advance(flow_rate_dot_i, nozzle.area, time_step_i)
-        return q_dot, drift_dot, emitted_in_dot_i + faster + advance(flow_rate_i, nozzle.area, time_step_dot_i)
+        q_dot, along = path_dot[i, step_i], nozzle.direction / nozzle.area
+        flow_rate, flow_rate_dot = flow[i, step_i], flow_dot[i, step_i]
+        turn = drift_i - flow_rate * along
+        drift_dot = (q_dot - outlet_in_dot_i - time_step_dot_i * turn) / time_step_i + flow_rate_dot * along
+        faster = advance(flow_rate_dot, nozzle.area, time_step_i)
+        return q_dot, drift_dot, emitted_in_dot_i + faster + advance(flow_rate, nozzle.area, time_step_dot_i)
 
-    @particle_kernel(derivatives, "outlet_bar emitted_bar +flow_rate_bar +time_step_bar", numbers=["nozzle"])
+    @particle_kernel(derivatives, "outlet_bar emitted_bar +time_step_bar", numbers=["nozzle"])
     @typed
     def begin_adjoint(
         i: int,
         nozzle,
-        nozzle_path_bar,
+        path_bar,
+        flow,
+        flow_bar,
         step_i,
-        flow_rate_i,
         time_step_i,
         drift_i,
         x_total_i,
         v_total_i,
         outlet_bar_i,
         emitted_bar_i,
-    ) -> tuple[vector, wp.float64, real, real]:
-        nozzle_path_bar[i, step_i] = nozzle_path_bar[i, step_i] + outlet_bar_i + x_total_i + v_total_i / time_step_i
+    ) -> tuple[vector, wp.float64, real]:
+        path_bar[i, step_i] = path_bar[i, step_i] + outlet_bar_i + x_total_i + v_total_i / time_step_i
         along, whole = nozzle.direction / nozzle.area, emitted_bar_i + wp.float64(wp.dot(nozzle.direction, x_total_i))
-        further, turn = real(whole) / nozzle.area, drift_i - flow_rate_i * along
+        flow_rate = flow[i, step_i]
+        further, turn = real(whole) / nozzle.area, drift_i - flow_rate * along
         faster, longer = wp.dot(along, v_total_i), -wp.dot(v_total_i, turn) / time_step_i
-        return -v_total_i / time_step_i, whole, further * time_step_i + faster, further * flow_rate_i + longer
+        flow_bar[i, step_i] = flow_bar[i, step_i] + further * time_step_i + faster
+        return -v_total_i / time_step_i, whole, further * flow_rate + longer
 
     @particle_kernel(module, "x v", numbers=numbers)
     @typed
     def prescribe(
-        i: int, member: int, particles: int, nozzle, outlet, drift, emitted, x_free_i, v_free_i
+        i: int,
+        member: int,
+        particles: int,
+        nozzle,
+        outlet,
+        drift,
+        emitted,
+        places: wp.array(dtype=vector),
+        serial_i,
+        x_free_i,
+        v_free_i,
     ) -> tuple[vector, vector]:
         p = i - member * particles
-        s, x, v = remaining(p, nozzle, emitted), x_free_i, v_free_i
-        if s > real(0.0):
-            place = outlet + nozzle.offsets[p - nozzle.first] - s * nozzle.direction
-            x = wp.where(s > nozzle.column, place + nozzle.reserve, place)
+        s, x, v = remaining(p, nozzle, serial_i, emitted), x_free_i, v_free_i
+        if s > nozzle.column:
+            x = places[p]
+            v = vector()
+        elif s > real(0.0):
+            k = p - nozzle.first
+            if serial_i > wp.float64(0.0):
+                k = int((wp.int64(serial_i) - wp.int64(1)) % wp.int64(nozzle.count))
+            x = outlet + nozzle.offsets[k] - s * nozzle.direction
             v = drift
         return x, v
 
     @particle_kernel(derivatives, "x_dot v_dot", numbers=numbers)
     @typed
     def prescribe_tangent(
-        i: int, member: int, particles: int, nozzle, emitted, outlet_dot, drift_dot, emitted_dot, x_dot_i, v_dot_i
+        i: int,
+        member: int,
+        particles: int,
+        nozzle,
+        emitted,
+        outlet_dot,
+        drift_dot,
+        emitted_dot,
+        serial_i,
+        x_dot_i,
+        v_dot_i,
     ) -> tuple[vector, vector]:
-        if remaining(i - member * particles, nozzle, emitted) > real(0.0):
+        s, no = remaining(i - member * particles, nozzle, serial_i, emitted), vector()
+        if s > nozzle.column:
+            return no, no
+        if s > real(0.0):
             return outlet_dot + real(emitted_dot) * nozzle.direction, drift_dot
         return x_dot_i, v_dot_i
 
     @particle_kernel(derivatives, "x_free_bar v_free_bar x_prescribed_bar v_prescribed_bar", numbers=numbers)
     @typed
     def prescribe_adjoint(
-        i: int, member: int, particles: int, nozzle, emitted, x_bar_i, v_bar_i
+        i: int, member: int, particles: int, nozzle, emitted, serial_i, x_bar_i, v_bar_i
     ) -> tuple[vector, vector, vector, vector]:
         """Split the adjoints of new positions and velocities into those of free and of prescribed particles."""
-        led, no = remaining(i - member * particles, nozzle, emitted) > real(0.0), vector()
-        x_free_bar, v_free_bar = wp.where(led, no, x_bar_i), wp.where(led, no, v_bar_i)
+        s, no = remaining(i - member * particles, nozzle, serial_i, emitted), vector()
+        led, free = s > real(0.0) and s <= nozzle.column, s <= real(0.0)
+        x_free_bar, v_free_bar = wp.where(free, x_bar_i, no), wp.where(free, v_bar_i, no)
         return x_free_bar, v_free_bar, wp.where(led, x_bar_i, no), wp.where(led, v_bar_i, no)
 
     begins = Kernels(begin, begin_tangent, begin_adjoint)
     return begins, Kernels(prescribe, prescribe_tangent, prescribe_adjoint)
 
 
-OUTLET = StateField("outlet", "m", Entry.VECTOR, Axis.SCALAR, first="nozzle_path")
-"""The position of the nozzle's opening."""
-EMITTED = StateField("emitted", "m", Entry.DOUBLE, Axis.SCALAR)
-"""The length of the column of fluid that has left the nozzle."""
+@cache
+def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
+    """Make the kernel that marks, in scene order, the particles which the drains of a nozzle hold, and the kernel that
+    gives those which join its column their places in line. ``before`` counts the marked particles before each."""
+    real, nozzle_of, remaining = precision.real, nozzle_type(precision), remaining_function(precision)
+    module = integration_module(precision, True, taped)
+    typed = TypesByName(real, {nozzle_of: "nozzle", wp.float64: "serial emitted", wp.int32: "held before"})
+
+    @particle_kernel(module, "held", numbers=["nozzle", "particles"])
+    @typed
+    def hold(
+        i: int, member: int, particles: int, nozzle, emitted_in, drains: wp.array(dtype=wp.bool), drained_i, serial_i
+    ) -> wp.int32:
+        in_line = remaining(i - member * particles, nozzle, serial_i, emitted_in) > real(0.0)
+        return wp.where(drains[int(drained_i)] and not in_line, 1, 0)
+
+    @wp.func
+    def layers(nozzle: nozzle_of, emitted: wp.float64) -> wp.float64:
+        """Return the number of layers that have been in line until then."""
+        return wp.floor((emitted + wp.float64(nozzle.column)) / nozzle.spacing + wp.float64(0.5))
+
+    @particle_kernel(module, "serial", numbers=["nozzle", "particles"])
+    @typed
+    def join(
+        i: int,
+        member: int,
+        particles: int,
+        nozzle,
+        emitted_in,
+        emitted,
+        held: wp.array(dtype=wp.int32),
+        before: wp.array(dtype=wp.int32),
+        serial_in_i,
+    ) -> wp.float64:
+        layer = wp.float64(nozzle.layer)
+        first = wp.max(layers(nozzle, emitted_in), wp.float64(nozzle.count) / layer)
+        rank = wp.float64(before[i] - before[member * particles])
+        if held[i] == 1 and rank < (layers(nozzle, emitted) - first) * layer:
+            return first * layer + rank + wp.float64(1.0)
+        return serial_in_i
+
+    return hold, join
 
 
 @dataclass(frozen=True)
 class Nozzle:
-    """The particles that wait in a nozzle, the last ones of a scene: how far each is behind the opening and beside the
-    axis, and the direction and the area of the opening."""
+    """The particles that wait in a nozzle: how far each is behind the opening and beside the axis, and the direction
+    and the area of the opening."""
 
+    name: str
+    """Name of the emitter."""
     first: int
     """Number of the first of them."""
-    upstream: np.ndarray
-    """(m,) distance from the opening [m]"""
-    offsets: np.ndarray
-    """(m, d) from the axis [m]"""
+    sample: EmitterSample
     direction: np.ndarray
     """(d,) of the flow, a unit vector"""
     area: float
     """Area of the opening [m2], in 2-D [m]."""
-    column: float
-    """Particles further upstream are in reserve [m]."""
-    reserve: np.ndarray
-    """Distance (d,) of particles in reserve from their place in line [m]."""
+    places: np.ndarray
+    """Places (n, d) [m] at which particles of a scene rest that are in reserve."""
+    feeding: np.ndarray
+    """(drains + 1,) true where it gives the particles out again that the drain of this number took."""
 
     def part(self, layout: Layout, requires_grad: bool) -> "Emitter":
         return Emitter(self, layout, requires_grad)
+
+    def constants(self, layout: Layout) -> Any:
+        """Return the struct of its constants."""
+        precision, device, sample = layout.precision, layout.device, self.sample
+        constants = nozzle_type(precision)()
+        constants.first, constants.area, constants.layer = self.first, self.area, sample.layer
+        constants.count, constants.spacing = len(sample.upstream), 2.0 * sample.upstream[0]
+        constants.upstream = wp.array(sample.upstream, dtype=precision.real, device=device)
+        constants.offsets = to_device(sample.offsets, precision, device)
+        constants.column = sample.column
+        constants.direction = precision.vector(*padded(self.direction[None])[0])
+        return constants
 
 
 class Emitter(Part):
     """The part of a step that prescribes the particles which wait in a nozzle, in one solver."""
 
-    fields = (OUTLET, EMITTED)
-    """Fields that the emitter carries from step to step."""
-
     def __init__(self, nozzle: Nozzle, layout: Layout, requires_grad: bool = False):
-        self.nozzle, self.layout = nozzle, layout
+        self.nozzle, self.layout, name = nozzle, layout, nozzle.name
+        self.fields: tuple[StateField, ...] = (
+            StateField(outlet_name(name), "m", Entry.VECTOR, Axis.SCALAR, first=path_name(name)),
+            StateField(emitted_name(name), "m", Entry.DOUBLE, Axis.SCALAR),
+        )
+        """Fields that the emitter carries from step to step."""
+        is_fed = nozzle.feeding.any()
+        if is_fed:
+            self.fields += (StateField(again_name(name), "", Entry.DOUBLE),)
         self.free = layout.state((POSITIONS, VELOCITIES), requires_grad)
         """Room for the end of a step if no particle were prescribed."""
         precision, device = layout.precision, layout.device
         self.begins, self.ends = emitter_kernels(precision, requires_grad)
-        constants = nozzle_type(precision)()
-        constants.first, constants.area = nozzle.first, nozzle.area
-        constants.upstream = wp.array(nozzle.upstream, dtype=precision.real, device=device)
-        constants.offsets = to_device(nozzle.offsets, precision, device)
-        constants.column, padding = nozzle.column, (0, 3 - len(nozzle.direction))
-        constants.direction = precision.vector(*np.pad(nozzle.direction, padding))
-        constants.reserve = precision.vector(*np.pad(nozzle.reserve, padding))
+        self.feeds = feeding_kernels(precision, requires_grad)
         drift = wp.zeros(layout.members, dtype=precision.vector, device=device, requires_grad=requires_grad)
-        self.constants = {"nozzle": constants, "drift": drift, **layout.state(self.fields, requires_grad).named()}
+        places = to_device(nozzle.places, precision, device)
+        self.own = layout.state(self.fields, requires_grad)
+        """Its fields at the end of a step."""
+        serial = wp.zeros(layout.all_particles, dtype=wp.float64, device=device)
+        self.constants = {"nozzle": nozzle.constants(layout), "drift": drift, "places": places, "serial": serial}
         """Of the nozzle, and of a step once it has begun, for kernels."""
+        self.constants |= {"outlet": self.own[outlet_name(name)], "emitted": self.own[emitted_name(name)]}
+        if is_fed:
+            self.constants["serial"] = self.own[again_name(name)]
+            drains = {"drains": wp.array(nozzle.feeding, dtype=wp.bool, device=device)}
+            self._pool = {**drains, **layout.arrays(held=wp.int32, before=wp.int32)}
+
+    def parameters(self, parameters: Parameters, suffix: str = "") -> dict[str, wp.array]:
+        """Return the rows of its path and its flow rate, or of their tangents or adjoints, for kernels."""
+        name = self.nozzle.name
+        return {f"path{suffix}": parameters[path_name(name)], f"flow{suffix}": parameters[f"{name}.flow_rate"]}
 
     def begin(self, step: StepContext, state: State) -> None:
         """Compute the motion of the column in the step, from the state before it, which the end may write over."""
-        before = {"outlet_in": state["outlet"], "emitted_in": state["emitted"]}
-        step.launch(self.begins.forward, self.constants, **before, threads=self.layout.members)
+        name = self.nozzle.name
+        before = {"outlet_in": state[outlet_name(name)], "emitted_in": state[emitted_name(name)]}
+        known = self.constants, self.parameters(step.parameters)
+        step.launch(self.begins.forward, *known, **before, threads=self.layout.members)
+        if self.nozzle.feeding.any():
+            self._feed(step, before, state)
+
+    def _feed(self, step: StepContext, before: dict[str, wp.array], state: State) -> None:
+        """Let particles that drains hold join the end of the column, where it has room in the step."""
+        held, joined = self.feeds
+        known = {**self.constants, **before, **self._pool, "serial_in": state[again_name(self.nozzle.name)]}
+        step.launch(held, {**known, "serial": known["serial_in"]}, drained=state["drained"])
+        wp.utils.array_scan(self._pool["held"], self._pool["before"], inclusive=False)
+        step.launch(joined, known)
 
     def target(self, moved: State) -> State:
         return self.free
@@ -228,7 +365,7 @@ class Emitter(Part):
         free = {"x_free": self.free.positions, "v_free": self.free.velocities}
         step.launch(self.ends.forward, self.constants, **free, x=moved.positions, v=moved.velocities)
         for field in self.fields:
-            wp.copy(state[field.name], self.constants[field.name])
+            wp.copy(state[field.name], self.own[field.name])
 
     def new_tangent(self) -> "EmitterTangent":
         return EmitterTangent(self)
@@ -242,16 +379,22 @@ class EmitterTangent(PartTangent):
 
     def __init__(self, emitter: Emitter):
         self._emitter = emitter
-        drift_dot = wp.zeros_like(emitter.constants["drift"], requires_grad=False)
-        self._dot = {"drift_dot": drift_dot, **emitter.layout.state(emitter.fields).named("_dot")}
+        known = emitter.constants
+        self._dot = {f"{name}_dot": wp.zeros_like(known[name], requires_grad=False) for name in FOLLOWED}
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        known = self._emitter.constants, self._dot, dot.parameters.named("_dot")
-        before = {f"{field.name}_in_dot": state_dot[field.name] for field in self._emitter.fields}
-        step.launch(self._emitter.begins.tangent, *known, **before, threads=self._emitter.layout.members)
-        step.launch(self._emitter.ends.tangent, *known, x_dot=state_dot.positions, v_dot=state_dot.velocities)
-        for field in self._emitter.fields:
-            wp.copy(state_dot[field.name], self._dot[f"{field.name}_dot"])
+        emitter, name = self._emitter, self._emitter.nozzle.name
+        known = emitter.constants, self._dot, emitter.parameters(step.parameters)
+        before = {"outlet_in_dot": state_dot[outlet_name(name)], "emitted_in_dot": state_dot[emitted_name(name)]}
+        before |= emitter.parameters(dot.parameters, "_dot") | {"time_step_dot": dot.parameters["time_step"]}
+        step.launch(emitter.begins.tangent, *known, **before, threads=emitter.layout.members)
+        step.launch(emitter.ends.tangent, *known, x_dot=state_dot.positions, v_dot=state_dot.velocities)
+        wp.copy(state_dot[outlet_name(name)], self._dot["outlet_dot"])
+        wp.copy(state_dot[emitted_name(name)], self._dot["emitted_dot"])
+
+
+FOLLOWED = ("outlet", "drift", "emitted")
+"""What has derivatives."""
 
 
 class EmitterAdjoint(PartAdjoint):
@@ -280,8 +423,9 @@ class EmitterAdjoint(PartAdjoint):
             v_prescribed_bar=prescribed.velocities,
         )
         x_total, v_total = (add_up(x) for add_up, x in zip(self._sums, prescribed.arrays(), strict=True))
-        own = {"outlet_bar": state_bar["outlet"], "emitted_bar": state_bar["emitted"]}
-        totals = {"x_total": x_total, "v_total": v_total}
-        collected = {**own, **totals, "threads": emitter.layout.members}
-        step.launch(emitter.begins.adjoint, emitter.constants, bar.named("_bar"), **collected)
+        name, known = emitter.nozzle.name, (emitter.constants, emitter.parameters(step.parameters))
+        own = {"outlet_bar": state_bar[outlet_name(name)], "emitted_bar": state_bar[emitted_name(name)]}
+        collected = {**own, "x_total": x_total, "v_total": v_total, "time_step_bar": bar["time_step"]}
+        collected |= emitter.parameters(bar, "_bar")
+        step.launch(emitter.begins.adjoint, *known, **collected, threads=emitter.layout.members)
         return free

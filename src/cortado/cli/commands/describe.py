@@ -35,6 +35,7 @@ from cortado.rollout.step_bounds import ROOM, scheduled_bounds
 from cortado.runs.frames import Pace
 from cortado.runs.recording import FrameChoice
 from cortado.scene.appearance import Picture
+from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.scene import Scene, load_scene, overrides_of, read_toml
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
 from cortado.simulation import Simulation
@@ -136,8 +137,7 @@ def describe_scene(
         raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
     of_search = overrides_of(overrides, ("problem", "optimise")) if "optimise" in read_toml(scene_file) else []
     scene = load_scene(scene_file, [one for one in overrides if one not in of_search]).lasting(time, steps)
-    bodies = scene.fluid if scene.emitter is None else (*scene.fluid, scene.emitter)
-    count = sum(body.count(scene.discretisation.spacing) for body in bodies)
+    count = sum(body.count(scene.discretisation.spacing) for body in (*scene.fluid, *scene.emitter))
     with timed_note(f"About {count:,.0f} particles are made") if count > MANY else nullcontext():
         simulation = Simulation(scene, device, precision)
     length = RunLength(simulation, steps, time, frames)
@@ -163,7 +163,7 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
         "particles": simulation.particles,
         "particles_of_phase": {phase.name: of_phase[k] for k, phase in enumerate(scene.phase)},
         "particles_in_emitter": simulation.particles - simulation.free_particles,
-        **of_emitter(scene),
+        "emitters": [of_emitter(emitter, scene.discretisation.spacing) for emitter in scene.emitter],
         "wall_particles": len(simulation.walls),
         "fluid_size_m": _fluid_size(simulation),
         "container_size_m": None if ends is None else (ends[1] - ends[0]).tolist(),
@@ -185,10 +185,11 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
 
 
 def _fluid_size(simulation: Simulation) -> list[float]:
-    """Return the size (d,) [m] of the fluid with the particles in line in an emitter, and without its reserve."""
-    emitter, spacing = simulation.scene.emitter, simulation.scene.discretisation.spacing
-    shown = simulation.free_particles + (0 if emitter is None else len(emitter.particles(spacing)))
-    return (np.ptp(simulation.positions[:shown], axis=0) + spacing).tolist()
+    """Return the size (d,) [m] of the fluid with the particles in line in emitters, and without their reserves."""
+    scene, spacing = simulation.scene, simulation.scene.discretisation.spacing
+    columns = [emitter.particles(spacing) for emitter in scene.emitter]
+    shown = np.concatenate([simulation.positions[: simulation.free_particles], *columns])
+    return (np.ptp(shown, axis=0) + spacing).tolist()
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
@@ -242,13 +243,12 @@ def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
     return {"memory_bytes": forward + own, "gradient_memory_bytes": backward + own + checkpoints}
 
 
-def of_emitter(scene: Scene) -> dict[str, float | None]:
-    """Return when an emitter is empty, its speed, and the areas of its particles' cells and of its opening."""
-    emitter, spacing = scene.emitter, scene.discretisation.spacing
-    if emitter is None:
-        return {"emitter_runs_dry_at_s": None}
-    areas = {"emitter_area": emitter.area(spacing), "emitter_area_asked": emitter.asked_area()}
-    return {"emitter_runs_dry_at_s": emitter.dry_after(spacing), "emitter_speed_m_s": emitter.speed(spacing), **areas}
+def of_emitter(emitter: EmitterTable, spacing: float) -> dict[str, Any]:
+    """Return when an emitter is empty, None where never; what feeds it, its greatest speed, and the areas of its
+    particles' cells and of its opening."""
+    dry, areas = emitter.dry_after(spacing), {"area": emitter.area(spacing), "area_asked": emitter.asked_area()}
+    known = {"name": emitter.name, "fed_by": list(emitter.fed_by), "speed_m_s": emitter.speed(spacing), **areas}
+    return {**known, "runs_dry_at_s": dry if math.isfinite(dry) else None}
 
 
 def seconds_of_picture(simulation: Simulation) -> float | None:
@@ -287,7 +287,7 @@ def _drawn(simulation: Simulation, path: Path) -> Path:
 
 def _as_text(found: dict[str, Any], length: RunLength) -> str:
     phases = ", ".join(f"{count} {name}" for name, count in found["particles_of_phase"].items())
-    waiting = f", {found['particles_in_emitter']} of them in the emitter" if found["particles_in_emitter"] else ""
+    waiting = f", {found['particles_in_emitter']} of them in emitters" if found["particles_in_emitter"] else ""
     limits = {name: limit for name, limit in found["time_step_limits_s"].items() if limit is not None}
     least = min(limits.values(), default=math.inf)
     by_name = ", ".join(f"{name} {limit:.3g}" for name, limit in sorted(limits.items(), key=lambda item: item[1]))
@@ -305,7 +305,7 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
             else f"{found['time_step_s']:g} s; {allowed}",
         ),
         ("viscosity", found["viscosity"]),
-        *emitter_rows(found, length),
+        *(emitter_row(one, found["dimension"], length) for one in found["emitters"]),
         (
             "memory",
             f"{_bytes(found['memory_bytes'])} for a run, {_bytes(found['gradient_memory_bytes'])} for a gradient, "
@@ -322,19 +322,19 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
     return "\n".join([found["name"], *(f"{label:<12}{text}" for label, text in rows)])
 
 
-def emitter_rows(found: dict[str, Any], length: RunLength) -> list[tuple[str, str]]:
-    """Return rows of a table that say when an emitter is empty, before or after the end of the run, and its speed."""
-    dry = found["emitter_runs_dry_at_s"]
-    if dry is None:
-        return []
-    given, asked = found["emitter_area"], found["emitter_area_asked"]
-    speed = f"fluid comes out at {found['emitter_speed_m_s']:.3g} m/s"
+def emitter_row(found: dict[str, Any], dimension: int, length: RunLength) -> tuple[str, str]:
+    """Return the row of a table that says when an emitter is empty, before or after the end of the run, and its
+    speed."""
+    given, asked, dry = found["area"], found["area_asked"], found["runs_dry_at_s"]
+    speed = f"fluid comes out of {found['name']} at {found['speed_m_s']:.3g} m/s"
     if abs(given - asked) > EXCESS * asked:
-        unit = "m" if found["dimension"] == 2 else "m2"
+        unit = "m" if dimension == 2 else "m2"
         speed += f", through {given:.3g} {unit} of cells, where an opening of {asked:.3g} {unit} was asked for"
-    if length.time is None or dry >= length.time * (1.0 - SAME):
-        return [("emitter", f"has fluid for {dry:.4g} s; {speed}")]
-    return [("emitter", f"runs dry at {dry:.4g} s, before the end of the run at {length.time:g} s; {speed}")]
+    if found["fed_by"]:
+        return "emitter", f"{' and '.join(found['fed_by'])} feed it; {speed}"
+    if dry is None or length.time is None or dry >= length.time * (1.0 - SAME):
+        return "emitter", f"{'never runs dry' if dry is None else f'has fluid for {dry:.4g} s'}; {speed}"
+    return "emitter", f"runs dry at {dry:.4g} s, before the end of the run at {length.time:g} s; {speed}"
 
 
 def _size(found: dict[str, Any]) -> str:
@@ -354,7 +354,7 @@ def _time(found: dict[str, Any], length: RunLength) -> str:
         return f"unknown. {found['diverged']}"
     slower = "later ones may take more pressure iterations"
     if found["particles_in_emitter"]:
-        slower = "later ones take longer, as fluid comes out of the emitter"
+        slower = "later ones take longer, as fluid comes out of emitters"
     read = f"with {counted(found['sensors'], 'sensor')}, " if found["sensors"] else ""
     return (
         f"{found['milliseconds_per_step']:.3g} ms a step on {found['device']} in {found['precision']}, {read}without "

@@ -29,6 +29,7 @@ from cortado.runs.frames import Pace, common_rate, posed, solid_motions
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensor import Readings, summary
 from cortado.runs.trajectory import Trajectory
+from cortado.scene.emitter_table import OF_OPENINGS
 from cortado.scene.scene import Scene, scene_in_words
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
@@ -187,7 +188,7 @@ def _out(simulation: Simulation, state: State) -> NDArray[np.bool_]:
 
 def _others(state: State) -> dict[str, NDArray[Any]]:
     """Return the fields of a state that say which particles are in the fluid."""
-    return {name: state[name].numpy() for name in ("emitted", "drained") if name in state.names}
+    return {name: state[name].numpy() for name in state.names if name.endswith(OF_OPENINGS)}
 
 
 def _spilt(simulation: Simulation, state: State) -> int:

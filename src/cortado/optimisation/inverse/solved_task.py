@@ -39,6 +39,7 @@ from cortado.pictures.tracing.space import State
 from cortado.runs.frames import Pace, pace_of
 from cortado.runs.probes import sensors_of
 from cortado.scene.appearance import Picture
+from cortado.scene.emitter_table import OF_OPENINGS
 from cortado.scene.parameter_values import Arrays, Tilt
 from cortado.scene.parameters import Axis
 from cortado.scene.scene import Scene, read_toml, scene_from_dict
@@ -262,8 +263,7 @@ def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -
 def _state(made: Setup, run: Run, step: int) -> State:
     state = run[step]
     colours = colours_of(made.task.scene, state.mass_fractions, len(state.positions), state.colours)
-    names = {"emitted", "drained"} & set(state.state.names)
-    others = {name: state.state[name].numpy() for name in names}
+    others = {name: state.state[name].numpy() for name in state.state.names if name.endswith(OF_OPENINGS)}
     out = those(is_out(made.task.scene, others, len(colours)))
     fractions = None if state.mass_fractions is None else state.mass_fractions[out]
     return State(state.positions[out], colours[out], fractions=fractions)
