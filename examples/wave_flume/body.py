@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from panels import BESIDE, LinearFlume
-from scipy.linalg import block_diag, cholesky, solve_triangular
 from scipy.optimize import least_squares, minimize
 from wave_flume import BEGIN, END, MOTIONS, PROBES, TOLD, Rig, draw, on_section, period, simulated, swing
 
@@ -33,28 +32,40 @@ def moved(flume, times, stroke, u):
     return np.stack([np.interp(times - late, times, one) for one in found.T], axis=1)
 
 
-def covariance(times, log_hyper, rate):
-    """Of a discrepancy: a wave that comes and goes, a slow part (both Matern 3/2), and noise."""
+def covariance(lags, log_hyper, rate):
+    """Of a discrepancy at lags (times,) [s]: a wave that comes and goes, a slow part (both Matern 3/2), and noise."""
     wave, lasts, slow, long, noise = np.exp(log_hyper)
-    apart = np.abs(times[:, None] - times)
-    matern = [(1.0 + np.sqrt(3.0) * apart / one) * np.exp(-np.sqrt(3.0) * apart / one) for one in (lasts, long)]
-    turning = wave**2 * matern[0] * np.cos(rate * apart) + slow**2 * matern[1]
-    return turning + (noise**2 + 1e-9) * np.eye(len(times))
+    matern = [(1.0 + np.sqrt(3.0) * lags / one) * np.exp(-np.sqrt(3.0) * lags / one) for one in (lasts, long)]
+    return wave**2 * matern[0] * np.cos(rate * lags) + slow**2 * matern[1] + np.where(lags == 0.0, noise**2, 0.0)
+
+
+def whitening(covariances):
+    """The matrix (times, times) that makes white noise of a series with such covariances of its lags (Durbin 1960).
+
+    Each row is what a value is beside what those before it predict, over the deviation of that.
+    """
+    weights, variance = np.zeros(0), covariances[0]
+    rows = np.diag(np.full(len(covariances), variance**-0.5))
+    for n in range(1, len(covariances)):
+        share = (covariances[n] - weights @ covariances[n - 1 : 0 : -1]) / variance
+        weights = np.append(weights - share * weights[::-1], share)
+        variance *= 1.0 - share**2
+        rows[n, :n], rows[n, n] = -weights[::-1] / np.sqrt(variance), 1.0 / np.sqrt(variance)
+    return rows
 
 
 def discrepancy(times, left, rate):
-    """The covariance of residuals (times,) under which they are likeliest."""
+    """The `whitening` under which residuals (times,) are likeliest."""
+    lags, size = times - times[0], left.std()
 
     def unlikely(log_hyper):
-        factor = cholesky(covariance(times, log_hyper, rate), lower=True)
-        white = solve_triangular(factor, left, lower=True)
+        rows = whitening(covariance(lags, log_hyper, rate))
         prior = 0.5 * ((log_hyper[[1, 3]] - np.log([4.0, 2.0])) ** 2).sum()  # lengths between 1 and 10 s
-        return 0.5 * white @ white + np.log(np.diag(factor)).sum() + prior
+        return 0.5 * (np.einsum("ij,j", rows, left) ** 2).sum() - np.log(np.diag(rows)).sum() + prior
 
-    size = left.std()
     start = np.log([0.5 * size, 4.0, 0.5 * size, 2.0, 0.3 * size])
     limits = [(np.log(1e-3 * size), np.log(10.0 * size)), (-1.0, 3.5)] * 2 + [(np.log(1e-2 * size), np.log(2.0 * size))]
-    return covariance(times, minimize(unlikely, start, method="L-BFGS-B", bounds=limits).x, rate)
+    return whitening(covariance(lags, minimize(unlikely, start, method="L-BFGS-B", bounds=limits).x, rate))
 
 
 def drawn_again(left, jacobian, block, draws=DRAWS):
@@ -77,11 +88,10 @@ def fitted(flume, times, stroke, measured, long, start):
     left, around = first.fun.reshape(-1, 3), np.linalg.inv(first.jac.T @ first.jac)
     noise = np.sqrt(np.diag(around) * 2.0 * first.cost / (left.size - len(start)))
     blocks = drawn_again(left, first.jac, round(2.0 * long / (times[EVERY] - times[0])))
-    parts = [cholesky(discrepancy(times[counted], one, 2.0 * np.pi / long), lower=True) for one in left.T]
-    factor = block_diag(*parts)
+    white = np.stack([discrepancy(times[counted], one, 2.0 * np.pi / long) for one in left.T])
 
     def whitened(u):
-        return solve_triangular(factor, residuals(u).reshape(-1, 3).T.ravel(), lower=True)
+        return np.einsum("kij,jk->ki", white, residuals(u).reshape(-1, 3)).ravel()
 
     second = least_squares(whitened, first.x, diff_step=1e-4)
     bars = np.sqrt(np.diag(np.linalg.inv(second.jac.T @ second.jac)))
