@@ -24,7 +24,7 @@ import cortado
 from benchmarks.bench.scene import dam_break
 from benchmarks.bench.timing import median_seconds
 from cortado import Simulation
-from cortado.device.lanes import lane_functions
+from cortado.device.precision import lane_functions
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import BY_HAND, ByHand

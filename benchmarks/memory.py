@@ -17,7 +17,7 @@ from programs import ProgramError, last_json
 from benchmarks.bench.dam_break import memory_high
 from benchmarks.bench.scene import dam_break
 from cortado import Problem, Simulation
-from cortado.cli.commands.describe import estimated_bytes
+from cortado.cli.describe import estimated_bytes
 from cortado.losses import FinalPositions
 
 BUDGETS = (8, 24, 80, 141)

@@ -9,8 +9,8 @@ from pydantic import ValidationInfo, field_validator
 from cortado.errors import InputError
 from cortado.files.image_encoding import to_srgb
 from cortado.image_losses import psnr
-from cortado.optimisation.inverse.task_files import Setup, load_task, setup
 from cortado.optimisation.optimise import Record, optimise
+from cortado.optimisation.task_files import Setup, load_task, setup
 from cortado.pictures.plots import PALETTE, whole_numbers
 from cortado.scene.tables import Several, Text
 from experiments.canvas import blank

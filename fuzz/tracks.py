@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 import cortado
-from cortado.optimisation.inverse.solved_task import observation
-from cortado.optimisation.inverse.task_tables import TracksTable
+from cortado.optimisation.solved_task import observation
+from cortado.optimisation.task_tables import TracksTable
 from fuzz.cases import Case
 from fuzz.files import PLANE
 from fuzz.oddities import Random

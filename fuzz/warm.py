@@ -12,8 +12,8 @@ MODULES = (
     "scipy.spatial",
     "cortado.__main__",
     "cortado.cli",
-    "cortado.cli.commands.optimise",
-    "cortado.cli.commands.run",
+    "cortado.cli.optimise",
+    "cortado.cli.run",
     "experiments.experiment_files",
 )
 

@@ -44,7 +44,7 @@ from cortado import Problem, Scene, Simulation, forces, gradients, load_scene
 from cortado.certificate.horizon import directions, everything, scales
 from cortado.cli import main
 from cortado.cli.subcommands import CORTADO, new_scene, templates
-from cortado.optimisation.inverse.task_tables import file_schema
+from cortado.optimisation.task_tables import file_schema
 from cortado.scene.parameters import Role
 from scenes import jet, scene, two_layers
 from scenes import plane as in_the_plane

@@ -18,15 +18,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import cortado.cli.commands.optimise
-import cortado.cli.commands.run
+import cortado.cli.optimise
+import cortado.cli.run
 import cortado.files.vtkhdf
 from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence, assert_refused
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
 from cortado.files.disk import locked
-from cortado.optimisation.inverse.solved_task import TaskFigures
-from cortado.optimisation.inverse.task_files import load_task
+from cortado.optimisation.solved_task import TaskFigures
+from cortado.optimisation.task_files import load_task
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.pictures.image_files import heart, rosetta, write_picture
 from cortado.runs.run_folder import FIGURES
@@ -49,8 +49,8 @@ def folder(tmp_path, monkeypatch, unrendered):
     (tmp_path / "task.toml").write_text(GOOD_TASK)
     monkeypatch.chdir(tmp_path)
     # tests/test_shading.py draws them
-    monkeypatch.setattr("cortado.cli.commands.run_report.run_pictures", lambda *_: [])
-    monkeypatch.setattr("cortado.cli.commands.optimise.shaded_figures", lambda *_: TaskFigures())
+    monkeypatch.setattr("cortado.cli.run_report.run_pictures", lambda *_: [])
+    monkeypatch.setattr("cortado.cli.optimise.shaded_figures", lambda *_: TaskFigures())
     return tmp_path
 
 
@@ -185,7 +185,7 @@ def interrupting(after):
 
 
 def test_an_interrupted_run_keeps_its_frames(run, monkeypatch):
-    monkeypatch.setattr(cortado.cli.commands.run, "track", interrupting(after=3))
+    monkeypatch.setattr(cortado.cli.run, "track", interrupting(after=3))
     code, out, err = run("--steps", 20)
     assert (code, out) == (130, "")
     assert_one_sentence(err.removesuffix("\n"))
@@ -198,8 +198,8 @@ def test_an_interrupted_run_keeps_its_frames(run, monkeypatch):
     ("drawn", "missing"), [("run_pictures", set()), ("particles", {"report.html"})], ids=["pictures", "plain figures"]
 )
 def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(run, monkeypatch, drawn, missing):
-    monkeypatch.setattr("cortado.cli.commands.run_report.lacking", lambda _: None)
-    monkeypatch.setattr(f"cortado.cli.commands.run_report.{drawn}", stopped)
+    monkeypatch.setattr("cortado.cli.run_report.lacking", lambda _: None)
+    monkeypatch.setattr(f"cortado.cli.run_report.{drawn}", stopped)
     code, _, err = run("--steps", 5)
     there = Path("dam").absolute()
     sentence = f"Interrupted; the run is whole, and in {there}; cortado picture {there} --film films it."
@@ -216,16 +216,16 @@ def test_how_far_a_run_is_that_ends_at_a_time_is_told_in_percent(run, monkeypatc
         told.append(whole)
         yield lambda n: told.append(n)
 
-    monkeypatch.setattr(cortado.cli.commands.run, "track", track)
+    monkeypatch.setattr(cortado.cli.run, "track", track)
     assert run("--time", 0.02, *sets("solver.time_step=auto"), "--no-pictures")[0] == 0
     assert told[0] == (100, "run, % of its time") and sum(told[1:]) == 100 and min(told[1:]) >= 0
 
 
 @COMMANDS
 def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command, monkeypatch, command):
-    for module in (cortado.cli.commands.run, cortado.cli.commands.optimise):
+    for module in (cortado.cli.run, cortado.cli.optimise):
         monkeypatch.setattr(module, "track", interrupting(after=-1))
-    monkeypatch.setattr(cortado.cli.commands.run, "frame_writer", interrupting(after=-1))
+    monkeypatch.setattr(cortado.cli.run, "frame_writer", interrupting(after=-1))
     assert cortado_command(*command, "--out", "dam") == (130, "", "Interrupted.\n")
 
 
@@ -322,7 +322,7 @@ def test_optimise_writes_its_folder(optimise, folder):
     ids=["run", "optimise"],
 )
 def test_what_came_out_is_told_before_it_is_drawn(cortado_command, monkeypatch, command, drawing, told):
-    monkeypatch.setattr(f"cortado.cli.commands.{drawing}", stopped)
+    monkeypatch.setattr(f"cortado.cli.{drawing}", stopped)
     code, out, err = cortado_command(*command, "--out", "found")
     assert code == 130 and re.fullmatch(told, out), out
     assert ("the search has ended" in err and "--resume draws its pictures" in err) == (command[0] == "optimise")
@@ -352,8 +352,8 @@ def test_a_search_of_a_long_run_that_comes_to_nothing_says_what_to_try(optimise,
     ],
 )
 def test_a_search_that_cannot_be_trusted_says_what_to_try(optimise, monkeypatch, change, settings, told):
-    own = cortado.cli.commands.optimise.optimise
-    monkeypatch.setattr("cortado.cli.commands.optimise.optimise", lambda *a, **o: replace(own(*a, **o), **change))
+    own = cortado.cli.optimise.optimise
+    monkeypatch.setattr("cortado.cli.optimise.optimise", lambda *a, **o: replace(own(*a, **o), **change))
     _, out, _ = optimise("--no-pictures", *sets(*settings, "problem.steps=20"))
     report, found = Path("found/report.html").read_text(), result_of("found")
     assert {name: found[name] for name in ("misled", "stays")} == {"misled": False, "stays": False, **change}
@@ -425,7 +425,7 @@ def test_progress_counts_updates_and_not_evaluations(optimise, monkeypatch, opti
         yield lambda n=1, **fields: shown.append((n, fields))
         assert total == 8
 
-    monkeypatch.setattr("cortado.cli.commands.optimise.track", track)
+    monkeypatch.setattr("cortado.cli.optimise.track", track)
     assert optimise(*sets(f"optimise.optimiser={optimiser}", "optimise.iterations=8"))[0] == 0
     assert all(n in (0, 1) for n, _ in shown) and sum(n for n, _ in shown) == 8
     last = [fields["evaluations"] for _, fields in shown if fields][-1]
@@ -509,7 +509,7 @@ SMOOTHED = ["name=adjoint_viscosity", "coefficient=3.0", "samples=4", "spread.gr
 def assert_goes_on(optimise, monkeypatch, after, *options):
     """Interrupted after so many updates, a search ends where one does that is not."""
     with monkeypatch.context() as patch:
-        patch.setattr(cortado.cli.commands.optimise, "track", interrupting(after=after))
+        patch.setattr(cortado.cli.optimise, "track", interrupting(after=after))
         assert optimise(*options, out="stopped")[0] == 130
     assert len(metrics("stopped")) == after + 1
     assert optimise(*options, "--resume", out="stopped")[0] == 0

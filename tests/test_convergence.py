@@ -62,7 +62,7 @@ def test_numbers_without_an_order_say_so(values, words):
 def scene(tmp_path, monkeypatch):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cortado.cli.commands.run.write_run_report", lambda *_: None)
+    monkeypatch.setattr("cortado.cli.run.write_run_report", lambda *_: None)
 
 
 def run(cortado_command, name, step, *options, steps=4):

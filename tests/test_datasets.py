@@ -13,7 +13,7 @@ import pytest
 
 import cortado
 from cortado import DivergedError, InputError, SceneError, Simulation
-from cortado.cli.commands import dataset as command
+from cortado.cli import dataset as command
 from cortado.discretise.shapes import wrapped
 from cortado.optimisation import datasets
 from cortado.optimisation.datasets import DatasetTable, Sample, one_run

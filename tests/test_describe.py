@@ -10,11 +10,11 @@ import cortado
 from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, PARTICLES, TINY_LATTE, TINY_SCENE
 from cortado.cli import main
-from cortado.cli.commands.describe import RunLength, seconds_of_picture
-from cortado.cli.commands.run import RunRequest, run_scene
-from cortado.cli.commands.run_report import Energy, RunSummary
+from cortado.cli.describe import RunLength, seconds_of_picture
+from cortado.cli.run import RunRequest, run_scene
+from cortado.cli.run_report import Energy, RunSummary
 from cortado.discretise.smoothing import KERNELS, SLACK
-from cortado.optimisation.inverse.task_files import load_task, task_in_words
+from cortado.optimisation.task_files import load_task, task_in_words
 from cortado.pictures.image_files import read_picture
 from cortado.pictures.plane import PlanePainter
 from cortado.runs.recording import EverySteps, FramesPerSecond
@@ -26,8 +26,8 @@ from scenes import box, jet, plane, pool, stability_limit, two_layers
 def folder(tmp_path, monkeypatch, unrendered):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cortado.cli.commands.describe.seconds_of_picture", lambda _: 0.5)  # drawing takes long
-    monkeypatch.setattr("cortado.cli.commands.describe.MOST_STEPS", 4)  # and so do 100 steps that are timed
+    monkeypatch.setattr("cortado.cli.describe.seconds_of_picture", lambda _: 0.5)  # drawing takes long
+    monkeypatch.setattr("cortado.cli.describe.MOST_STEPS", 4)  # and so do 100 steps that are timed
     return tmp_path
 
 
@@ -41,7 +41,7 @@ def described(capsys, *arguments):
 
 
 def test_it_says_what_the_scene_has(capsys, monkeypatch):
-    monkeypatch.setattr("cortado.cli.commands.describe.MOST_STEPS", 12)
+    monkeypatch.setattr("cortado.cli.describe.MOST_STEPS", 12)
     found, scene = described(capsys, "scene.toml", "--steps", "30"), cortado.load_scene("scene.toml")
     simulation = cortado.Simulation(scene)
     assert found["particles"] == PARTICLES and found["wall_particles"] == len(simulation.walls)
@@ -102,7 +102,7 @@ def test_the_run_and_its_film_are_told(capsys):
 
 def test_a_picture_is_timed_where_there_is_something_to_draw(monkeypatch):
     drawn, ticks = [], iter([3.0, 5.5])
-    monkeypatch.setattr("cortado.cli.commands.describe.time.perf_counter", lambda: next(ticks))
+    monkeypatch.setattr("cortado.cli.describe.time.perf_counter", lambda: next(ticks))
     monkeypatch.setattr(PlanePainter, "image", lambda _, *state: drawn.append(len(state[0])))
     simulation = cortado.Simulation("scene.toml")
     assert seconds_of_picture(simulation) == 2.5 and drawn == 2 * [simulation.particles]
@@ -170,7 +170,7 @@ def test_the_first_state_is_drawn(capsys):
 
 
 def test_a_scene_that_does_not_bear_its_first_steps(capsys, monkeypatch):
-    monkeypatch.setattr("cortado.cli.commands.describe.MOST_STEPS", 100)
+    monkeypatch.setattr("cortado.cli.describe.MOST_STEPS", 100)
     found = described(capsys, "scene.toml", "--set", "fluid.0.velocity=[10,25]")
     assert "diverged in step" in found["diverged"] and "milliseconds_per_step" not in found
     assert "unknown. The simulation diverged" in told(capsys, "scene.toml", "--set", "fluid.0.velocity=[10,25]")

@@ -21,9 +21,9 @@ import trimesh
 
 import cortado
 from cortado.cli import main
-from cortado.optimisation.inverse.solved_task import load_fit
-from cortado.optimisation.inverse.task_files import load_task
-from cortado.optimisation.inverse.task_tables import FitTables, TaskTables
+from cortado.optimisation.solved_task import load_fit
+from cortado.optimisation.task_files import load_task
+from cortado.optimisation.task_tables import FitTables, TaskTables
 from cortado.scene.scene import Scene, load_scene
 from scenes import plane
 

@@ -13,7 +13,7 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado import Simulation, load_scene
 from cortado.optimisation.datasets import DatasetTables
-from cortado.optimisation.inverse.task_tables import FitTables, TaskTables
+from cortado.optimisation.task_tables import FitTables, TaskTables
 from cortado.pictures.image_files import write_picture
 from every_key import key_at, keys_of, numbers, places, put, same
 

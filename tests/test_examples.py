@@ -14,16 +14,16 @@ import matplotlib.pyplot
 import numpy as np
 import pytest
 
-import cortado.cli.commands.describe
-import cortado.cli.commands.optimise
-import cortado.cli.commands.run
-import cortado.cli.commands.sweep
+import cortado.cli.describe
+import cortado.cli.optimise
+import cortado.cli.run
 import cortado.cli.subcommands
+import cortado.cli.sweep
 from compiling_notice import SAME_FLAGS, without_compiling
 from cortado import CortadoWarning, load_scene
 from cortado.cli import main
 from cortado.cli.subcommands import new_scene, templates
-from cortado.optimisation.inverse.task_files import load_task
+from cortado.optimisation.task_files import load_task
 from cortado.pictures.image_files import read_picture
 from cortado.rollout.run_checks import unstable_sentence
 from cortado.scene.parameter_values import Tilt
@@ -159,11 +159,11 @@ def test_the_code_runs_as_printed(capsys):
 def test_a_command_is_one(command, monkeypatch):
     for module, function in (
         (cortado.cli.subcommands, "new_scene"),
-        (cortado.cli.commands.describe, "describe_scene"),
-        (cortado.cli.commands.run, "run_scene"),
-        (cortado.cli.commands.optimise, "optimise_task"),
-        (cortado.cli.commands.describe, "check_scene"),
-        (cortado.cli.commands.sweep, "run_sweep"),
+        (cortado.cli.describe, "describe_scene"),
+        (cortado.cli.run, "run_scene"),
+        (cortado.cli.optimise, "optimise_task"),
+        (cortado.cli.describe, "check_scene"),
+        (cortado.cli.sweep, "run_sweep"),
     ):
         monkeypatch.setattr(module, function, lambda *arguments: "done")
     words = shlex.split(command)

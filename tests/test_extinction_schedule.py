@@ -11,8 +11,8 @@ from bad_tasks import GOOD_TASK, PLANE_PICTURE, TINY_LATTE
 from cortado import SceneError, optimise
 from cortado.cli import main
 from cortado.image_losses import psnr
-from cortado.optimisation.inverse.task_files import load_task, setup
 from cortado.optimisation.optimisers import Adam
+from cortado.optimisation.task_files import load_task, setup
 
 STAGED = "optimise.extinction_schedule=[0.25, 1.0]"
 

@@ -19,7 +19,7 @@ from cortado.cli import main
 from cortado.cli.process import usage_sentence
 from cortado.cli.subcommands import COMMANDS, app, gradients, scene_text, templates
 from cortado.files.disk import SCHEMA, examples_folder
-from cortado.optimisation.inverse.task_tables import file_schema, file_schema_text
+from cortado.optimisation.task_tables import file_schema, file_schema_text
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted(examples_folder().glob("*.toml"))
@@ -35,7 +35,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def without_pictures(monkeypatch):
     """Runs draw none, which takes seconds: tests/test_shading.py is about them."""
-    monkeypatch.setattr("cortado.cli.commands.run_report.run_pictures", lambda *_: [])
+    monkeypatch.setattr("cortado.cli.run_report.run_pictures", lambda *_: [])
 
 
 # ---- what there is -----------------------------------------------------------------------------------------------

@@ -20,8 +20,8 @@ from cortado.files.image_encoding import write_video
 from cortado.measured import Experiment
 from cortado.optimisation.fitting.gauss_newton import least, next_point, other_starts, over_the_bars, search
 from cortado.optimisation.fitting.least_squares import Coordinates, LeastSquares, TrialPoints, Weighting, slope_weights
-from cortado.optimisation.inverse.solved_task import load_fit
-from cortado.optimisation.inverse.task_files import load_task
+from cortado.optimisation.solved_task import load_fit
+from cortado.optimisation.task_files import load_task
 from cortado.pictures.image_files import read_frames, write_picture
 from cortado.scene.parameters import Range
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from cortado import InputError, Trajectory
-from cortado.optimisation.inverse.task_files import load_task
+from cortado.optimisation.task_files import load_task
 from cortado.scene.scene import scene_from_dict
 from fuzz import answers, bases, judge, oddities
 from fuzz.campaign import Campaign

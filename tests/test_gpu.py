@@ -7,8 +7,7 @@ import warp as wp
 from cortado import Problem, Simulation, gradients, losses
 from cortado.device.cells import CellSort
 from cortado.device.grid import Grid
-from cortado.device.lanes import COUNTS
-from cortado.device.precision import FLOAT32, FLOAT64
+from cortado.device.precision import COUNTS, FLOAT32, FLOAT64
 from cortado.device.reduction import sum_and_maximum, sum_of
 from cortado.pictures.painter import painter
 from cortado.scene.motions import told

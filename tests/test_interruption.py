@@ -33,7 +33,7 @@ except KeyboardInterrupt as stop:
 WORKERS = f"""{START}
 import os, signal
 from multiprocessing.context import SpawnProcess
-from cortado.cli.commands.options import Where
+from cortado.cli.options import Where
 
 start, begun = SpawnProcess.start, []
 
@@ -189,7 +189,7 @@ def test_a_shortage_is_told(cortado_command, monkeypatch, tmp_path, error, begin
     def end(*_):
         raise error
 
-    monkeypatch.setattr("cortado.cli.commands.run.write_run_report", end)
+    monkeypatch.setattr("cortado.cli.run.write_run_report", end)
     code, _, err = cortado_command("run", "scene.toml", "--steps", 2, "--out", "dam")
     assert code == 1 and err.splitlines()[-1].startswith(begin)
     assert (tmp_path / "dam" / "trajectory.vtkhdf").exists() and (tmp_path / "dam" / "result.json").exists()

@@ -9,9 +9,8 @@ import pytest
 import warp as wp
 
 from cortado import InputError, Problem, Simulation, losses
-from cortado.device.lanes import BY_SIZE, lanes_for, lanes_of
 from cortado.device.launching import Bundles, KernelLauncher, bound, launch, launch_together, watched
-from cortado.device.precision import FLOAT32, FLOAT64
+from cortado.device.precision import BY_SIZE, FLOAT32, FLOAT64, lanes_for, lanes_of
 from cortado.device.reduction import SHARED, add, sum_and_maximum, sum_and_maximum_kernel, sum_kernel, sum_of
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C4
 from cortado.gradients.reverse_mode import adjoint_filter_kernels
@@ -19,11 +18,11 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import fill_kernel
 from cortado.particles.pair_sums import fluid_sum
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
-from cortado.solvers.pcisph.steps import density_ratio_kernels, wall_kernels
+from cortado.solvers.pcisph.solver import density_ratio_kernels, wall_kernels
 from cortado.sph.curvature import curvature_kernels
 from cortado.sph.density import density_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE, Diffusion, diffusion_kernels
-from cortado.sph.integration import integration_kernels
+from cortado.sph.parts import integration_kernels
 from cortado.sph.stress_forces import newtonian_law
 from cortado.sph.stress_kernels import stress_kernels
 from cortado.sph.surface_tension import normal_kernels, surface_tension_kernels

@@ -18,7 +18,7 @@ from scenes import HONEY, MIXING, OIL, box, plane, scene
 ROOT = Path(cortado.__file__).parent
 
 UNNAMED = {
-    "sph.integration": {"integration_kernels.collect_masses"},
+    "sph.parts": {"integration_kernels.collect_masses"},
     "sph.curvature": {
         *("curvature_sums.colour_back", "curvature_sums.average_back"),
         *("curvature_sums.bend_back", "curvature_sums.mean_back"),
@@ -65,7 +65,7 @@ ELSEWHERE = {
     "particles.pair_sums": "it notes adjoints and has none",
     "device.modules": "it compiles adjoints and has none",
     "particles.made_derivatives": "it makes them of terms, in texts: tests/test_terms.py",
-    "sph.integration.begin_adjoint_kernel.begin_adjoint": "for solvers from outside: tests/test_solver.py",
+    "sph.parts.begin_adjoint_kernel.begin_adjoint": "for solvers from outside: tests/test_solver.py",
     "solvers.projection.mean_stress": "of quantities that no loss of these scenes sees: tests/test_energy_budget.py",
 }
 """Modules with functions of adjoints that no plant is in, and single such functions, and why."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import cortado.cli.commands.run as run_recording
+import cortado.cli.run as run_recording
 from bad_scenes import assert_one_sentence
 from cortado import InputError, Scene, Simulation, Trajectory, load_scene
 from cortado.runs.frames import Marks
@@ -252,7 +252,7 @@ schedule.gravity = {{ times = [0.0, 0.2], values = [[0.0, -9.81], [3.0, -9.81]] 
 def folder(tmp_path, monkeypatch):
     (tmp_path / "scene.toml").write_text(SCENE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cortado.cli.commands.run.write_run_report", lambda *_: None)
+    monkeypatch.setattr("cortado.cli.run.write_run_report", lambda *_: None)
     return tmp_path
 
 

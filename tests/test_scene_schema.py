@@ -18,7 +18,7 @@ from bad_scenes import GOOD_SCENE, MIXTURE, RENDER
 from bad_scenes import plane as plane_tables
 from cortado import InputError, Problem, SceneError, Simulation
 from cortado.device.precision import FLOAT64
-from cortado.optimisation.inverse.task_tables import TaskTables
+from cortado.optimisation.task_tables import TaskTables
 from cortado.particles.state import to_device
 from cortado.render.cameras import TopView
 from cortado.render.renderer import scene_renderer

@@ -9,7 +9,7 @@ import cortado
 from bad_scenes import one_sentence
 from bad_tasks import TINY_SCENE
 from cortado import CortadoWarning, InputError, Problem, Scene, SceneError, Simulation, certify, losses, reference
-from cortado.cli.commands.run_report import Energy, RunSummary
+from cortado.cli.run_report import Energy, RunSummary
 from cortado.scene.motions import Course
 from cortado.scene.parameter_values import Tilt
 from cortado.scene.scene import scene_in_words

@@ -8,7 +8,7 @@ import pytest
 import cortado
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
-from cortado.cli.commands.describe import measured_speed
+from cortado.cli.describe import measured_speed
 from cortado.discretise.smoothing import KERNELS
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series

@@ -7,8 +7,8 @@ from bad_scenes import one_sentence
 from bad_tasks import GOOD_TASK, LATTE_PARTICLES, PARTICLES, PLANE_PICTURE, TINY_LATTE
 from cortado import optimise
 from cortado.image_losses import Pyramid, SquaredDifference
-from cortado.optimisation.inverse.task_files import load_task, setup
 from cortado.optimisation.optimisers import LBFGS, Adam
+from cortado.optimisation.task_files import load_task, setup
 from cortado.optimisation.transforms import Logarithm, Softmax, TimeInterpolation
 from cortado.pictures.image_files import heart, rosetta, write_picture
 from cortado.scene.parameter_values import Tilt

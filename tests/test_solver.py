@@ -9,7 +9,7 @@ import pytest
 
 import cortado
 from cortado import InputError, Problem, Simulation, Trajectory, gradients, losses, reference
-from cortado.cli.commands.run import RunRequest, run_scene
+from cortado.cli.run import RunRequest, run_scene
 from cortado.runs.recording import EverySteps
 from cortado.scene.parameters import Axis, Parameter
 from cortado.scene.solvers import PackageSolver

@@ -14,9 +14,9 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_LATTE
 from cortado.cli import main
 from cortado.gradients import AdjointViscosity, Exact
-from cortado.optimisation.inverse.task_files import load_task, setup
 from cortado.optimisation.optimise import optimise
 from cortado.optimisation.optimisers import Adam
+from cortado.optimisation.task_files import load_task, setup
 from cortado.reference import Simulation, Terms
 from experiments.__main__ import EXPERIMENTS as EXPERIMENTS_PROGRAM
 from experiments.experiment_files import load_experiment

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import cortado.cli.commands.sweep
+import cortado.cli.sweep
 from bad_scenes import assert_one_sentence, one_sentence
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado import InputError, Trajectory
@@ -192,7 +192,7 @@ def test_a_scene_is_run_and_what_diverges_is_in_the_table(sweep, folder):
 
 
 def test_an_interrupted_sweep_goes_on(sweep, folder, monkeypatch):
-    optimise_task, begun = cortado.cli.commands.sweep.optimise_task, []
+    optimise_task, begun = cortado.cli.sweep.optimise_task, []
 
     def stopped(*arguments):
         begun.append(arguments)
@@ -200,7 +200,7 @@ def test_an_interrupted_sweep_goes_on(sweep, folder, monkeypatch):
             raise Interrupted(signal.SIGINT, "the evaluations so far are somewhere; --resume goes on with them")
         return optimise_task(*arguments)
 
-    monkeypatch.setattr(cortado.cli.commands.sweep, "optimise_task", stopped)
+    monkeypatch.setattr(cortado.cli.sweep, "optimise_task", stopped)
     code, out, err = sweep("task.toml", *RATES, "--out", "all")
     wanted = f"Interrupted; 1 of 2 are finished, in {folder / 'all'}; the same command goes on with the rest.\n"
     assert (code, out, err) == (130, "", wanted)
@@ -220,7 +220,7 @@ def test_another_task_is_not_gone_on_with(sweep, folder):
 
 def test_a_worker_that_does_not_see_the_folder_says_so(folder):
     options = (None, folder / "elsewhere", "cpu", "float32", ALL_FRAMES, True)
-    member = cortado.cli.commands.sweep.Member(folder / "task.toml", *options)
+    member = cortado.cli.sweep.Member(folder / "task.toml", *options)
     with pytest.raises(InputError, match=r"^A worker does not see \S+elsewhere, but the task and the folder"):
         member(combinations(["problem.steps=4"])[0])
 
@@ -268,7 +268,7 @@ def test_a_sweep_has_no_more_processes_than_combinations(sweep, monkeypatch):
         numbers.append(number)
         yield InProcess()
 
-    monkeypatch.setattr("cortado.cli.commands.options.local_workers", local_workers)
+    monkeypatch.setattr("cortado.cli.options.local_workers", local_workers)
     one = ("task.toml", "--set", "problem.steps=4", "--out", "all")
     assert sweep(*one, "--workers", 40)[0] == 0 and numbers == [1]
     code, out, err = sweep(*one, "--workers", 10**6)

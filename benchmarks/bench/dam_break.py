@@ -11,7 +11,7 @@ from benchmarks.bench.passes import Pass, PassTimer
 from benchmarks.bench.scene import ITERATIONS, dam_break, search_of
 from benchmarks.bench.timing import median_seconds
 from cortado.arrays import check_steps
-from cortado.cli.commands.describe import estimated_bytes
+from cortado.cli.describe import estimated_bytes
 from cortado.device.launching import CapturedGraph
 from cortado.losses import FinalPositions
 from cortado.problem import Problem

@@ -7,7 +7,7 @@ import numpy as np
 import cortado
 from cortado.optimisation.fitting.figures import AGREE
 from cortado.optimisation.fitting.fit import Fit, with_error
-from cortado.optimisation.inverse.solved_task import load_fit
+from cortado.optimisation.solved_task import load_fit
 from cortado.pictures.plots import images
 
 from .dissipation import viscosity_by_energy

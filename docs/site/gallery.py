@@ -49,8 +49,8 @@ class Entry:
         """Run the scene into a folder, and write the picture and the film into another."""
         from PIL import Image
 
-        from cortado.cli.commands.picture import draw_runs
-        from cortado.cli.commands.run import RunRequest, run_scene
+        from cortado.cli.picture import draw_runs
+        from cortado.cli.run import RunRequest, run_scene
         from cortado.runs.recording import FramesPerSecond
         from cortado.runs.trajectory import Trajectory
 

@@ -1,6 +1,6 @@
 """The page that lists the tables of a task: ``python docs/site/task_page.py`` writes docs/task_file.md.
 
-Its tables come from the models in `cortado.optimisation.inverse.task_tables`, so that they say what is checked. Each
+Its tables come from the models in `cortado.optimisation.task_tables`, so that they say what is checked. Each
 table has an example, which below the scene of `scene_page` is a valid task; `tests/test_docs.py` loads them.
 """
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rows import rows, shown, split, toml
 
-from cortado.optimisation.inverse.task_tables import FitTables, TaskTables
+from cortado.optimisation.task_tables import FitTables, TaskTables
 
 PAGE = Path(__file__).parents[1] / "task_file.md"
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from cortado.arrays import check_step_numbers, check_steps, require_arguments, require_function, whole_number
 from cortado.calls import Staying, counted, fixed, public
-from cortado.code_words import code_words
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import DivergedError, InputError, warn
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
@@ -38,6 +37,7 @@ from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
 from cortado.solvers.build import fingerprint as parts_fingerprint
 from cortado.sph.free_energy import FREE_ENERGIES
+from cortado.sph.function_text import code_words
 
 __all__ = ["NAMES", "UNITS", "Problem"]
 

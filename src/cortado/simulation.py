@@ -12,9 +12,8 @@ import numpy as np
 
 from cortado.arrays import whole_number
 from cortado.calls import counted, fixed, public
-from cortado.device.lanes import checked_lanes
 from cortado.device.modules import device_named, start_warp
-from cortado.device.precision import precision_named
+from cortado.device.precision import checked_lanes, precision_named
 from cortado.device.threads import WARP, Turn, frame_parts, in_turn, require, simulation_parts, within
 from cortado.discretise.smoothing import circulation_factor
 from cortado.errors import InputError, shown, unwarned, warn

@@ -35,7 +35,7 @@ def compare(
         first: The folder of a run.
         second: The folder of another, or a table of measured data with the columns of sensors.csv.
     """
-    from cortado.cli.commands.compare import compare_runs, compare_with_data
+    from cortado.cli.compare import compare_runs, compare_with_data
 
     return partial(compare_with_data if second.suffix.lower() == ".csv" else compare_runs, first, second, json)
 
@@ -72,8 +72,8 @@ def sweep(
     frames.check()
     combinations, together = as_text(sets), as_text(zips)
     read_toml(file)
-    from cortado.cli.commands.options import Where
-    from cortado.cli.commands.sweep import run_sweep
+    from cortado.cli.options import Where
+    from cortado.cli.sweep import run_sweep
 
     where = Where(scheduler, workers)
     asked = (combinations, together, steps, time, out, device, precision, where, frames, pictures)
@@ -91,7 +91,7 @@ def convergence(
         runs: Folders of at least three runs until the same time, or of a sweep of them.
         quantities: A number of your own besides: a function of a cortado.Trajectory; may be given again.
     """
-    from cortado.cli.commands.compare import convergence_table
+    from cortado.cli.compare import convergence_table
 
     return partial(convergence_table, runs, as_text(quantities), json)
 
@@ -119,8 +119,8 @@ def dataset(
         workers: Number of worker processes on this machine; on a GPU each has one of its own.
     """
     words = text_overrides(file, overrides)
-    from cortado.cli.commands.dataset import make_dataset
-    from cortado.cli.commands.options import Where
+    from cortado.cli.dataset import make_dataset
+    from cortado.cli.options import Where
 
     return partial(make_dataset, file, runs, out, words, device, precision, Where(scheduler, workers))
 
@@ -157,7 +157,7 @@ def picture(
         _refuse(words, ("colour",), "--colour says so already")
     if not film:
         _refuse(words, ("film_frames", "film_speed"), "one picture is drawn: add --film")
-    from cortado.cli.commands.picture import camera_override, draw_runs, picture_settings
+    from cortado.cli.picture import camera_override, draw_runs, picture_settings
 
     replaced, settings = camera_override(camera) + words, picture_settings(lines, colour)
     return partial(draw_runs, runs, -1 if frame is None else frame, film, out, replaced, device, settings)
@@ -186,7 +186,7 @@ def export(
             raise InputError(
                 f"--set is {word}, but must replace picture.colour or picture.surface: others act in pictures."
             )
-    from cortado.cli.commands.picture import export_run
+    from cortado.cli.picture import export_run
 
     return partial(export_run, run, to, out, every, words)
 

@@ -72,7 +72,7 @@ def check(
     """
     require_at_least(0, seed, "--seed")
     words = text_overrides(scene, overrides)
-    from cortado.cli.commands.describe import check_scene
+    from cortado.cli.describe import check_scene
 
     return partial(check_scene, scene, steps, parameters, loss, perturbation, out, words, device, json, seed)
 
@@ -138,7 +138,7 @@ def describe(
     frames.check()
     steps = steps_or_time(steps, time)
     words = text_overrides(scene, overrides)
-    from cortado.cli.commands.describe import describe_scene
+    from cortado.cli.describe import describe_scene
 
     return partial(describe_scene, scene, steps, time, frames.choice(), words, device, precision, picture, json)
 
@@ -177,7 +177,7 @@ def run(
     frames.check()
     steps = steps_or_time(steps, time)
     wanted, words, told = as_text(record), text_overrides(scene, overrides), command_line()
-    from cortado.cli.commands.run import RunRequest, run_scene
+    from cortado.cli.run import RunRequest, run_scene
 
     asked = (steps, time, words, device, precision, frames.choice(), wanted, state, resume, overwrite, pictures, told)
     return partial(run_scene, scene, RunRequest(out, *asked))
@@ -213,8 +213,8 @@ def optimise(
     """
     require_one_of_both(resume, overwrite)
     words, told = text_overrides(task, overrides), command_line()
-    from cortado.cli.commands.optimise import optimise_task
-    from cortado.cli.commands.options import Where
+    from cortado.cli.optimise import optimise_task
+    from cortado.cli.options import Where
 
     where = Where(scheduler, workers)
     return partial(optimise_task, task, out, words, device, precision, resume, overwrite, told, where, pictures)
@@ -238,7 +238,7 @@ def fit(
         overwrite: Replace an earlier run in the same folder.
     """
     words, told = text_overrides(task, overrides), command_line()
-    from cortado.cli.commands.optimise import fit_task
+    from cortado.cli.optimise import fit_task
 
     return partial(fit_task, task, out, words, device, precision, overwrite, told)
 
@@ -252,7 +252,7 @@ command(app)(dataset)
 @command(app, answers=True)
 def schema() -> Work:
     """Print the JSON schema of scenes and tasks, with which editors complete and check them."""
-    from cortado.optimisation.inverse.task_tables import file_schema_text
+    from cortado.optimisation.task_tables import file_schema_text
 
     return lambda: file_schema_text().rstrip("\n")
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.lanes import check_lanes, lanes_of
 from cortado.device.modules import announce
+from cortado.device.precision import check_lanes, lanes_of
 from cortado.device.threads import MOST_CORES, WARP, in_parallel, usable_cores
 
 MOST_BUNDLES = 4_096

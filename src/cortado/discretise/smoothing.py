@@ -161,7 +161,7 @@ def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: floa
 
 
 def wall_response(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return sum_j G_j . G_j [1 / m^(2 d + 2)], the scale of the relaxation beside walls (`solvers.pcisph.steps`)."""
+    """Return sum_j G_j . G_j [1 / m^(2 d + 2)], the scale of the relaxation beside walls (`solvers.pcisph.solver`)."""
     return float((kernel.gradient(lattice_offsets(spacing, support, dimension), support) ** 2).sum())
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from cortado.arrays import is_whole
 from cortado.calls import FixedDict, counted, fixed
-from cortado.code_words import code_words
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.reduction import add
 from cortado.errors import InputError, shown
@@ -19,6 +18,7 @@ from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameters import check_readable
 from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
+from cortado.sph.function_text import code_words
 
 
 def precision_of(state: State) -> Precision:

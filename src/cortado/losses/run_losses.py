@@ -8,7 +8,6 @@ import warp as wp
 
 from cortado.arrays import as_numbers, as_one_number, require_arguments
 from cortado.calls import fixed
-from cortado.code_words import code_words
 from cortado.device.threads import WARP
 from cortado.errors import InputError
 from cortado.losses.loss import (
@@ -28,6 +27,7 @@ from cortado.losses.loss import (
 from cortado.particles.state import State
 from cortado.runs.sensor import SensedScene
 from cortado.scene.parameters import check_readable
+from cortado.sph.function_text import code_words
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
 LAUNCHED = "positions", "velocities", "an array for the loss"

@@ -12,9 +12,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions, set_lanes
 from cortado.device.modules import by_name, kernel_module, kind_of
-from cortado.device.precision import Precision, arithmetic
+from cortado.device.precision import Precision, arithmetic, lane_functions, set_lanes
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
 from cortado.particles.mirrors import mirror_functions
@@ -84,7 +83,7 @@ class Discretisation:
     smoothing: SmoothingKernel
     precision: Precision
     lanes: int = 1
-    """Threads for each particle, in kernels that are made for them: see `cortado.device.lanes`."""
+    """Threads for each particle, in kernels that are made for them: see `cortado.device.precision`."""
     periodic: bool = False
     """True where particles see the nearest images of one another: see ``period`` in the neighbourhood."""
     moving: bool = False

@@ -24,9 +24,8 @@ import warp as wp
 
 from cortado.device.cells import CellSort, cell_functions, cell_grid_type
 from cortado.device.grid import Grid
-from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, HostCopy, KernelLauncher
-from cortado.device.precision import TypesByName
+from cortado.device.precision import TypesByName, lane_functions
 from cortado.errors import InputError
 from cortado.particles.mirrors import most_imaged, reflections
 from cortado.particles.moving_walls import MovingWalls, WallArrays

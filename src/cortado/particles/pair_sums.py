@@ -27,7 +27,7 @@ With ``ahead=False`` entries of a neighbour are loaded when it is its turn, and 
 tenth of a step on a GPU, but is of little use where terms take longer than loads.
 
 Sums are texts of loops over the neighbours of a particle, which Warp compiles; all such loops are written here. The
-lanes of a particle share its neighbours (`cortado.device.lanes`). All names in a text but those of parameters begin
+lanes of a particle share its neighbours (`cortado.device.precision`). All names in a text but those of parameters begin
 with an underscore, which those of parameters must not.
 
 Derivatives of sums are written by hand (`tangent_of`, `adjoint_of`) where a step is faster with them than with the ones
@@ -44,7 +44,7 @@ from typing import Any, get_args
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions, sum_over_lanes
+from cortado.device.precision import lane_functions, sum_over_lanes
 from cortado.particles.mirrors import OF_IMAGES, OVER_IMAGES, reflections
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
@@ -264,7 +264,7 @@ def summed(
     }
     exec(text, known)
     made: Any = wp.Function(known[name], name, "", module=module, source=text)
-    made.shares_lanes = True  # which `cortado.device.lanes.check_lanes` looks for
+    made.shares_lanes = True  # which `cortado.device.precision.check_lanes` looks for
     made.arrays, made.others, made.results, made.discretisation = arrays, others, results, d
     return made
 

@@ -34,10 +34,9 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, lane_functions
 from cortado.particles.made_derivatives import bars_of, dot_of, warp_function, work_of
 from cortado.particles.moving_walls import turn_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type

@@ -246,7 +246,7 @@ class Lattice:
     stiffness: float
     """k [m2]: delta = k / dt^2 [Pa m3 / kg] (Solenthaler and Pajarola 2009) for a filled neighbourhood."""
     response: float
-    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.steps`."""
+    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.solver`."""
     laplacian_correction: float
     """[-], see `cortado.discretise.smoothing.lattice_laplacian_correction`."""
     domain: Domain

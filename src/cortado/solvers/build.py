@@ -11,10 +11,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from cortado.code_words import code_words
 from cortado.device.grid import Grid
-from cortado.device.lanes import lanes_for
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, lanes_for
 from cortado.discretise.smoothing import SKIN
 from cortado.discretise.solid import Hollow, Solid
 from cortado.errors import InputError, shown
@@ -44,6 +42,7 @@ from cortado.solvers.solver import Solver
 from cortado.sph.drains import Drains
 from cortado.sph.free_energy import MOBILITIES, Diffusion, FreeEnergy
 from cortado.sph.free_solids import FreeSolids, FreeSolidsPart, FreeTable, Push
+from cortado.sph.function_text import code_words
 from cortado.sph.mixture import Phases
 from cortado.sph.moving_solids import MovingSolids
 from cortado.sph.own_force import Rheology
@@ -141,7 +140,7 @@ class SolverSetting:
     called: str
     """The name of the solver in messages."""
     lanes: int | None = None
-    """Threads of a GPU that share a particle; None takes a number that suits the scene, see `cortado.device.lanes`."""
+    """Threads of a GPU that share a particle; None takes as many as suit the scene (`cortado.device.precision`)."""
 
 
 class SolverMaker(Protocol):

@@ -12,8 +12,7 @@ from cortado.particles.wall_terms import SolidShares
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import WithinBar
 from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent
-from cortado.sph.integration import begin_adjoint_kernel
-from cortado.sph.parts import Adjoints, Carried, Shares, StepContext, Tangents
+from cortado.sph.parts import Adjoints, Carried, Shares, StepContext, Tangents, begin_adjoint_kernel
 
 
 class ParticleTangent:

@@ -30,8 +30,7 @@ from cortado.solvers.obstacles import FlatFaces, NamedSolid, Walled
 from cortado.solvers.solver import Counts, StepAdjoint, StepTangent
 from cortado.sph.density import Density, WallAction, WallSums, wall_slope_term
 from cortado.sph.free_solids import FreeSolidsPart
-from cortado.sph.integration import integration_kernels
-from cortado.sph.parts import Carried, Force, Part, PartMaker, StepContext
+from cortado.sph.parts import Carried, Force, Part, PartMaker, StepContext, integration_kernels
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,7 @@ from cortado.particles.state import (
 )
 from cortado.scene.emitter_table import EmitterSample, again_name, emitted_name, outlet_name, path_name
 from cortado.scene.parameters import Axis
-from cortado.sph.integration import integration_module
-from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tangents
+from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tangents, integration_module
 
 
 @cache

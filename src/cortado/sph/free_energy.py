@@ -37,7 +37,6 @@ import warp as wp
 
 from cortado.arrays import as_one_number, require_function
 from cortado.calls import public
-from cortado.code_words import code_words
 from cortado.device.modules import Kernels, by_name, kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.smoothing import laplacian_rate, smoothing_kernel
@@ -47,6 +46,7 @@ from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.particles.particle_kernels import dotted, over, particle_kernel
 from cortado.scene.scene import Scene
 from cortado.sph.formula import compiled
+from cortado.sph.function_text import code_words
 
 FLOOR = 1e-3
 """delta of the degenerate mobility."""

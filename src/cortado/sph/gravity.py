@@ -9,8 +9,7 @@ from cortado.device.precision import Precision
 from cortado.device.reduction import TreeReduction
 from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import Layout
-from cortado.sph.integration import integration_module
-from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
+from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents, integration_module
 
 
 @cache

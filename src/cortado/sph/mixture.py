@@ -23,8 +23,7 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import Entry, Layout, State, StateField
 from cortado.sph.free_energy import FREE_ENERGIES, Diffusion, diffusion_kernels
-from cortado.sph.integration import order_kernels
-from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
+from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents, order_kernels
 
 
 def mixture_module(precision: Precision, phases: int, forward: bool, taped: bool = False) -> Any:

@@ -41,8 +41,7 @@ from cortado.particles.state import Entry, Layout, Parameters, State, StateField
 from cortado.scene.links import Hold
 from cortado.scene.motions import displacement_name, position_name, rotation_name, scale_name, turn_name
 from cortado.scene.parameters import Axis
-from cortado.sph.integration import integration_module
-from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
+from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents, integration_module
 
 
 @cache

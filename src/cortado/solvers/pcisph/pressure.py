@@ -6,7 +6,7 @@
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
 n is the number density (`cortado.sph.density`; for fluids of different masses: Solenthaler and Pajarola 2008),
-y the relaxation beside walls (`cortado.solvers.pcisph.steps`). G is taken at x(t), n* at the predicted
+y the relaxation beside walls (`cortado.solvers.pcisph.solver`). G is taken at x(t), n* at the predicted
 positions over the neighbours of x(t). The force is the transpose of the derivative of n with respect to positions,
 that of walls included: moving particles against it takes the work V sum_i c_i dn_i. After the last iteration (x*, v*)
 is the new state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
@@ -24,7 +24,7 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, 
 from cortado.particles.pair_sums import adjoint_of, pair_sum, tangent_of
 from cortado.particles.wall_terms import solid_kernel
 from cortado.sph.density import density_sums
-from cortado.sph.integration import prediction_share
+from cortado.sph.parts import prediction_share
 
 
 @cache

@@ -1,27 +1,289 @@
-"""PCISPH as the solver of a scene: its steps, put together with their derivatives: the tangent of a replayed step, and
-its transpose, the adjoint.
+"""Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009) as the solver of a scene: its steps, their
+tangent and adjoint, and two factors on the pressure correction delta of an iteration.
+
+`PcisphSteps.step` goes on until the density error is small; `PcisphSteps.replay` repeats a step with a known number of
+iterations and keeps every intermediate value, for the derivatives.
+
+The factors are the density-ratio relaxation of a heavy particle among lighter ones, and the pressure relaxation beside
+walls. delta is made for particles of one mass. The pressure of a particle with lighter neighbours moves these further,
+by the ratio of the masses, and where the answer of its own density is more than twice what is wanted the iteration
+diverges. So its pressure relaxation is multiplied with
+
+    1 / (1 + e(t_i)),   t_i = V sum_j W_ij (m_i / m_j - 1),   e(t) = t^2 / (2 (t + a)) for t > 0, else 0,
+
+which is 1 among particles of its own mass or heavier ones, and tends to the mean 1 / (1 + t / 2) that the lattice asks
+for. a makes it smooth at 0.
+
+delta is made for a particle with a filled neighbourhood. Beside a wall the same pressure moves a particle's own
+density further, by |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = sum_b w_b G_ib, and where that is above 2
+the iteration overshoots and kicks it away. A particle that nears a wall within the step meets a steeper one than at the
+step's start, where S_i is taken, so that the answer counts twice. delta is multiplied by the pressure relaxation
+
+    y_i = 1 / (1 + |S_i|^2 / response),   response = sum_j G_j . G_j,
+
+which is 1 away from walls, and smooth. It changes how fast the iteration converges, not what it converges to. Sums are
+multiplied with the response scale, response^(-1/2), before they are squared: in float32 the square of a gradient
+overflows where spacings are small.
 """
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
 from math import inf
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import Named
+from cortado.device.modules import Kernels
+from cortado.device.precision import TypesByName
 from cortado.device.reduction import add
+from cortado.particles.neighbourhood import Discretisation, pair_functions
+from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
+from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernels
 from cortado.particles.state import Parameters, State
 from cortado.scene.solvers import PcisphSolver
 from cortado.solvers.build import SolverSetting, particle_system
-from cortado.solvers.loop import LoopLimits
+from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
-from cortado.solvers.pcisph.pressure import pressure_solid_kernel
-from cortado.solvers.pcisph.steps import PcisphSteps
+from cortado.solvers.particles import ParticleSolver, ParticleSystem
+from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels, pressure_solid_kernel
 from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepTangent, WithinBar
-from cortado.sph.density import density_solid_kernel, wall_slope_term
+from cortado.sph.density import density_solid_kernel, wall_slope_sums, wall_slope_term
 from cortado.sph.parts import StepContext
+
+SOFTNESS = 0.2
+"""The softness a of the density-ratio relaxation [-]."""
+
+
+@dataclass(frozen=True)
+class DensityRatio:
+    """The kernels of the density-ratio relaxation."""
+
+    total: Kernels
+    """t"""
+    relaxation: Kernels
+    """y from t and the relaxation beside walls, whose adjoints are written."""
+
+
+@cache
+def density_ratio_kernels(discretisation: Discretisation) -> DensityRatio:
+    """Make the kernels of the density-ratio relaxation."""
+    real, vector, neighbourhood = discretisation.types
+    pair = pair_functions(discretisation)
+    weight, gradient = pair.weight, pair.gradient
+    modules = discretisation.modules("density_ratio")
+    a, typed = wp.constant(real(SOFTNESS)), TypesByName(real, {neighbourhood: "s", vector: "x"})
+
+    @fluid_sum(discretisation)
+    def density_ratio_sum(x_ij: vector, m_i: real, m_j: real, s: neighbourhood) -> real:
+        """Return a pair's term W_ij (m_i / m_j - 1) of t_i / V."""
+        return weight(x_ij, s) * (m_i / m_j - real(1.0))
+
+    @tangent_of(density_ratio_sum)
+    @fluid_sum(discretisation, ahead=False)
+    @typed
+    def density_ratio_sum_tangent(x_ij, x_dot_ij, m_i, m_j, m_dot_i, m_dot_j, s) -> real:
+        ratio = m_i / m_j
+        change = wp.dot(gradient(x_ij, s), x_dot_ij) * (ratio - real(1.0))
+        return change + weight(x_ij, s) * ratio * (m_dot_i / m_i - m_dot_j / m_j)
+
+    @adjoint_of(density_ratio_sum)
+    @fluid_sum(discretisation)
+    @typed
+    def density_ratio_sum_adjoint(x_ij, m_i, m_j, t_bar_i, t_bar_j, s) -> tuple[vector, real]:
+        own = t_bar_i * m_i / m_j
+        other = t_bar_j * m_j / m_i
+        return (own - t_bar_i + other - t_bar_j) * gradient(x_ij, s), weight(x_ij, s) * (own - other) / m_i
+
+    def relaxation(wall_y_i: real, t_i: real) -> real:
+        """Return the wall relaxation over 1 + e(t), with e(t) = t^2 / (2 (t + a)) for t > 0, else 0."""
+        excess = real(0.0)
+        if t_i > real(0.0):
+            excess = real(0.5) * t_i * t_i / (t_i + a)
+        return wall_y_i / (real(1.0) + excess)
+
+    sums = density_ratio_sum, density_ratio_sum_tangent, density_ratio_sum_adjoint
+    precision, replaced = discretisation.precision, {"y": "wall_y"}
+    return DensityRatio(
+        sum_kernels("density_ratio", modules, sums, "t", times="s.volume"),
+        pointwise_kernels(precision, modules, lambda _: relaxation, ["y"], replaced, written=["t"]),
+    )
+
+
+@cache
+def wall_kernels(discretisation: Discretisation) -> Kernels:
+    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the pressure relaxation beside walls."""
+    real, vector, neighbourhood = discretisation.types
+    sums = wall_slope_sums(discretisation)
+    slope, change, LANES = sums.slope, sums.change, discretisation.lanes
+    module, tangent_module, adjoint_module = discretisation.modules("pcisph")
+    lane, typed = discretisation.lane, TypesByName(real, {neighbourhood: "s", vector: "x slope"})
+
+    @particle_kernel(module, "y", [over(slope, "total")])
+    def wall_relaxation(total: vector, s: neighbourhood) -> real:
+        scaled = s.response_scale * total
+        return real(1.0) / (real(1.0) + wp.dot(scaled, scaled))
+
+    @particle_kernel(tangent_module, "y_dot", [over(slope, "total"), over(sums.tangent, "total_dot")])
+    def wall_relaxation_tangent(total: vector, total_dot: vector, y_i: real, s: neighbourhood) -> real:
+        along = wp.dot(s.response_scale * total, s.response_scale * total_dot)
+        return real(-2.0) * y_i * y_i * along
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    @typed.arrays
+    def wall_relaxation_adjoint(s, x, y, y_bar, x_bar, slope_bar):
+        """Add to the adjoint of positions from that of y; ``slope_bar`` gets the adjoint of S."""
+        i = s.first + wp.tid() // LANES
+        total = s.response_scale * slope(i, x, s)
+        along = (real(-2.0) * y_bar[i] * y[i] * y[i] * s.response_scale) * total
+        x_sum = change(i, x, along, s)
+        if lane() > 0:
+            return
+        x_bar[i] = x_bar[i] + x_sum
+        slope_bar[i] = along
+
+    return Kernels(wall_relaxation, wall_relaxation_tangent, wall_relaxation_adjoint)
+
+
+@cache
+def scaling_kernel(discretisation: Discretisation) -> Any:
+    """Make the kernel of the adjoint of the pressure acceleration over m, with which the way back begins."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+
+    @particle_kernel(discretisation.module(False, "pcisph"), "scaled_bar")
+    def scale_adjoint(time_step: real, m_i: real, v_bar_i: vector) -> vector:
+        return (time_step / m_i) * v_bar_i
+
+    return scale_adjoint
+
+
+@dataclass(frozen=True)
+class PcisphKernels:
+    """The kernels that only PCISPH needs, by topic, each with its forward, tangent and adjoint."""
+
+    wall_relaxation: Kernels
+    density_ratio: DensityRatio | None
+    """Only where there are several phases."""
+    pressure: Kernels
+    force: Kernels
+    scale_adjoint: wp.Kernel
+
+    @classmethod
+    def of(cls, discretisation: Discretisation, phases: int) -> "PcisphKernels":
+        """Make the kernels of PCISPH for a smoothing kernel, a precision and a number of phases."""
+        return cls(
+            wall_kernels(discretisation),
+            density_ratio_kernels(discretisation) if phases > 1 else None,
+            pressure_kernels(discretisation),
+            pressure_force_kernels(discretisation),
+            scaling_kernel(discretisation),
+        )
+
+
+class Iterates:
+    """Predicted states and pressures of the iterations of one step; a single slot is overwritten each time."""
+
+    def __init__(self, numbers: Callable[[], wp.array], vectors: Callable[[], wp.array]):
+        """Allocate one iteration by two functions, which make arrays (n,) of zero numbers and zero vectors."""
+        self._numbers, self._vectors = numbers, vectors
+        self.x_star: list[wp.array] = []
+        self.v_star: list[wp.array] = []
+        self.p: list[wp.array] = [numbers()]
+        """``p[k]`` before iteration k; ``p[0]`` is 0 and never written."""
+        self.c: list[wp.array] = []
+        self.reserve(1)
+
+    def reserve(self, iterations: int) -> None:
+        """Make room for the values of ``iterations`` iterations."""
+        while len(self.x_star) <= iterations:
+            self.x_star.append(self._vectors())
+            self.v_star.append(self._vectors())
+            self.p.append(self._numbers())
+            self.c.append(self._numbers())
+
+
+class PcisphSteps(ParticleSolver):
+    """The forward steps of PCISPH for one set of particles."""
+
+    topic = "pcisph"
+
+    def __init__(self, system: ParticleSystem, limits: LoopLimits | None, requires_grad: bool = False):
+        """Prepare steps of a system; ``limits`` None leaves the pressure out."""
+        super().__init__(system, requires_grad)
+        self.limits, self.kernels = limits, PcisphKernels.of(self.discretisation, self.layout.phases)
+        self.wall_relaxation, self.density_ratio = self.numbers(), self.numbers()
+        self.pressure_relaxation = self.numbers() if self.layout.phases > 1 else self.wall_relaxation
+        """(n,) what delta is multiplied with [-]: beside walls, and with several phases among lighter neighbours."""
+        self.iterates = Iterates(self.numbers, self.vectors)
+        self.pressure_loop = Loop(limits, self.layout, self.launch)
+        self.loops = (self.pressure_loop,)
+
+    def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
+        context = self.predict(state, parameters)
+        self.pressure_loop.run(lambda k: self.iterate(k, 0, context))
+        self.write_state((0,), parameters, new_state)
+        self.end_step(self.iterates.x_star[0], self.iterates.v_star[0], new_state, log)
+
+    def reserve(self, counts: Counts) -> None:
+        (iterations,) = counts
+        self.iterates.reserve(iterations)
+
+    def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
+        self.reserve(counts)
+        context = self.predict(state, parameters)
+        for k in range(*counts):
+            self.iterate(k, k + 1, context)
+
+    def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
+        """Write the last prediction as the new state."""
+        (iterations,) = counts
+        it = self.iterates
+        self.unsort(self.context(parameters), it.x_star[iterations], it.v_star[iterations], new_state)
+
+    def pressures(self) -> wp.array | None:
+        return None if self.limits is None else self.iterates.p[1]
+
+    def predict(self, state: State, parameters: Parameters) -> StepContext:
+        """Do all of a step before the pressure iterations: sort and measure the density (`sort`), write the relaxation
+        y, add up the explicit forces, gravity among them. Then predict v* = v + dt a, x* = x + dt v*."""
+        it, context = self.iterates, self.sort(state, parameters)
+        with context.aside():
+            self._relax(context)
+        first = {"x_star": it.x_star[0], "v_star": it.v_star[0]}
+        context.launch(self.integration.predict, acceleration=self.accelerate(context), **first)
+        context.join()
+        return context
+
+    def _relax(self, context: StepContext) -> None:
+        """Compute the relaxation of the pressure beside walls and among lighter neighbours."""
+        kernels = self.kernels
+        context.launch(kernels.wall_relaxation.forward, y=self.wall_relaxation)
+        if kernels.density_ratio:
+            found = {"t": self.density_ratio, "wall_y": self.wall_relaxation, "y": self.pressure_relaxation}
+            context.launch(kernels.density_ratio.total.forward, t=found["t"])
+            context.launch(kernels.density_ratio.relaxation.forward, found)
+
+    def iterate(self, k: int, slot: int, context: StepContext) -> None:
+        """Take pressure iteration k, from the predicted state of the slot before to ``slot`` (0: the only one)."""
+        it, kernels, before = self.iterates, self.kernels, max(slot - 1, 0)
+        going = {"k": k, "rounds": self.pressure_loop.rounds}
+        context.launch(
+            kernels.pressure.forward,
+            going,
+            stiffness=self.lattice.stiffness,
+            y=self.pressure_relaxation,
+            x_star=it.x_star[before],
+            p_in=it.p[0] if k == 0 else it.p[max(slot - 1, 1)],
+            p_out=it.p[max(slot, 1)],
+            c=it.c[before],
+            error=self.pressure_loop.errors,
+        )
+        going |= {"x_before": it.x_star[before], "v_before": it.v_star[before]}
+        new = {"x_star": it.x_star[slot], "v_star": it.v_star[slot]}
+        context.launch(kernels.force.forward, going, acceleration=self.accelerations[-1], c=it.c[before], **new)
 
 
 class PcisphAdjoint(ParticleAdjoint):
@@ -67,19 +329,9 @@ class PcisphAdjoint(ParticleAdjoint):
         pressure_bar = {"y_bar": self._y_bar, "p_bar": self._p_bar}
         for k in reversed(range(iterations)):
             going = {"k": k, "rounds": solver.pressure_loop.rounds}
-            context.launch(
-                kernels.force.adjoint,
-                going,
-                *known,
-                stiffness=solver.lattice.stiffness,
-                y=solver.pressure_relaxation,
-                p_in=it.p[k],
-                p_out=it.p[k + 1],
-                c=it.c[k],
-                scaled_bar=scaled_bar,
-                r=self._r,
-                **pressure_bar,
-            )
+            given = {"stiffness": solver.lattice.stiffness, "y": solver.pressure_relaxation, "c": it.c[k]}
+            pressures = {"p_in": it.p[k], "p_out": it.p[k + 1], **pressure_bar}
+            context.launch(kernels.force.adjoint, going, *known, given, pressures, scaled_bar=scaled_bar, r=self._r)
             pushed = partial(pressure_solid_kernel, solver.discretisation)
             self.bar.solids.add(context.launch, pushed, going, *known, scaled_bar=scaled_bar, c=it.c[k])
             predicted = {"x_star": it.x_star[k], "v_star": it.v_star[k]}
@@ -123,21 +375,10 @@ class PcisphTangent(ParticleTangent):
         for k in range(iterations):
             p_dot, c_dot = self._p_dot[k % 2], self._c_dot
             going = {"k": k, "rounds": solver.pressure_loop.rounds}
-            context.launch(
-                kernels.pressure.tangent,
-                going,
-                *known,
-                stiffness=solver.lattice.stiffness,
-                y=solver.pressure_relaxation,
-                y_dot=self._y_dot,
-                x_star=it.x_star[k],
-                x_star_dot=self._x_star_dot,
-                p_in=it.p[k],
-                p_in_dot=p_dot_before,
-                p_out=it.p[k + 1],
-                p_out_dot=p_dot,
-                c_dot=c_dot,
-            )
+            given = {"stiffness": solver.lattice.stiffness, "y": solver.pressure_relaxation, "y_dot": self._y_dot}
+            pressures = {"p_in": it.p[k], "p_in_dot": p_dot_before, "p_out": it.p[k + 1], "p_out_dot": p_dot}
+            there = {"x_star": it.x_star[k], "x_star_dot": self._x_star_dot}
+            context.launch(kernels.pressure.tangent, going, *known, given, pressures, there, c_dot=c_dot)
             forces = {"c": it.c[k], "c_dot": c_dot, "v_star": it.v_star[k + 1]}
             context.launch(kernels.force.tangent, going, *known, **accelerations, **forces, **predicted)
             p_dot_before = p_dot
@@ -185,19 +426,10 @@ class PcisphMaker:
 
     def build(self, setting: SolverSetting) -> Solver:
         """Make the PCISPH solver of a scene that is cut into particles, on a device."""
-        limits = pressure_limits(self._table) if setting.scene.forces.pressure else None
+        table, counts = self._table, (self._table.minimum_iterations, self._table.maximum_iterations)
+        greatest = inf if table.maximum_density_tolerance is None else table.maximum_density_tolerance
+        limits = LoopLimits(*counts, table.density_tolerance, greatest) if setting.scene.forces.pressure else None
         return Pcisph(particle_system(setting), limits)
 
 
 maker = PcisphMaker
-
-
-def pressure_limits(table: PcisphSolver) -> LoopLimits:
-    """Return the bounds on iterations and density errors at which PCISPH's pressure loop stops."""
-    greatest = table.maximum_density_tolerance
-    return LoopLimits(
-        table.minimum_iterations,
-        table.maximum_iterations,
-        table.density_tolerance,
-        inf if greatest is None else greatest,
-    )

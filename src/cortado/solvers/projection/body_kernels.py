@@ -27,8 +27,7 @@ from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
-from cortado.solvers.projection.names import types_by_name
-from cortado.solvers.projection.wall_sums import normal_part
+from cortado.solvers.projection.wall_sums import normal_part, types_by_name
 from cortado.sph.moving_solids import free_module, move_kernels
 
 

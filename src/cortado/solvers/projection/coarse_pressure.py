@@ -50,8 +50,8 @@ from cortado.particles.particle_kernels import particle_kernel, pointwise_kernel
 from cortado.particles.state import Layout
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse_nodes import ALONE, hat_functions, node_functions
-from cortado.solvers.projection.names import types_by_name, weights_type
 from cortado.solvers.projection.pressure import clamp_functions
+from cortado.solvers.projection.wall_sums import types_by_name, weights_type
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
 from cortado.sph.moving_solids import hold_functions
 from cortado.sph.parts import Adjoints, StepContext, Tangents

@@ -45,8 +45,7 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import image_sum, mirror_sum
-from cortado.solvers.projection.names import types_by_name, weights_type
-from cortado.solvers.projection.wall_sums import DIRECTION, normal_part
+from cortado.solvers.projection.wall_sums import DIRECTION, normal_part, types_by_name, weights_type
 from cortado.sph.moment_functions import matrix_type, moment_functions
 
 TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95)

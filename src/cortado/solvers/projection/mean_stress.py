@@ -41,13 +41,11 @@ from cortado.particles.pair_sums import fluid_sum, image_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
 from cortado.particles.state import Fields, Layout
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm
-from cortado.solvers.projection.names import types_by_name
 from cortado.solvers.projection.surroundings import Surroundings, SurroundingsAdjoint, SurroundingsTangent
-from cortado.solvers.projection.wall_sums import FaceShares, normal_part
+from cortado.solvers.projection.wall_sums import FaceShares, normal_part, types_by_name
 from cortado.sph.density import WallSums
-from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
-from cortado.sph.parts import Adjoints, StepContext, Tangents
+from cortado.sph.parts import Adjoints, StepContext, Tangents, integration_module
 
 TOPIC = "mean_stress"
 """Topic of its Warp modules, to which the dimension is appended where it counts."""

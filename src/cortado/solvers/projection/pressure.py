@@ -44,9 +44,9 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels
 from cortado.solvers.projection.effects import image_sums
-from cortado.solvers.projection.names import types_by_name, weights_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
+from cortado.solvers.projection.wall_sums import types_by_name, weights_type
 from cortado.sph.moment_functions import matrix_type, symmetric
 
 

@@ -27,9 +27,9 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, 
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.particles.wall_terms import solid_kernel
 from cortado.solvers.projection.effects import image_sums
-from cortado.solvers.projection.names import weights_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
+from cortado.solvers.projection.wall_sums import weights_type
 from cortado.sph.density import density_sums
 
 FARTHEST = 1.0 / 6.0

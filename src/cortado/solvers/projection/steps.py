@@ -51,18 +51,16 @@ from cortado.solvers.projection.coarse import Coarse
 from cortado.solvers.projection.effects import effect_functions
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.mean_stress import ImageLoads, MeanStress, pressed_kernels
-from cortado.solvers.projection.names import types_by_name
 from cortado.solvers.projection.pressure import PressureKernels, beginning_kernels, pressure_kernels
 from cortado.solvers.projection.repair import RepairKernels, repair_kernels
 from cortado.solvers.projection.sides import Sides
 from cortado.solvers.projection.sums import VelocityKernels, velocity_kernels
 from cortado.solvers.projection.surroundings import Surroundings
-from cortado.solvers.projection.wall_sums import ProjectionPush
+from cortado.solvers.projection.wall_sums import ProjectionPush, types_by_name
 from cortado.solvers.solver import Counts
 from cortado.sph.free_solids import FreeSolidsPart
-from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type, symmetric
-from cortado.sph.parts import Carried, StepContext
+from cortado.sph.parts import Carried, StepContext, integration_module
 
 RATE = 20.0
 """Factor of dt |grad v| in the rate r of the shift."""

@@ -17,7 +17,7 @@ from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.solvers.projection.effects import image_sums
-from cortado.solvers.projection.names import types_by_name
+from cortado.solvers.projection.wall_sums import types_by_name
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions, symmetric
 
 CROWDED = 0.25

@@ -14,9 +14,14 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.state import Layout
 from cortado.solvers.projection.effects import effect_functions, image_share, image_sums
 from cortado.solvers.projection.lattice import ProjectionConstants
-from cortado.solvers.projection.names import weights_type
 from cortado.solvers.projection.sums import APART, projection_sums
-from cortado.solvers.projection.wall_sums import FaceShares, beside_solid_kernel, beside_sums, edge_functions
+from cortado.solvers.projection.wall_sums import (
+    FaceShares,
+    beside_solid_kernel,
+    beside_sums,
+    edge_functions,
+    weights_type,
+)
 from cortado.sph.density import Density, DensityAdjoint, DensityTangent
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents

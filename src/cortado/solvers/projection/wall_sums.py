@@ -25,9 +25,11 @@ work that is linear in adjoints,
 
 as the lift is the transpose of the spread. The slope B is that of the push by a coarse pressure. Warp makes gradients
 of W by the poses of the solid before and after the step. Those by positions stand elsewhere, but for what e gives.
+
+`types_by_name` has the types of the projection's quantities by their names, for these sums and all others.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from typing import Any
@@ -45,9 +47,8 @@ from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm, share_kinds, solid_kernel
 from cortado.solvers.projection.lattice import ProjectionConstants
-from cortado.solvers.projection.names import types_by_name
 from cortado.sph.density import WallSums, wall_slope_term
-from cortado.sph.moment_functions import moment_functions
+from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 EDGED = (0.1, 0.4)
@@ -374,3 +375,24 @@ class FaceShares:
         if self._faces:
             known = {**self._nothing, **{name: array for group in groups for name, array in group.items()}, **arrays}
             bar.solids.add(context.launch, self._kernel, *bar.named, known, over=over)
+
+
+@cache
+def weights_type(precision: Precision) -> Any:
+    """Return the Warp type of a particle's four weights (sigma, f, u, r)."""
+    return wp.types.vector(length=4, dtype=precision.real)
+
+
+def types_by_name(precision: Precision, more: Mapping[Any, str] | None = None) -> TypesByName:
+    """Return the types of names in sums and kernels: vectors, matrices, symmetric ones as six numbers, and numbers for
+    all others. ``more`` are names of some kernels, and count before these."""
+    common = {
+        neighbourhood_type(precision): "s",
+        precision.vector: "x v u g f h gamma beside mirror normal whole crowd apart arm kick thrust delta foot turn "
+        "total lifted row lift direct diagonal others",
+        matrix_type(precision): "A L M N Q",
+        symmetric(precision).kind: "S T",
+        weights_type(precision): "weights",
+        precision.pair: "error sums sizes",
+    }
+    return TypesByName(precision.real, common, more or {})

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cortado.cli.commands.options import named_runs
+from cortado.cli.options import named_runs
 from cortado.errors import InputError
 from cortado.files.terminal import keeping
 from cortado.pictures.export_formats import export

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.cli.commands.run_report import RunSummary, write_run_report
+from cortado.cli.run_report import RunSummary, write_run_report
 from cortado.device.modules import compile_ahead
 from cortado.device.threads import frame_parts, require
 from cortado.errors import DivergedError, InputError, warn

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cortado.optimisation.inverse.solved_task import KnotValues, TaskFigures, component_names
-from cortado.optimisation.inverse.task_files import Setup, Task, task_in_words
 from cortado.optimisation.optimise import Result
+from cortado.optimisation.solved_task import KnotValues, TaskFigures, component_names
+from cortado.optimisation.task_files import Setup, Task, task_in_words
 from cortado.pictures.pages import MOST_NUMBERS, Section, written
 from cortado.pictures.particle_view import scene_view
 from cortado.scene.scene import scene_in_words

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.cli.commands.options import OwnQuantity, named_runs
+from cortado.cli.options import OwnQuantity, named_runs
 from cortado.errors import InputError, shown, warn
 from cortado.optimisation.sweep import Extrapolation
 from cortado.pictures.run_pictures import beside_measured

@@ -8,14 +8,14 @@ from typing import Any
 from cortado.arrays import check_steps
 from cortado.calls import counted
 from cortado.cli.arguments import ALL_FRAMES, FrameOptions, steps_or_time
-from cortado.cli.commands.optimise import optimise_task, search_settings
-from cortado.cli.commands.options import HERE, Where, require_shared
-from cortado.cli.commands.run import RunRequest, run_scene, run_settings
+from cortado.cli.optimise import optimise_task, search_settings
+from cortado.cli.options import HERE, Where, require_shared
+from cortado.cli.run import RunRequest, run_scene, run_settings
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, unwarned, warn
 from cortado.files.disk import locked
 from cortado.files.terminal import Interrupted, keeping, track, untracked
-from cortado.optimisation.inverse.task_files import load_task
 from cortado.optimisation.sweep import NAME, Combination, combinations, failed, write_table
+from cortado.optimisation.task_files import load_task
 from cortado.runs.recording import FrameChoice
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.scene import load_scene, read_toml

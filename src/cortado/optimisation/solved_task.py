@@ -17,8 +17,9 @@ from cortado.files.terminal import announce
 from cortado.losses import Snapshot
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.observations import Observation, SensorSeries, Tracks, Video
-from cortado.optimisation.inverse.task_files import GIVEN, Setup, Task, read_tables
-from cortado.optimisation.inverse.task_tables import (
+from cortado.optimisation.optimise import Result
+from cortado.optimisation.task_files import GIVEN, Setup, Task, read_tables
+from cortado.optimisation.task_tables import (
     FitTable,
     FitTables,
     MeasuredTable,
@@ -27,7 +28,6 @@ from cortado.optimisation.inverse.task_tables import (
     TracksTable,
     VideoTable,
 )
-from cortado.optimisation.optimise import Result
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.pictures.film import FilmedRun, Page, film, is_out, those
 from cortado.pictures.image_files import open_picture, read_frames, resized, warn_of_cropping, write_picture

@@ -23,7 +23,7 @@ from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.files.disk import make_folder
 from cortado.files.terminal import tell, timed_note
 from cortado.losses import CentreOfMass, FinalPositions, Image, Loss
-from cortado.optimisation.inverse.task_files import load_task, task_in_words
+from cortado.optimisation.task_files import load_task, task_in_words
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.painter import colours_of, painter, plan
 from cortado.problem import Problem

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cortado.calls import counted
-from cortado.cli.commands.optimise_report import (
+from cortado.cli.optimise_report import (
     MOST_ERROR,
     Verdict,
     asked,
@@ -22,7 +22,7 @@ from cortado.cli.commands.optimise_report import (
     sections,
     worst_in_words,
 )
-from cortado.cli.commands.options import HERE, Where
+from cortado.cli.options import HERE, Where
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
 from cortado.files.disk import locked
@@ -30,7 +30,8 @@ from cortado.files.terminal import announce, keeping, say, track
 from cortado.image_losses import psnr
 from cortado.optimisation.fitting.figures import profile_figure, residual_figure, video_figures
 from cortado.optimisation.fitting.fit import NOISE_ALONE, Fit, Profile, fit, unit_of
-from cortado.optimisation.inverse.solved_task import (
+from cortado.optimisation.optimise import Record, Result, optimise
+from cortado.optimisation.solved_task import (
     FitTask,
     TaskFigures,
     begin_shaded,
@@ -39,8 +40,7 @@ from cortado.optimisation.inverse.solved_task import (
     shaded_figures,
     task_figures,
 )
-from cortado.optimisation.inverse.task_files import Setup, Task, load_task, setup
-from cortado.optimisation.optimise import Record, Result, optimise
+from cortado.optimisation.task_files import Setup, Task, load_task, setup
 from cortado.pictures.film import lacking
 from cortado.pictures.pages import Section, write_report
 from cortado.runs.run_folder import TO_RESUME, RunFolder

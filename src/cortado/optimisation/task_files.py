@@ -11,7 +11,7 @@ import numpy as np
 from cortado.calls import counted
 from cortado.errors import DivergedError, InputError, SceneError, Words
 from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
-from cortado.optimisation.inverse.task_tables import DISTANCES, RANDOM, OptimiseTable, ProblemTable, TaskTables
+from cortado.optimisation.task_tables import DISTANCES, RANDOM, OptimiseTable, ProblemTable, TaskTables
 from cortado.optimisation.transforms import Bijector, Logarithm, Softmax, TimeInterpolation, Transformed
 from cortado.pictures.image_files import heart, read_picture, rosetta
 from cortado.problem import Problem
