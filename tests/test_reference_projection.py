@@ -192,7 +192,7 @@ def test_same_bits_with_any_number_of_threads(name):
 def test_without_pressure_nothing_is_projected():
     forces = {"gravity": [0.0, -9.81], "pressure": False}
     solvers = {"time_step": 0.002}, SOLVER
-    one, other = (reference.Simulation(plane(forces=forces, solver=solver)) for solver in solvers)
+    one, other = (reference.Simulation(plane(forces=forces, solver=solver, discretisation=C2)) for solver in solvers)
     wanted, found = (simulation.run(10, thrown(simulation)) for simulation in (one, other))
     assert np.array_equal(found.positions.high, wanted.positions.high)
     assert found.iterations.tolist() == [0] * 10
