@@ -73,3 +73,25 @@ def test_bars_with_a_discrepancy_hold(body):
         missed.append(np.abs(found) > 2.5 * bars[2])
         ratios.append(bars[0] / bars[2])
     assert np.mean(missed) < 0.15 and np.mean(ratios) < 0.6
+
+
+def test_the_section_of_a_run_has_the_numbers_that_are_told(monkeypatch, tmp_path, capsys):
+    """Centre of gravity, radius of gyration and springs within two bars, which are at most 10 %."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.setattr(sys, "argv", ["body.py"])
+    runpy.run_path(str(FOLDER / "body.py"), run_name="__main__")
+    lines = capsys.readouterr().out.splitlines()
+    rows = [line.split() for line in lines if line.startswith(("centre", "radius", "springs"))]
+    assert len(rows) == 3
+    for row in rows:
+        bar, off = float(row[-2].rstrip("%")), float(row[-1])
+        assert bar < 10.0 and off < 2.0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["body_3061_2.png", "body_3102_1.png"]
+
+
+def test_a_softer_line_pulls_with_half_the_force(capsys):
+    """Found by one gradient through the whole simulation; the script itself fails where no stiffness is found."""
+    runpy.run_path(str(FOLDER / "mooring.py"), run_name="__main__")
+    first, *_, last = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert float(first[0]) == 2000.0 and float(last[-4]) == pytest.approx(0.5, abs=0.025)
