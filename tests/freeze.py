@@ -46,7 +46,7 @@ from cortado.cli import main
 from cortado.cli.subcommands import CORTADO, new_scene, templates
 from cortado.optimisation.task_tables import file_schema
 from cortado.scene.parameters import Role
-from scenes import jet, scene, two_layers
+from scenes import CUBIC, jet, scene, two_layers
 from scenes import plane as in_the_plane
 from scenes import plane_of_three as of_three
 from test_examples import FILES
@@ -100,7 +100,6 @@ def drag(x, v, t, k):
     return -k * v
 
 
-CUBIC = {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"}
 plane, plane_of_three = (partial(make, discretisation=CUBIC) for make in (in_the_plane, of_three))
 
 

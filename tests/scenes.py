@@ -84,6 +84,7 @@ def splash(**solver: Any) -> Scene:
 
 
 C2 = {"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"}
+CUBIC = {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"}
 
 
 def scene(**changes: Any) -> Scene:
@@ -92,7 +93,7 @@ def scene(**changes: Any) -> Scene:
     tables: dict[str, Any] = {
         "name": "collapse",
         "dimension": 3,
-        "discretisation": {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"},
+        "discretisation": CUBIC,
         "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}],
         "fluid": [{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.25, 0.25, 0.25], "phase": "water"}],
         "container": {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.4, 0.6, 0.25]},

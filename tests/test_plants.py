@@ -13,7 +13,7 @@ import pytest
 import cortado
 from cortado.particles.particle_kernels import MADE
 from planting import adjoints, plant_all
-from scenes import HONEY, MIXING, OIL, box, plane, scene
+from scenes import CUBIC, HONEY, MIXING, OIL, box, plane, scene
 
 ROOT = Path(cortado.__file__).parent
 
@@ -112,7 +112,14 @@ SOLVER = {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 3, "maximu
 def small(viscosity: str, **changes):
     """24 particles in a pool and a few in a nozzle, in the plane."""
     forces = {"gravity": [1.0, -9.81], "viscosity": viscosity}
-    tables = {"fluid": [POOL], "container": ROOM, "phase": PHASES, "solver": SOLVER, "forces": forces}
+    tables = {
+        "fluid": [POOL],
+        "container": ROOM,
+        "phase": PHASES,
+        "solver": SOLVER,
+        "forces": forces,
+        "discretisation": CUBIC,
+    }
     return plane(**{**tables, "emitter": [NOZZLE], **changes})
 
 
@@ -172,6 +179,7 @@ SCENES = {
             container=box([0.0, 0.0], [1.0, 1.0]),
             forces={"gravity": [1.0, -9.81]},
             solver=SHORT,
+            discretisation=CUBIC,
             solid=[RAFT, BUOY, ARM],
         ),
         "positions",
@@ -182,6 +190,7 @@ SCENES = {
             container=box([0.0] * 3, [0.5, 0.6, 0.25]),
             forces={"gravity": [1.0, -9.81, 0.5]},
             solver=SHORT,
+            discretisation=CUBIC,
             solid=TURNED,
         ),
         "positions",

@@ -11,11 +11,10 @@ from cortado.reference import Terms
 from cortado.scene.discrete_scene import discretise, mirrors_of
 from cortado.solvers.projection.lattice import coarse_grid
 from reference_projection import Projection
-from scenes import C2, box, plane, scene
+from scenes import C2, CUBIC, box, plane, scene
 from test_projection import CASES, HURLED, PERIODIC, SOLVER, begun, thrown
 from test_reference import C4, distance, gradients_agree, target_of
 
-CUBIC = {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"}
 SCENES = {
     "plane": plane(solver=SOLVER),
     "space": scene(solver=SOLVER),
