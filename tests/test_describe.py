@@ -26,7 +26,8 @@ from scenes import box, jet, plane, pool, stability_limit, two_layers
 def folder(tmp_path, monkeypatch, unrendered):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cortado.cli.describe.seconds_of_picture", lambda _: 0.5)  # drawing takes long
+    times = {"traced": 0.5, "quick": 0.2}  # drawing takes long
+    monkeypatch.setattr("cortado.cli.describe.seconds_of_picture", lambda _, quality: times[quality])
     monkeypatch.setattr("cortado.cli.describe.MOST_STEPS", 4)  # and so do 100 steps that are timed
     return tmp_path
 
@@ -105,11 +106,11 @@ def test_a_picture_is_timed_where_there_is_something_to_draw(monkeypatch):
     monkeypatch.setattr("cortado.cli.describe.time.perf_counter", lambda: next(ticks))
     monkeypatch.setattr(PlanePainter, "image", lambda _, *state: drawn.append(len(state[0])))
     simulation = cortado.Simulation("scene.toml")
-    assert seconds_of_picture(simulation) == 2.5 and drawn == 2 * [simulation.particles]
+    assert seconds_of_picture(simulation, "traced") == 2.5 and drawn == 2 * [simulation.particles]
     shooting = cortado.Simulation(jet())
     assert shooting.free_particles < shooting.particles
     ticks = iter([0.0, 1.0])
-    assert seconds_of_picture(shooting) == 1.0 and drawn[-1] == (shooting.free_particles or shooting.particles)
+    assert seconds_of_picture(shooting, "quick") == 1.0 and drawn[-1] == (shooting.free_particles or shooting.particles)
 
 
 def test_steps_that_are_chosen_are_estimated():
@@ -132,7 +133,8 @@ def test_phases_and_an_emitter_are_told(capsys):
     found = described(capsys, "latte.toml")
     each = found["particles_of_phase"].values()
     assert sum(each) == found["particles"] and min(each) > 0
-    out = told(capsys, "latte.toml")
+    out = told(capsys, "latte.toml", "--steps", "20")
+    assert "as a quick look, about" in out and "to draw with its light traced, 0.2 s and 0.5 s for the first" in out
     assert "milk" in out and "in 3-D" in out and "limits: " in out and "ms a step on cpu in float32" in out
 
 

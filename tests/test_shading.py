@@ -20,12 +20,13 @@ from cortado.pictures import film as shading_film
 from cortado.pictures import stage as stage_module
 from cortado.pictures.film import Page, film, lacking
 from cortado.pictures.painter import colours_of, labelled, painter, side_by_side
+from cortado.pictures.run_pictures import run_pictures
 from cortado.pictures.stage import Stage, screen_axes, upright
 from cortado.pictures.tracing.liquid_surface import spheres
 from cortado.pictures.tracing.solid_surfaces import NODES, FloorShadow
 from cortado.pictures.tracing.space import State, environment_of, particles_of, scenery, wetting
 from cortado.pictures.tracing.trace import find_contrast
-from cortado.runs.frames import Pace, pace_of
+from cortado.runs.frames import Film, Pace, pace_of
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.appearance import Picture
 from scenes import bodies, box
@@ -231,17 +232,22 @@ def test_spheres_have_their_size_and_look_outwards():
     assert (outwards > 0.0).all() and len(surface.triangles) == 128
 
 
-def test_contrast_is_found_between_neighbours_alone():
+def test_contrast_marks_pixels_among_white_squares_that_differ_and_black_ones_are_filled():
     image = np.random.default_rng(3).random((5, 7, 3)).astype(np.float32)
     image[:2, :4] = 0.5
-    across, down = (np.abs(np.diff(image, axis=axis)).max(axis=2) > 0.8 for axis in (1, 0))
-    wanted = np.pad(across, ((0, 0), (1, 0))) | np.pad(across, ((0, 0), (0, 1)))
-    wanted |= np.pad(down, ((1, 0), (0, 0))) | np.pad(down, ((0, 1), (0, 0)))
     found = wp.zeros(35, dtype=wp.int32, device="cpu")
     pixels = wp.array(image.reshape(-1, 3), dtype=wp.vec3, device="cpu")
-    launch(find_contrast, 35, "cpu", first=0, columns=7, image=pixels, contrast=0.8, found=found)
-    np.testing.assert_array_equal(found.numpy().reshape(5, 7), wanted)
-    assert 0 < wanted.sum() < 35
+    launch(find_contrast, 35, wp.get_device("cpu"), first=0, columns=7, image=pixels, contrast=0.8, found=found)
+    marks, filled = found.numpy().reshape(5, 7), pixels.numpy().reshape(5, 7, 3)
+    for row, column in np.ndindex(5, 7):
+        black = (row + column) % 2
+        around = ((0, 1), (1, 0), (0, -1), (-1, 0)) if black else ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+        places = ((row + down, column + across) for down, across in around)
+        near = np.array([image[y, x] for y, x in places if 0 <= y < 5 and 0 <= x < 7])
+        assert marks[row, column] == (np.ptp(near, axis=0).max() > 0.8)
+        wanted = near.mean(axis=0) if black else image[row, column]
+        np.testing.assert_allclose(filled[row, column], wanted, rtol=1e-6)
+    assert 0 < marks.sum() < 35
 
 
 def page_of(picture, fingerprint=""):
@@ -475,6 +481,25 @@ def test_a_simulation_draws_its_frames():
     assert simulation.picture(trajectory[-1], width=128, height=72).shape == (72, 128, 3)
     with pytest.raises(SceneError, match="height"):
         simulation.picture(trajectory[-1], height=1)
+
+
+def test_a_run_has_a_quick_film_and_sheet_unless_its_scene_says_how(tmp_path, monkeypatch):
+    drawn, simulation = [], cortado.Simulation(scene_of())
+    trajectory = simulation.run(steps=1)
+    monkeypatch.setattr("cortado.pictures.run_pictures.film", lambda path, page, _, pace: shown(path, page, pace))
+
+    def shown(path, page, pace):
+        drawn.append(page.image(0))
+        return Film(path, pace)
+
+    for given in ({}, {"quality": "traced"}):
+        figures = run_pictures(scene_of(picture=given), trajectory, tmp_path, simulation.device)
+    assert [path.name for _, path in figures] == ["film.mp4", "first.png", "last.png", "sheet.png"]
+    quick, traced = (simulation.picture(trajectory[0], quality=one) for one in ("quick", "traced"))
+    for image, wanted in zip(drawn, (quick, traced), strict=True):
+        np.testing.assert_allclose(image, wanted, atol=1e-3)
+    assert 0.002 < np.abs(quick - traced).mean() < 0.05
+    assert cortado.pictures.read_picture(tmp_path / "sheet.png").shape == (64, 3 * 64, 3)
 
 
 PICTURE = "\n[picture]\nwidth = 96\nheight = 64\n"

@@ -140,10 +140,11 @@ def describe_scene(
     count = sum(body.count(scene.discretisation.spacing) for body in (*scene.fluid, *scene.emitter))
     with timed_note(f"About {count:,.0f} particles are made") if count > MANY else nullcontext():
         simulation = Simulation(scene, device, precision)
-    length = RunLength(simulation, steps, time, frames)
-    found = _described(simulation, length)
+    found = _described(simulation, length := RunLength(simulation, steps, time, frames))
     if length.film is not None:
-        found["picture_seconds"] = seconds_of_picture(simulation)
+        found["picture_seconds"] = seconds_of_picture(simulation, "traced")
+        if scene.dimension == 3:
+            found["quick_picture_seconds"] = seconds_of_picture(simulation, "quick")
     if "optimise" in read_toml(scene_file):
         found["search"] = task_in_words(load_task(scene_file, overrides))
     if picture is not None:
@@ -251,9 +252,10 @@ def of_emitter(emitter: EmitterTable, spacing: float) -> dict[str, Any]:
     return {**known, "runs_dry_at_s": dry if math.isfinite(dry) else None}
 
 
-def seconds_of_picture(simulation: Simulation) -> float | None:
-    """Time a picture of the first state, with all cores that a film has; None where no fluid is seen then."""
+def seconds_of_picture(simulation: Simulation, quality: str) -> float | None:
+    """Time a picture of the first state on all cores, in a quality; None where no fluid is seen then."""
     scene, positions = simulation.scene, simulation.positions[: simulation.free_particles or None]
+    scene = scene.model_copy(update={"picture": (scene.picture or Picture()).model_copy(update={"quality": quality})})
     colours = colours_of(scene, simulation.mass_fractions, simulation.particles)[: len(positions)]
     draws = painter(scene, positions, simulation.device)
     try:
@@ -293,6 +295,7 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
     by_name = ", ".join(f"{name} {limit:.3g}" for name, limit in sorted(limits.items(), key=lambda item: item[1]))
     beyond = " (beyond it: the run may diverge)" if found["time_step_s"] > least * (1.0 + 1e-9) else ""
     chosen = found["time_step_chosen_by"]
+    run, gradient = (_bytes(found[f"{name}memory_bytes"]) for name in ("", "gradient_"))
     allowed = f"stable up to about {least:.3g} s{beyond}; limits: {by_name}" if limits else "nothing limits it"
     rows = [
         ("particles", f"{found['particles']} of fluid ({phases}{waiting}), {found['wall_particles']} of walls"),
@@ -306,14 +309,10 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
         ),
         ("viscosity", found["viscosity"]),
         *(emitter_row(one, found["dimension"], length) for one in found["emitters"]),
-        (
-            "memory",
-            f"{_bytes(found['memory_bytes'])} for a run, {_bytes(found['gradient_memory_bytes'])} for a gradient, "
-            "beside Python and Warp themselves",
-        ),
+        ("memory", f"{run} for a run, {gradient} for a gradient, beside Python and Warp themselves"),
         ("time", _time(found, length)),
         ("trajectory", _trajectory(length)),
-        ("film", _film(length, found.get("picture_seconds"))),
+        ("film", _film(length, found.get("picture_seconds"), found.get("quick_picture_seconds"))),
     ]
     courses = [f"{name} changes until {last:g} s" for name, last in found["scheduled_until_s"].items()]
     rows += [("schedule", f"{', '.join(courses)}, and is constant from then on")] if courses else []
@@ -372,14 +371,16 @@ def _trajectory(length: RunLength) -> str:
     )
 
 
-def _film(length: RunLength, seconds: float | None) -> str:
-    """Write what the film of the run shows, its length, and the time to draw it, if a picture takes ``seconds``."""
-    if length.film is not None and seconds is not None:
-        drawn = _duration(len(length.film.frames) * seconds)
-        return f"{length.film}; {drawn} to draw, {seconds:.2g} s for the first state; splashes take up to twice as long"
-    if length.film is not None:
+def _film(length: RunLength, traced: float | None, quick: float | None) -> str:
+    """Write what the film of the run shows, its length, and the times to draw it, by those of pictures [s]."""
+    if length.film is None:
+        return "of unknown length; --time says it" if length.time is None else "none"
+    if traced is None:
         return f"{length.film}; what it takes to draw it comes on top"
-    return "of unknown length; --time says it" if length.time is None else "none"
+    times = [(quick, "as a quick look"), (traced, "with its light traced")] if quick else [(traced, "")]
+    drawn = ", ".join(f"{_duration(len(length.film.frames) * each)} to draw {how}".strip() for each, how in times)
+    first = " and ".join(f"{each:.2g} s" for each, _ in times)
+    return f"{length.film}; {drawn}, {first} for the first state; splashes take up to twice as long"
 
 
 def _duration(seconds: float) -> str:

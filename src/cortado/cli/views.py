@@ -41,7 +41,7 @@ RADIUS = 0.4
 """Radius of a particle that is drawn, in spacings."""
 DISTANCE = 1.7
 """Distance of the camera at the start, in radii of the contents."""
-PALETTE = "cividis"
+PALETTE = "viridis"
 BRIGHTEST = 99.5
 """Percentile at the upper end of the colours, so that a few particles do not darken all the others."""
 LINES = (130, 125, 118)

@@ -218,22 +218,22 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
     runs = {"first guess": before, "found": after}
     if made.task.problem.picture is None:  # else there is a picture to aim at, and no run
         runs["target"] = run(made.task.true_parameters)
-    page = partial(_page, made, device=device)
-    three = page(list(runs), list(runs.values()))
+    still, moving = (partial(_page, made, one, device=device) for one in (picture, picture.for_films))
+    three = still(list(runs), list(runs.values()))
     write_picture(folder / "found.png", three.image(steps[-1]))
     compared: Figures = [(f"The end of the run: {', '.join(runs)}.", folder / "found.png")]
     shown = [k for k in EVALUATIONS if k < len(result.history)] or [0]
-    searched = page([f"evaluation {k}" for k in shown], [found(result.history[k].parameters) for k in shown])
-    write_picture(folder / "search.png", searched.image(steps[-1]))
+    searched = [f"evaluation {k}" for k in shown], [found(result.history[k].parameters) for k in shown]
+    write_picture(folder / "search.png", still(*searched).image(steps[-1]))
     search: Figures = [("The end of the run as the search went on.", folder / "search.png")]
     if picture.film_frames == 0 or len(steps) < 2:
         return TaskFigures(compared=compared, search=search)
     pair = {name: runs[name] for name in (("found", "target") if "target" in runs else ("first guess", "found"))}
-    two = page(list(pair), list(pair.values()))
+    two = moving(list(pair), list(pair.values()))
     pace = step_pace(made.task.scene, steps)
     motion = film(folder / "found.mp4", two, steps, pace)
     announce(str(motion))
-    sought = film(folder / "search.mp4", searched, steps, pace)
+    sought = film(folder / "search.mp4", moving(*searched), steps, pace)
     search.insert(0, (f"The search in motion, {pace.in_words}.", sought.path))
     found_figures: Figures = [(f"The run, {pace.in_words}: {' and '.join(pair)}.", motion.path)]
     return TaskFigures(found=found_figures, compared=compared, search=search)
@@ -247,10 +247,9 @@ def step_pace(scene: Scene, steps: Sequence[int]) -> Pace:
     return replace(pace, of_search=True)
 
 
-def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -> Page:
+def _page(made: Setup, picture: Picture, names: Sequence[str], runs: Sequence[Run], device: Any) -> Page:
     """Lay out the pictures of runs after a number of steps, side by side, each with its name."""
-    scene, across = made.task.scene, len(runs) if len(runs) < 4 else 2
-    picture, half = scene.picture or Picture(), len(runs) > 1
+    scene, across, half = made.task.scene, len(runs) if len(runs) < 4 else 2, len(runs) > 1
     size = {"width": picture.width // (1 + half), "height": picture.height // (1 + (len(runs) > across))}
     panel = picture.model_copy(update=size)
     places = [run[step].positions for run in runs for step in run]

@@ -23,7 +23,7 @@ from cortado.pictures.film import coloured_by, is_out, shown_places, those
 from cortado.pictures.painter import Scale, colours_of
 from cortado.pictures.shown_solids import ShownSolid, SolidMesh, shown_solids, turn_in_space
 from cortado.pictures.stage import Stage, upright
-from cortado.pictures.tracing.liquid_surface import Surface, liquid_surface, nearest_colours, sized_level, spheres
+from cortado.pictures.tracing.liquid_surface import Surface, liquid_surface, nearest_colours, spheres
 from cortado.pictures.tracing.space import environment_of, particles_of, wetting
 from cortado.runs.frames import SAME, Marks, SolidMotions, fraction_names, posed, sized
 from cortado.runs.trajectory import Frame, Trajectory
@@ -409,7 +409,7 @@ def contained_liquid(stage: Stage, positions: Points, colours: Points, device: A
     with WARP:
         own = particles_of(stage, positions, colours, launch)
         fluid = wetting(stage, environment_of(stage), own, launch)
-        found = liquid_surface(fluid, stage.spacing, launch, sized_level(fluid, stage.spacing, launch))
+        found = liquid_surface(fluid, stage.spacing, launch)
         places = own.places.numpy().astype(np.float64)
         points, normals = (one.numpy().astype(np.float64) for one in (found.points, found.normals))
         triangles, colours = found.triangles.numpy().reshape(-1, 3), found.colours.numpy()

@@ -34,7 +34,7 @@ Text = tuple[tuple[int, int], str, str]
 SMALL, SMALLEST = 11, 7
 """Pixels of the letters of a word on a small picture, and of one that is too long for it."""
 INK = from_srgb(np.array([43, 42, 40], dtype=np.uint8))
-PALETTE = "cividis"
+PALETTE = "viridis"
 OUTERMOST = (0.5, 99.5)
 """Percentiles at the ends of the scale, so that a few particles do not darken all the others."""
 UNITS = {"age": "s", **{name: quantity.unit for name, quantity in QUANTITIES.items()}}

@@ -251,7 +251,7 @@ class _ColourScale:
         self.clips = bool(len(values) and values.max() > high)
         flat = high - low <= 1e-12 * max(abs(high), abs(low))  # one value, or plane: the near colour
         by_depth = LinearSegmentedColormap.from_list("depth", [_FAR, _NEAR])
-        self._map = ScalarMappable(Normalize(low - 1.0 if flat else low, high), "cividis" if numbers else by_depth)
+        self._map = ScalarMappable(Normalize(low - 1.0 if flat else low, high), "viridis" if numbers else by_depth)
         self.mappable = self._map if numbers else None
 
     def rgb(self, points: NDArray[Any], colours: NDArray[Any] | None) -> NDArray[Any]:

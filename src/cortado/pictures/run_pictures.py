@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,7 @@ from cortado.particles.state import Entry
 from cortado.pictures.film import LEAST_PIXELS, Page, ShownRun, alone, coloured_by, film, lacking
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.pages import Figures
-from cortado.pictures.painter import Scale
+from cortado.pictures.painter import Scale, side_by_side
 from cortado.pictures.particle_view import scene_view
 from cortado.pictures.plane import PlaneStage
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, whole_numbers
@@ -40,24 +41,38 @@ from cortado.scene.scene import Scene, as_scene
 from cortado.scene.tables import field_name
 from cortado.simulation import Simulation
 
+SHEET = 3
+"""Pictures in a row of a contact sheet, and rows of it."""
+
 
 def run_pictures(
     scene: Scene, trajectory: Trajectory, folder: Path, device: Any, values: NDArray | None = None
 ) -> Figures:
-    """Draw the first and the last state of a run, and a film of it, into a folder; (caption, path) of each. ``values``
-    as those of `run_page`."""
-    page, last = run_page(ShownRun(scene, trajectory, values), device), len(trajectory) - 1
+    """Draw the first and the last state of a run, a contact sheet and a film of it, into a folder; (caption, path) of
+    each. Sheet and film are quick if the scene does not say which quality they have. ``values`` as those of
+    `run_page`."""
+    run, last, picture = ShownRun(scene, trajectory, values), len(trajectory) - 1, scene.picture or Picture()
+    page, is_quick = run_page(run, device), picture.quality is None and scene.dimension == 3
     stills: Figures = []
     for k, name, words in ((0, "first", "at the start"), (last, "last", "at the end")):
         path = folder / f"{name}.png"
         write_picture(path, page.image(k))
         stills.append((f"The fluid {words}, t = {trajectory.times[k]:.4g} s.", path))
-    picture = scene.picture or Picture()
     if picture.film_frames == 0 or not last:
         return stills
-    pace = pace_of(trajectory.due, picture, common_rate([trajectory.marks]))
-    made = film(folder / "film.mp4", page, range(last + 1), pace)
-    announce(str(made))
+    small = {"width": max(picture.width // SHEET, LEAST_PIXELS), "height": max(picture.height // SHEET, LEAST_PIXELS)}
+    parts, page = (
+        run_page(replace(run, scene=scene.model_copy(update={"picture": one})), device)
+        for one in (picture.for_films.model_copy(update=small), picture.for_films)
+    )
+    shown = np.linspace(0, last, min(SHEET * SHEET, last + 1)).round().astype(int).tolist()
+    names = [f"{trajectory.times[k]:.3g} s" for k in shown]
+    path = write_picture(folder / "sheet.png", side_by_side([parts.image(k) for k in shown], SHEET, names))
+    stills.append(("The whole run, from the start to the end.", path))
+    made = film(
+        folder / "film.mp4", page, range(last + 1), pace_of(trajectory.due, picture, common_rate([trajectory.marks]))
+    )
+    announce(f"{made}{f'; cortado picture {folder.parent} --film traces its light' if is_quick else ''}")
     return [(f"The run, {made.pace.in_words}.", made.path), *stills]
 
 

@@ -145,6 +145,8 @@ class Environment:
     """Size of the contents [m]: floor, grid and rims go by it."""
     nearest: wp.float32
     """Distance of a ray's start from the surface that sends it [m]."""
+    segments: wp.int32
+    """Most parts of the way of a ray that is refracted into fluid, within it and between two places of it."""
     sun: wp.vec3
     """Unit vector towards the lamp."""
     fill: wp.vec3
@@ -363,6 +365,10 @@ EDGE = (0.50, 0.62, 0.64)
 GLASS_EDGE = wp.constant(wp.vec3(*EDGE))
 
 
+MILKY = wp.constant(wp.float32(0.07))
+"""Greatest part of the light that a pane of glass reflects, so that one sees through panes along which one looks."""
+
+
 @wp.struct
 class Passed:
     """The light that the glass on a ray's way adds, and the part that it leaves."""
@@ -379,7 +385,7 @@ def pane(
     1."""
     cosine = wp.abs(wp.dot(d, normal))
     f = schlick(0.04, cosine)
-    reflectance = 0.7 * is_pane * 2.0 * f / (1.0 + f)
+    reflectance = is_pane * wp.min(1.4 * f / (1.0 + f), MILKY)
     r = mirrored(d, normal)
     seen = sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))
     seen = wp.vec3(wp.min(seen[0], 1.8), wp.min(seen[1], 1.8), wp.min(seen[2], 1.8))

@@ -208,35 +208,36 @@ Level = tuple[Any, wp.array]
 """The level of a fluid: its `Blocks`, and the numbers of those that its surface may pass."""
 
 
-def liquid_level(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Level, Any]:
-    """Return the level of particles' fluid, and the `NearParticles` that it is made of."""
+def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0) -> tuple[Level, Any]:
+    """Return the level of particles' fluid, in which drops, sheets and spray have about the volume of their particles,
+    and the `NearParticles` that it is made of. Cubes are at least ``least`` spacings wide."""
     reach, ends = REACH * spacing, _shown(particles, spacing, launch)
+    cube = max(next(width for most, width in CUBE_WIDTHS if len(particles) <= most), least)
     s = near_particles(particles, ends, spacing, reach, launch)
-    return level_blocks(s, ends, _cube(particles) * spacing, reach, launch), s
-
-
-def sized_level(particles: Particles, spacing: float, launch: BandLauncher) -> Level:
-    """Return the level of `liquid_level` where drops, sheets and spray have about the volume of their particles."""
-    reach, ends = REACH * spacing, _shown(particles, spacing, launch)
-    s = near_particles(particles, ends, spacing, reach, launch)
-    volumes = wp.empty_like(s.volumes)
+    volumes, whole = wp.empty_like(s.volumes), s.volumes
     launch(find_sizes, len(volumes), s=s, reach=reach, volumes=volumes)
     s.volumes = volumes
-    return level_blocks(s, ends, _cube(particles) * spacing, reach, launch)
+    level = level_blocks(s, ends, cube * spacing, reach, launch)
+    s.volumes = whole
+    return level, s
 
 
 def liquid_surface(
-    particles: Particles, spacing: float, launch: BandLauncher, level: Level | None = None
+    particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0, level: Level | None = None
 ) -> LiquidSurface:
     """Make the surface of particles' fluid: a level of their density, smoothed by weights that keep thin sheets
-    (Löschner et al. 2023), with the looks of the nearest particles. ``level``: theirs if left out, or a similar one.
+    (Löschner et al. 2023), with the looks of the nearest particles. ``level``: that of `liquid_level` if left out, or a
+    similar one.
 
     Raises:
         ComputationError: there is none.
     """
-    device, reach, ends = launch.device, REACH * spacing, _shown(particles, spacing, launch)
-    s = near_particles(particles, ends, spacing, reach, launch)
-    net = net_of(*(level or level_blocks(s, ends, _cube(particles) * spacing, reach, launch)), launch)
+    device, reach = launch.device, REACH * spacing
+    if level is None:
+        level, s = liquid_level(particles, spacing, launch, least)
+    else:
+        s = near_particles(particles, _shown(particles, spacing, launch), spacing, reach, launch)
+    net = net_of(*level, launch)
     points, count = net.points, len(net.points)
     if not count:
         raise ComputationError("The fluid has no surface to draw: its particles are too far from each other.")
@@ -247,11 +248,6 @@ def liquid_surface(
     launch(find_looks, count, s=s, reach=REACH_OF_COLOURS * spacing, points=points, colours=colours, media=media)
     triangles, normals = triangles_of(net, points, launch), normals_of(net, points, launch)
     return LiquidSurface(points, triangles, normals, colours, media, net.neighbours)
-
-
-def _cube(particles: Particles) -> float:
-    """Return the width of a cube of the surface's lattice, in spacings."""
-    return next(width for most, width in CUBE_WIDTHS if len(particles) <= most)
 
 
 def _shown(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Points, Points]:

@@ -33,7 +33,18 @@ from cortado.pictures.tracing.near_particles import (
 )
 from cortado.pictures.tracing.solid_surfaces import DeviceSurface, FloorShadow, SolidSurfaces, cast
 from cortado.pictures.tracing.steady import steadied, still_of
-from cortado.pictures.tracing.trace import Eye, find_contrast, illuminate_kernel, trace_kernel
+from cortado.pictures.tracing.trace import (
+    MIDDLE,
+    ROTATED_GRID,
+    SOLID_LIGHTS,
+    SPHERE_LIGHTS,
+    Eye,
+    effort_of,
+    find_contrast,
+    illuminate_kernel,
+    in_tiles,
+    trace_kernel,
+)
 from cortado.scene.appearance import View
 from cortado.scene.scene import Scene
 
@@ -215,7 +226,7 @@ def environment_of(stage: Stage) -> Any:
     """Return the `Environment` of a stage, without its solids, which are added elsewhere."""
     picture, light, s = stage.picture, stage.picture.sun_and_sky, Environment()
     horizon = np.asarray(light.background)
-    s.size, s.nearest = stage.size, 1e-4 * stage.size
+    s.size, s.nearest, s.segments = stage.size, 1e-4 * stage.size, effort_of(stage.picture).segments
     s.sun, s.fill = wp.vec3(*stage.sun), wp.vec3(*stage.fill)
     s.horizon, s.zenith = wp.vec3(*horizon), wp.vec3(*(horizon * light.zenith))
     s.lamp, s.strip, s.sunlight = wp.vec3(*light.lamp), wp.vec3(*light.strip), wp.vec3(*light.sunlight)
@@ -289,7 +300,9 @@ def still(home: Stage, state: State, launch: BandLauncher) -> Any:
     if stage.picture.surface != "liquid" or not len(particles):
         return None
     shadow.of_fluid(particles)
-    level, near = liquid_level(wetting(stage, s, particles, launch), stage.spacing, launch)
+    level, near = liquid_level(
+        wetting(stage, s, particles, launch), stage.spacing, launch, effort_of(stage.picture).cube
+    )
     return still_of(level, near, shadow.light, launch)
 
 
@@ -307,7 +320,8 @@ def _surface(
     if not len(particles):
         return _nothing(stage, launch.device)
     if stage.picture.surface == "liquid":
-        found = liquid_surface(wetting(stage, s, particles, launch), stage.spacing, launch, level)
+        cube = effort_of(stage.picture).cube
+        found = liquid_surface(wetting(stage, s, particles, launch), stage.spacing, launch, cube, level)
         softened = partial(found.softened, launch=launch)
         surface = DeviceSurface.of(found.points, found.triangles, found.normals, found.colours, softened)
         surface.lit.media = found.media
@@ -322,21 +336,6 @@ def _nothing(stage: Stage, device: Any) -> DeviceSurface:
     """Make a triangle that is too small and too far below the floor to be seen: meshes need one."""
     places = stage.lower - 1e3 * stage.size + 1e-6 * stage.size * np.eye(3)
     return DeviceSurface.on(device, places, np.arange(3), np.eye(3), np.eye(3))
-
-
-ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
-"""Places in a pixel of four more rays, in pixels from its middle."""
-MIDDLE = ((0.0, 0.0),)
-CONTRAST = 0.03
-"""Contrast of neighbouring pixels, in linear light, above which four more rays go through both."""
-TILE = 8, 4
-"""Pixels that rays are sent through together."""
-LIGHT_RAYS = {"liquid": (20, 4), "spheres": (10, 1)}
-"""Rays that find how much light falls on a point of the surface: from all around, and from the lamp."""
-
-
-SOLID_RAYS = 40, 6
-"""Numbers of such rays for solids, which have fewer points and even sides."""
 
 
 class SpacePainter:
@@ -358,10 +357,11 @@ class SpacePainter:
             cell_kernels(FLOAT32).count,
         )
         """One of each module that a picture needs: they are compiled side by side before the first."""
-        self._lamps = self._rays_to_light(*LIGHT_RAYS[stage.picture.surface])
-        self._lamps_of_solids = self._rays_to_light(*SOLID_RAYS)
-        self._pixels = wp.array(_in_tiles(stage.picture.width, stage.picture.height), dtype=wp.int32, device=device)
-        self._offsets = [wp.array(one, dtype=wp.vec2, device=device) for one in (MIDDLE, ROTATED_GRID)]
+        effort, is_liquid = effort_of(stage.picture), stage.picture.surface == "liquid"
+        self._lamps = self._rays_to_light(*(effort.lights if is_liquid else SPHERE_LIGHTS))
+        self._lamps_of_solids = self._rays_to_light(*SOLID_LIGHTS)
+        self._pixels = wp.array(in_tiles(stage.picture.width, stage.picture.height), dtype=wp.int32, device=device)
+        self._offsets = [wp.array(one, dtype=wp.vec2, device=device) for one in (MIDDLE, ROTATED_GRID[: effort.again])]
 
     def image(self, *state: Any) -> Points:
         """Draw the picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
@@ -396,9 +396,10 @@ class SpacePainter:
         image = wp.empty(picture.width * picture.height, dtype=wp.vec3, device=self.device)
         given |= {"eye": _eye(stage), "shadow": fluid.shadow.light, "image": image}
         once, again = self._offsets
-        self._launch(self._trace, len(image), **given, pixels=self._pixels, offsets=once)
+        self._launch(self._trace, len(self._pixels), **given, pixels=self._pixels, offsets=once)
         rough = wp.empty(len(image), dtype=wp.int32, device=self.device)
-        self._launch(find_contrast, len(image), columns=picture.width, image=image, contrast=CONTRAST, found=rough)
+        how = {"columns": picture.width, "contrast": effort_of(picture).contrast}
+        self._launch(find_contrast, len(image), image=image, **how, found=rough)
         pixels, _ = marked(rough, self._launch)
         self._launch(self._trace, len(pixels), **given, pixels=pixels, offsets=again)
         found: Points = image.numpy().reshape(picture.height, picture.width, 3)
@@ -420,14 +421,6 @@ class SpacePainter:
         in_lamp /= np.linalg.norm(in_lamp, axis=1)[:, None]
         found = [wp.array(one, dtype=wp.vec3, device=self.device) for one in (_directions(around), in_lamp)]
         return found[0], found[1]
-
-
-def _in_tiles(columns: int, rows: int) -> np.ndarray:
-    """Return the numbers (pixels,) of all pixels in small tiles, whose rays go nearly the same way."""
-    wide, high = TILE
-    row, column = np.divmod(np.arange(columns * rows), columns)
-    tile = (row // high) * -(-columns // wide) + column // wide
-    return np.argsort(tile, kind="stable").astype(np.int32)
 
 
 def _directions(count: int) -> Points:

@@ -2,7 +2,7 @@
 
 Before rays are traced from the eye, `illuminate_kernel` finds the light that falls on surfaces. A ray that meets the
 fluid is split in two, by Fresnel's law. Reflected light sees the surroundings, or other fluid. Refracted light goes on
-through the fluid and out of it, up to `SEGMENTS` times. On a way L within the fluid it loses the part
+through the fluid and out of it, up to ``segments`` times. On a way L within the fluid it loses the part
 1 - exp(-scattering L), and gets instead the colour of the fluid in the light that falls on it. Of the rest the part
 colour^(absorption L) is left, by Beer and Lambert's law. Where it leaves the fluid for the surroundings near the
 critical angle, it is split again, and what is reflected goes on. Fluid is all the way what it is where a ray comes into
@@ -10,8 +10,9 @@ it.
 """
 
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
 from cortado.device.modules import kernel_module
@@ -30,6 +31,33 @@ from cortado.pictures.tracing.backdrop import (
 )
 from cortado.pictures.tracing.near_particles import Ints, Vec2s, Vec3s, Vec3s2d
 from cortado.pictures.tracing.ray_hits import glass_functions, meet_solid, reach_solid, shaded_solid, surface_functions
+from cortado.scene.appearance import Picture
+
+
+class Effort(NamedTuple):
+    """The effort that a picture of a quality takes."""
+
+    cube: float
+    """Least width of the cubes of the surface's lattice, in spacings."""
+    segments: int
+    """Most parts of a ray's way that is refracted into fluid."""
+    contrast: float
+    """Contrast around a pixel, in linear light, above which more rays go through it."""
+    again: int
+    """Number of these rays, of those in `ROTATED_GRID`."""
+    lights: tuple[int, int]
+    """Rays that find how much light falls on a point of the surface: from all around, and from the lamp."""
+
+
+EFFORTS = {"traced": Effort(0.0, 4, 0.045, 4, (20, 4)), "quick": Effort(0.5, 1, 0.1, 2, (8, 2))}
+SPHERE_LIGHTS, SOLID_LIGHTS = (10, 1), (40, 6)
+"""Numbers of rays to the light from spheres, and from solids, which have fewer points and even sides."""
+
+
+def effort_of(picture: Picture) -> Effort:
+    """Return the effort of a picture."""
+    return EFFORTS[picture.quality or "traced"]
+
 
 BOUNCED = wp.constant(wp.float32(0.45))
 """The part of the light around that falls on solids, and back from them."""
@@ -113,7 +141,6 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
     return illuminate
 
 
-SEGMENTS = 4
 INDEX = wp.constant(wp.float32(1.33))
 """Refractive index of water."""
 FAINT = wp.constant(wp.float32(0.05))
@@ -174,7 +201,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         lit = entered.light
         medium = medium_at(surface, entered)
         inside = wp.bool(True)
-        for _ in range(SEGMENTS):
+        for _ in range(s.segments):
             if inside:
                 met = leave(s, surface, o, d, wp.min(DARK / wp.max(medium[0], 1.0e-6), FAR))
                 left = wp.exp(-medium[0] * met.t)
@@ -291,19 +318,53 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     return trace
 
 
+ROTATED_GRID = ((-0.375, -0.125), (0.375, 0.125), (-0.125, 0.375), (0.125, -0.375))
+"""Places in a pixel of more rays, in pixels from its middle."""
+MIDDLE = ((0.0, 0.0),)
+TILE = 8, 4
+"""Pixels that rays are sent through together."""
+
+
+def in_tiles(columns: int, rows: int) -> np.ndarray:
+    """Return the numbers of every second pixel, as on a chequered board, in small tiles, whose rays go nearly the same
+    way."""
+    wide, high = TILE
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    tile = (row // high) * -(-columns // wide) + column // wide
+    numbers = np.argsort(tile, kind="stable").astype(np.int32)
+    return numbers[((row + column) % 2 == 0)[numbers]]
+
+
 @wp.kernel(module=kernel_module("contrast"), enable_backward=False)
 def find_contrast(first: wp.int32, columns: wp.int32, image: Vec3s, contrast: wp.float32, found: Ints):
-    """Write 1 where a pixel differs by more than ``contrast``, in one of its colours, from one beside, above or below
-    it, and 0 elsewhere."""
+    """Fill the black squares of a chequered ``image`` whose white ones are drawn by the mean of those around, and mark
+    the pixels that need more rays in ``found``: those in whose neighbourhood a colour differs by more than
+    ``contrast``, between white squares, which are on either side of a black one, or around the corners of a white one.
+    """
     i = first + wp.tid()
     column = i % columns
-    greatest = wp.float32(0.0)
-    if column > 0:
-        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i - 1])))
-    if column < columns - 1:
-        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i + 1])))
-    if i >= columns:
-        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i - columns])))
-    if i < image.shape[0] - columns:
-        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i + columns])))
-    found[i] = wp.where(greatest > contrast, 1, 0)
+    row = i / columns
+    rows = image.shape[0] / columns
+    black = (column + row) % 2
+    least = wp.vec3(1.0e9)
+    greatest = wp.vec3(-1.0e9)
+    if black == 0:
+        least = image[i]
+        greatest = image[i]
+    total = wp.vec3(0.0)
+    count = wp.float32(0.0)
+    for k in range(4):
+        across = 2 * (k & 1) - 1
+        down = 2 * (k >> 1) - 1
+        if black > 0:  # beside, above and below it
+            across, down = (across + down) // 2, (across - down) // 2
+        if column + across >= 0 and column + across < columns and row + down >= 0 and row + down < rows:
+            light = image[i + down * columns + across]
+            least = wp.min(least, light)
+            greatest = wp.max(greatest, light)
+            total += light
+            count += 1.0
+    off = greatest - least
+    found[i] = wp.where(wp.max(wp.max(off[0], off[1]), off[2]) > contrast, 1, 0)
+    if black > 0:
+        image[i] = total / count
