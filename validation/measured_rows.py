@@ -23,7 +23,7 @@ FOLDER = Path(__file__).parent
 DATA, PAGE = FOLDER / "measured.csv", FOLDER / "README.md"
 Figures = dict[str, list[float]]
 """Of rows, by their names."""
-HEAD = ("claim", "setting", "measured", "exact", "off", "when", "command")
+HEAD = ("claim", "setting", "measured", "exact", "off", "command and when")
 MEASURED = re.compile(r"\{([^}]*)\}")
 """Figures that the command of the row prints; the rest of a cell stays as it was written."""
 
@@ -74,8 +74,8 @@ class Row:
     def line(self) -> str:
         """The row of the page."""
         when = f"{self.date}, {self.commit}" if self.machine else f"*{self.date}, {self.commit}*"
-        cells = asdict(self) | {"measured": MEASURED.sub(r"\1", self.measured), "when": when}
-        return "| " + " | ".join(cells[name] or "—" for name in HEAD[:-1]) + f" | `{self.command}` |"
+        cells = asdict(self) | {"measured": MEASURED.sub(r"\1", self.measured)}
+        return "| " + " | ".join(cells[name] or "—" for name in HEAD[:-1]) + f" | `{self.command}` {when} |"
 
 
 def read() -> dict[str, Row]:
