@@ -121,14 +121,14 @@ def test_energy_does_not_grow(dimension, across):
 
 
 def test_hardly_any_viscosity_a_narrow_support_and_a_long_time_step_are_warned_of():
-    solver = drop(2, 16).solver.model_dump()
+    solver, square = drop(2, 8).solver.model_dump(), [box([0.0, 0.0], [RADIUS, RADIUS])]
     for changes, words in [
         ({"ohnesorge": 0.01}, "viscosity of phase 'water' is 0.0187083 Pa s"),
-        ({"discretisation": {"spacing": RADIUS / 8, "support": 1.5}}, "support is 1.5"),
+        ({"discretisation": {"spacing": RADIUS / 4, "support": 1.5}, "fluid": square}, "support is 1.5"),
         ({"solver": {**solver, "time_step": 1.2 * solver["time_step"]}}, "limit of stability"),
     ]:
         with pytest.warns(CortadoWarning, match=words):
-            Simulation(drop(2, 16, **changes))
+            Simulation(drop(2, 8, **changes))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

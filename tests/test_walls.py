@@ -200,7 +200,7 @@ def test_the_side_of_a_cup_stops_a_particle_alone(kernel, support):
 @pytest.mark.parametrize("periodic", [False, True])
 def test_a_long_box_has_the_weights_that_are_found_for_all_of_it(monkeypatch, kernel, support, periodic):
     """Of which one side is longer than the shorter box's and the other no multiple of the spacing."""
-    long = box([100, 12.2], periodic=[periodic, False])
+    long = box([60, 12.2], periodic=[periodic, False])
     found = filled(long, kernel, support).walls
     monkeypatch.setattr(BoxContainer, "shortened", Container.shortened)
     whole = filled(long, kernel, support).walls
