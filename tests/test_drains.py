@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from cortado import Scene, SceneError, Simulation
+from cortado.cli.run_report import Balance
 from cortado.pictures.film import is_out, shown_places
-from cortado.runs.balance import Balance
 from cortado.scene.drain_tables import open_sphere
 from cortado.scene.emitter_table import samples, waits
 from scenes import jet, plane, scene

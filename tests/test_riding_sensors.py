@@ -10,7 +10,7 @@ from bad_scenes import one_sentence
 from cortado.errors import InputError
 from cortado.losses import Series
 from cortado.losses.distances import SensorMatch
-from cortado.runs.riding import Carrier
+from cortado.runs.particle_sums import Carrier
 from cortado.runs.sensor import value_of
 from cortado.scene.motions import matrix
 from cortado.sensors import BodyMotion, PressureProbe, SolidLoad, WallForce, WaveGauge

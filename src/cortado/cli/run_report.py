@@ -1,4 +1,5 @@
-"""What ``cortado run`` tells at its end: a summary in its last lines, and the report.
+"""What ``cortado run`` tells at its end: a summary in its last lines, with the balance of particles that came in and
+went out, and the report.
 
 The report is written at first without shaded pictures, which take long, then with them.
 """
@@ -8,11 +9,12 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.calls import counted
 from cortado.discretise.room import TOLERANCE
 from cortado.files.image_encoding import write_video
 from cortado.files.terminal import say
@@ -24,12 +26,12 @@ from cortado.pictures.run_pictures import density_errors, readings, run_pictures
 from cortado.pictures.shown_solids import solid_outline
 from cortado.rollout.outcome import divergence_sentence, dry_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
-from cortado.runs.balance import Balance
 from cortado.runs.frames import Pace, common_rate, posed, solid_motions
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensor import Readings, summary
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.emitter_table import OF_OPENINGS
+from cortado.scene.drain_tables import count_name
+from cortado.scene.emitter_table import OF_OPENINGS, waits
 from cortado.scene.scene import Scene, scene_in_words
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
@@ -326,3 +328,42 @@ def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunF
     told = [every if converged.all() else not_converged_sentence(converged, scene)]
     torn = divergence_sentence(rollout.diagnostics, scene)
     return Section("The solver", [*told, torn] if torn else told, figures=figures)
+
+
+@dataclass(frozen=True)
+class Balance:
+    """Numbers of particles, of which ``first`` + ``came`` = ``last`` + all that ``went``."""
+
+    first: int
+    """In the fluid at the start."""
+    came: int
+    """Out of emitters."""
+    went: Mapping[str, int]
+    """Into each drain, by name."""
+    last: int
+    """In the fluid at the end."""
+
+    @classmethod
+    def of(cls, scene: Scene, first: Mapping[str, Any], last: Mapping[str, Any]) -> Self:
+        """Count the particles of two frames of a run of a scene, of which it takes `Frame.others`."""
+        counts = {drain.name: count_name(drain.name) for drain in scene.drain}
+        went = {name: int(np.ravel(last[key])[0] - np.ravel(first[key])[0]) for name, key in counts.items()}
+        inside, left = (
+            int(((np.ravel(at["drained"]) == 0.0) & ~waits(scene, at, np.size(at["drained"]))).sum())
+            for at in (first, last)
+        )
+        return cls(inside, left - inside + sum(went.values()), went, left)
+
+    def for_machines(self) -> dict[str, Any]:
+        """Return the numbers by names."""
+        return {"first": self.first, "in": self.came, "out": dict(self.went), "last": self.last}
+
+    def rows(self) -> list[tuple[str, int, str]]:
+        """Return rows (what, value, unit) of a table."""
+        gone = [(f"particles that went into {name}", count, "") for name, count in self.went.items()]
+        came = [("particles that came out of emitters", self.came, "")]
+        return [("particles at the start", self.first, ""), *came, *gone, ("particles at the end", self.last, "")]
+
+    def __str__(self) -> str:
+        gone = " and ".join(f"{count} went into {name}" for name, count in self.went.items())
+        return f"Of {counted(self.first, 'particle')} and {self.came} that came in {gone}, {self.last} are left"

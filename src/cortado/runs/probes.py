@@ -14,19 +14,25 @@ from cortado.runs.body_sensors import BodyMotion, SpringForce
 from cortado.runs.particle_sums import (
     ACROSS,
     Around,
+    Axes,
+    Carrier,
     LoadSensor,
     LoadSum,
     RegionSum,
+    Ride,
     Seen,
     Summed,
     WeightedSum,
+    axes_of,
     in_the_scene,
     load_bars,
+    named,
     parts_of,
     reach_of,
+    ride_of,
+    together,
     turned,
 )
-from cortado.runs.riding import Axes, Carrier, Ride, axes_of, named, ride_of, together
 from cortado.runs.sensor import Cut, Reading, SensedScene, Sensor, corner, direction, in_dimension, point, positive
 from cortado.runs.wave_gauge import WaveGauge
 from cortado.scene.parameters import load_name
@@ -304,8 +310,7 @@ class Prepared(Cut, Protocol):
 def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
     """Warn of sensors, by their names, from which the scene, as it begins, keeps all fluid away."""
     for name, sensor in sensors.items():
-        found = _doubt(simulation, sensor)
-        if found is not None:
+        if (found := _doubt(simulation, sensor)) is not None:
             warn(f"the sensor {name!r} {found}.")
 
 
@@ -324,9 +329,8 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
     if all(there):
         what = {PressureProbe: "is at", WaveGauge: "has its column at", FlowRate: "has its plane through"}[type(sensor)]
         reads = f"its floor, {sensor.floor:g} m" if isinstance(sensor, WaveGauge) else "0"
-        names = " and ".join(dict.fromkeys(filter(None, there)))
-        reads += f", or what is within its {key}"
-        return f"{what} {point_in_words(place)} m, {names}: it reads {reads}{_in_metres(scene, place)}"
+        reads += f", or what is within its {key}{_in_metres(scene, place)}"
+        return f"{what} {point_in_words(place)} m, {' and '.join(dict.fromkeys(filter(None, there)))}: it reads {reads}"
     wide = getattr(sensor, key)
     if wide is not None and wide < 0.5 * spacing:
         return f"has a {key} of {wide:g} m, less than half a spacing of {spacing:g} m: it sees next to no particles"
@@ -425,9 +429,8 @@ def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
 def _in_metres(scene: Scene, place: Points) -> str:
     """Return a hint where a place is far outside, as it would be in millimetres."""
     ends = scene.container.extent()
-    if ends is None or np.abs(place).max() <= 10.0 * np.abs(ends).max():
-        return ""
-    return " (positions are in metres)"
+    far = ends is not None and np.abs(place).max() > 10.0 * np.abs(ends).max()
+    return " (positions are in metres)" if far else ""
 
 
 def _without_walls(simulation: Prepared, sensor: WallForce) -> str | None:

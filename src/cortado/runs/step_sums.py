@@ -19,9 +19,8 @@ from cortado.discretise.room import Domain
 from cortado.discretise.shapes import in_space
 from cortado.errors import InputError
 from cortado.particles.state import Parameters, State, StateSeries
-from cortado.runs.particle_sums import LoadSum, NoSum, ParticleSum, RegionSum, WeightedSum
+from cortado.runs.particle_sums import LoadSum, NoSum, ParticleSum, RegionSum, Ride, WeightedSum, square
 from cortado.runs.quantity_formulas import SIX, QuantityFormula
-from cortado.runs.riding import Ride, square
 from cortado.runs.sensor import SensedScene
 from cortado.scene.motions import AXES
 from cortado.solvers.particles import ParticleSolver
@@ -59,7 +58,7 @@ class _Region:
 
 @wp.struct
 class _Ride:
-    """A point that a solid carries, and R_0^T of that: see `cortado.runs.riding`."""
+    """A point that a solid carries, and R_0^T of that: see `cortado.runs.particle_sums`."""
 
     arm: wp.vec3d
     own: wp.mat33d

@@ -24,8 +24,22 @@ from cortado.discretise.room import Domain
 from cortado.discretise.shapes import corners, grid, in_space
 from cortado.discretise.solid import Solid
 from cortado.particles.state import padded
-from cortado.runs.particle_sums import ACROSS, Around, Summed, WeightedSum, Weights, parts_of, reach_of
-from cortado.runs.riding import Axes, Carrier, axes_of, named, ride_of, square, together
+from cortado.runs.particle_sums import (
+    ACROSS,
+    Around,
+    Axes,
+    Carrier,
+    Summed,
+    WeightedSum,
+    Weights,
+    axes_of,
+    named,
+    parts_of,
+    reach_of,
+    ride_of,
+    square,
+    together,
+)
 from cortado.runs.sensor import Cut, Reading, SensedScene, direction, in_dimension, point, positive
 from cortado.scene.motions import Pose, position_name, scale_name
 from cortado.scene.shape_tables import Container, NoContainer

@@ -25,7 +25,6 @@ from cortado.particles.state import Layout, padded
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
 from cortado.scene.drain_tables import drain_parameters
 from cortado.scene.emitter_table import emitter_parameters
-from cortado.scene.links import Hold
 from cortado.scene.motions import mass_of_one, motion_parameters, moving, solid_frames, wall_numbers, weight_name
 from cortado.scene.parameter_values import REGISTRY, Known, checked_value
 from cortado.scene.parameters import PARAMETERS, Parameter, Source
@@ -33,10 +32,20 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import NoContainer
 from cortado.scene.solids import SolidTable
 from cortado.scene.solvers import OWN, PackageSolver, SolverTable
-from cortado.scene.springs import ends_of, spring_parameters, turned_by
+from cortado.scene.springs import Hold, ends_of, spring_parameters, turned_by
 from cortado.solvers.contacts import Contacts, Touching
-from cortado.solvers.drained import drained_of, nozzles_of
-from cortado.solvers.obstacles import FINE, ON, FlatFaces, NamedSolid, Obstacle, Walled, flat_faces, placed_sheets
+from cortado.solvers.obstacles import (
+    FINE,
+    ON,
+    FlatFaces,
+    NamedSolid,
+    Obstacle,
+    Walled,
+    drained_of,
+    flat_faces,
+    nozzles_of,
+    placed_sheets,
+)
 from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.solver import Solver
 from cortado.sph.drains import Drains
