@@ -259,6 +259,22 @@ WRONG = [
 ]
 
 
+BLOCK = {"name": "block", "shape": "box", "lower": [0.3, 0.5], "upper": [0.7, 0.9]}
+
+
+def test_a_drain_or_a_column_in_a_solid_is_told_in_a_sentence():
+    room = {"shape": "box", "name": "over", "lower": [0.4, 0.6], "upper": [0.6, 0.8]}
+    tank(solid=[BLOCK], drain=[{**room, "upper": [0.6, 0.95]}])
+    with pytest.raises(
+        SceneError, match=r"drain\[0\] is all of it in solids, but must be where a part of it is outside"
+    ):
+        tank(solid=[BLOCK], drain=[room])
+    tap = {"phase": "water", "outlet": [0.2, 0.7], "radius": 0.05, "flow_rate": 0.05, "direction": [-1.0, 0.0]}
+    tank(solid=[BLOCK], emitter=[{**tap, "length": 0.05}])
+    with pytest.raises(SceneError, match=r"emitter\[0\] is partly in a solid, for example at"):
+        tank(solid=[BLOCK], emitter=[tap])
+
+
 @pytest.mark.parametrize(("drains", "key", "words"), WRONG)
 def test_a_wrong_drain_is_told_in_a_sentence(drains, key, words):
     with pytest.raises(SceneError) as error:

@@ -399,7 +399,7 @@ def _check_outlet(scene: SceneTables, path: FieldPath, emitter: EmitterTable) ->
     if not scene.container.contains(outlet[None], tolerance).all():
         raise field_error((*path, "outlet"), emitter.outlet, "inside the container")
     outside = ~scene.container.contains(opening, tolerance)
-    _check_free(scene, path, opening)
+    _check_free(scene, path, np.concatenate([opening, emitter.particles(spacing)]))
     if outside.any():
         wanted = f"so small that the opening is inside the container, also at {point_in_words(opening[outside][0])}"
         size = "radius" if emitter.sides is None else "sides"

@@ -233,6 +233,18 @@ def check_drains(scene: Any) -> None:
                 )
         elif ends is not None:
             _check_reached(drain, np.array(ends), path)
+            if isinstance(drain, BoxDrain) and not _is_open(scene, drain, np.array(ends)):
+                raise field_error(path, Words("all of it in solids"), "where a part of it is outside of them")
+
+
+def _is_open(scene: Any, drain: BoxDrain, ends: Points) -> bool:
+    """Test whether a part of a drain within the corners (2, d) of a container [m] is outside of solids at rest."""
+    lower, upper = np.clip(drain.ends(scene.dimension), *ends)
+    most = 512 if scene.dimension == 2 else 64
+    cells = np.clip(np.ceil((upper - lower) / (0.5 * scene.discretisation.spacing)), 1, most).astype(int)
+    parts = [low + (high - low) * (np.arange(n) + 0.5) / n for low, high, n in zip(lower, upper, cells, strict=True)]
+    points = np.stack(np.meshgrid(*parts, indexing="ij"), axis=-1).reshape(-1, scene.dimension)
+    return bool(scene.resting_room.contains(points, 0.0).any())
 
 
 def _check_reached(drain: BoxDrain | PlaneDrain, ends: Points, path: FieldPath) -> None:
