@@ -350,7 +350,7 @@ class Projection:
         for left in reversed(range(self.iterations)):
             if correct is not None and (left < self.iterations - 1 or not (k > 0).any()):
                 r = divergence(v) - falls - yielding @ y - wanted
-                r = np.where((y > 0) | (tension == 1) | (r > 0), r, 0)
+                r = np.where((y > 0) | (tension == 1), r, between(dt * r, -1e-6, 1e-6) * r)
                 z = y + correct(r)
                 least = np.minimum(y, 0)
                 change = np.where(z > least, z, least + tension * (z - least)) - y

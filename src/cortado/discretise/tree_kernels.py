@@ -251,8 +251,8 @@ def find_crossings(
     counts[i] = count
 
 
-MARGIN = 1e-6
-"""In spacings: by how much faces are wider than they are."""
+MARGIN = {"float64": 1e-6, "float32": 1e-3}
+"""In spacings: by how much faces are wider than they are, more than round-off 1,000 spacings from the origin."""
 AROUND = 1e-3
 """In spacings: how far around a segment one looks for faces, in float32."""
 
@@ -345,7 +345,7 @@ def faces_on(sheets: Sequence[tuple[Points, Points]], spacing: float, precision:
     made.starts = array(np.cumsum([0, *(len(corners) for corners, _ in sheets)])[:-1], wp.int32)
     for name, parts in zip(("normals", "places", "inwards"), zip(*rows, strict=True), strict=True):
         setattr(made, name, array(np.concatenate(parts), precision.vector))
-    made.margin, made.around = MARGIN * spacing, AROUND * spacing
+    made.margin, made.around = MARGIN[precision.name] * spacing, AROUND * spacing
     return made, trees
 
 
@@ -355,12 +355,12 @@ def _three(rows: Points) -> Points:
 
 
 @cache
-def find_crossing() -> Any:
-    """Make the kernel that tells which of some segments go through the one sheet that there is, in float64."""
-    goes_through, vector = face_functions(FLOAT64)[2], FLOAT64.vector
-    typed = TypesByName(wp.bool, {faces_type(FLOAT64): "faces", vector: "starts ends"})
+def find_crossing(precision: Precision = FLOAT64) -> Any:
+    """Make the kernel that tells which of some segments go through the one sheet that there is."""
+    goes_through, vector = face_functions(precision)[2], precision.vector
+    typed = TypesByName(wp.bool, {faces_type(precision): "faces", vector: "starts ends"})
 
-    @wp.kernel(module=kernel_module("sheet_crossings"), enable_backward=False)
+    @wp.kernel(module=kernel_module(f"sheet_crossings_{precision.name}"), enable_backward=False)
     @typed.arrays
     def find(first: int, faces, starts, ends, found):
         i = first + wp.tid()

@@ -25,6 +25,7 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.sheet import Sheet
 from cortado.discretise.tree_kernels import face_functions, faces_on, faces_type
 from cortado.particles.mirrors import CONTAINER, reflections
+from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout
@@ -56,10 +57,11 @@ def sheets_type(precision: Precision) -> Any:
 
 @cache
 def sheet_functions(precision: Precision) -> tuple[Any, Any]:
-    """Make Warp functions: ``scale_of`` sheet k; and ``seen_from``, a place before a step as the sheet has it about its
-    middle, in units of its scale."""
+    """Make Warp functions: ``scale_of`` sheet k; and ``seen_from``, a place as the sheet has it about its middle, in
+    units of its scale, where solids have the poses ``middles`` and ``turns``."""
     real, vector, sheets_of = precision.real, precision.vector, sheets_type(precision)
-    neighbourhood = neighbourhood_type(precision)
+    neighbourhood, poses = neighbourhood_type(precision), wp.array2d(dtype=vector)
+    turnings = wp.array2d(dtype=matrix_of(precision))
 
     @wp.func
     def scale_of(k: int, member: int, s: neighbourhood, sheets: sheets_of) -> real:
@@ -69,11 +71,12 @@ def sheet_functions(precision: Precision) -> tuple[Any, Any]:
         return scale
 
     @wp.func
-    def seen_from(x: vector, k: int, member: int, s: neighbourhood, sheets: sheets_of) -> vector:
+    def seen_from(
+        x: vector, middles: poses, turns: turnings, k: int, member: int, s: neighbourhood, sheets: sheets_of
+    ) -> vector:
         number, y = sheets.numbers[k], x
         if number >= 0:
-            y = wp.transpose(s.turns_before[member, number]) * (x - s.before[member, number])
-            y = y / s.scales[member, number]
+            y = wp.transpose(turns[member, number]) * (x - middles[member, number]) / s.scales[member, number]
         return y - sheets.faces.middles[k]
 
     return scale_of, seen_from
@@ -97,7 +100,8 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
         another one, 3 for both."""
         found = int(0)
         for k in range(sheets.numbers.shape[0]):
-            start, end = seen_from(p, k, member, s, sheets), seen_from(q, k, member, s, sheets)
+            start = seen_from(p, s.before, s.turns_before, k, member, s, sheets)
+            end = seen_from(q, s.before, s.turns_before, k, member, s, sheets)
             if goes_through(start, end, k, sheets.faces):
                 found = found | wp.where(sheets.numbers[k] == own, 1, 2)
         return found
@@ -106,7 +110,7 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
     def is_near(x: vector, member: int, reach: real, s: neighbourhood, sheets: sheets_of) -> bool:
         """Test whether a face of a sheet may be so near that its wall particles are within reach."""
         for k in range(sheets.numbers.shape[0]):
-            y = seen_from(x, k, member, s, sheets)
+            y = seen_from(x, s.before, s.turns_before, k, member, s, sheets)
             face = int(0)
             candidates = query(y, y, reach / scale_of(k, member, s, sheets), k, sheets.faces)
             while wp.bvh_query_next(candidates, face):

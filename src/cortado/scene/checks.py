@@ -15,7 +15,7 @@ from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.solid import Solid
 from cortado.errors import InputError, Words, shown
 from cortado.scene.drain_tables import check_drains
-from cortado.scene.emitter_table import EmitterTable, check_fed
+from cortado.scene.emitter_table import EmitterTable, check_columns, check_fed
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
 from cortado.scene.model import MixtureTable, SceneTables
 from cortado.scene.motions import free
@@ -225,6 +225,7 @@ def check_scene(scene: SceneTables) -> None:
     check_drains(scene)
     check_fed(scene)
     check_sheets(scene)
+    check_columns(scene)
     _check_names(scene)
     _check_sensors(scene)
     for index, fluid in enumerate(scene.fluid):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import field_validator
 
 from cortado.discretise.shapes import ROUND_OFF, Points, across, disc, lattice, whole_cells
+from cortado.discretise.sheet import Sheet
 from cortado.errors import Words, shown
 from cortado.scene.drain_tables import FlowTable
 from cortado.scene.fluids import FluidBody
@@ -271,6 +272,20 @@ def check_fed(scene: Any) -> None:
             if name not in names or name in fed:
                 raise field_error(path, name, f"drains that feed no other emitter, of {shown(names)}")
             fed.append(name)
+
+
+def check_columns(scene: Any) -> None:
+    """Check that no sheet begins across an emitter's column, or nearer than a spacing to its opening."""
+    spacing = scene.discretisation.spacing
+    for index, emitter in enumerate(scene.emitter):
+        opening, ahead = emitter.opening(spacing), spacing * np.array(emitter.direction)
+        for table in scene.solid:
+            about = table.own_solid() if table.is_sheet else None
+            if isinstance(about, Sheet):
+                sheet = about.placed(table.middle(), table.turn(scene.dimension))
+                if sheet.crossed(opening - emitter.layers(spacing) * ahead, opening + ahead, spacing).any():
+                    wanted = "clear of sheets from the end of its column to a spacing beyond its opening"
+                    raise field_error(("emitter", index), Words(f"crossed by the sheet {table.name!r}"), wanted)
 
 
 def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:

@@ -34,7 +34,7 @@ template <class Scalar, int D>
 struct Correction {
     Values<Scalar> y;
     Vectors<Scalar, D> u;
-    Values<Scalar> counted;  // 1, or 0 where iterations leave a tension a part of its divergence; 1/2 between
+    Values<Scalar> counted;  // dr / d(D u): 1, or 0 where iterations leave a tension a part of its divergence
     Values<Scalar> r;        // D u - b where it counts
     Values<Scalar> e;        // of each node
     Values<Scalar> d;        // z - y where z = y + c E is above y- = min(y, 0), else y- + sigma (z - y-) - y

@@ -229,9 +229,10 @@ private:
         each_particle(n.size(), model.threads, [&](std::size_t i) {
             const Scalar left = divergence_of(model, fluid, x, before.u, i) - wanted(model, i, n[i]);
             const bool inside = before.y[i] > Scalar(0) || real_part(effects[i].tension) >= Real(1);
-            const bool all = inside || !(real_part(left) <= Real(0));  // NaN must stay
-            before.counted[i] = Scalar(all ? Real(1) : real_part(left) == Real(0) ? Real(1) / Real(2) : Real(0));
-            before.r[i] = before.counted[i] * left;
+            const Scalar calm = Scalar(1'000'000) * model.time_step * left;
+            const Smoothstep<Scalar> share(calm, -100, 100);
+            before.r[i] = inside ? left : share.value * left;  // NaN must stay
+            before.counted[i] = inside ? Scalar(1) : share.value + calm * share.slope;
         });
         before.e = coarse.solve(
             [&](std::size_t i, const Hat<Scalar, D>& hat) { return hat.value * effects[i].shared * before.r[i]; });

@@ -4,11 +4,12 @@ With the share c of each particle, and N and h of `cortado.solvers.projection.co
 
     q_iI = N_i grad phi_I(x_i) + phi_I(x_i) h_i        what the coarse pressure phi_I c pushes particle i with,
     A_IJ = sum_i (q_iI . q_iJ + (eps + h_i^2 / 100) delta_IJ) / m_i    over the particles of the cells around I and J,
-    A e = sum_i phi_I c_i r_i,   r = D u - b where y > 0 or sigma = 1 or D u > b, else 0,
+    A e = sum_i phi_I c_i r_i,   r = D u - b where y > 0 or sigma = 1, else S (D u - b),
     d = z - y where z = y + c_i sum_I phi_I(x_i) e_I > y-, else y- + sigma (z - y-) - y,   y- = min(y, 0),
     y' = y + alpha d,   u' = u - alpha D^T d / m,
     alpha = sum_i (r_i d_i + l_i) / sum_i (|D^T d|^2 / m + l_i), from 0 to 1,   l_i = m_i (1e-6 s / dt)^2.
 
+S is a smoothstep from -1e-6 to 1e-6 of dt (D u - b): 1 for a compression, and 0 for a tension.
 But for l, alpha is the step along d after which the kinetic energy is least, so that a correction adds none, whatever
 the clamp leaves of it. Where it is next to nothing, as in fluid that falls freely, alpha is 1 by l, and y' follows a
 small change of u linearly. Before the first iteration, l is in the second sum alone, and alpha is 0 there: a small

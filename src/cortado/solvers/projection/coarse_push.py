@@ -192,6 +192,12 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     return Kernels((pull, coarse_push), (pull_tangent, coarse_push_tangent), (pull, coarse_push_adjoint))
 
 
+CALM = 1e-6
+"""The divergence, times the time step, beyond which a tension does not count in r at all, and a compression wholly;
+between, its share is a smoothstep. Where fluid at rest is let go, the divergence beside upright walls is 0 to
+round-off, in float32 to 1e-7. A step of the share would be a kink there, and round-off would choose the slope."""
+
+
 @cache
 def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     """Make the kernels of the residual r, the part of the divergence that a coarse pressure is to take away, in 2 or 3
@@ -204,16 +210,16 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     gradient, gradient_tangent = sums.velocity_gradient.forward, sums.velocity_gradient.tangent
     packed, clamp = symmetric(precision), clamp_functions(precision)
     wanted, wanted_tangent, typed = clamp.wanted, clamp.wanted_tangent, types_by_name(precision)
-    six, pack = packed.kind, packed.pack
+    six, pack, (one, width) = packed.kind, packed.pack, (wp.constant(real(value)) for value in (1.0, 2.0 * CALM))
     module, tangent_module, adjoint_module = discretisation.modules(f"projection_{dimension}d")
 
     @wp.func
-    def counts(y: real, tension: real, left: real) -> real:
-        """Return the share, 1, 1/2 or 0, of a divergence in the coarse residual: 0 where iterations let through part of
-        a tension, whose divergence must stay; 1/2 at the corner between; 1 for NaN."""
-        if y > real(0.0) or tension >= real(1.0) or not (left <= real(0.0)):
-            return real(1.0)
-        return wp.where(left == real(0.0), real(0.5), real(0.0))
+    def counts(y: real, tension: real, q: real):
+        """Return the share S of a divergence q, times the time step, in the coarse residual, and q dS/dq."""
+        if y > real(0.0) or tension >= one:
+            return one, real(0.0)
+        t = wp.clamp(real(0.5) + q / width, real(0.0), one)
+        return t * t * (real(3.0) - real(2.0) * t), real(6.0) * t * (one - t) * q / width
 
     both = [over(gradient, "row_x row_y row_z", v="u"), over(spread, "widened")]
 
@@ -226,7 +232,8 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         A = wp.matrix_from_rows(row_x, row_y, row_z)
         D = wp.ddot(L_i, A) + wp.dot(gamma_i, u_i) - drift_i + image_i * widened
         left = D - wanted(n_i, weights_i[1], time_step)
-        left *= counts(y_i, weights_i[0], left)
+        part, _bend = counts(y_i, weights_i[0], time_step * left)
+        left *= part
         return A, D, left, coarse_i * left, vector(), vector(), real(0.0)
 
     both = [
@@ -267,7 +274,8 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         full = weights_i[1]
         b = wanted(n_i, full, time_step)
         b_dot = wanted_tangent(n_i, n_dot_i, full, weights_dot_i[1], time_step, time_step_dot)
-        return counts(y_i, weights_i[0], d_i - b) * (D_dot - b_dot)
+        part, bend = counts(y_i, weights_i[0], time_step * (d_i - b))
+        return (part + bend) * (D_dot - b_dot) + bend * (d_i - b) * time_step_dot / time_step
 
     @particle_kernel(adjoint_module, "+n_bar +weights_bar +time_step_bar +drift_bar d_bar S")
     def residual_adjoint(
@@ -275,11 +283,13 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     ) -> tuple[real, weights4, real, real, real, six]:
         no, full = real(0.0), weights_i[1]
         b = wanted(n_i, full, time_step)
-        found = counts(y_i, weights_i[0], d_i - b) * r_bar_i
+        part, bend = counts(y_i, weights_i[0], time_step * (d_i - b))
+        found = (part + bend) * r_bar_i
         n_part, full_part = real(0.0), real(0.0)
         if n_i < real(1.0):
             n_part = (real(1.0) - full) / time_step * found
             full_part = (real(1.0) - n_i) / time_step * found
-        return n_part, weights4(no, full_part, no, no), b / time_step * found, -found, found, found * pack(L_i)
+        time_part = (b * found + bend * (d_i - b) * r_bar_i) / time_step
+        return n_part, weights4(no, full_part, no, no), time_part, -found, found, found * pack(L_i)
 
     return Kernels(residual, residual_tangent, residual_adjoint)

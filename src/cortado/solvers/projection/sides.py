@@ -47,15 +47,13 @@ def side_kernels(precision: Precision) -> Kernels:
     bars = bundle(**share_kinds(precision), x=vector)
     modules = [kernel_module(f"sheet_sides{kind}_{precision.name}") for kind in ("", "_tangent", "_adjoint")]
     typed = TypesByName(vector, {neighbourhood: "s", sheets_of: "sheets", bars: "bar"})
-    one = wp.constant(real(1.0))
+    one, poses = wp.constant(real(1.0)), wp.array2d(dtype=vector)
 
     @wp.func
-    def seen_after(x: vector, k: int, member: int, s: neighbourhood, sheets: sheets_of) -> vector:
-        number, y = sheets.numbers[k], x
-        if number >= 0:
-            y = wp.transpose(s.turns[member, number]) * (x - s.after[member, number])
-            y = y / s.scales[member, number]
-        return y - sheets.faces.middles[k]
+    def way_of(x: vector, x_now: vector, k: int, member: int, s: neighbourhood, sheets: sheets_of):
+        """Return where a particle begins a step and where it ends it, as the sheet has both."""
+        start = seen_from(x, s.before, s.turns_before, k, member, s, sheets)
+        return start, seen_from(x_now, s.after, s.turns, k, member, s, sheets)
 
     @wp.func
     def turn_of(k: int, member: int, s: neighbourhood, sheets: sheets_of) -> matrix:
@@ -118,7 +116,7 @@ def side_kernels(precision: Precision) -> Kernels:
     def keep(s, sheets, k: int, least: real, x, x_now, x_kept):
         i = s.first + wp.tid()
         member = i // s.particles
-        start, end = seen_from(x[i], k, member, s, sheets), seen_after(x_now[i], k, member, s, sheets)
+        start, end = way_of(x[i], x_now[i], k, member, s, sheets)
         y, used, stays = kept(start, end, k, least / scale_of(k, member, s, sheets), sheets)
         number = sheets.numbers[k]
         x_end = vector(x_now[i])
@@ -129,23 +127,18 @@ def side_kernels(precision: Precision) -> Kernels:
         x_kept[i] = x_end
 
     @wp.func
-    def twist(x: vector, k: int, member: int, s: neighbourhood) -> vector:
-        arm = x - s.after[member, k]
+    def twist(x: vector, middles: poses, moved: poses, turned: poses, k: int, member: int, s: neighbourhood) -> vector:
+        """Return t(x) of a solid with a middle that changes by ``moved`` and a turn that does by ``turned``."""
+        arm = x - middles[member, k]
         grown = s.scales_dot[member, k] / s.scales[member, k]
-        return s.after_dot[member, k] + wp.cross(s.turned_dot[member, k], arm) + grown * arm
-
-    @wp.func
-    def twist_before(x: vector, k: int, member: int, s: neighbourhood) -> vector:
-        arm = x - s.before[member, k]
-        grown = s.scales_dot[member, k] / s.scales[member, k]
-        return s.before_dot[member, k] + wp.cross(s.turned_before_dot[member, k], arm) + grown * arm
+        return moved[member, k] + wp.cross(turned[member, k], arm) + grown * arm
 
     @wp.kernel(module=modules[1], enable_backward=False)
     @typed.arrays
     def keep_tangent(s, sheets, k: int, least: real, x, x_dot, x_now, x_kept, x_now_dot):
         i = s.first + wp.tid()
         member, number = i // s.particles, sheets.numbers[k]
-        start, end = seen_from(x[i], k, member, s, sheets), seen_after(x_now[i], k, member, s, sheets)
+        start, end = way_of(x[i], x_now[i], k, member, s, sheets)
         _y, used, stays = kept(start, end, k, least / scale_of(k, member, s, sheets), sheets)
         if used[0] == NONE and stays == 0:
             return
@@ -153,7 +146,7 @@ def side_kernels(precision: Precision) -> Kernels:
         change = vector(x_now_dot[i])
         if number >= 0:
             grown = s.scales_dot[member, number] / s.scales[member, number]
-            change -= twist(x_now[i], number, member, s)
+            change -= twist(x_now[i], s.after, s.after_dot, s.turned_dot, number, member, s)
         rounds = int(ROUNDS)
         for round in range(rounds):
             if used[round] != NONE:
@@ -162,10 +155,10 @@ def side_kernels(precision: Precision) -> Kernels:
         if stays == 1:
             change = vector(x_dot[i])
             if number >= 0:
-                change -= twist_before(x[i], number, member, s)
+                change -= twist(x[i], s.before, s.before_dot, s.turned_before_dot, number, member, s)
                 change = R * (wp.transpose(s.turns_before[member, number]) * change)
         if number >= 0:
-            change += twist(x_kept[i], number, member, s)
+            change += twist(x_kept[i], s.after, s.after_dot, s.turned_dot, number, member, s)
         x_now_dot[i] = change
 
     @wp.kernel(module=modules[2], enable_backward=False)
@@ -173,7 +166,7 @@ def side_kernels(precision: Precision) -> Kernels:
     def keep_adjoint(s, sheets, k: int, least: real, x, x_now, x_kept, x_now_bar, bar):
         i = s.first + wp.tid()
         member, number = i // s.particles, sheets.numbers[k]
-        start, end = seen_from(x[i], k, member, s, sheets), seen_after(x_now[i], k, member, s, sheets)
+        start, end = way_of(x[i], x_now[i], k, member, s, sheets)
         _y, used, stays = kept(start, end, k, least / scale_of(k, member, s, sheets), sheets)
         if used[0] == NONE and stays == 0:
             return
