@@ -49,7 +49,7 @@ class Effort(NamedTuple):
     """Rays that find how much light falls on a point of the surface: from all around, and from the lamp."""
 
 
-EFFORTS = {"traced": Effort(0.0, 4, 0.045, 4, (20, 4)), "quick": Effort(0.5, 1, 0.1, 2, (8, 2))}
+EFFORTS = {"traced": Effort(0.0, 4, 0.045, 4, (20, 4)), "quick": Effort(0.5, 1, 0.045, 2, (8, 2))}
 SPHERE_LIGHTS, SOLID_LIGHTS = (10, 1), (40, 6)
 """Numbers of rays to the light from spheres, and from solids, which have fewer points and even sides."""
 
