@@ -71,7 +71,7 @@ IN_THE_PLANE = [
     {
         **{"name": "disc", "shape": "sphere", "centre": [0.5, 0.42], "radius": 0.1, "slip": "free"},
         **{"motion": "free", "density": 300.0, "velocity": [0.3, 0.1], "angular_velocity": 1.0},
-        **{"freedom": ["x", "y", "rotation"]},
+        **{"freedom": ["x", "y", "rotation"], "friction": 0.3, "restitution": 0.5},
     },
     {
         **{"name": "rod", "shape": "capsule", "start": [0.7, 0.3], "end": [0.7, 0.4], "radius": 0.05},

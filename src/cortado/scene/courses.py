@@ -244,9 +244,10 @@ def check_motion(solid: Any, dimension: int, path: FieldPath) -> None:
     given = [name for name in ("path", "times", *rows, *steady, "ramp") if getattr(solid, name) is not None]
     if solid.interpolation != "linear":
         given.append("interpolation")
-    for name in ("density", "mass", "centre_of_mass", "gyration_radius", "inertia", "freedom"):
+    words = {"freedom": "can be held", "friction": "rubs what it touches", "restitution": "bounces"}
+    for name in ("density", "mass", "centre_of_mass", "gyration_radius", "inertia", *words):
         if (value := getattr(solid, name)) is not None and solid.motion != "free":
-            has = "can be held" if name == "freedom" else "has a mass"
+            has = words.get(name, "has a mass")
             raise field_error((*path, name), value, f'left out, as only a body whose motion is "free" {has}')
     if solid.motion == "fixed":
         if given:

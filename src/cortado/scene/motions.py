@@ -139,6 +139,8 @@ Schedule: Any = create_model("Schedule", __base__=_Schedule, __module__=__name__
 
 AXES = ("turn_x", "turn_y", "turn_z")
 """Endings of state fields' names for a free body's rotation: how far the ends of its unit axes have moved [-]."""
+RESTITUTION = 0.6
+"""That of a free body that does not say its own."""
 RADIAN = 1.0
 """A large turn for an optimiser [rad]."""
 STRETCH = 0.2
@@ -216,6 +218,10 @@ angular_velocity_name = _name("angular_velocity")
 """The parameter: how fast it turns, a free body at the start [rad/s]; the field of a free body."""
 density_name = _name("density")
 mass_name = _name("mass")
+friction_name = _name("friction")
+"""The parameter: the coefficient of friction of a free body [-]."""
+restitution_name = _name("restitution")
+"""The parameter: with which part of the speed of a hit a free body leaves [-]."""
 
 
 def weight_name(solid: SolidTable) -> str:
@@ -258,7 +264,10 @@ def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
                 found.append(replace(known[name(solid.name)], role=Role.VIEW, in_place_of=of(solid.name)))
     begun = (position_name, rotation_name, velocity_name, angular_velocity_name)
     found += [replace(known[name(solid.name)], role=Role.STATE) for solid in free(solids) for name in begun]
-    return [*found, *(known[weight_name(solid)] for solid in free(solids))]
+    found += [known[weight_name(solid)] for solid in free(solids)]
+    said = [friction_name(solid.name) for solid in free(solids) if solid.friction is not None]
+    said += [restitution_name(solid.name) for solid in free(solids) if solid.restitution is not None]
+    return [*found, *(known[name] for name in said)]
 
 
 def _parameters(solid: SolidTable) -> list[Parameter]:
@@ -281,6 +290,8 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
     displaced = f"how far the middle of the solid {name} is from where it began, after each step"
     turned = f"how far the solid {name} is turned from how it began, after each step"
     heavy, unit = f"the mass of the body {name}", "kg" if len(middle) == 3 else "kg/m"
+    bounce = RESTITUTION if solid.restitution is None else solid.restitution
+    number = {"range": Range.NOT_NEGATIVE, "change": lambda source, value: np.maximum(np.abs(value), 0.1)}
     stretched = f"how many times as large as in the scene the solid {name} is, about its middle"
     return [
         made(position_name, "m", f"where the middle of the solid {name} is at the start", middle, **place),
@@ -294,6 +305,8 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
         made(angular_velocity_name, "rad/s", f"how fast the solid {name} turns about its middle{when}", spin, **rate),
         made(density_name, "kg/m³", f"{heavy} over its volume", solid.density or 0.0, range=Range.POSITIVE),
         made(mass_name, unit, heavy, solid.mass or 0.0, range=Range.POSITIVE),
+        made(friction_name, "", f"the friction of what the body {name} touches", solid.friction or 0.0, **number),
+        made(restitution_name, "", f"with which part of its speed the body {name} leaves a wall", bounce, **number),
     ]
 
 

@@ -68,6 +68,12 @@ class SolidTable(Coloured):
     freedom: tuple[Annotated[str, OneOf(sorted({*WAYS[2], *WAYS[3]}))], ...] | None = None
     """Ways in which a free body can move, all if left out: of "x", "y" and "rotation", in 3-D of "x", "y", "z",
     "rotation_x", "rotation_y" and "rotation_z", along the axes of space."""
+    friction: Annotated[float, quantity(ge=0.0)] | None = None
+    """Coefficient of Coulomb's friction of a free body with what it touches; 0 if left out. Two free bodies that touch
+    have the mean of both."""
+    restitution: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
+    """Part of the speed of a hit with which a free body leaves what it touches; 0.6 if left out. Two free bodies that
+    touch have the mean of both."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of the path, from 0 on, each greater than the one before [s]; after the last it rests."""
     positions: tuple[tuple[Length, ...], ...] | None = None

@@ -403,7 +403,8 @@ def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:
         for against, one in enumerate(moved):
             if against != number:
                 other = bodies.index(against) if against in bodies else -1
-                found.append(Touching(body, against, other, [_obstacle(one, one.own_solid(), spacing)], points))
+                obstacles, slides = [_obstacle(one, one.own_solid(), spacing)], one.surface_velocity or ()
+                found.append(Touching(body, against, other, obstacles, points, slides))
     return found
 
 

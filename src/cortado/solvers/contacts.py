@@ -1,167 +1,23 @@
-"""Bodies that touch the container, solids and each other: the force between a body and a solid is a smooth penalty.
-
-Points of a body's surface that are in the other solid, d_j > 0 deep, give it the momentum
-
-    P = (q / dt) M sum_j f_j n_j,   f_j = d_j^3 / sqrt(S),   S = sum_j d_j^4,
-
-along the normals n_j of the faces above them, and the other one -P. This force has the potential
-q M sqrt(S) / (2 dt^2), for a depth S^(1/4) that is near the greatest one whatever the number of points. It is the
-potential of a spring in which the lighter of two bodies, with M m / (M + m), would swing with sqrt(q) / dt. As d_j is
-where the body would go, a swing shrinks by sqrt(1 - q) in a step: a body leaves what it falls on with 0.6 of its speed,
-whatever the time step. At a depth of 0 f_j has two derivatives, both 0; where the face above a point changes, there is
-a corner.
-"""
+"""The contacts of free bodies with the container, solids and each other in a step: see `contact_kernels`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.launching import Named, bundle
-from cortado.device.modules import Kernels
-from cortado.device.precision import Precision, TypesByName
-from cortado.device.reduction import sum_of
+from cortado.device.launching import Named
+from cortado.device.reduction import add, sum_of
 from cortado.particles.moving_walls import matrix_of, resting_pose
-from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout, Parameters, padded, zeros
+from cortado.scene.motions import RESTITUTION, friction_name, restitution_name
+from cortado.solvers.contact_kernels import NUMBERS, OWN, SHARES, contact_kernels
 from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart, given_to
-from cortado.sph.moving_solids import free_module
+from cortado.sph.friction_kernels import lift_kernels
 from cortado.sph.parts import Adjoints, StepContext, Tangents
-
-STIFFNESS = 0.04
-"""The stiffness q of contacts [-]."""
-FAR = 1e6
-"""[m] beyond which no face is looked for."""
-SHARES = ("push", "twist", "other", "square")
-"""What a point adds: d^3 n, its moments about the middles of both solids, and d^4."""
-
-
-@dataclass(frozen=True)
-class ContactKernels:
-    """Kernels of contact between a body and a solid; the first two have a thread for each surface point in each
-    scene."""
-
-    look: Any
-    """This finds the face that a point is deepest behind, and goes on from the deepest so far: the normal in the frame
-    of the other solid, how far the plane is from the middle of that along it, for a scale of 1, and the shift to the
-    image that is near."""
-    push: Kernels
-    """These compute `SHARES` from both poses and the scale of the other solid; adjoints of these are written, point by
-    point."""
-    give: Kernels
-    """These turn the sums of shares into the momenta of both, with a thread for each scene; a solid that is not free
-    gets none."""
-
-
-@cache
-def contact_kernels(precision: Precision) -> ContactKernels:
-    """Make the kernels of contacts between bodies and solids in a precision."""
-    real, vector, matrix, pair = precision.real, precision.vector, matrix_of(precision), precision.pair
-    modules, stiffness = [free_module(precision)] * 3, wp.constant(real(STIFFNESS))
-
-    @wp.func
-    def vec(a: wp.vec3f) -> vector:
-        return vector(real(a[0]), real(a[1]), real(a[2]))
-
-    @wp.func
-    def along(way: real, length: real) -> real:
-        """Shorten a separation along one axis [m] to that of the nearest periodic image."""
-        found = way
-        if length > real(0.0):
-            found = way - length * wp.round(way / length)
-        return found
-
-    vectors = "after other_after own face shift push twist other_sum"
-    typed = TypesByName(real, {vector: vectors, matrix: "turns other_turns", pair: "volumes", bool: "is_free"})
-
-    @wp.kernel(module=modules[0], enable_backward=False)
-    @typed.arrays
-    def look(
-        particles: int,
-        period: vector,
-        mesh: wp.uint64,
-        origin: vector,
-        inner: vector,
-        side: real,
-        own,
-        after,
-        turns,
-        other_after,
-        other_turns,
-        other_scales,
-        of: bundle(face=vector, plane=real, shift=vector, depth=real),
-    ):
-        """Find the face. The mesh is about ``origin`` of a solid at rest, and about ``inner`` in the frame of one that
-        moves; ``period`` is 0 along an axis without one."""
-        j = wp.tid()
-        b = j // particles
-        way = after[b] + turns[b] * own[j] - other_after[b] - origin
-        x = vector(along(way[0], period[0]), along(way[1], period[1]), along(way[2], period[2]))
-        y = wp.transpose(other_turns[b]) * x / other_scales[b] - inner
-        place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
-        found = wp.mesh_query_point_sign_winding_number(mesh, place, wp.float32(FAR))
-        if not found.result or real(found.sign) * side > real(0.0):
-            return
-        corners = wp.mesh_get(mesh)
-        first = vec(corners.points[corners.indices[3 * found.face]])
-        second = vec(corners.points[corners.indices[3 * found.face + 1]])
-        third = vec(corners.points[corners.indices[3 * found.face + 2]])
-        n = side * wp.normalize(wp.cross(second - first, third - first))
-        d = other_scales[b] * wp.dot(n, first - y)
-        if d > of.depth[j]:
-            of.face[j] = n
-            of.plane[j] = wp.dot(n, first + inner)
-            of.shift[j] = way - x + origin
-            of.depth[j] = d
-
-    @typed
-    def push(
-        after, turns, other_after, other_turns, other_scales, own_i, face_i, plane_i, shift_i
-    ) -> tuple[vector, vector, vector, real]:
-        r = turns * own_i
-        x, n = after + r - other_after - shift_i, other_turns * face_i
-        d = other_scales * plane_i - wp.dot(n, x)
-        f = (d * d * d) * n
-        return f, wp.cross(r, f), wp.cross(x, f), d * d * d * d
-
-    @typed
-    def give(
-        time_step_i, density_i, other_density_i, is_free, volumes, push_sum_i, twist_sum_i, other_sum_i, square_sum_i
-    ) -> tuple[vector, vector, vector, vector]:
-        mass, other, strength = density_i * volumes[0], other_density_i * volumes[1], real(0.0)
-        both = wp.where(is_free, mass * other / (mass + other), mass)
-        if square_sum_i > real(0.0):
-            strength = stiffness * both / (time_step_i * wp.sqrt(square_sum_i))
-        against = wp.where(is_free, -strength, real(0.0))
-        return strength * push_sum_i, strength * twist_sum_i, against * push_sum_i, against * other_sum_i
-
-    moved = ["after", "turns", "other_after", "other_turns", "other_scales"]
-    pushes = pointwise_kernels(
-        precision,
-        modules,
-        lambda _: push,
-        SHARES,
-        written=moved,
-        known=["own", "face", "plane", "shift"],
-        where="depth",
-        summed=SHARES,
-        turned={"turns": "turned", "other_turns": "other_turned"},
-    )
-    gives = pointwise_kernels(
-        precision,
-        modules,
-        lambda _: give,
-        [f"{name}:{name}" for name in ("pushed", "twisted", "pushed_other", "twisted_other")],
-        numbers=["is_free", "volumes"],
-        written=[f"{name}_sum" for name in SHARES],
-    )
-    return ContactKernels(look, pushes, gives)
-
 
 Arrays = dict[str, wp.array]
 
@@ -179,6 +35,8 @@ class Touching:
     obstacles: Sequence[Obstacle]
     points: NDArray[np.float64]
     """(n, d) of the surface of the body, in its frame [m]"""
+    slides: Sequence[float] = ()
+    """(d,) How fast the surface of the other solid slides, in its frame [m/s]; 0 where it does not."""
 
 
 class Contact:
@@ -194,6 +52,7 @@ class Contact:
             side = -1.0 if one.is_hollow else 1.0
             self.places.append({"mesh": mesh.id, "origin": origin, "inner": inner, "side": side})
         points, real, vector = padded(touching.points), precision.real, precision.vector
+        self.slides = vector(*padded(np.array([touching.slides]))[0]) if len(touching.slides) else vector()
         self.count, self.layout = len(points), layout
         self.own = wp.array(np.tile(points, (layout.members, 1)), dtype=vector, device=device)
         self.all = layout.members * self.count
@@ -231,7 +90,8 @@ class Totals:
 
 def share_kinds(layout: Layout) -> dict[str, Any]:
     """Return the types of `SHARES` by name."""
-    return {name: layout.precision.real if name == "square" else layout.precision.vector for name in SHARES}
+    matrix = matrix_of(layout.precision)
+    return dict(zip(SHARES, (matrix, matrix, layout.precision.six), strict=True))
 
 
 class Contacts:
@@ -253,6 +113,15 @@ class Contacts:
         self._period = layout.precision.vector(*padded(periods[None])[0])
         self._shares = [Totals(contact, share_kinds(layout)) for contact in self.contacts]
         self._sums: list[Arrays] = [{} for _ in self.contacts]
+        unsaid = {"friction": 0.0, "restitution": RESTITUTION}
+        self._unsaid = {
+            f"{label}{suffix}": wp.full(layout.members, 0.0 if suffix else value, layout.precision.real, layout.device)
+            for label, value in unsaid.items()
+            for suffix in ("", "_dot", "_bar")
+        }
+        """Numbers of bodies that say none, which are no parameters, with tangents and adjoints that nobody reads."""
+        self.lifts = lift_kernels(layout.precision)
+        self.lift = {"lift": wp.zeros(layout.members, dtype=layout.precision.vector, device=layout.device)}
 
     def bodies(self, number: int) -> tuple[FreeBody, FreeBody]:
         """Return the body of a contact and the other free body; the first one twice where the other is not free."""
@@ -262,21 +131,29 @@ class Contacts:
 
     def known(self, step: StepContext, number: int) -> tuple[Named, ...]:
         """Return the arrays and constants of a contact by the names that kernels have for them."""
-        contact, (own, other) = self.contacts[number], self.bodies(number)
+        contact, (own, other), pair = self.contacts[number], self.bodies(number), self.layout.precision.pair
         constants: dict[str, Any] = {
             "particles": contact.count,
             "period": self._period,
             "is_free": contact.touching.other >= 0,
-            "volumes": self.layout.precision.pair(own.table.mass.volume, other.table.mass.volume),
+            "volumes": pair(own.table.mass.volume, other.table.mass.volume),
+            "greatest": pair(own.table.bounds["greatest"], other.table.bounds["greatest"]),
+            "slides": contact.slides,
             "own": contact.own,
         }
-        densities = self.densities(step.parameters, number)
-        return constants, densities, contact.found, self._sums[number], self._poses[number], own.constants
+        known = constants, self.numbers(step.parameters, number), contact.found, self._sums[number]
+        return *known, self._poses[number], own.constants, self.lift
 
-    def densities(self, parameters: Parameters, number: int, suffix: str = "") -> Arrays:
-        """Return the densities of both solids, or their tangents or adjoints, by the kernels' names."""
-        names = (f"density{suffix}", f"other_density{suffix}")
-        return {name: parameters[body.table.weight] for name, body in zip(names, self.bodies(number), strict=True)}
+    def numbers(self, parameters: Parameters, number: int, suffix: str = "") -> Arrays:
+        """Return what both solids are by their parameters, or tangents or adjoints, by the kernels' names."""
+        found = {f"time_step{suffix}": parameters["time_step"]}
+        for way, body in zip(("", "other_"), self.bodies(number), strict=True):
+            name, weight = body.table.name, body.table.weight
+            of = {"density": weight, "friction": friction_name(name), "restitution": restitution_name(name)}
+            for label, one in of.items():
+                value = parameters[one] if one in parameters.names else self._unsaid[f"{label}{suffix}"]
+                found[f"{way}{label}{suffix}"] = value
+        return found
 
     def given(self, number: int, each: Sequence[FreeBody | Changes]) -> Arrays:
         """Return the momenta that both solids get, or their changes."""
@@ -285,6 +162,7 @@ class Contacts:
 
     def look(self, step: StepContext) -> None:
         """Find the contacts of a step, and add the momenta that bodies get from them."""
+        step.launch(self.lifts.forward, self.lift, threads=self.layout.members)
         for number, (contact, shares) in enumerate(zip(self.contacts, self._shares, strict=True)):
             for array in contact.found.values():
                 array.zero_()
@@ -310,16 +188,23 @@ class ContactsTangent:
     def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
         self._contacts, self._changes = contacts, changes
         self._shares = [Totals(contact, share_kinds(contacts.layout), "_dot") for contact in contacts.contacts]
+        self._lift = {"lift_dot": wp.zeros_like(contacts.lift["lift"])}
 
     def look(self, step: StepContext, dot: Tangents) -> None:
         """Add the tangents of the momenta that bodies get from contacts in `Contacts.look`."""
-        contacts = self._contacts
+        contacts, members = self._contacts, self._contacts.layout.members
+        step.launch(contacts.lifts.tangent, self._lift, contacts.lift, lift_sizes(dot, "_dot"), threads=members)
         for number, shares in enumerate(self._shares):
-            known = contacts.known(step, number)
-            step.launch(contacts.kernels.push.tangent, shares.each, *known, threads=contacts.contacts[number].all)
-            rates = contacts.densities(dot.parameters, number, "_dot"), {"time_step_dot": dot.parameters["time_step"]}
+            known = contacts.numbers(dot.parameters, number, "_dot"), *contacts.known(step, number)
+            all_points = contacts.contacts[number].all
+            step.launch(contacts.kernels.push.tangent, shares.each, self._lift, *known, threads=all_points)
             moved = contacts.given(number, self._changes), shares.sums()
-            step.launch(contacts.kernels.give.tangent, *moved, *rates, *known, threads=contacts.layout.members)
+            step.launch(contacts.kernels.give.tangent, *moved, *known, threads=members)
+
+
+def lift_sizes(of: Tangents | Adjoints, suffix: str) -> Arrays:
+    """Return tangents or adjoints of what the lift is made of."""
+    return {f"{name}{suffix}": of.parameters[name] for name in ("time_step", "gravity")}
 
 
 class ContactsAdjoint:
@@ -327,22 +212,33 @@ class ContactsAdjoint:
 
     def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
         self._contacts, self._changes, layout = contacts, changes, contacts.layout
-        vectors = dict.fromkeys(("after", "turned", "other_after", "other_turned"), layout.precision.vector)
-        kinds = {**vectors, "other_scales": layout.precision.real}
+        vectors = [*OWN, *(f"other_{name}" for name in OWN), "lift"]
+        kinds = {**dict.fromkeys(vectors, layout.precision.vector)}
+        kinds |= dict.fromkeys(("other_scales", *NUMBERS), layout.precision.real)
         self._moved = [Totals(contact, kinds, "_bar", end="") for contact in contacts.contacts]
         sums = {f"{name}_sum_bar": (layout.members, kind) for name, kind in share_kinds(layout).items()}
         self._sums = zeros(sums, layout.device)
 
     def look(self, step: StepContext, bar: Adjoints) -> None:
         """Apply the adjoint of `Contacts.look`: from adjoints of the bodies' momenta to adjoints of their poses."""
-        contacts = self._contacts
+        contacts, members = self._contacts, self._contacts.layout.members
         for number, (contact, moved) in enumerate(zip(contacts.contacts, self._moved, strict=True)):
-            rates = contacts.densities(bar.parameters, number, "_bar"), {"time_step_bar": bar.parameters["time_step"]}
+            numbers = contacts.numbers(bar.parameters, number, "_bar")
             known = (self._sums, *contacts.known(step, number))
             given = contacts.given(number, self._changes)
-            step.launch(contacts.kernels.give.adjoint, given, *rates, *known, threads=contacts.layout.members)
+            step.launch(contacts.kernels.give.adjoint, given, numbers, *known, threads=members)
             step.launch(contacts.kernels.push.adjoint, moved.each, *known, threads=contact.all)
-            bars, own = moved.sums(), ("after_bar", "turned_bar")
+            bars = moved.sums()
+            for name in NUMBERS:
+                add(bars[f"{name}_bar"], numbers[f"{name}_bar"])
+            step.launch(
+                contacts.lifts.adjoint,
+                {"lift_bar": bars["lift_bar"]},
+                lift_sizes(bar, "_bar"),
+                contacts.lift,
+                threads=members,
+            )
+            own = [f"{name}_bar" for name in OWN]
             bar.solids.add_whole(contacts.bodies(number)[0].table.number, **{name: bars[name] for name in own})
             if contact.touching.against >= 0:
                 others = {name: bars[f"other_{name}"] for name in (*own, "scales_bar")}

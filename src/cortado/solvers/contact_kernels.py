@@ -1,0 +1,264 @@
+"""Bodies that touch the container, solids and each other: a smooth penalty with restitution and friction.
+
+Points of a body's surface are in the other solid, where they would go, by d_j > 0, along the normals n_j of the faces
+above them. With the weights w_j = d_j^3 / sum d_j^3 the contact is D = sum_j w_j d_j deep, near the greatest depth
+whatever the number of points. The body gets the momentum
+
+    P = (q / dt) m D sum_j w_j n_j,   1 / m = 1 / M + r^2 / I,
+
+and the other solid -P. Here r is the arm of P, I the least moment of inertia, and 1 / m has the same of another body
+that is free. So each contact swings with sqrt(q) / dt. Of two free bodies each has points in the other, and both
+contacts count half.
+
+*Restitution*: D has also beta - 1 of its growth in the step. beta(e), by which a body leaves with e of its
+speed, is a fit to steps of one that hits a wall, within 0.004 for e from 0.03 to 0.95, and 0.98 for 1.
+
+*Friction* (Coulomb's): to stop what slips takes Q = sum_j w_j (m_j u_j + M g dt). Point j slips by u_j, m_j is the mass
+that a push there sees, and gravity counts along the face where the other solid is not free. The body gets
+
+    -Q / (1 + t^8)^(1/8),   t = sum_j w_j |m_j u_j + M g dt| / (mu (q / dt) m D):
+
+what stops it where that is little, and mu times the push where it is much. So what lies on a slope creeps with up to
+t^8 / 8 times M g dt / m_j.
+
+All is smooth but for corners where a contact begins, or the face above a point changes. At mu = 0 the derivative by mu
+is that of one side.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.launching import bundle
+from cortado.device.modules import Kernels
+from cortado.device.precision import Precision, TypesByName
+from cortado.particles.moving_walls import matrix_of
+from cortado.particles.particle_kernels import pointwise_kernels
+from cortado.sph.held_bodies import hold_type
+from cortado.sph.moving_solids import free_module
+
+STIFFNESS = 0.04
+"""The stiffness q of contacts [-]."""
+FAR = 1e6
+"""[m] beyond which no face is looked for."""
+SHARES = ("pushes", "drags", "scales")
+"""What a point adds: d^3 n and its moments about the middles of both solids, as columns; the same of d^3 times what
+stops the point; and d^3, d^4, both also with d before the step, and the length of that."""
+OWN = ("before", "turned_before", "after", "turned")
+POSES = ("before", "turns_before", "after", "turns")
+NUMBERS = ("time_step", "density", "other_density")
+
+
+@dataclass(frozen=True)
+class ContactKernels:
+    """Kernels of contact between a body and a solid; the first two have a thread for each surface point in each
+    scene."""
+
+    look: Any
+    """This finds the face that a point is deepest behind, and goes on from the deepest so far: the normal in the frame
+    of the other solid, how far the plane is from the middle of that along it, for a scale of 1, and the shift to the
+    image that is near."""
+    push: Kernels
+    """These compute `SHARES` from both poses, the scale of the other solid, the lift of `lift_kernels` and `NUMBERS`;
+    adjoints of these are written, point by point."""
+    give: Kernels
+    """These turn the sums of shares into the momenta of both, with a thread for each scene; a solid that is not free
+    gets none."""
+
+
+@cache
+def contact_kernels(precision: Precision) -> ContactKernels:
+    """Make the kernels of contacts between bodies and solids in a precision."""
+    real, vector, matrix, pair = precision.real, precision.vector, matrix_of(precision), precision.pair
+    modules, stiffness = [free_module(precision)] * 3, wp.constant(real(STIFFNESS))
+
+    @wp.func
+    def vec(a: wp.vec3f) -> vector:
+        return vector(real(a[0]), real(a[1]), real(a[2]))
+
+    @wp.func
+    def along(way: real, length: real) -> real:
+        """Shorten a separation along one axis [m] to that of the nearest periodic image."""
+        found = way
+        if length > real(0.0):
+            found = way - length * wp.round(way / length)
+        return found
+
+    no, half, one, tiny = (wp.constant(real(value)) for value in (0.0, 0.5, 1.0, precision.tiny))
+    vectors, six = "before after other_before other_after own face shift lift slides", precision.six
+    kinds = {
+        matrix: "turns turns_before other_turns other_turns_before pushes_sum drags_sum",
+        six: "scales_sum",
+        pair: "volumes greatest",
+        bool: "is_free",
+    }
+    typed = TypesByName(real, {vector: vectors, hold_type(precision): "hold", **kinds})
+
+    @wp.func
+    def ease(density: real, other: real, volumes: pair, greatest: pair, is_free: bool, arms: pair) -> real:
+        """Return 1 / m of a push with arms of these squares about the middles of both solids."""
+        found = (one / volumes[0] + greatest[0] * arms[0]) / density
+        if is_free:
+            found += (one / volumes[1] + greatest[1] * arms[1]) / other
+        return found
+
+    @wp.func
+    def column(M: matrix, k: int) -> vector:
+        return vector(M[0, k], M[1, k], M[2, k])
+
+    @wp.func
+    def mean(own: real, other: real, is_free: bool) -> real:
+        return wp.where(is_free, half * (own + other), own)
+
+    @wp.func
+    def eased(t: real) -> real:
+        """Return (1 + t^8)^(-1/8)."""
+        fourth = (t * t) * (t * t)
+        return one / wp.sqrt(wp.sqrt(wp.sqrt(one + fourth * fourth)))
+
+    @wp.kernel(module=modules[0], enable_backward=False)
+    @typed.arrays
+    def look(
+        particles: int,
+        period: vector,
+        mesh: wp.uint64,
+        origin: vector,
+        inner: vector,
+        side: real,
+        own,
+        after,
+        turns,
+        other_after,
+        other_turns,
+        other_scales,
+        of: bundle(face=vector, plane=real, shift=vector, depth=real),
+    ):
+        """Find the face. The mesh is about ``origin`` of a solid at rest, and about ``inner`` in the frame of one that
+        moves; ``period`` is 0 along an axis without one."""
+        j = wp.tid()
+        b = j // particles
+        way = after[b] + turns[b] * own[j] - other_after[b] - origin
+        x = vector(along(way[0], period[0]), along(way[1], period[1]), along(way[2], period[2]))
+        y = wp.transpose(other_turns[b]) * x / other_scales[b] - inner
+        place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
+        found = wp.mesh_query_point_sign_winding_number(mesh, place, wp.float32(FAR))
+        if not found.result or real(found.sign) * side > real(0.0):
+            return
+        corners = wp.mesh_get(mesh)
+        first = vec(corners.points[corners.indices[3 * found.face]])
+        second = vec(corners.points[corners.indices[3 * found.face + 1]])
+        third = vec(corners.points[corners.indices[3 * found.face + 2]])
+        n = side * wp.normalize(wp.cross(second - first, third - first))
+        d = other_scales[b] * wp.dot(n, first - y)
+        if d > of.depth[j]:
+            of.face[j] = n
+            of.plane[j] = wp.dot(n, first + inner)
+            of.shift[j] = way - x + origin
+            of.depth[j] = d
+
+    @typed
+    def push(
+        time_step,
+        lift,
+        density,
+        other_density,
+        before,
+        turns_before,
+        after,
+        turns,
+        other_before,
+        other_turns_before,
+        other_after,
+        other_turns,
+        other_scales,
+        volumes,
+        greatest,
+        is_free,
+        hold,
+        slides,
+        own_i,
+        face_i,
+        plane_i,
+        shift_i,
+    ) -> tuple[matrix, matrix, six]:
+        r, n = turns * own_i, other_turns * face_i
+        x = after + r - other_after - shift_i
+        y = wp.transpose(other_turns) * x
+        y_before = wp.transpose(other_turns_before) * (before + turns_before * own_i - other_before - shift_i)
+        d = other_scales * plane_i - wp.dot(face_i, y)
+        d_before = wp.max(other_scales * plane_i - wp.dot(face_i, y_before), no)
+        u, g = other_turns * (y - y_before - time_step * slides), wp.cw_mul(hold.moving, lift)
+        u, g = u - wp.dot(n, u) * n, wp.where(is_free, no, density * volumes[0]) * (g - wp.dot(n, g) * n)
+        size = wp.dot(u, u) + tiny
+        arm, other_arm = wp.cross(r, u), wp.cross(x, u)
+        arms = pair(wp.dot(arm, arm) / size, wp.dot(other_arm, other_arm) / size)
+        w = d * d * d
+        stop = u / (time_step * ease(density, other_density, volumes, greatest, is_free, arms)) - g
+        slide = w * wp.sqrt(wp.dot(stop, stop) + tiny)
+        f, drag = w * n, w * stop
+        begun = d_before * d_before * d_before
+        pushes = wp.matrix_from_cols(f, wp.cross(r, f), wp.cross(x, f))
+        drags = wp.matrix_from_cols(drag, wp.cross(r, drag), wp.cross(x, drag))
+        return pushes, drags, six(w, w * d, begun, begun * d_before, slide, no)
+
+    @typed
+    def give(
+        time_step_i,
+        density_i,
+        other_density_i,
+        restitution_i,
+        other_restitution_i,
+        friction_i,
+        other_friction_i,
+        is_free,
+        volumes,
+        greatest,
+        pushes_sum_i,
+        drags_sum_i,
+        scales_sum_i,
+    ) -> tuple[vector, vector, vector, vector]:
+        part, grip, share, cube = no, no, wp.where(is_free, half, one), scales_sum_i[0]
+        if cube > no:
+            turn, back = column(pushes_sum_i, 1) / cube, column(pushes_sum_i, 2) / cube
+            arms, by = pair(wp.dot(turn, turn), wp.dot(back, back)), share / cube
+            u = wp.log(mean(restitution_i, other_restitution_i, is_free) + real(0.03))
+            beta = real(0.02943804) + u * (real(-3.44174961) + u * (real(0.11397519) - real(0.21607366) * u))
+            deep = beta * scales_sum_i[1] / cube
+            if scales_sum_i[2] > no:
+                deep += (one - beta) * scales_sum_i[3] / scales_sum_i[2]
+            light = ease(density_i, other_density_i, volumes, greatest, is_free, arms)
+            part = by * stiffness * wp.max(deep, no) / (time_step_i * light)
+            most, stop = mean(friction_i, other_friction_i, is_free) * part * cube, by * scales_sum_i[4]
+            if stop > most:
+                grip = by * (most / stop) * eased(most / stop)
+            elif most > no:
+                grip = by * eased(stop / most)
+        found, against = part * pushes_sum_i - grip * drags_sum_i, wp.where(is_free, -one, no)
+        return column(found, 0), column(found, 1), against * column(found, 0), against * column(found, 2)
+
+    moved = [*POSES, *(f"other_{name}" for name in POSES), "other_scales", "lift", *NUMBERS]
+    turned = dict(zip(POSES[1::2], OWN[1::2], strict=True))
+    turned |= {f"other_{name}": f"other_{turn}" for name, turn in turned.items()}
+    pushes = pointwise_kernels(
+        precision,
+        modules,
+        lambda _: push,
+        SHARES,
+        numbers=["volumes", "greatest", "is_free", "hold", "slides"],
+        written=moved,
+        known=["own", "face", "plane", "shift"],
+        where="depth",
+        summed=SHARES,
+        turned=turned,
+    )
+    gives = pointwise_kernels(
+        precision,
+        modules,
+        lambda _: give,
+        [f"{name}:{name}" for name in ("pushed", "twisted", "pushed_other", "twisted_other")],
+        numbers=["is_free", "volumes", "greatest"],
+        written=[f"{name}_sum" for name in SHARES],
+    )
+    return ContactKernels(look, pushes, gives)
