@@ -217,7 +217,7 @@ def test_a_body_leaves_the_floor_with_its_part_of_the_speed(part, time_step):
         .solids["ball"]
         .velocities[:, 1]
     )
-    assert up[-1] == pytest.approx(0.6 if part is None else part, abs=0.03)
+    assert up[-1] == pytest.approx(0.6 if part is None else part, abs=0.05)
 
 
 SOLVER = {"kind": "projection", "time_step": 0.001}
@@ -265,7 +265,8 @@ def test_bodies_touch_across_a_period():
     velocity = solid.velocities + hit.velocities
     assert np.allclose(velocity[10], [2.0, -2 * 9.81 * 0.1], rtol=1e-9) and hit.velocities[10, 0] > 1.0
     assert hit.velocities[:, 0].min() < -0.1 and solid.positions[:, 0].max() > 0.95
-    assert all(body.positions[:, 1].min() > 0.04 for body in (solid, hit))
+    fastest = np.abs([solid.velocities[:, 1], hit.velocities[:, 1]]).max()
+    assert all(body.positions[:, 1].min() > 0.05 - fastest * 0.001 / STIFFNESS**0.5 for body in (solid, hit))
 
 
 @pytest.mark.parametrize("made", [touching, touching_in_space])

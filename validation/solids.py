@@ -21,7 +21,14 @@ from piston_waves import piston
 
 from baffles import held, sloshed
 from cortado import Scene, Simulation
-from floating_bodies import added_mass, disc_in_a_round_tank, floating_box, settling_disc, stopping_cylinder
+from floating_bodies import (
+    added_mass,
+    disc_in_a_round_tank,
+    floating_box,
+    settling_ball,
+    settling_disc,
+    stopping_cylinder,
+)
 from held_water import MESHES, cup_turned, meshes, stirred
 
 DATA = Path(__file__).parents[1] / "tests" / "data"
@@ -111,6 +118,8 @@ def cases(device: str) -> dict[str, Callable[[], object]]:
         **{f"stopping-cylinder, {across} across": partial(stopping_cylinder, across) for across in (8, 12, 24)},
         "settling-disc, 12 across": partial(settling_disc, 12, 1.73e-4, 0.15, device),
         "settling-disc, 24 across": partial(settling_disc, 24, 4.34e-5, 0.15, device),
+        "settling-ball, b/a = 2, 12 across": partial(settling_ball, 12, 2.0, 1.73e-4, 0.15, device),
+        "settling-ball, b/a = 4, 12 across": partial(settling_ball, 12, 4.0, 1.73e-4, 0.15, device),
         "floating-box, 16 particles long": lambda: floating_box(16),
         "floating-box, 32 particles long": lambda: floating_box(32),
         "added-mass, a sphere 8 across, 20 deep, 2 iterations": lambda: added_mass(8, 20, 100, 2),

@@ -36,8 +36,7 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.moving_walls import matrix_of
 from cortado.particles.particle_kernels import pointwise_kernels
-from cortado.sph.held_bodies import hold_type
-from cortado.sph.moving_solids import free_module
+from cortado.sph.moving_solids import free_module, hold_type
 
 STIFFNESS = 0.04
 """The stiffness q of contacts [-]."""
