@@ -1,15 +1,15 @@
 """``python -m benchmarks.gradients.policies``: policies trained in closed loop, with gradients and without.
 
 A network looks at the fluid of the tasks Carry and Splash before every action and is to bring in as much reward as it
-can, over 800 steps. It is trained by Adam on the gradients of `cortado.jax.step`, exact and by `AdjointViscosity`, and
-by the cross-entropy method (CEM) on values alone, all with the same number of simulated steps. A gradient counts as
-many steps as it takes time: it is timed at the start against values of the same episodes. Episodes differ in their
-first positions, by 2 % of a spacing. What is shown is the mean reward of an action in four test episodes, which nobody
-trains with and which do not count.
+can, over 800 steps. It is trained by L-BFGS (Nocedal 1980) on the gradients of `cortado.jax.step`, exact and by
+`AdjointViscosity`, and by the cross-entropy method (CEM) on values alone, all with the same number of simulated steps.
+A gradient counts as many steps as it takes time: it is timed at the start against values of the same episode. Episodes
+differ in their first positions, by 2 % of a spacing. What is shown is the mean reward of an action in four test
+episodes, which nobody trains with and which do not count.
 
     python -m benchmarks.gradients.policies --task carry --seeds 1 --steps 200 --budget 20000    # small, minutes
-    python -m benchmarks.gradients.policies --task carry --device cuda:0                         # seeds in one batch
     python -m benchmarks.gradients.policies --task carry --processes 15                          # a core each
+    python -m benchmarks.gradients.policies --task carry --method CEM --device cuda:0            # batches
 """
 
 import argparse
@@ -26,7 +26,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from numpy.typing import NDArray
 
 import cortado.jax
@@ -40,8 +39,11 @@ METHODS = {"AdjointViscosity": gradients.AdjointViscosity(), "Exact": None, "CEM
 TASKS = {"carry": Carry(), "splash": Splash()}
 JITTER, TESTS, CHECKS = 0.02, 4, 10
 """Of first positions [spacings]; test episodes; how often they are run."""
-RATE, CLIP, EPISODES = 0.02, 1.0, 2
-"""Of Adam at first, falling to 0 by half a cosine; greatest norm of a gradient; episodes of a gradient."""
+PAIRS, FIRST, FARTHEST, TRIES = 8, 1.0, 3.0, 6
+"""Of L-BFGS: changes that it remembers, length of the first step and greatest length of a step, both in weights, and
+how often a step is shortened."""
+SHORTER, ENOUGH = 0.35, 1e-4
+"""Factor by which a step is shortened, and share of the slope by which it has to lower the loss (Armijo 1966)."""
 POPULATION, ELITE, WIDTH, NARROWEST = 20, 5, 0.5, 0.05
 """Of CEM: policies of a generation, how many of them lead, first and least standard deviation of the weights."""
 Row = dict[str, Any]
@@ -162,90 +164,142 @@ def splashed(task: Splash, simulation: Simulation) -> Callable[[Any], Any]:
 REWARDS: dict[str, Any] = {"Carry": carried, "Splash": splashed}
 
 
+class Descent:
+    """L-BFGS with a search along each direction, on one episode until no step lowers its loss, then on another."""
+
+    def __init__(self, loop: Loop, estimator: Any, weights: NDArray[Any], random: np.random.Generator, device: str):
+        self._loop, self._random, self._weights = loop, random, weights
+        self._value, self._slope = jax.jit(loop.loss(None)), jax.jit(jax.value_and_grad(loop.loss(estimator)))
+        self._begin()
+        given = self._given(weights)
+        self._longer = seconds(device, self._slope, *given) / seconds(device, self._value, *given)
+
+    def _begin(self) -> None:
+        """Draw an episode, of which nothing is known yet."""
+        self._start = jnp.asarray(self._loop.starts(self._random, 1)[0], jnp.float32)
+        self._pairs: list[tuple[NDArray[Any], NDArray[Any]]] = []
+        self._last: tuple[float, NDArray[Any]] | None = None
+
+    def _given(self, weights: NDArray[Any]) -> tuple[Any, Any]:
+        return jnp.asarray(weights, jnp.float32), self._start
+
+    def _along(self, slope: NDArray[Any]) -> NDArray[Any]:
+        """Return the direction of descent, by the two loops of Nocedal (1980)."""
+        found, shares = slope.copy(), []
+        for moved, turned in reversed(self._pairs):
+            shares.append(moved @ found / (moved @ turned))
+            found -= shares[-1] * turned
+        moved, turned = self._pairs[-1] if self._pairs else (FIRST * slope / np.linalg.norm(slope), slope)
+        found *= (moved @ turned) / (turned @ turned)
+        for (moved, turned), own in zip(self._pairs, reversed(shares), strict=True):
+            found += moved * (own - turned @ found / (moved @ turned))
+        found *= -min(1.0, FARTHEST / np.linalg.norm(found))
+        return found
+
+    def update(self) -> tuple[NDArray[Any], float]:
+        """Return weights with a lower loss, or the same after a search in vain, and what it cost [episodes]."""
+        cost, (loss, slope) = 0.0, self._last or self._measure()
+        if self._last is None:
+            cost += self._longer
+        step = self._along(slope)
+        for _ in range(TRIES):
+            found, cost = self._loss(self._weights + step), cost + 1.0
+            if found < loss + ENOUGH * (step @ slope):
+                break
+            step = SHORTER * step
+        else:
+            self._last, self._pairs, was_fresh = (loss, slope), [], not self._pairs
+            if was_fresh:
+                self._begin()
+            return self._weights, cost
+        self._weights = self._weights + step
+        self._last = self._measure()
+        turned = self._last[1] - slope
+        if step @ turned > 1e-3 * np.linalg.norm(step) * np.linalg.norm(turned):
+            self._pairs = [*self._pairs, (step, turned)][-PAIRS:]
+        return self._weights, cost + self._longer
+
+    def _loss(self, weights: NDArray[Any]) -> float:
+        """Return the loss of an episode; infinite if particles were lost."""
+        try:
+            return float(self._value(*self._given(weights)))
+        except jax.errors.JaxRuntimeError:
+            return np.inf
+
+    def _measure(self) -> tuple[float, NDArray[Any]]:
+        loss, slope = self._slope(*self._given(self._weights))
+        return float(loss), np.nan_to_num(np.asarray(slope, np.float64), posinf=0.0, neginf=0.0)
+
+
+class CrossEntropy:
+    """The cross-entropy method, whose generations are batches."""
+
+    def __init__(self, loop: Loop, weights: NDArray[Any], random: np.random.Generator):
+        self._loop, self._random, self._value = loop, random, jax.jit(jax.vmap(loop.loss(None)))
+        self._mean, self._width = weights, np.full(weights.shape, WIDTH)
+
+    def update(self) -> tuple[NDArray[Any], float]:
+        """Return the mean of the next generation, and what it cost [episodes]."""
+        drawn = self._mean + self._width * self._random.standard_normal((POPULATION, len(self._mean)))
+        starts = np.repeat(self._loop.starts(self._random, 1), POPULATION, axis=0)
+        losses = rewards(self._loop, self._value, drawn, starts)
+        best = drawn[np.argsort(-losses)[:ELITE]]
+        self._mean, self._width = best.mean(0), np.maximum(best.std(0), NARROWEST)
+        return self._mean, float(POPULATION)
+
+
+def rewards(loop: Loop, value: Any, weights: NDArray[Any], starts: NDArray[Any]) -> NDArray[Any]:
+    """Return rewards (b,) of policies (b, w) and starts (b, n, 2); of lost episodes the lowest."""
+    found = -np.asarray(value(jnp.asarray(weights, jnp.float32), jnp.asarray(starts, jnp.float32)))
+    return np.where(np.isfinite(found), found, loop.task.lowest)
+
+
 @dataclass(frozen=True)
 class Job:
-    """The training of the policies of some seeds at once, by one method."""
+    """The training of one seed's policy by one method."""
 
     task: str
     method: str
-    seeds: tuple[int, ...]
+    seed: int
     steps: int
     budget: int
     device: str
 
-    def run(self) -> list[Row]:
-        """Return a row for each seed: rewards of test episodes over the number of simulated steps."""
+    def run(self) -> Row:
+        """Return rewards of test episodes over the number of simulated steps."""
         task = TASKS[self.task]
         loop = Loop(task, Simulation(task.scene, self.device, "float32"), max(self.steps // task.substeps, 1))
-        value = jax.jit(jax.vmap(loop.loss(None)))
+        value, random = jax.jit(jax.vmap(loop.loss(None))), np.random.default_rng([self.seed])
         tests = loop.starts(np.random.default_rng(0), TESTS)
-        weights = np.stack([loop.weights(seed) for seed in self.seeds])
-        random, history, taken = np.random.default_rng(self.seeds), [], 0.0
+        weights, taken, history = loop.weights(self.seed), 0.0, list[tuple[float, float]]()
 
-        def check(weights: NDArray[Any]) -> None:
-            found = self._each(value, np.repeat(weights, TESTS, axis=0), np.tile(tests, (len(weights), 1, 1)))
-            history.append((taken, -found.reshape(len(weights), TESTS).mean(1)))
-            print(f"{self.task} {self.method} {self.seeds}: {taken:,.0f} {np.round(history[-1][1], 4)}", flush=True)
+        def check() -> None:
+            found = rewards(loop, value, np.repeat(weights[None], TESTS, axis=0), tests).mean()
+            history.append((taken, float(found)))
+            print(f"{self.task} {self.method} {self.seed}: {taken:,.0f} {found:.4f}", flush=True)
 
-        check(weights)
-        update, cost = (self._cem if self.method == "CEM" else self._adam)(loop, value, weights, random)
+        check()
+        method = (
+            CrossEntropy(loop, weights, random)
+            if self.method == "CEM"
+            else Descent(loop, METHODS[self.method], weights, random, self.device)
+        )
+        cost = 0.0
         while taken + cost <= self.budget:
-            weights = update()
+            weights, episodes = method.update()
+            cost = episodes * loop.steps
             taken += cost
             if taken >= len(history) * self.budget / CHECKS or taken + cost > self.budget:
-                check(weights)
-        own = {"task": self.task, "method": self.method, "cost": cost, "steps": [at for at, _ in history]}
-        return [
-            {**own, "seed": seed, "rewards": [float(r[b]) for _, r in history]} for b, seed in enumerate(self.seeds)
-        ]
-
-    def _each(self, function: Any, weights: NDArray[Any], starts: NDArray[Any]) -> NDArray[Any]:
-        """Return losses of policies and starts, one after the other or in one batch; of lost episodes the worst."""
-        found = np.asarray(function(jnp.asarray(weights, jnp.float32), jnp.asarray(starts, jnp.float32)))
-        return np.where(np.isfinite(found), found, -TASKS[self.task].lowest)
-
-    def _adam(self, loop: Loop, value: Any, weights: NDArray[Any], random: Any) -> tuple[Callable[[], Any], float]:
-        mapped, seeds = jax.vmap(loop.loss(METHODS[self.method])), len(weights)
-        slope = jax.jit(jax.grad(lambda w, x: mapped(jnp.repeat(w, EPISODES, axis=0), x).sum() / EPISODES))
-        x = jnp.asarray(loop.starts(random, seeds * EPISODES), jnp.float32)
-        w = jnp.asarray(weights, jnp.float32)
-        longer = seconds(self.device, slope, w, x) / seconds(self.device, value, jnp.repeat(w, EPISODES, axis=0), x)
-        cost, now = EPISODES * loop.steps * longer, weights
-        rate = optax.cosine_decay_schedule(RATE, int(self.budget // cost) or 1)
-        optimiser = optax.chain(optax.clip_by_global_norm(CLIP), optax.adam(rate))
-        memory = [optimiser.init(jnp.asarray(own)) for own in weights]
-
-        def update() -> NDArray[Any]:
-            nonlocal now
-            starts = jnp.asarray(loop.starts(random, seeds * EPISODES), jnp.float32)
-            found = np.nan_to_num(np.asarray(slope(jnp.asarray(now, jnp.float32), starts)), posinf=0.0, neginf=0.0)
-            for b, own in enumerate(found):
-                change, memory[b] = optimiser.update(jnp.asarray(own, jnp.float32), memory[b])
-                now = np.where(np.arange(seeds)[:, None] == b, now + np.asarray(change), now)
-            return now
-
-        return update, cost
-
-    def _cem(self, loop: Loop, value: Any, weights: NDArray[Any], random: Any) -> tuple[Callable[[], Any], float]:
-        mean, width = weights, np.full(weights.shape, WIDTH)
-
-        def update() -> NDArray[Any]:
-            nonlocal mean, width
-            drawn = mean[:, None] + width[:, None] * random.standard_normal((len(mean), POPULATION, mean.shape[1]))
-            starts = np.repeat(loop.starts(random, len(mean)), POPULATION, axis=0)
-            losses = self._each(value, drawn.reshape(-1, mean.shape[1]), starts).reshape(len(mean), POPULATION)
-            best = np.take_along_axis(drawn, np.argsort(losses, axis=1)[:, :ELITE, None], axis=1)
-            mean, width = best.mean(1), np.maximum(best.std(1), NARROWEST)
-            return mean
-
-        return update, float(POPULATION * loop.steps)
+                check()
+        own = {"task": self.task, "method": self.method, "seed": self.seed}
+        return {**own, "steps": [at for at, _ in history], "rewards": [reward for _, reward in history]}
 
 
 def seconds(device: str, function: Any, *given: Any) -> float:
     """Return how long a call takes, of the processor or on a GPU: the shorter one of two, after the first."""
     ends = []
     for _ in range(3):
-        function(*given).block_until_ready()
+        jax.block_until_ready(function(*given))
         ends.append(time.process_time() if device == "cpu" else time.perf_counter())
     return float(np.diff(ends).min())
 
@@ -270,14 +324,14 @@ def draw(rows: list[Row], path: Path) -> None:
 def table(rows: list[Row]) -> str:
     """Return the table of last rewards."""
     lines = [
-        "| task | method | steps of an update | reward at last: median [least, greatest] | first |",
-        "|---|---|---|---|---|",
+        "| task | method | reward at last: median [least, greatest] | first |",
+        "|---|---|---|---|",
     ]
     for task, method in dict.fromkeys((row["task"], row["method"]) for row in rows):
         own = [row for row in rows if (row["task"], row["method"]) == (task, method)]
         last, first = ([row["rewards"][k] for row in own] for k in (-1, 0))
         ends = f"{np.median(last):.4f} [{min(last):.4f}, {max(last):.4f}]"
-        lines.append(f"| {task} | {method} | {own[0]['cost']:,.0f} | {ends} | {np.median(first):.4f} |")
+        lines.append(f"| {task} | {method} | {ends} | {np.median(first):.4f} |")
     return "\n".join(lines)
 
 
@@ -288,13 +342,12 @@ def main() -> None:
     parser.add_argument("--method", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
     parser.add_argument("--steps", type=int, default=800, help="simulated steps of an episode")
-    parser.add_argument("--budget", type=int, default=240_000, help="simulated steps of a training")
+    parser.add_argument("--budget", type=int, default=112_000, help="simulated steps of a training")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--processes", type=int, default=1, help="more than 1: a seed and method at a time in each")
     parser.add_argument("--out", type=Path, default=Path("runs/policies"), help="files of former calls are kept")
     asked = parser.parse_args()
-    groups = [(seed,) for seed in asked.seeds] if asked.processes > 1 else [tuple(asked.seeds)]
-    each = [(task, method, group) for task in asked.task for method in asked.method for group in groups]
+    each = [(task, method, seed) for task in asked.task for method in asked.method for seed in asked.seeds]
     jobs = [Job(*own, asked.steps, asked.budget, asked.device) for own in each]
     asked.out.mkdir(parents=True, exist_ok=True)
     if asked.processes > 1:
@@ -303,9 +356,9 @@ def main() -> None:
             found = list(pool.map(Job.run, jobs))
     else:
         found = [job.run() for job in jobs]
-    for (task, method, group), rows in zip(each, found, strict=True):
-        (asked.out / f"{task}-{method}-{'-'.join(map(str, group))}.json").write_text(json.dumps(rows))
-    rows = [row for file in sorted(asked.out.glob("*.json")) for row in json.loads(file.read_text())]
+    for own, row in zip(each, found, strict=True):
+        (asked.out / f"{'-'.join(map(str, own))}.json").write_text(json.dumps(row))
+    rows = [json.loads(file.read_text()) for file in sorted(asked.out.glob("*.json"))]
     draw(rows, asked.out / "policies.png")
     (asked.out / "policies.md").write_text(table(rows) + "\n")
     print(table(rows))
