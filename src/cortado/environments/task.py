@@ -121,6 +121,9 @@ class Task(ABC):
     def __post_init__(self) -> None:
         if self.size not in ("small", "large"):
             raise InputError(f'size is {shown(self.size)}, but must be "small" or "large".')
+        needed = ("name", "horizon", "repeats", "coarse_spacing", "coarse_step", "lowest")
+        if missing := [name for name in needed if not hasattr(self, name)]:
+            raise InputError(f"{type(self).__name__} has no {', '.join(missing)}, but must have {', '.join(needed)}.")
 
     @property
     def fineness(self) -> int:
