@@ -193,6 +193,7 @@ ASIDE = {
     ("PlaneDrain", "name"): "what the balance calls it",
     ("SinkDrain", "name"): "what parameters call it",
     ("Picture", "colour"): "what is computed colours: tests/test_films.py",
+    ("Picture", "quality"): "in space alone: tests/test_shading.py",
     ("SceneTables", "name"): "titles",
     ("SheetSolid", "file"): "in place of corners: tests/test_sheets.py",
     ("SolidTable", "name"): "what others call it",

@@ -193,7 +193,7 @@ class Descent:
         found *= (moved @ turned) / (turned @ turned)
         for (moved, turned), own in zip(self._pairs, reversed(shares), strict=True):
             found += moved * (own - turned @ found / (moved @ turned))
-        found *= -min(1.0, FARTHEST / np.linalg.norm(found))
+        found *= -min(1.0, FARTHEST / float(np.linalg.norm(found)))
         return found
 
     def update(self) -> tuple[NDArray[Any], float]:
