@@ -200,6 +200,8 @@ ASIDE = {
     ("HingeTable", "name"): "what messages call it",
     ("HingeTable", "axis"): "in space alone: tests/test_hinges.py",
     ("HingeTable", "torque"): "in place of torques: tests/test_springs.py",
+    ("SolidTable", "friction"): "where bodies touch: tests/test_free_bodies.py",
+    ("SolidTable", "restitution"): "where bodies touch: tests/test_free_bodies.py",
     ("SolidTable", "inertia"): "in place of gyration_radius: tests/test_body_masses.py",
     ("SpringTable", "name"): "what sensors and parameters call it",
     ("SpringTable", "preload"): "in place of rest_length: tests/test_springs.py",

@@ -82,7 +82,7 @@ def test_particles_by_speed_have_a_colour_bar(tmp_path):
     speed = np.linalg.norm(points, axis=1)
     plain = plots.particles([points], ["a"], tmp_path / "a.png")
     coloured = plots.particles([points], ["a"], tmp_path / "b.png", colours=[speed], colour_label="speed [m/s]")
-    yellow = (254, 232, 56)
+    yellow = (253, 231, 37)
     assert share_of(yellow, pixels(coloured)) > 0.002 and share_of(yellow, pixels(plain)) == 0.0
 
 

@@ -275,7 +275,7 @@ def test_a_first_lattice_can_be_jittered(tmp_path):
     assert np.abs(moves[:100]).max() <= 0.2 * SPACING and np.abs(moves[:100]).std() > 0.05 * SPACING
     assert not moves[100:].any() and len(moves) > 102
     assert discretise(stirred).fluid.positions.tobytes() == discretise(stirred).fluid.positions.tobytes()
-    assert stirred.computed_json() != even.computed_json() and "jitter" not in even.computed_json()
+    assert stirred.computed_json() != even.computed_json() and "jitter" not in even.computed_json().split("emitter")[0]
     with pytest.raises(SceneError, match=r"discretisation.jitter is 0\.4, but must be at least 0 and at most 0"):
         even.replaced("discretisation.jitter=0.4")
 

@@ -446,7 +446,7 @@ def test_pictures_change_neither_results_nor_whether_a_search_goes_on(tmp_path):
     assert len({problem.fingerprint for problem in problems}) == 1
     folder = RunFolder.create(tmp_path / "run", plain.to_json(), [], kind="optimise")
     folder.require(other.to_json(), "optimise")
-    aside = ("picture", "sensor", "force", "solid", "hinge", "spring", "drain")
+    aside = ("picture", "sensor", "force", "solid", "hinge", "spring", "drain", "emitter")
     former = {name: table for name, table in json.loads(plain.to_json()).items() if name not in aside}
     unused = [("discretisation", "jitter"), ("solver", "courant"), ("solver", "greatest_time_step")]
     for table, key in (*unused, ("container", "material"), ("container", "colour")):
