@@ -1,6 +1,26 @@
 """Cortado: a differentiable SPH fluid simulator with verified gradients.
 
-Names are imported when they are first used, so that ``import cortado`` is quick.
+Begin, in Python::
+
+    scene = cortado.Scene(
+        dimension=2,
+        discretisation={"spacing": 0.04},  # m
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 1.0}],  # kg/m3, Pa s
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "water"}],
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.8, 0.8]},
+        solver={"time_step": 0.002},  # s
+    )
+    simulation = cortado.Simulation(scene, precision="float64")
+    gauge = cortado.sensors.WaveGauge([0.2, 0.0])
+    trajectory = simulation.run(40, record_every=10, sensors={"gauge": gauge})
+    print(trajectory.sensors["gauge"]["height"])
+    cortado.pictures.write_picture("last.png", trajectory.picture())
+    problem = cortado.Problem(simulation, 20, cortado.losses.SensorMatch(gauge, [0.31]))
+    value, gradient = problem.value_and_gradient({"gravity": [0.5, -9.81], "viscosity": 1.0})
+
+``cortado new dam`` writes a scene file with comments, which ``cortado.Simulation("dam.toml")`` takes, and ``cortado
+schema`` prints all keys with their meanings. Names are imported when they are first used, so that ``import cortado`` is
+quick.
 """
 
 from cortado.lazy import getter
