@@ -284,10 +284,10 @@ def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
     """Return places (frames, n, d) [m] of particles in pictures; those that wait in an emitter are at its opening, and
     those that a drain took in its middle."""
     places, others, count = trajectory.positions, trajectory.others, trajectory.particles
+    out = np.array([is_out(scene, frame.others, count) for frame in (trajectory if scene.emitter else ())])
     for name, first, sample in samples(scene, count):
         if outlet_name(name) in others:
-            waiting = np.array([sample.waits(name, first, frame.others, count) for frame in trajectory])
-            waiting &= ~np.array([is_out(scene, frame.others, count) for frame in trajectory])
+            waiting = np.array([sample.waits(name, first, frame.others, count) for frame in trajectory]) & ~out
             places = np.where(waiting[..., None], others[outlet_name(name)], places) if waiting.any() else places
     for number, drain in enumerate(scene.drain, 1):
         places = np.where((others["drained"] == number)[..., None], drain.middle(scene.dimension), places)
@@ -305,9 +305,7 @@ def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
     since, count = np.full(trajectory.positions.shape[:2], float(trajectory.times[0])), trajectory.particles
     for name, first, sample in samples(scene, count):
         if emitted_name(name) in trajectory.others:
-            came = np.asarray(trajectory.others[emitted_name(name)], dtype=np.float64).reshape(len(trajectory), -1)[
-                :, 0
-            ]
+            came = np.reshape(trajectory.others[emitted_name(name)], (len(trajectory), -1))[:, 0].astype(np.float64)
             line = np.array([sample.in_line(name, first, frame.others, count) for frame in trajectory])
             since = np.where(line > 0.0, np.interp(line, came, trajectory.times, right=np.inf), since)
     return np.maximum(trajectory.times[:, None] - since, 0.0)

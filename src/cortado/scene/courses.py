@@ -351,3 +351,18 @@ def _check_knots(solid: Any, dimension: int, path: FieldPath) -> None:
         raise field_error((*path, "positions", 0), solid.positions[0], wanted)
     if solid.rotations is not None and any(solid.rotations[0]):
         raise field_error((*path, "rotations", 0), solid.rotations[0], "0, as it is not turned yet")
+
+
+def check_over_time(path: FieldPath, table: Any, values: str, constant: str) -> None:
+    """Check the ``times`` of a table, from 0 on, with as many ``values``, in place of the ``constant``; these are names
+    of its keys."""
+    times: Sequence[float] = table.times or ()
+    given = getattr(table, values)
+    if len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
+        wanted = "at least two times, from 0 on, each greater than the one before"
+        raise field_error((*path, "times"), MISSING if table.times is None else times, wanted)
+    if given is None or len(given) != len(times):
+        found = MISSING if given is None else Words(f"a list of {len(given)}")
+        raise field_error((*path, values), found, f"a list of {len(times)}, as are times")
+    if (alone := getattr(table, constant)) is not None:
+        raise field_error((*path, constant), alone, f"left out, as there are {values}")

@@ -1,6 +1,5 @@
 """Drains, which take particles out of the fluid: their tables, and the parameters of those that suck."""
 
-from itertools import pairwise
 from math import inf
 from typing import Annotated, Any, Literal, Self
 
@@ -10,7 +9,7 @@ from pydantic import Field, model_validator
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError, Words
-from cortado.scene.courses import Knots, values_in_file
+from cortado.scene.courses import Knots, check_over_time, values_in_file
 from cortado.scene.parameters import Axis, Parameter, Range
 from cortado.scene.shape_tables import File, check_order
 from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity
@@ -104,18 +103,10 @@ class FlowTable(Table):
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if self.file is not None:
             return self._read(dimension, path)
-        times, rates = self.times or (), self.flow_rates
-        if self.times is None and rates is None:
-            if self.flow_rate is None:
-                raise field_error((*path, "flow_rate"), MISSING, "given, or times with flow_rates, or a file")
-        elif len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
-            wanted = "at least two times, from 0 on, each greater than the one before"
-            raise field_error((*path, "times"), MISSING if self.times is None else times, wanted)
-        elif rates is None or len(rates) != len(times):
-            found = MISSING if rates is None else Words(f"a list of {len(rates)}")
-            raise field_error((*path, "flow_rates"), found, f"a list of {len(times)}, as are times")
-        elif self.flow_rate is not None:
-            raise field_error((*path, "flow_rate"), self.flow_rate, "left out, as there are flow_rates")
+        if self.times is not None or self.flow_rates is not None:
+            check_over_time(path, self, "flow_rates", "flow_rate")
+        elif self.flow_rate is None:
+            raise field_error((*path, "flow_rate"), MISSING, "given, or times with flow_rates, or a file")
         return super().in_dimension(dimension, path)
 
     def _read(self, dimension: int, path: FieldPath) -> Self:

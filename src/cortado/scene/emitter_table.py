@@ -248,10 +248,8 @@ def emitter_parameters(scene: Any) -> list[Parameter]:
     found = []
     for emitter in scene.emitter:
         outlet, course = np.array(emitter.outlet), None if emitter.path is None else emitter.path.knots
-        meaning, value = (
-            f"where the opening of the emitter {emitter.name} is after each step",
-            partial(_constant, outlet),
-        )
+        meaning = f"where the opening of the emitter {emitter.name} is after each step"
+        value = partial(_constant, outlet)
         found.append(replace(_PATH, name=path_name(emitter.name), meaning=meaning, value=value, course=course))
         found.append(emitter.flow_parameter(scene.dimension))
     return found

@@ -4,7 +4,6 @@ and parameters, and bound the time step.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from math import inf, sqrt
 from typing import Annotated, Any, Self
 
@@ -16,12 +15,12 @@ from cortado.arrays import unit
 from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Mass
 from cortado.errors import Words, shown
-from cortado.scene.courses import WAYS, Knots
+from cortado.scene.courses import WAYS, Knots, check_over_time
 from cortado.scene.motions import mass_of_one, weight_name
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.parameters import Axis, Parameter, Range, Source
 from cortado.scene.solids import SolidTable
-from cortado.scene.tables import MISSING, FieldPath, Flag, Length, Table, Text, Vector, field_error, quantity
+from cortado.scene.tables import FieldPath, Flag, Length, Table, Text, Vector, field_error, quantity
 
 Three = tuple[float, float, float]
 
@@ -76,17 +75,8 @@ class HingeTable(Table):
         return None if self.times is None else Knots(np.array(self.times), np.array(self.torques))
 
     def _check_torques(self, path: FieldPath) -> None:
-        times, torques = self.times or (), self.torques
-        if self.times is None and torques is None:
-            return
-        if len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
-            wanted = "at least two times, from 0 on, each greater than the one before"
-            raise field_error((*path, "times"), MISSING if self.times is None else times, wanted)
-        if torques is None or len(torques) != len(times):
-            found = MISSING if torques is None else Words(f"a list of {len(torques)}")
-            raise field_error((*path, "torques"), found, f"a list of {len(times)}, as are times")
-        if self.torque is not None:
-            raise field_error((*path, "torque"), self.torque, "left out, as there are torques")
+        if self.times is not None or self.torques is not None:
+            check_over_time(path, self, "torques", "torque")
 
 
 @dataclass(frozen=True)
