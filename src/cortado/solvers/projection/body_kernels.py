@@ -105,7 +105,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
         return pair_of(wp.length(gamma_of_i), wp.length(wp.cross(arm_i, gamma_of_i)))
 
     def weigh(density: real, pushed_volume: real, greatest: real, sizes_i: pair_of, whole: pair_of) -> real:
-        return wp.dot(sizes_i, pair_of(whole[0] / (density * pushed_volume), greatest * whole[1] / density))
+        return wp.dot(sizes_i, pair_of(whole[0] / pushed_volume, greatest * whole[1])) / density
 
     @particle_kernel(adjoint_module, "+sizes_bar")
     def share(whole_bar: pair_of) -> pair_of:
