@@ -9,7 +9,7 @@ FLAGS = "-march=native"
 """LLVM's own limits of inlining: kernels compile in two thirds of the time, and long gradients take a fifth more."""
 SAME_FLAGS = f"import warp as wp; wp.config.cpu_compiler_flags = {FLAGS!r}\n"
 """First line of a program whose kernels are those of the tests, so that they are compiled once."""
-COMPILING = re.compile(r"Compiling (\d+ kernel modules for \w+|kernels), once on this machine(: [\d.]+ s|\.)\n")
+COMPILING = re.compile(r"Compiling (\d+ kernel modules for \w+|kernels), each once on this machine(: [\d.]+ s|\.)\n")
 
 
 def without_compiling(err):

@@ -278,3 +278,13 @@ def test_points_fit_the_spacing_or_are_warned_of_or_refused(tmp_path):
         warnings.simplefilter("error", CortadoWarning)
         Simulation(points(tmp_path, 0.05))
         Simulation(points(tmp_path, 0.051))
+
+
+def test_points_that_overlap_a_body_are_told_of_both(tmp_path):
+    """A line of points where two boxes meet is a spacing apart, and nowhere nearer than half of one to the boxes."""
+    np.save(tmp_path / "points.npy", [[0.5, 0.05 * (k + 0.5)] for k in range(10)])
+    line = {"shape": "points", "file": str(tmp_path / "points.npy"), "phase": "water"}
+    box = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 0.5], "phase": "water"}
+    boxes = [box, {**box, "lower": [0.5, 0.0], "upper": [1.0, 0.5]}]
+    with pytest.raises(InputError, match=r"^fluid\[2\] is overlapping fluid\[0\] at \(0.5, .* 1.68 times the rest"):
+        Simulation(plane(fluid=[*boxes, line], container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}))

@@ -408,6 +408,8 @@ SERIES = "time,height\n0.0,1\n0.04,2\n0.02,1\n0.06,1\n"
         ("sensor", SERIES.replace("0.02", "0.04"), "has the time 0.04 s after 0.04 s"),
         ("sensor", SERIES.replace("time", "height"), "has 2 columns 'height'"),
         ("sensor", SERIES.replace("0.02", ""), "line 4 has the time nan"),
+        ("sensor", SERIES.replace("time", "time [ms]"), "has time in ms, but must have it in s"),
+        ("sensor", "time [s],height,left.height [m]\n0,1,1\n", "has 2 columns 'height'"),
     ],
 )
 def test_a_table_that_says_two_things_is_a_sentence(task, kind, text, words):
@@ -419,6 +421,17 @@ def test_a_table_that_says_two_things_is_a_sentence(task, kind, text, words):
     with one_sentence() as error:
         load_fit(task).experiments[0].experiment("cpu", "float32")
     assert words in str(error.value)
+
+
+def test_a_sensor_is_fitted_to_a_table_with_the_names_of_sensors_csv(task):
+    (one,) = load_fit(task).experiments
+    plain = one.experiment("cpu", "float32").observations["left gauge"].measured
+    table = task.parent / "fit_heights_left.csv"
+    head, *lines = table.read_text().splitlines()
+    assert head == "time,height"
+    mixed = "".join(f"\n{line},{k}" for k, line in enumerate(lines))
+    table.write_text(f"time [s],left.height [m],right.height [m]{mixed}\n")
+    assert np.array_equal(one.experiment("cpu", "float32").observations["left gauge"].measured, plain)
 
 
 @pytest.mark.parametrize(

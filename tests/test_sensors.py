@@ -549,7 +549,9 @@ def test_sensors_that_need_a_step_share_it(monkeypatch):
         alone |= simulation.run(5, sensors={name: sensor}).sensors
     assert len(solved) == 2  # of the last state alone: of all others the run's own steps tell
     solved.clear()
-    together = simulation.run(5, sensors=sensors).sensors
+    told: list[int] = []
+    together = simulation.run(5, sensors=sensors, observe=told.append).sensors
+    assert told == [1, 2, 3, 4, 5]
     assert len(solved) == 1
     for name, one in alone.items():
         assert one.values.tobytes() == together[name].values.tobytes(), name

@@ -524,6 +524,11 @@ def test_commands_write_pictures_and_films(tmp_path, monkeypatch, cortado_comman
     out = well("picture", "a", "--film", "--lines", "64", "--colour", "speed")
     told = "film.mp4: 4 frames, 0.9 s, at 0.0095 x, with 4.5 frames a second, as no more were recorded: --fps 16667 "
     assert told in out
+    well("picture", "a", "--lines", "72")
+    well("picture", "a", "--lines", "64")
+    report = (tmp_path / "a" / "report.html").read_text()
+    assert report.count("data:video/mp4") == 2 and report.count("<!-- picture.png -->") == 1
+    assert report.index("Drawn later") < report.index("<!-- film.mp4 -->") < report.index("How to run it again")
     out = well("optimise", "task.toml", "--out", "b")
     assert out.splitlines()[-1].endswith("; open figures/found.mp4, or report.html.")
     written = {path.name for path in (tmp_path / "b" / "figures").iterdir()}

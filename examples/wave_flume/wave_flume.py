@@ -15,6 +15,8 @@ Waves are compared with what was measured, and with linear theory of a flap that
 """
 
 import argparse
+import sys
+import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,8 +117,24 @@ def simulated(times, stroke, places, asked, has_section=False, rig=None, often=N
         simulation = cortado.Simulation(scene, device=asked.device, forces=[force])
         sensors = {f"{place:g}": WaveGauge([place, 0.0], radius=2.0 / asked.deep) for place in places}
         sensors |= {"load": SolidLoad("section")} if has_section and rig is None else {}
-        frames = 10**9 if often is None else max(round(often / step), 1)
-        return simulation.run(round(asked.end / step), record_every=frames, sensors=sensors)
+        frames, steps = 10**9 if often is None else max(round(often / step), 1), round(asked.end / step)
+        return simulation.run(steps, record_every=frames, sensors=sensors, observe=told(steps))
+
+
+def told(steps, every=10.0):
+    """A function of the number of a step, which says every so many seconds how far a run is."""
+    begun = last = None
+
+    def tell(step):
+        nonlocal begun, last
+        now = time.monotonic()
+        begun, last = begun or (step, now), last or now  # the first step compiles kernels
+        if now - last > every:
+            left = (now - begun[1]) * (steps - step) / (step - begun[0])
+            print(f"step {step:,} of {steps:,}, about {left:.0f} s left", file=sys.stderr, flush=True)
+            last = now
+
+    return tell
 
 
 def surface(run, times, places):

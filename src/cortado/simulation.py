@@ -1,6 +1,6 @@
 """A scene on a device in a precision: the thing that runs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
 from math import isqrt, prod
 from os import PathLike
@@ -190,6 +190,7 @@ class Simulation(Stepping):
         record: Sequence[str] = (),
         sensors: Mapping[str, Sensor] | None = None,
         time: float | None = None,
+        observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
         """Run from the scene's first state and return the frames, the first and the last state included; of a batch a
         `TrajectoryBatch`. A frame is kept every ``record_every`` steps. ``time`` [s], in the place of ``steps``: as
@@ -201,8 +202,9 @@ class Simulation(Stepping):
         value for each of the steps to come, and a rest density that the earlier run was given is given again. A batch
         goes on from one state for each scene. ``record=["density"]`` keeps quantities of the particles with every
         frame: see `quantity`. ``sensors`` by name are read in every step, besides those of the scene: see
-        `cortado.sensors`. Warns when the pressure did not converge; raises `DivergedError` when a particle is lost,
-        where a batch warns, and goes on without the scene.
+        `cortado.sensors`. ``observe`` is called with the number of each step, to show how far a run is. Warns when the
+        pressure did not converge; raises `DivergedError` when a particle is lost, where a batch warns, and goes on
+        without the scene.
         """
         own, number = self.__dict__, steps_of_run(self, steps, time, {} if controls is None else controls)
         rollout = own.pop("_idle", None)  # not to be had by a run within this one
@@ -211,7 +213,7 @@ class Simulation(Stepping):
         try:
             rollout.steps = number
             self._begin(rollout, controls, state, time)
-            return self.collect(rollout, record_every, record, sensors)
+            return self.collect(rollout, record_every, record, sensors, observe)
         finally:
             own["_idle"] = rollout
 
@@ -222,9 +224,10 @@ class Simulation(Stepping):
         record_every: int = 1,
         record: Sequence[str] = (),
         sensors: Mapping[str, Sensor] | None = None,
+        observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
-        """Run a rollout forward and return its frames. ``record_every``, ``record`` and ``sensors`` are those of `run`,
-        which warns and raises in the same way."""
+        """Run a rollout forward and return its frames. ``record_every``, ``record``, ``sensors`` and ``observe`` are
+        those of `run`, which warns and raises in the same way."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         expected = expected_frames(rollout, record_every)
@@ -239,7 +242,7 @@ class Simulation(Stepping):
 
         record_frame(0, rollout.initial)
         watch.first()
-        last = watch.run(lambda step: step % record_every == 0 or rollout.is_last(step), record_frame)
+        last = watch.run(lambda step: step % record_every == 0 or rollout.is_last(step), record_frame, observe)
         for sentence in trouble(rollout, self.scene):
             warn(sentence)
         fields, constants = frames.arrays(), self.constants(rollout)

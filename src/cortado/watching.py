@@ -87,7 +87,7 @@ class Watch:
         self,
         is_frame: Callable[[int], bool],
         record: Observer,
-        observe: Callable[[int], None] | None = None,
+        observe: Callable[[int], object] | None = None,
     ) -> State:
         """Run the rollout forward and return its last state. Sensors read every state; ``record`` is given frames.
 

@@ -13,6 +13,7 @@ from cortado.files.terminal import keeping
 from cortado.pictures.export_formats import export
 from cortado.pictures.film import ShownRun, coloured_by, film
 from cortado.pictures.image_files import write_picture
+from cortado.pictures.pages import add_to_report
 from cortado.pictures.run_pictures import device_of, run_page
 from cortado.pictures.several_runs import labels, runs_page, shown_alike
 from cortado.runs.frames import common_rate, pace_of
@@ -56,7 +57,7 @@ def draw_runs(
     settings: Mapping[str, Any],
 ) -> str:
     """Draw one recorded frame of a run, counted from the end where it is negative, or a film of all; of several runs
-    side by side. Return a sentence that says where it is."""
+    side by side. Return a sentence that says where it is. The report of a run shows what is drawn in its folder."""
     folders, device = named_runs(runs), device_of(device_name)
     look = scene_of_run(folders[0], overrides)
     others = [scene_of_run(folder, []) for folder in folders[1:]]
@@ -82,12 +83,16 @@ def draw_runs(
         with keeping(lambda: f"what is drawn is in {path}{further}"):
             pace = pace_of(times, picture, common_rate(run.marks for run in trajectories))
             made = film(path, page, range(len(times)), pace)
+        if path.parent == folders[0].figures:
+            add_to_report(folders[0], f"A film, {made.in_words}.", path)
         return f"The film is in {path}: {made.in_words}."
     if frame not in range(-len(times), len(times)):
         of = "the run has" if len(each) == 1 else "together the runs have"
         raise InputError(f"--frame is {frame}, but {of} {len(times)} frames, from 0.")
     path = out or place / f"{name}.png"
     write_picture(path, page.image(frame % len(times)))
+    if path.parent == folders[0].figures:
+        add_to_report(folders[0], f"The fluid at {times[frame]:.4g} s.", path)
     return f"The picture is in {path}{f': {page.notes}' if page.notes else ''}."
 
 

@@ -137,7 +137,7 @@ def announce(kernel: wp.Kernel, device: Any) -> None:
         _looked_at.add(module)
         if not _Said.anything and module.name.startswith("cortado_") and not _is_compiled(module, device):
             _Said.anything = True
-            note("Compiling kernels, once on this machine.")
+            note("Compiling kernels, each once on this machine.")
 
 
 def kernels_of(owner: Any) -> list[wp.Kernel]:
@@ -174,7 +174,7 @@ def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
     # For a GPU one after the other: NVRTC gains less from threads than it loses without its precompiled headers.
     cores = min(usable_cores(), MOST_CORES, len(missing)) if device.is_cpu else 1
     _Said.anything = True
-    with timed_note(f"Compiling {len(missing)} kernel modules for {device.alias}, once on this machine"):
+    with timed_note(f"Compiling {len(missing)} kernel modules for {device.alias}, each once on this machine"):
         _compile_all(missing, device, cores)
 
 

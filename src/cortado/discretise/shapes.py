@@ -263,9 +263,10 @@ def check_crowding(
     volume: float,
     spacing: float,
     period: Period,
+    bodies: Sequence[str] | NDArray[np.str_] = (),
 ) -> str | None:
     """Return a warning of particles that are crowded or hardly touch each other, where this may be meant; None of
-    others. Raise `InputError` where they would burst.
+    others. Raise `InputError` where they would burst; it says if two bodies overlap that are sound by themselves.
 
     Args:
         what: they in words, in the plural.
@@ -275,15 +276,18 @@ def check_crowding(
         volume: of a particle at rest [m^d].
         spacing: [m].
         period: as of `check_apart`.
+        bodies: (n,) the name of each particle's body.
     """
-    point, _, distances = pairs_within(positions, positions, support, *period)
-    seen = kernel.weight(distances, positions.shape[1], support)
-    densities = volume * np.bincount(point, seen, minlength=len(positions))  # over that of the lattice
-    average = float(np.maximum(densities - 1.0, 0.0).mean())
-    greatest, inside = densities.max(), float(np.quantile(densities, 0.75))  # away from the surface
+    point, other, distances = pairs_within(positions, positions, support, *period)
+    seen = volume * kernel.weight(distances, positions.shape[1], support)
+    densities = np.bincount(point, seen)  # over that of the lattice
+    average, greatest = _compression(densities), densities.max()
+    inside = float(np.quantile(densities, 0.75))  # away from the surface
     fit = spacing * inside ** (-1.0 / positions.shape[1])
     advice = f"discretisation.spacing is {spacing:g} m, and these points would fit one of {fit:.3g} m"
     if average > MOST_AVERAGE_COMPRESSION or greatest > MOST_DENSITY:
+        if len(bodies):
+            _check_meeting(np.asarray(bodies), positions, point, other, seen)
         place = ", ".join(f"{x:g}" for x in positions[densities.argmax()])
         raise InputError(
             f"{what[0].upper()}{what[1:]} have {greatest:.3g} times the rest density at ({place}) m and are compressed "
@@ -295,6 +299,32 @@ def check_crowding(
     if greatest < NOTED_DENSITY:
         return f"{what} have {greatest:.2g} times the rest density at most, and hardly touch each other: {advice}."
     return None
+
+
+def _compression(densities: NDArray[Any]) -> float:
+    return float(np.maximum(densities - 1.0, 0.0).mean())
+
+
+def _check_meeting(
+    bodies: NDArray[np.str_], positions: Points, point: Numbers, other: Numbers, seen: NDArray[Any]
+) -> None:
+    """Raise `InputError` where particles are crowded only by those of other bodies: (k,) pairs, and what a particle
+    adds to the density at another one."""
+    foreign = bodies[point] != bodies[other]
+    together = np.bincount(point, seen)
+    added = np.bincount(point, seen * foreign)
+    alone = together - added
+    if alone.max() > MOST_DENSITY or _compression(alone) > MOST_AVERAGE_COMPRESSION:
+        return
+    worst = int(np.argmax(np.where(added > 0.0, together, 0.0)))
+    near = np.flatnonzero(foreign & (point == worst))
+    second, first = sorted((bodies[worst], bodies[other[near[np.argmax(seen[near])]]]), reverse=True)
+    place = ", ".join(f"{x:g}" for x in positions[worst])
+    raise InputError(
+        f"{second} is overlapping {first} at ({place}) m, where both together have {together[worst]:.3g} times the "
+        f"rest density, but must have at most {MOST_DENSITY:g} times, and be compressed by at most "
+        f"{MOST_AVERAGE_COMPRESSION:.0%} on average: move one away from the other."
+    )
 
 
 def check_apart(what: str, positions: Points, spacing: float, period: Period) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 
 from cortado.device.modules import compile_meanwhile
 from cortado.errors import InputError, SceneError
-from cortado.files.disk import read_columns
 from cortado.files.terminal import announce
 from cortado.losses import Snapshot
 from cortado.optimisation.fitting.experiment import Experiment
@@ -38,6 +37,7 @@ from cortado.pictures.shown_solids import solid_outline
 from cortado.pictures.tracing.space import State
 from cortado.runs.frames import Pace, pace_of
 from cortado.runs.probes import sensors_of
+from cortado.runs.sensor import measured_columns
 from cortado.scene.appearance import Picture
 from cortado.scene.emitter_table import OF_OPENINGS
 from cortado.scene.parameter_values import Arrays, Tilt
@@ -371,12 +371,12 @@ def _(table: SensorSeriesTable, simulation: Simulation, folder: Path, last: floa
     if table.sensor not in sensors:
         raise InputError(f"sensor is {table.sensor!r}, but must be one of {', '.join(sensors) or 'the [[sensor]]s'}.")
     sensor, path = sensors[table.sensor], folder / table.file
-    data = _with(read_columns(path), ("time",), path)
+    known = sensor.columns(simulation.dimension)
+    data = _with(measured_columns(path, known, table.sensor, sensors), ("time",), path)
     falls = np.flatnonzero(np.diff(data["time"]) <= 0.0)
     if len(falls):
         before, after = data["time"][falls[0] : falls[0] + 2]
         raise InputError(f"{path} has the time {after:g} s after {before:g} s, but times must rise from line to line.")
-    known = sensor.columns(simulation.dimension)
     names = [name for name in data if name != "time"]
     for name in names:
         if name not in known:
@@ -391,7 +391,7 @@ def _(table: SensorSeriesTable, simulation: Simulation, folder: Path, last: floa
 @observation.register
 def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> Observation:
     path, axes = folder / table.file, ["x", "y", "z"][: simulation.dimension]
-    data = _with(read_columns(path), ("time", "tracer", *axes), path)
+    data = _with(measured_columns(path, dict.fromkeys(axes, "m")), ("time", "tracer", *axes), path)
     times, when = _instants(data["time"] + table.start, 1e-9 * max(last, 1e-300))
     tracers, who = np.unique(data["tracer"], return_inverse=True)
     once, often = np.unique(np.stack([when, who]), axis=1, return_counts=True)

@@ -163,7 +163,8 @@ class VideoTable(MeasuredTable):
 
 
 class SensorSeriesTable(MeasuredTable):
-    """What a sensor measured: a CSV file with a column "time" [s], and columns by the names of the sensor's numbers."""
+    """What a sensor measured: a CSV file with a column "time" [s], and columns by the names of the sensor's numbers.
+    They may be named as in `sensors.csv`, such as "gauge.height [m]"; columns of other sensors are left out."""
 
     kind: Literal["sensor"]
     """A series, compared with a [[sensor]] of the scene; heights of a surface are those of a "wave_gauge"."""

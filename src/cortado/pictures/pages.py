@@ -6,6 +6,7 @@ network.
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -40,6 +41,7 @@ _KINDS = {
     **{".webp": "image/webp", ".mp4": "video/mp4", ".webm": "video/webm"},
 }
 WIDE = ' style="width: 100%"'
+AGAIN, LATER = "<h2>How to run it again</h2>", "<h2>Drawn later</h2>"
 MOST_WRITTEN_OUT = 12
 """Most numbers that are written out one by one."""
 
@@ -89,7 +91,7 @@ def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> 
 <body>
 <h1>{_safe(title)}</h1>
 {parts}
-<h2>How to run it again</h2>
+{AGAIN}
 {_again(folder)}
 {_details("Scene", folder.scene)}
 {_details("Where it ran", folder.environment)}
@@ -99,6 +101,17 @@ def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> 
 """
     write_atomically(folder.report, page.encode(errors="backslashreplace"))  # names of files may not be UTF-8
     return folder.report
+
+
+def add_to_report(folder: RunFolder, caption: str, path: Path) -> None:
+    """Show a picture or a film of a run, drawn later, in its report, where it has one; a file is shown once."""
+    page = folder.report.read_text(encoding="utf-8") if folder.report.exists() else ""
+    before, again, after = page.partition(AGAIN)
+    if again:
+        mark = f"<!-- {_safe(path.name)} -->"
+        before = re.sub(f"{re.escape(mark)}.*\n", "", before) if LATER in before else f"{before}{LATER}\n"
+        page = f"{before}{mark}{_figure(caption, path)}\n{again}{after}"
+        write_atomically(folder.report, page.encode(errors="backslashreplace"))
 
 
 def written(value: Any) -> str:

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -303,4 +303,26 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
         found.append(MeasuredColumn(name, own.units[column], times[within], values[within], simulated, left_out))
     if not found:
         raise InputError(f"{path} has times alone, but must have some of {', '.join(known)}.")
+    return found
+
+
+def measured_columns(
+    path: Path, units: Mapping[str, str], own: str = "", sensors: Collection[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """Return the columns of a table, (lines,) by name. As in sensors.csv, a name may have the ``own`` sensor before it
+    and its unit in brackets behind it; columns of other ``sensors`` are left out. Raises `InputError` for a column in
+    another unit, or twice."""
+    found: dict[str, NDArray[Any]] = {}
+    for head, values in read_columns(path).items():
+        name, unit = name_and_unit(head)
+        whose, _, column = name.rpartition(".")
+        if whose in sensors and whose != own:
+            continue
+        name = column if whose == own else name
+        wanted = {"time": "s", **units}.get(name, unit)
+        if unit is not None and unit != wanted:
+            raise InputError(f"{path} has {name} in {unit}, but must have it in {wanted}.")
+        if name in found:
+            raise InputError(f"{path} has 2 columns {name!r}, but must have each of them once.")
+        found[name] = values
     return found

@@ -318,7 +318,7 @@ def discretise(scene: Scene) -> DiscreteScene:
     fluid = replace(fluid, velocities=_velocities(scene, fluid))
     if any(isinstance(body, PointsFluid) for body in scene.fluid):
         of_lattice = kernel, support, lattice.volume, spacing
-        told = check_crowding("the points of the fluid", fluid.positions, *of_lattice, scene.periods)
+        told = check_crowding("the points of the fluid", fluid.positions, *of_lattice, scene.periods, fluid.names)
         if told is not None:
             warn(told)
     return DiscreteScene(kernel, lattice, fluid, masses, layers, walls, scene.periods[1])

@@ -209,6 +209,13 @@ class FluidSample:
         return replace(self, sizes=tuple(np.diff(ends, prepend=0).tolist()), emitters=emitters, **arrays)
 
     @property
+    def names(self) -> NDArray[np.str_]:
+        """Return the name (n,) of each particle's body, such as "fluid[1]"."""
+        named = *(f"fluid[{k}]" for k in range(len(self.sizes))), *(f"emitter {name}" for name, _, _ in self.emitters)
+        ends = *np.cumsum(self.sizes), *(first for _, first, _ in self.emitters[1:]), len(self.positions)
+        return np.repeat(named, np.diff(ends[: len(named)], prepend=0))
+
+    @property
     def emitted(self) -> slice:
         """Return the slice of the emitters' particles."""
         count = len(self.positions)
