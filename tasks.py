@@ -34,15 +34,17 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "docs-links": ("sphinx-build", "--builder", "linkcheck", "--quiet", "docs", "build/docs-links"),
     "docs-browser": ("python", "docs/site/look.py", "build/docs"),
 }
-SEVERAL = {
+SEVERAL: dict[str, tuple[str, ...]] = {
     "setup": (),
-    "test": ("lint", "format", "types", "tests"),
-    "test-all": ("lint", "format", "types", "tests-all"),
+    "test": ("lint", "format", "tests"),
+    "test-all": ("lint", "format", "tests-all"),
     **{name: (name,) for name in COMMANDS},
     "docs-browser": ("docs", "docs-browser"),
 }
 EXTRAS = {"demo": ("pictures,view",), **{name: ("test", "docs") for name in COMMANDS if name.startswith("docs")}}
 """What a task needs; all others need what tests do."""
+BESIDE = {"test": "types", "test-all": "types"}
+"""What runs beside the last command of a task: it has one core busy for most of a minute."""
 SANITIZED = "build/sanitize"
 MADE = {"docs": "build/docs/index.html"}
 """What a task says at its end."""
@@ -59,7 +61,11 @@ def main(arguments: list[str]) -> int:
     if name == "sanitize":
         return sanitize()
     for part in SEVERAL[name]:
-        code = run((*COMMANDS[part], *(options if part == SEVERAL[name][-1] else ())))
+        is_last = part == SEVERAL[name][-1]
+        with ThreadPoolExecutor() as pool:
+            beside = [pool.submit(run, COMMANDS[BESIDE[name]])] if is_last and name in BESIDE else []
+            code = run((*COMMANDS[part], *(options if is_last else ())))
+        code = code or max((other.result() for other in beside), default=0)
         if code:
             return code
         if part in MADE:

@@ -156,8 +156,9 @@ def qualified(node: ast.AST, outer: str = "") -> Iterator[tuple[str, ast.Functio
 def adjoints(package: Path) -> dict[str, set[str]]:
     """Functions by module that have the word adjoint in their name, without those that only make such functions."""
     found: dict[str, set[str]] = {}
-    for path in sorted(package.rglob("*.py")):
-        for name, function in qualified(ast.parse(path.read_text())):
+    texts = {path: path.read_text() for path in sorted(package.rglob("*.py"))}
+    for path in (path for path, text in texts.items() if "adjoint" in text):
+        for name, function in qualified(ast.parse(texts[path])):
             maker = any(isinstance(statement, ast.FunctionDef) for statement in function.body)
             if "adjoint" in function.name.split("_") and not maker:
                 found.setdefault(".".join(path.relative_to(package).with_suffix("").parts), set()).add(name)

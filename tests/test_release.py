@@ -63,11 +63,16 @@ def test_make_has_all_tasks():
     assert {name for name, parts in tasks.SEVERAL.items() if "docs" in parts} == {"docs", "docs-browser"}
 
 
-def test_a_task_ends_with_the_first_failure(monkeypatch):
+ALL = ["mypy", "pytest", "ruff", "ruff"]
+
+
+@pytest.mark.parametrize(("fails", "wanted"), [("format", ALL[2:]), ("mypy", ALL), ("pytest", ALL)])
+def test_a_task_ends_with_the_first_failure(monkeypatch, fails, wanted):
+    """Types are looked at beside the tests."""
     ran = []
     monkeypatch.setattr(tasks, "set_up", lambda extra: None)
-    monkeypatch.setattr(tasks, "run", lambda command: ran.append(command[0]) or (3 if command[0] == "mypy" else 0))
-    assert tasks.main(["test"]) == 3 and ran == ["ruff", "ruff", "mypy"]
+    monkeypatch.setattr(tasks, "run", lambda command: ran.append(command[0]) or (3 if fails in command else 0))
+    assert tasks.main(["test"]) == 3 and sorted(ran) == wanted
     assert tasks.main(["lint", "--fix"]) == 0
 
 
