@@ -210,10 +210,18 @@ def settling_ball(across: int, wide: float, step: float, duration: float, device
 
 def sinking(scene: Scene, exact: float, duration: float, device: str) -> dict[str, float]:
     """How fast the free body of a scene, 0.1 m across in syrup of 0.1 m2/s, sinks in the last quarter of a run, over an
-    ``exact`` speed [m/s], and by how much of that it swings about its course."""
-    name = next(solid.name for solid in scene.solid if solid.motion == "free")
+    ``exact`` speed [m/s], and by how much of that it swings about its course. Before that the body is as heavy as the
+    syrup for as long: where a surface cuts the lattice there is room, and in syrup particles take their time to it."""
+    name, density = next((solid.name, solid.density) for solid in scene.solid if solid.motion == "free")
     simulation, steps = Simulation(scene, device, precision="float64"), round(duration / scene.solver.time_step)
-    run = simulation.run(steps, record_every=steps, sensors={"body": BodyMotion(name)})
+    settled = simulation.run(steps, {f"{name}.density": 1000.0}, record_every=steps)
+    run = simulation.run(
+        steps,
+        {f"{name}.density": density},
+        state=settled.last_state,
+        record_every=steps,
+        sensors={"body": BodyMotion(name)},
+    )
     late = run.sensors["body"]["velocity_y"][3 * steps // 4 :]
     course = np.polyval(np.polyfit(np.arange(len(late)), late, 2), np.arange(len(late)))
     return {

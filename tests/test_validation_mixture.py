@@ -119,7 +119,7 @@ def growth(wavelength: int, substep: float | None = None) -> np.ndarray:
     x, k = simulation.positions[:, 0], RATIOS / (2.0 * width)
     first = 0.5 + 2.5e-5 * np.cos(k * x[:, None] + np.arange(4)).sum(axis=1)
     until = 32.0 * width**2
-    last = run(simulation, first, until, 1 if substep is None else int(np.ceil(until / substep))).mass_fractions[-1]
+    last = run(simulation, first, until, 4 if substep is None else int(np.ceil(until / substep))).mass_fractions[-1]
     waves = np.exp(-1j * k * x[:, None])
     size, first_size = (np.abs((c - 0.5) @ waves) for c in (last[:, 0], first))
     return np.log(size / first_size) / until / (k**2 * (0.5 - width**2 * k**2))

@@ -146,13 +146,7 @@ def _per_cent(found: list[dict[str, float]]) -> list[float]:
     return [100.0 * one[name] for one in found for name in ("u", "v")]
 
 
-BODIES = (
-    "torus",
-    "200,000 triangles",
-    "bodies that overlap",
-    "a torus that crosses itself",
-    "a sheet one spacing thick",
-)
+BODIES = "torus", "200,000 triangles", "bodies that overlap", "a torus that crosses itself"
 TEN = "added-mass, a sphere 8 across, 20 deep, 2 iterations, 10 steps"
 ROWS = {
     "cavity": Measure(("cavity, Re 100, 50 x 50",), _per_cent),
@@ -165,7 +159,7 @@ ROWS = {
     ),
     "piston": Measure(("piston, kd = 1.5, 20 deep",), values("over theory")),
     "plunged_box": Measure(("plunged-box, 24",), values("upwards", "sideways")),
-    "taylor_couette": Measure(("taylor-couette, 40 across",), values("inner", "outer")),
+    "taylor_couette": Measure(("taylor-couette, 40 across",), lambda found: [-found[0]["inner"], found[0]["outer"]]),
     "turning_cup": Measure(("turning-cup",), values("rise")),
     "floating_box": Measure(("floating-box",), values("draft over the exact one")),
     "added_mass": Measure(
