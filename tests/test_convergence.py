@@ -8,7 +8,7 @@ import pytest
 
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
-from cortado.optimisation.sweep import Extrapolation
+from cortado.cli.compare import Extrapolation
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensor import Readings
 

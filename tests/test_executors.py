@@ -16,7 +16,7 @@ import pytest
 
 import cortado
 from cortado import ComputationError, CortadoWarning, DivergedError, InputError, Problem, Simulation, executors
-from cortado.cli.options import Where
+from cortado.cli.arguments import Where
 from cortado.device import worker_calls as calls
 from cortado.device.threads import usable_cores
 from cortado.errors import OutOfRangeError
@@ -448,7 +448,7 @@ def test_no_more_processes_than_items(monkeypatch):
         started.append((number, device))
         yield InProcess()
 
-    monkeypatch.setattr("cortado.cli.options.local_workers", local_workers)
+    monkeypatch.setattr("cortado.executors.local_workers", local_workers)
     for workers, items in ((40, 1), (3, 8), (2, 0)):
         with Where(workers=workers).executor("cuda:0", items):
             pass

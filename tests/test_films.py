@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import cortado
-from cortado.cli.picture import camera_override
+from cortado.cli.existing_runs import camera_override
 from cortado.device.launching import BandLauncher
 from cortado.discretise.shapes import corners
 from cortado.errors import InputError, SceneError

@@ -33,7 +33,7 @@ except KeyboardInterrupt as stop:
 WORKERS = f"""{START}
 import os, signal
 from multiprocessing.context import SpawnProcess
-from cortado.cli.options import Where
+from cortado.cli.arguments import Where
 
 start, begun = SpawnProcess.start, []
 

@@ -55,7 +55,7 @@ MODULES = modules()
 MOST_PACKAGES = 17
 MOST_LINES = 450
 ON_TOP = ("pictures", "environments", "cli", "__main__", "measured")
-ON_TOP += tuple(f"optimisation.{name}" for name in ("dataset_files", "datasets", "fitting", "sweep"))
+ON_TOP += tuple(f"optimisation.{name}" for name in ("dataset_files", "datasets", "fitting"))
 ON_TOP += tuple(f"optimisation.{name}" for name in ("solved_task", "task_files", "task_tables"))
 """Packages, and modules, that lie on top of the core; `cortado` itself has the names of all."""
 

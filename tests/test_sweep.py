@@ -20,9 +20,9 @@ from cortado import InputError, Trajectory
 from cortado import executors as of_dask
 from cortado.cli import main
 from cortado.cli.arguments import ALL_FRAMES
+from cortado.cli.sweep import combinations, write_table
 from cortado.executors import Distributed, InProcess
 from cortado.files.terminal import Interrupted
-from cortado.optimisation.sweep import combinations, write_table
 from cortado.runs.sensor import Readings, from_csv, summary
 from dask_processes import PATIENCE, scheduler
 
@@ -268,7 +268,7 @@ def test_a_sweep_has_no_more_processes_than_combinations(sweep, monkeypatch):
         numbers.append(number)
         yield InProcess()
 
-    monkeypatch.setattr("cortado.cli.options.local_workers", local_workers)
+    monkeypatch.setattr("cortado.executors.local_workers", local_workers)
     one = ("task.toml", "--set", "problem.steps=4", "--out", "all")
     assert sweep(*one, "--workers", 40)[0] == 0 and numbers == [1]
     code, out, err = sweep(*one, "--workers", 10**6)

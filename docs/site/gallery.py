@@ -49,7 +49,7 @@ class Entry:
         """Run the scene into a folder, and write the picture and the film into another."""
         from PIL import Image
 
-        from cortado.cli.picture import draw_runs
+        from cortado.cli.existing_runs import draw_runs
         from cortado.cli.run import RunRequest, run_scene
         from cortado.runs.recording import FramesPerSecond
         from cortado.runs.trajectory import Trajectory

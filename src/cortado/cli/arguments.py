@@ -5,8 +5,8 @@ What is asked of the values of arguments is checked here, before a command begin
 
 import io
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import partial, wraps
 from inspect import Parameter, signature
@@ -19,10 +19,12 @@ from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
 from cortado.errors import InputError
-from cortado.files.terminal import quietly
+from cortado.files.disk import LOCK
+from cortado.files.terminal import keeping, quietly
 from cortado.scene.scene import read_toml
 
 if TYPE_CHECKING:
+    from cortado.executors import Executor
     from cortado.runs.recording import FrameChoice
 
 Work = Callable[[], str]
@@ -116,6 +118,57 @@ class FrameOptions:
 
 
 ALL_FRAMES = FrameOptions()
+
+
+@dataclass(frozen=True)
+class Where:
+    """The options --scheduler and --workers of a command; raises `InputError` for both of them, and for more processes
+    than make sense."""
+
+    scheduler: str | None = None
+    """The address of a scheduler of Dask's."""
+    workers: int | None = None
+    """Number of worker processes on this machine."""
+
+    def __post_init__(self) -> None:
+        if self.scheduler is not None and self.workers is not None:
+            raise InputError("--scheduler and --workers are both given, but only one of them can be meant.")
+        if self.workers is not None:
+            from cortado.executors import require_processes
+
+            require_processes("--workers", self.workers)
+
+    @property
+    def option(self) -> str | None:
+        """Return the option that was given."""
+        return "--scheduler" if self.scheduler is not None else None if self.workers is None else "--workers"
+
+    @contextmanager
+    def executor(self, device: str, items: int) -> "Iterator[Executor]":
+        """Yield the executor: a Dask scheduler if one is given, workers if they are asked for, or else this process.
+        Workers end with the block, and on a GPU each has one of its own. There are no more of them than ``items``,
+        the computations that run at a time."""
+        from cortado.executors import Distributed, InProcess, local_workers
+
+        if self.scheduler is not None:
+            with Distributed(self.scheduler) as there:
+                yield there
+        elif self.workers is not None:
+            processes = min(self.workers, max(items, 1))
+            with keeping(lambda: ""), local_workers(processes, device.partition(":")[0]) as here:
+                yield here
+        else:
+            yield InProcess()
+
+
+HERE = Where()
+"""Computation in this process."""
+
+
+def require_shared(out: Path, what: str) -> None:
+    """Raise `InputError` where a worker process does not see a folder in which its command is at work."""
+    if not (out / LOCK).exists():
+        raise InputError(f"A worker does not see {out}, but {what} must be in a file system that all machines share.")
 
 
 def require_at_least(least: int, value: int, option: str) -> None:

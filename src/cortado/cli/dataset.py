@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cortado.calls import counted
-from cortado.cli.options import HERE, Where, require_shared
+from cortado.cli.arguments import HERE, Where, require_shared
 from cortado.errors import (
     ComputationError,
     CortadoWarning,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from cortado.calls import counted
+from cortado.cli.arguments import HERE, Where
 from cortado.cli.optimise_report import (
     MOST_ERROR,
     Verdict,
@@ -22,7 +23,6 @@ from cortado.cli.optimise_report import (
     sections,
     worst_in_words,
 )
-from cortado.cli.options import HERE, Where
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
 from cortado.files.disk import locked

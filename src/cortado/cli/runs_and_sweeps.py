@@ -14,6 +14,7 @@ from cortado.cli.arguments import (
     Json,
     Overrides,
     Precision,
+    Where,
     Work,
     as_text,
     require_at_least,
@@ -72,7 +73,6 @@ def sweep(
     frames.check()
     combinations, together = as_text(sets), as_text(zips)
     read_toml(file)
-    from cortado.cli.options import Where
     from cortado.cli.sweep import run_sweep
 
     where = Where(scheduler, workers)
@@ -120,7 +120,6 @@ def dataset(
     """
     words = text_overrides(file, overrides)
     from cortado.cli.dataset import make_dataset
-    from cortado.cli.options import Where
 
     return partial(make_dataset, file, runs, out, words, device, precision, Where(scheduler, workers))
 
@@ -157,7 +156,7 @@ def picture(
         _refuse(words, ("colour",), "--colour says so already")
     if not film:
         _refuse(words, ("film_frames", "film_speed"), "one picture is drawn: add --film")
-    from cortado.cli.picture import camera_override, draw_runs, picture_settings
+    from cortado.cli.existing_runs import camera_override, draw_runs, picture_settings
 
     replaced, settings = camera_override(camera) + words, picture_settings(lines, colour)
     return partial(draw_runs, runs, -1 if frame is None else frame, film, out, replaced, device, settings)
@@ -186,7 +185,7 @@ def export(
             raise InputError(
                 f"--set is {word}, but must replace picture.colour or picture.surface: others act in pictures."
             )
-    from cortado.cli.picture import export_run
+    from cortado.cli.existing_runs import export_run
 
     return partial(export_run, run, to, out, every, words)
 

@@ -25,6 +25,7 @@ from cortado.cli.arguments import (
     Program,
     Scene,
     Task,
+    Where,
     Work,
     as_text,
     command,
@@ -214,7 +215,6 @@ def optimise(
     require_one_of_both(resume, overwrite)
     words, told = text_overrides(task, overrides), command_line()
     from cortado.cli.optimise import optimise_task
-    from cortado.cli.options import Where
 
     where = Where(scheduler, workers)
     return partial(optimise_task, task, out, words, device, precision, resume, overwrite, told, where, pictures)

@@ -1,24 +1,165 @@
-"""``cortado sweep``: a scene or a task with every combination of some values, on any number of processes."""
+"""``cortado sweep``: a scene or a task with every combination of some values, on any number of processes, and the table
+of their results."""
 
+import csv
+import io
+import json
+import re
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
+from itertools import product
+from math import prod
 from pathlib import Path
 from typing import Any
 
 from cortado.arrays import check_steps
 from cortado.calls import counted
-from cortado.cli.arguments import ALL_FRAMES, FrameOptions, steps_or_time
+from cortado.cli.arguments import ALL_FRAMES, HERE, FrameOptions, Where, require_shared, steps_or_time
+from cortado.cli.existing_runs import SWEEP
 from cortado.cli.optimise import optimise_task, search_settings
-from cortado.cli.options import HERE, Where, require_shared
 from cortado.cli.run import RunRequest, run_scene, run_settings
-from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, unwarned, warn
-from cortado.files.disk import locked
+from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, shown, unwarned, warn
+from cortado.files.disk import locked, write_atomically
 from cortado.files.terminal import Interrupted, keeping, track, untracked
-from cortado.optimisation.sweep import NAME, Combination, combinations, failed, write_table
 from cortado.optimisation.task_files import load_task
 from cortado.runs.recording import FrameChoice
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.scene import load_scene, read_toml
+
+MOST_COMBINATIONS = 100_000
+"""Most combinations of a sweep; more are taken for a mistake."""
+_LONGEST_NAME = 120
+"""Most characters of a folder's name."""
+_PAIRS = {"[": "]", "{": "}"}
+_PLAIN = re.compile(r"[A-Za-z0-9_=,.+-]+")
+"""Names of folders that need no quotes in a shell."""
+
+
+@dataclass(frozen=True)
+class Combination:
+    """One value for each key of a sweep."""
+
+    values: tuple[tuple[str, str], ...]
+    """(key, value as the user wrote it) in the order of the options."""
+
+    @property
+    def overrides(self) -> list[str]:
+        """Return the values as options ``--set`` of `cortado run` and `cortado optimise`."""
+        return [f"{key}={value}" for key, value in self.values]
+
+    @property
+    def name(self) -> str:
+        """Return the name of its folder: the values; where these are long or strange, some of them with a checksum. It
+        does not depend on the other combinations of a sweep."""
+        name = ",".join(self.overrides)
+        if _PLAIN.fullmatch(name) and len(name) <= _LONGEST_NAME and not name.startswith(("-", ".")):
+            return name
+        plain = re.sub(r"[^A-Za-z0-9_=,.+-]+", "_", name).lstrip("-.")[:_LONGEST_NAME]
+        return f"{plain}-{sha256(name.encode()).hexdigest()[:8]}"
+
+
+def combinations(options: Sequence[str], zipped: Sequence[str] = ()) -> list[Combination]:
+    """Return every combination of the values of all keys, the first key changing slowest; the values of ``zipped`` keys
+    go together, the first of one with the first of the others, and change fastest. Raises `InputError`."""
+    if not options and not zipped:
+        raise InputError("--set is missing, but must name what changes, such as --set solver.time_step=0.001,0.002.")
+    keys, together = _values(options, "--set"), _values(zipped, "--zip")
+    if both := keys.keys() & together.keys():
+        raise InputError(f"--zip gives {min(both)}, which --set gives too, but must give other keys.")
+    lengths = {len(values) for values in together.values()}
+    if len(lengths) > 1:
+        told = ", ".join(f"{len(values)} of {key}" for key, values in together.items())
+        raise InputError(f"--zip gives {told}, but must give as many values of each, as they go together.")
+    rows = [tuple(zip(together, row, strict=True)) for row in zip(*together.values(), strict=True)]
+    number = prod(map(len, keys.values())) * max(len(rows), 1)
+    if number > MOST_COMBINATIONS:
+        raise InputError(f"--set makes {number:,} combinations, but there may be {MOST_COMBINATIONS:,} at most.")
+    own = [tuple(zip(keys, values, strict=True)) for values in product(*keys.values())]
+    return [Combination((*values, *row)) for values in own for row in rows or [()]]
+
+
+def _values(options: Sequence[str], name: str) -> dict[str, list[str]]:
+    """Return the values of each key; raise `InputError` in a sentence with the name of the option."""
+    keys: dict[str, list[str]] = {}
+    for option in options:
+        key, equals, text = option.partition("=")
+        key, values = key.strip(), [value.strip() for value in _split(text)]
+        if not equals or not key or not all(values):
+            raise InputError(f"{name} is {shown(option)}, but must have the form key=value,value.")
+        if key in keys:
+            raise InputError(f"{name} gives {key} twice, but must give each key once, with all its values.")
+        if len(set(values)) < len(values) and name == "--set":
+            raise InputError(f"{name} is {shown(option)}, but must give each value of {key} once.")
+        keys[key] = values
+    return keys
+
+
+def _split(text: str) -> list[str]:
+    """Split a text at its commas, but not at those within brackets or quotes."""
+    parts, closing, quote = [""], [], ""
+    for letter in text:
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "\"'":
+            quote = letter
+        elif letter in _PAIRS:
+            closing.append(_PAIRS[letter])
+        elif closing and letter == closing[-1]:
+            closing.pop()
+        elif letter == "," and not closing:
+            parts.append("")
+            continue
+        parts[-1] += letter
+    return parts
+
+
+MOST_NUMBERS = 12
+"""Most numbers of a list that the table shows; longer ones are in the result.json of each folder alone."""
+
+
+def write_table(folder: Path, combinations: Sequence[Combination], results: Mapping[int, Mapping[str, Any]]) -> None:
+    """Write the table, whole or not at all.
+
+    ``results``: what came out, as in result.json, by the number of the combination. Columns: the folder, every key that
+    changes, "done" or "failed", every number that came out, and why it failed.
+    """
+    rows = [
+        {
+            "folder": combinations[number].name,
+            **dict(combinations[number].values),
+            "status": "failed" if failed(result) else "done",
+            **_flat({name: value for name, value in result.items() if name != "failures"}),
+            "failures": " ".join(result["failures"]),
+        }
+        for number, result in sorted(results.items())
+    ]
+    columns = list(dict.fromkeys(column for row in rows for column in row if column != "failures")) + ["failures"]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(folder / SWEEP, text.getvalue())
+
+
+def failed(result: Mapping[str, Any]) -> bool:
+    """Return True if a result has failures."""
+    return bool(result["failures"])
+
+
+def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Return tables within tables as one, with names joined by full stops; short lists as JSON, longer ones not."""
+    found: dict[str, Any] = {}
+    for name, value in result.items():
+        if isinstance(value, Mapping):
+            found |= _flat(value, f"{before}{name}.")
+        elif not isinstance(value, list):
+            found[f"{before}{name}"] = value
+        elif len(text := json.dumps(value)) and text.count(",") < MOST_NUMBERS:
+            found[f"{before}{name}"] = text
+    return found
+
 
 SAME_TIME = 1e-9
 """Relative difference below which times are equal."""
@@ -161,7 +302,7 @@ def run_sweep(
     failures = sum(map(failed, done.values()))
     _warn_of_times(member, [chosen[number] for number in done if not failed(done[number])])
     all_of_them = f"Of {counted(len(chosen), 'combination')}{f', {there} of them there already,' if there else ''}"
-    table = f"table is {out.absolute() / NAME}, beside a folder for each."
+    table = f"table is {out.absolute() / SWEEP}, beside a folder for each."
     if failures:
         first = next(number for number in sorted(done) if failed(done[number]))
         why = " ".join(done[first]["failures"])

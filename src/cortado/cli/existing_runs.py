@@ -1,14 +1,18 @@
-"""``cortado picture`` and ``cortado export``: pictures, films and files of other programs, of runs."""
+"""What commands do with runs that are there: ``cortado picture`` and ``cortado export``, functions of the user's own of
+runs, and which runs are named."""
 
+import csv
 import json
 import os
+import runpy
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cortado.cli.options import named_runs
-from cortado.errors import InputError
+import numpy as np
+
+from cortado.errors import CortadoError, InputError, shown
 from cortado.files.terminal import keeping
 from cortado.pictures.export_formats import export
 from cortado.pictures.film import ShownRun, coloured_by, film
@@ -22,6 +26,67 @@ from cortado.runs.trajectory import Trajectory
 from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
+
+SWEEP = "sweep.csv"
+"""Name of the table of a sweep."""
+
+
+def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
+    """Return the runs that are named, in each folder of a sweep all of them, in the order of its table. Raise
+    `InputError` for a folder without a run."""
+    if not folders:
+        raise InputError("RUN is missing, but must be the folder of a run, or of a sweep.")
+    found: list[RunFolder] = []
+    for folder in folders:
+        inner, order = sorted(one.parent for one in folder.glob("*/environment.json")), folders_in(folder)
+        inner.sort(key=lambda one: order.index(one.name) if one.name in order else len(order))
+        found += [RunFolder.open(one) for one in inner or [folder]]
+    return found
+
+
+def folders_in(folder: Path) -> list[str]:
+    """Return the names of the folders in the table of a sweep, in its order; none without a table that can be read."""
+    try:
+        with open(folder / SWEEP, newline="", encoding="utf-8") as file:
+            return [row["folder"] for row in csv.DictReader(file)]
+    except (OSError, ValueError, KeyError, csv.Error):
+        return []
+
+
+class OwnQuantity:
+    """A user's function of a trajectory that returns a number."""
+
+    def __init__(self, where: str):
+        """Run the file of ``FILE.py:FUNCTION``; raise `InputError` for one that cannot be run, or has no such
+        function."""
+        file, _, name = where.rpartition(":")
+        if not file.endswith(".py") or not name.isidentifier():
+            raise InputError(f"--quantity is {shown(where)}, but must be FILE.py:FUNCTION.")
+        try:
+            function = runpy.run_path(str(Path(file))).get(name)
+        except Exception as problem:
+            raise InputError(f"--quantity {where} cannot be read: {_told(problem)}.") from problem
+        if not callable(function):
+            raise InputError(f"{file} has no function {name}, but must, as --quantity names it.")
+        self.where, self.name, self._function = where, name, function
+
+    def __call__(self, trajectory: Trajectory) -> float:
+        """Return the number of a trajectory; raise `InputError` where the function fails, or returns something else."""
+        try:
+            found = self._function(trajectory)
+            value = np.asarray(found, dtype=np.float64)
+        except CortadoError:
+            raise
+        except Exception as problem:
+            raise InputError(f"--quantity {self.where} failed: {_told(problem)}.") from problem
+        if value.ndim:
+            raise InputError(f"--quantity {self.where} returned {shown(found)}, but must return a number.")
+        return float(value)
+
+
+def _told(problem: Exception) -> str:
+    """Return the kind and the words of an error, on one line."""
+    return " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".")
 
 
 def picture_settings(lines: int | None, colour: str | None) -> dict[str, Any]:
