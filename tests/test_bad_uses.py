@@ -84,6 +84,7 @@ REFUSED = [
     (lambda at: at.loss({"gravity": np.array(["a", "b"])}), "parameter gravity is made of text, but must be a number"),
     (lambda at: at.loss({"gravity": np.array([None, 1], object)}), "parameter gravity is array([None, 1]"),
     (lambda at: at.loss({"gravity": [[1, 2], [3]]}), "parameter gravity is [[1, 2], [3]], but must be a number or an"),
+    (lambda at: at.jax.grad(lambda a: at.loss({"gravity": [a, 0.0]}))(1.0), "numbers: make one with jax.numpy.stack"),
     (lambda at: at.loss({"gravity": {"x": 1.0}}), "parameter gravity is a table, but must be a number or an array"),
     (lambda at: at.loss({3: 1.0}), "parameters has the name 3, but must have texts as names."),
     (lambda at: at.step_from({**at.state, "positions": np.zeros((48, 2), np.float32)}), "state positions are usually"),

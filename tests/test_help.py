@@ -10,6 +10,10 @@ import pydantic
 import pytest
 
 import cortado
+from cortado.scene.fluids import BoxFluid
+from cortado.scene.model import Phase
+from cortado.scene.solvers import ProjectionSolver
+from cortado.scene.tables import field_docstrings
 
 GIVEN = {
     "AdjointEstimator",
@@ -123,6 +127,20 @@ def test_help_of_a_method_names_every_argument(path):
 def test_help_has_an_example_that_can_be_called(path):
     assert (code := example(MADE[path])), f"the docstring of {path} ends without an example"
     assert faults(code) == []
+
+
+@pytest.mark.parametrize("table", [cortado.Scene, Phase, BoxFluid, ProjectionSolver])
+def test_help_of_a_table_lists_its_keys(table):
+    """Each with its meaning, where the schema has one; its signature has the keys alone."""
+    own = inspect.getdoc(table).partition("Keys:")[2]
+    listed = {
+        key: " ".join(text.split()) for key, text in re.findall(r"^- (\w+) ((?:.*\n?)(?:  .*\n?)*)", own, re.MULTILINE)
+    }
+    assert [*listed] == [*table.model_fields] == [*inspect.signature(table).parameters]
+    texts = field_docstrings(table)
+    assert [key for key in listed if " ".join(texts.get(key, "").split()) not in listed[key]] == []
+    assert "typing" not in str(inspect.signature(table))
+    assert "Keys:" not in table.model_json_schema()["description"]
 
 
 def test_what_help_lacks_is_found():

@@ -242,7 +242,9 @@ def test_parts_built_in_python_raise_the_same_error():
 
 def test_unreadable_files_are_a_sentence(tmp_path):
     (tmp_path / "latin.toml").write_bytes(b'dimension = 3\nname = "caf\xe9"\n')
-    for name, reason in {"absent.toml": "No such file", ".": "directory", "latin.toml": "line 2"}.items():
+    (tmp_path / "made.json").write_text("{}")
+    reasons = {"absent.toml": "No such file", ".": "directory", "latin.toml": "line 2", "made.json": "Scene.from_json"}
+    for name, reason in reasons.items():
         with one_sentence(reason, error=SceneError):
             load_scene(tmp_path / name)
 

@@ -16,7 +16,7 @@ from cortado.pictures.run_pictures import shown_as
 from cortado.pictures.several_runs import ShownFrames, common_times, labels, runs_page
 from cortado.pictures.stage import Stage
 from cortado.scene.appearance import Picture
-from cortado.scene.scene import unit_of
+from cortado.scene.schema_words import unit_of
 from scenes import plane, scene
 
 SMALL = {"width": 256, "height": 144}

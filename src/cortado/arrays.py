@@ -52,7 +52,9 @@ def as_numbers(what: str, value: Any) -> np.ndarray:
             found = Words(f"made of {REFUSED[kind]}") if array.ndim and kind in REFUSED else value
     except Exception:  # whatever another library raises when it is asked for an array
         found = value
-    raise InputError(f"{what} is {shown(found)}, but must be a number or an array of real numbers.")
+    listed = value if isinstance(value, (list, tuple)) else ()
+    advice = ": make one with jax.numpy.stack" if any("Tracer" in type(one).__name__ for one in listed) else ""
+    raise InputError(f"{what} is {shown(found)}, but must be a number or an array of real numbers{advice}.")
 
 
 def as_precise_numbers(what: str, value: Any) -> np.ndarray:

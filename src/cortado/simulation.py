@@ -365,6 +365,8 @@ class Simulation(Stepping):
             SceneError: settings that do not fit.
             InputError: what ``colour`` names was not recorded in the frame, or is the age, which one frame does not
                 tell.
+
+        Example: ``cortado.pictures.write_picture("last.png", simulation.picture(trajectory[-1]))``
         """
         image: ShadedPicture = on_top("simulation_picture")(self, frame, settings)
         return image

@@ -21,7 +21,7 @@ from cortado.device.threads import frame_parts, gradient_parts, simulation_parts
 from cortado.discretise.shapes import EXCESS
 from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.files.disk import make_folder
-from cortado.files.terminal import tell, timed_note
+from cortado.files.terminal import note, tell, timed_note
 from cortado.losses import CentreOfMass, FinalPositions, Image, Loss
 from cortado.optimisation.task_files import load_task, task_in_words
 from cortado.pictures.image_files import write_picture
@@ -140,11 +140,10 @@ def describe_scene(
     count = sum(body.count(scene.discretisation.spacing) for body in (*scene.fluid, *scene.emitter))
     with timed_note(f"About {count:,.0f} particles are made") if count > MANY else nullcontext():
         simulation = Simulation(scene, device, precision)
+    note("Some steps and pictures are timed.")
     found = _described(simulation, length := RunLength(simulation, steps, time, frames))
-    if length.film is not None:
-        found["picture_seconds"] = seconds_of_picture(simulation, "traced")
-        if scene.dimension == 3:
-            found["quick_picture_seconds"] = seconds_of_picture(simulation, "quick")
+    for quality in ("traced", "quick")[: 0 if length.film is None else scene.dimension - 1]:
+        found[f"{quality}_picture_seconds".removeprefix("traced_")] = seconds_of_picture(simulation, quality)
     if "optimise" in read_toml(scene_file):
         found["search"] = task_in_words(load_task(scene_file, overrides))
     if picture is not None:

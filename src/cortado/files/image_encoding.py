@@ -99,7 +99,8 @@ def png(image: ArrayLike) -> bytes:
 
 
 class ShadedPicture(np.ndarray):
-    """A linear picture (rows, columns, 3) from 0 to 1: a NumPy array that notebooks show as a picture."""
+    """A linear picture (rows, columns, 3) from 0 to 1: a NumPy array that notebooks show as a picture, and that
+    `cortado.pictures.write_picture` saves."""
 
     @classmethod
     def of(cls, image: ArrayLike) -> Self:

@@ -34,7 +34,8 @@ from cortado.runs.frames import Film, common_rate, pace_of
 from cortado.runs.run_folder import computed, differences
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.appearance import Picture
-from cortado.scene.scene import Scene, as_scene, unit_of
+from cortado.scene.scene import Scene, as_scene
+from cortado.scene.schema_words import unit_of
 
 
 @public

@@ -337,8 +337,11 @@ class Trajectory:
         self, k: int = -1, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
     ) -> ShadedPicture:
         """Draw a shaded picture of frame k, (rows, columns, 3), linear from 0 to 1, which a notebook shows. The camera
-        is where it sees the fluid in every frame. The arguments
-        ``scene``, ``device`` and ``settings`` and the errors are those of `film`."""
+        is where it sees the fluid in every frame. The arguments ``scene``, ``device`` and ``settings`` and the errors
+        are those of `film`.
+
+        Example: ``cortado.pictures.write_picture("last.png", trajectory.picture(width=640, height=360))``
+        """
         image: ShadedPicture = on_top("trajectory_picture")(self, k, scene, device, settings)
         return image
 

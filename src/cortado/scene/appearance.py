@@ -306,8 +306,8 @@ class Picture(Table):
     """"liquid": the surface of the fluid; "spheres": a sphere for each particle, in 3-D."""
     quality: Literal["traced", "quick"] | None = None
     """"traced" follows light through fluid, up to three times in and out; "quick" follows it once, on a coarser
-    surface, in a third of the time, in 3-D. If left out films of `cortado run` and `optimise` are quick, and all else
-    is traced."""
+    surface, in about half of the time, in 3-D. If left out films of `cortado run` and `optimise` are quick, and all
+    else is traced."""
     camera: Place | None = None
     """(3,) where the camera is [m], in 3-D; left out, it sees all of the container."""
     camera_path: AnyCameraPath | None = None

@@ -163,10 +163,11 @@ class DiscretisationTable(Table):
     spacing: Annotated[float, quantity("m", gt=0.0)]
     """Distance between particles at rest [m]."""
     support: Annotated[float, quantity(ge=1.2, le=4.0)] = 2.0
-    """Distance within which particles act on each other: support radius / spacing."""
+    """Distance within which particles act on each other: support radius / spacing. With the solver "projection" it is
+    2.6 if neither it nor the kernel is given."""
     kernel: Literal["cubic_spline", "wendland_c2", "wendland_c4"] = "cubic_spline"
-    """Name of the smoothing kernel. With the solver "projection" it is "wendland_c2", with a support of 2.6, if neither
-    is given."""
+    """Name of the smoothing kernel. With the solver "projection" it is "wendland_c2" if neither it nor the support is
+    given."""
 
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
     """How far a particle of a body is from its first place at most, along each axis and in spacings, the same in every

@@ -134,7 +134,9 @@ class _Schedule(Table):
         return self.model_copy(update=placed)
 
 
-Schedule: Any = create_model("Schedule", __base__=_Schedule, __module__=__name__, __doc__=_Schedule.__doc__, **_COURSES)
+Schedule: Any = create_model(
+    "Schedule", __base__=_Schedule, __module__=__name__, __doc__=vars(_Schedule)["__doc__"], **_COURSES
+)
 """A course for each parameter over time that changes, made from the registry of parameters."""
 
 AXES = ("turn_x", "turn_y", "turn_z")

@@ -10,7 +10,6 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,7 +20,7 @@ from cortado.arrays import as_one_number
 from cortado.calls import counted, point_in_words, public
 from cortado.device.threads import require, sampling_parts
 from cortado.errors import LONGEST, InputError, SceneError, Words, shown, warn
-from cortado.files.disk import SCHEMA, as_path, content, reason
+from cortado.files.disk import as_path, content, reason
 from cortado.scene.checks import check_bounded, check_scene
 from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.restart import RestartState
@@ -44,7 +43,24 @@ EMPTY = ("force", "solid", "hinge", "spring", "emitter", "drain")
 
 @public
 class Scene(SceneTables):
-    """A scene, from which a simulation starts: `SceneTables` that fit each other."""
+    """A scene, from which a simulation starts.
+
+    Its keys are those of a scene file. A table such as [discretisation] is a dict, and tables such as [[phase]] are a
+    list of dicts. What is missing or wrong is a `SceneError`, one sentence. A scene does not change: `replaced` makes
+    another one, with all checks, which pydantic's ``model_copy(update=...)`` leaves out.
+
+    Example::
+
+        scene = cortado.Scene(
+            dimension=2,
+            discretisation={"spacing": 0.04},
+            phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 1.0}],
+            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "water"}],
+            container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.8, 0.8]},
+            solver={"time_step": 0.002},
+        )
+        thick = scene.replaced("phase.water.viscosity=5.0")
+    """
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -282,6 +298,8 @@ def read_toml(
         raise _unreadable(file, f"is not text in UTF-8 (at line {line}).") from None
     except (ValueError, RecursionError) as problem:  # among them TOMLDecodeError, which names the line
         problem.__traceback__ = None  # it may have a thousand frames, too many to be pickled where a library does so
+        if file.endswith(".json"):
+            raise _unreadable(file, "is not TOML: Scene.from_json reads what Scene.to_json wrote.") from None
         said = _TWICE.sub(r"\g<0>; entries of a list are written [[\1]]", reason(problem))
         raise _unreadable(file, f"is not valid TOML: {said}.") from None
     except OSError as problem:
@@ -411,39 +429,3 @@ def _value(text: str) -> Any:
     except (ValueError, RecursionError):
         return text
     return parsed["value"] if parsed.keys() == {"value"} else text
-
-
-JsonSchema = dict[str, Any]
-
-
-def unit_of(key: str) -> str:
-    """Return the unit of the value of a scene with a dotted key, such as "Pa s" of ``phase.0.viscosity``; nothing where
-    it has none, or where shapes of a body have different ones."""
-    found = list(_choices(_schema()))
-    for part in key.split("."):
-        found = [choice for one in found for choice in _choices(_part(one, part))]
-    units = {choice["unit"] for one in found for choice in (one, *_choices(one.get("items", {}))) if "unit" in choice}
-    return units.pop() if len(units) == 1 and units != {"-"} else ""
-
-
-@cache
-def _schema() -> JsonSchema:
-    """Read the shipped JSON schema, which `Scene` is compared with in the tests."""
-    read: JsonSchema = json.loads(SCHEMA.read_text(encoding="utf-8"))
-    return read
-
-
-def _part(schema: JsonSchema, part: str) -> JsonSchema:
-    """Return the schema of an entry of a list, by its number, or of a table's field."""
-    found: JsonSchema = schema.get("items", {}) if part.isdigit() else schema.get("properties", {}).get(part, {})
-    return found
-
-
-def _choices(schema: JsonSchema) -> Iterator[JsonSchema]:
-    """Yield a schema, and those of which it has one or all."""
-    yield schema
-    if "$ref" in schema:
-        yield from _choices(_schema()["$defs"][schema["$ref"].rpartition("/")[2]])
-    for word in ("anyOf", "oneOf", "allOf"):
-        for one in schema.get(word, ()):
-            yield from _choices(one)

@@ -35,9 +35,8 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from cortado.errors import LONGEST, InputError, SceneError, Words, shown
+from cortado.scene.schema_words import GREATEST, Documented, Schema, any_of, wanted
 
-GREATEST = 1e50
-"""No number of a scene is larger, as its cube must fit into a float64, and no positive one smaller than its inverse."""
 MISSING = Words("missing")
 FieldPath = Sequence[str | int]
 
@@ -199,7 +198,6 @@ def _in_body(node: ast.ClassDef) -> dict[str, str]:
     }
 
 
-Schema = Mapping[str, Any]
 MOST_HOMES = 2
 """Most tables that have a key and are named in a sentence where the key stands in another table."""
 UNKNOWN = Words("unknown")
@@ -244,7 +242,7 @@ def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
     elif "discriminator" in schema and isinstance(found, Mapping):
         union = schema["discriminator"]
         path, found = [*path, union["propertyName"]], found.get(union["propertyName"], MISSING)
-        words = _any_of(union["mapping"])
+        words = any_of(union["mapping"])
     elif first["type"] in ("float_type", "finite_number"):
         words = f"a finite number{'' if words.startswith('a ') else f', {words}'}"
     elif first["type"] in ("less_than_equal", "greater_than_equal") and _is_out_of_size(found, schema):
@@ -306,54 +304,6 @@ def _whole(part: Schema) -> Schema:
     return part["allOf"][0] if "allOf" in part else part
 
 
-def wanted(schema: Schema, name: str = "") -> str:
-    """Describe a right value in words, from its part of a JSON schema; ``name`` is that of its field."""
-    match schema:
-        case {"enum": names}:
-            return _any_of(names)
-        case {"const": constant}:
-            return _any_of([constant])
-        case {"type": "number", "word": word}:
-            return f'{_limits(schema)} or "{word}"'
-        case {"type": "number"}:
-            return _limits(schema)
-        case {"type": "integer", "minimum": least, "maximum": most}:
-            return f"a whole number from {least} to {most}"
-        case {"type": "boolean"}:
-            return "true or false"
-        case {"type": "string"}:
-            return "a text that is not empty"
-        case {"type": "array", "components": [*first, last]}:
-            return f"a list of {len(first) + 1} components: {', '.join(first)} and {last}"
-        case {"type": "array", "items": {"$ref": _} | {"discriminator": _} | {"allOf": _}}:
-            return f"a list of at least one table, each written [[{name}]]"
-        case {"type": "array", "items": items, "minItems": 1, "maxItems": most}:
-            return f"a list of at most {most} components, each {wanted(items)}"
-        case {"type": "array", "items": items, "maxItems": _}:
-            return f"a list with one component for each axis, each {wanted(items)}"
-        case {"type": "array", "items": items}:
-            least = schema.get("minItems", 0)
-            entries = f" of at least {'one entry' if least == 1 else f'{least} entries'}" if least else ""
-            return f"a list{entries}, each {wanted(items)}"
-        case {"minProperties": _, "properties": properties}:
-            return f"a table of at least one parameter out of {', '.join(properties)}"
-    return "a table"
-
-
-def _any_of(names: Iterable[str]) -> str:
-    return " or ".join(f'"{name}"' for name in names)
-
-
-def _limits(schema: Schema) -> str:
-    """Describe the range of a number in words."""
-    unit = "" if schema["unit"] == "-" else f" {schema['unit']}"
-    least, most = schema["minimum"], schema["maximum"]
-    limits = [f"greater than {schema['exclusiveMinimum']:g}{unit}"] if "exclusiveMinimum" in schema else []
-    limits += [f"at least {least:g}{unit}"] if least not in (-GREATEST, 1.0 / GREATEST) else []
-    limits += [f"at most {most:g}{unit}"] if most != GREATEST else []
-    return " and ".join(limits) or f"a number{unit and f' in{unit}'}"
-
-
 ALSO_CALLED = {
     **dict.fromkeys(("dt", "step_size"), ("time_step",)),
     **dict.fromkeys(("dx", "h", "particle_size", "particle_radius", "resolution"), ("spacing",)),
@@ -375,7 +325,7 @@ ALSO_CALLED = {
 """Keys by the names that users of other programs have for them."""
 
 
-class Table(BaseModel):
+class Table(BaseModel, metaclass=Documented):
     """A table of the scene: frozen, without unknown keys, and with a `SceneError` for whatever is wrong."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -407,9 +357,13 @@ class Table(BaseModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Return the JSON schema with the docstrings of fields as their descriptions."""
+        """Return the JSON schema with the docstrings of the table and of its fields as their descriptions."""
         schema = handler(core_schema)
-        properties = handler.resolve_ref_schema(schema).get("properties", {})
+        own = handler.resolve_ref_schema(schema)
+        properties = own.get("properties", {})
+        if "description" in own:
+            words = inspect.cleandoc(cls.__dict__["__doc__"])  # without the keys that help lists
+            own["description"] = words.partition("\n\nExample")[0]
         texts = field_docstrings(cls)
         for name in properties.keys() & texts.keys():
             properties[name].setdefault("description", texts[name])

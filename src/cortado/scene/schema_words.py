@@ -1,0 +1,159 @@
+"""Words from the JSON schema of the tables of files: what a value must be, the units of keys, and the help of a table,
+which lists its keys."""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from inspect import Parameter, Signature, cleandoc
+from sys import modules
+from textwrap import fill
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel
+
+from cortado.files.disk import SCHEMA
+
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
+
+GREATEST = 1e50
+"""No number of a scene is larger, as its cube must fit into a float64, and no positive one smaller than its inverse."""
+Schema = Mapping[str, Any]
+
+
+def wanted(schema: Schema, name: str = "") -> str:
+    """Describe a right value in words, from its part of a JSON schema; ``name`` is that of its field."""
+    match schema:
+        case {"enum": names}:
+            return any_of(names)
+        case {"const": constant}:
+            return any_of([constant])
+        case {"type": "number", "word": word}:
+            return f'{_limits(schema)} or "{word}"'
+        case {"type": "number"}:
+            return _limits(schema)
+        case {"type": "integer", "minimum": least, "maximum": most}:
+            return f"a whole number from {least} to {most}"
+        case {"type": "boolean"}:
+            return "true or false"
+        case {"type": "string"}:
+            return "a text that is not empty"
+        case {"type": "array", "components": [*first, last]}:
+            return f"a list of {len(first) + 1} components: {', '.join(first)} and {last}"
+        case {"type": "array", "items": {"$ref": _} | {"discriminator": _} | {"allOf": _}}:
+            return f"a list of at least one table, each written [[{name}]]"
+        case {"type": "array", "items": items, "minItems": 1, "maxItems": most}:
+            return f"a list of at most {most} components, each {wanted(items)}"
+        case {"type": "array", "items": items, "maxItems": _}:
+            return f"a list with one component for each axis, each {wanted(items)}"
+        case {"type": "array", "items": items}:
+            least = schema.get("minItems", 0)
+            entries = f" of at least {'one entry' if least == 1 else f'{least} entries'}" if least else ""
+            return f"a list{entries}, each {wanted(items)}"
+        case {"minProperties": _, "properties": properties}:
+            return f"a table of at least one parameter out of {', '.join(properties)}"
+    return "a table"
+
+
+def any_of(names: Iterable[str]) -> str:
+    return " or ".join(f'"{name}"' for name in names)
+
+
+def _limits(schema: Schema) -> str:
+    """Describe the range of a number in words."""
+    unit = "" if schema["unit"] == "-" else f" {schema['unit']}"
+    least, most = schema["minimum"], schema["maximum"]
+    limits = [f"greater than {schema['exclusiveMinimum']:g}{unit}"] if "exclusiveMinimum" in schema else []
+    limits += [f"at least {least:g}{unit}"] if least not in (-GREATEST, 1.0 / GREATEST) else []
+    limits += [f"at most {most:g}{unit}"] if most != GREATEST else []
+    return " and ".join(limits) or f"a number{unit and f' in{unit}'}"
+
+
+def unit_of(key: str) -> str:
+    """Return the unit of the value of a scene with a dotted key, such as "Pa s" of ``phase.0.viscosity``; nothing where
+    it has none, or where shapes of a body have different ones."""
+    found = list(_choices(_schema()))
+    for part in key.split("."):
+        found = [choice for one in found for choice in _choices(_part(one, part))]
+    units = {choice["unit"] for one in found for choice in (one, *_choices(one.get("items", {}))) if "unit" in choice}
+    return units.pop() if len(units) == 1 and units != {"-"} else ""
+
+
+@cache
+def _schema() -> Schema:
+    """Read the shipped JSON schema, which `Scene` is compared with in the tests."""
+    read: Schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
+    return read
+
+
+def _part(schema: Schema, part: str) -> Schema:
+    """Return the schema of an entry of a list, by its number, or of a table's field."""
+    found: Schema = schema.get("items", {}) if part.isdigit() else schema.get("properties", {}).get(part, {})
+    return found
+
+
+def _choices(schema: Schema) -> Iterator[Schema]:
+    """Yield a schema, and those of which it has one or all."""
+    yield schema
+    if "$ref" in schema:
+        yield from _choices(_schema()["$defs"][schema["$ref"].rpartition("/")[2]])
+    for word in ("anyOf", "oneOf", "allOf"):
+        for one in schema.get(word, ()):
+            yield from _choices(one)
+
+
+_HOMES: dict[str, str] = {}
+"""The module of each table, by its name."""
+
+
+class Documented(ModelMetaclass):
+    """The class of tables, whose help has their keys, without the types that pydantic needs, and a line for each from
+    the shipped schema."""
+
+    def __init__(cls, name: str, *arguments: Any, **named: Any):
+        super().__init__(name, *arguments, **named)
+        _HOMES[name] = cls.__module__
+
+    @property
+    def __doc__(cls) -> str | None:  # type: ignore[override]
+        """Return the docstring of a table, with its keys."""
+        own: str | None = cls.__dict__.get("__doc__")
+        schema = _schema() if cls.__name__ == "Scene" else _schema()["$defs"].get(cls.__name__, {})
+        known, needed = cls.__dict__.get("__pydantic_fields__", {}), schema.get("required", ())
+        lines = [_line(key, part, key in needed) for key, part in schema.get("properties", {}).items() if key in known]
+        return "\n".join([cleandoc(own), "", "Keys:", "", *lines]) if own and lines else own
+
+    @property
+    def __signature__(cls) -> Signature:
+        """Return the keys with their defaults; a table that is left out is an empty one."""
+        found = []
+        for name, field in vars(cls)["__pydantic_fields__"].items():
+            default = Parameter.empty if field.is_required() else field.get_default(call_default_factory=True)
+            default = {} if isinstance(default, BaseModel) else default
+            found.append(Parameter(name, Parameter.KEYWORD_ONLY, default=default))
+        return Signature(found)
+
+    @__signature__.setter
+    def __signature__(cls, value: Any) -> None:
+        """Leave out pydantic's, with annotations."""
+
+
+def _line(key: str, schema: Schema, is_needed: bool) -> str:
+    """Say in a line what a key is, what it is if left out, and what it means."""
+    given, *others = schema.get("anyOf", (schema,))
+    words = [{"word": one["const"]} for one in others if "const" in one]
+    what = _tables(given, "a table") or _tables(given.get("items", {}), "a list of tables")
+    what = what or wanted({**given, **(words[0] if words else {})}, key)
+    default, meaning = schema.get("default"), " ".join(schema.get("description", "").split())
+    is_short = isinstance(default, (str, int, float, list)) and default != []
+    left_out = "; needed" if is_needed else f"; {json.dumps(default)} if left out" if is_short else ""
+    return fill(f"- {key} ({what}{left_out}): {meaning}", 112, subsequent_indent="  ", break_on_hyphens=False)
+
+
+def _tables(schema: Schema, what: str) -> str:
+    """Name the tables that a key takes, with the module that they are in; nothing where it takes none."""
+    names = [one["$ref"].rpartition("/")[2] for one in (schema, *schema.get("oneOf", ())) if "$ref" in one]
+    there = [name for name in names if hasattr(modules.get(_HOMES.get(name, "")), name)]
+    return f"{what}, {_HOMES[there[0]]}.{' or '.join(there)}" if there else what if names else ""
