@@ -27,7 +27,7 @@ from test_free_bodies import BRICK, RAFT, SHEAR_THINNING, rough, touching, touch
 from test_free_bodies import plane as afloat
 from test_free_bodies import space as afloat_in_space
 from test_held_bodies import held
-from test_hinges import on_hinge
+from test_hinges import chained, on_hinge
 from test_implicit_viscosity import cube, syrups, thick
 from test_moving_solids import ROTOR
 from test_moving_solids import plane as beside
@@ -100,6 +100,8 @@ BODIES = {
     "a body on a ball joint": lambda: on_hinge(afloat_in_space, BRICK, {"position": [0.12, 0.36, 0.1]}),
     "a body on a hinge with a spring": lambda: on_hinge(afloat, RAFT, {**PIN, **TURNED_BY}),
     "a body on a hinge with a spring in space": lambda: on_hinge(afloat_in_space, BRICK, {**AXLE, **TURNED_BY}),
+    "bodies on hinges to each other": lambda: chained(afloat, RAFT),
+    "bodies on hinges to each other in space": lambda: chained(afloat_in_space, BRICK),
     **{f"a body on a spring, {name}": lambda own=own: moored(afloat, RAFT, own) for name, own in TAUT.items()},
     **{f"one in space, {name}": lambda own=own: moored(afloat_in_space, BRICK, own) for name, own in ACROSS.items()},
     "a rubbed body": lambda: rough(afloat(RAFT)),
@@ -256,7 +258,7 @@ def test_float32_is_near_float64(name):
 
 def own_rows(point: dict[str, Any]) -> dict[str, Any]:
     """Gravity and numbers of a point for two scenes, but those that may have rows or that diffusion is cut by."""
-    others = ("mobility", "interface_width", "gust.k", "spring.damping", ".torque", ".flow_rate")
+    others = ("mobility", "interface_width", "gust.k", "spring.damping", ".torque", ".speed", ".flow_rate")
     names = [key for key, one in point.items() if np.ndim(one) == 0 and not key.endswith((".turn", *others))]
     numbers = {key: point[key] * np.array([1.0, 0.98]) for key in names}
     return {**numbers, "gravity": np.stack([point["gravity"], 0.8 * point["gravity"]])[:, None]}

@@ -213,6 +213,34 @@ def test_a_damped_hinge_slows_a_block_and_a_motor_turns_it():
     assert spins[500] == pytest.approx(1.5, rel=1e-9) and spins[-1] == pytest.approx(3.0, rel=1e-9)
 
 
+def test_a_motor_follows_the_torques_and_speeds_of_a_file(tmp_path):
+    """A damper of the rate 50 / s brings the block to a speed that grows by 6 rad / s2, 6 / 50 rad / s late."""
+    file = tmp_path / "motor.csv"
+    file.write_text("time [s],speed [rpm],torque [N m]\n0.0,0.0,0.0\n1.0,57.2957795,0.0\n")
+    times, _, spins = turning(file=str(file), damping=50.0 * ABOUT)
+    assert spins[500] == pytest.approx(6.0 * (times[500] - 0.02), rel=2e-3)
+    with pytest.raises(SceneError, match=r"hinge\[0\]\.torque is 1\.0, but must be left out, as there is a file"):
+        turning(file=str(file), damping=1.0, torque=1.0)
+    file.write_text("time [s],power [W]\n0.0,0.0\n1.0,1.0\n")
+    with pytest.raises(SceneError, match=r"cannot be used: .*its columns must be among time"):
+        turning(file=str(file), damping=1.0)
+
+
+def test_a_block_hangs_on_an_arm_that_moves_and_turns():
+    """Its hinge goes where the arm takes it, and the motor turns it against the arm."""
+    arm = box([0.8, 2.95], [0.9, 3.05], name="arm", motion="path", velocity=[0.3, 0.1], angular_velocity=2.0)
+    pin = {"name": "pin", "solid": "block", "to": "arm", "position": [0.65, 3.0], "damping": 100.0 * ABOUT}
+    scene = plane(block(2), arm, hinge=[{**pin, "speed": 1.0}], forces={"gravity": [0.0, 0.0]}, **ALONE)
+    run = Simulation(scene, precision="float64").run(500, record_every=1)
+    places = [
+        run.solids[name].positions
+        + way * np.stack([np.cos(run.solids[name].rotations), np.sin(run.solids[name].rotations)], axis=1)
+        for name, way in (("block", 0.15), ("arm", -0.2))
+    ]
+    assert np.abs(places[0] - places[1])[1:].max() < 1e-6
+    assert run.solids["block"].angular_velocities[-1] == pytest.approx(3.0, abs=0.15)
+
+
 def test_gradients_of_springs_in_float32_are_those_in_float64():
     scene, loss = moored(plane, RAFT, TAUT["to a ball"]), SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)
     point = {"line.stiffness": 3e3, "line.damping": 20.0, "line.rest_length": 0.3}

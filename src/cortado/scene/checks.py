@@ -17,6 +17,7 @@ from cortado.errors import InputError, Words, shown
 from cortado.scene.drain_tables import check_drains
 from cortado.scene.emitter_table import EmitterTable, check_columns, check_fed
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
+from cortado.scene.hinges import check_hinges
 from cortado.scene.model import MixtureTable, SceneTables
 from cortado.scene.motions import free
 from cortado.scene.parameters import BY_NAME
@@ -29,7 +30,7 @@ from cortado.scene.sensor_tables import (
 )
 from cortado.scene.shape_tables import MeshShape, check_length
 from cortado.scene.solids import SolidTable
-from cortado.scene.springs import check_hinges, check_springs
+from cortado.scene.springs import check_springs
 from cortado.scene.stability import chosen_limits
 from cortado.scene.tables import MISSING, FieldPath, field_error, field_name
 

@@ -139,6 +139,8 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "degrees": {"deg": 1.0, "rad": 180.0 / np.pi},
     "m3/s": {"m^3/s": 1.0, "m3/s": 1.0, "m³/s": 1.0, "l/s": 1e-3, "l/min": 1e-3 / 60.0},
     "m2/s": {"m^2/s": 1.0, "m2/s": 1.0, "m²/s": 1.0},
+    "N m": {"N m": 1.0, "Nm": 1.0, "kN m": 1e3, "N": 1.0},
+    "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0},
     "m/s2": {"m/s^2": 1.0, "m/s2": 1.0, "m/s²": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3, "g": 9.80665},
 }
 """Factors of the units that columns of a file may have, by the unit in which a scene has them."""

@@ -25,6 +25,7 @@ from cortado.particles.state import Layout, padded
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
 from cortado.scene.drain_tables import drain_parameters
 from cortado.scene.emitter_table import emitter_parameters
+from cortado.scene.hinges import Hold, joints_of
 from cortado.scene.motions import mass_of_one, motion_parameters, moving, solid_frames, wall_numbers, weight_name
 from cortado.scene.parameter_values import REGISTRY, Known, checked_value
 from cortado.scene.parameters import PARAMETERS, Parameter, Source
@@ -32,7 +33,7 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import NoContainer
 from cortado.scene.solids import SolidTable
 from cortado.scene.solvers import OWN, PackageSolver, SolverTable
-from cortado.scene.springs import Hold, ends_of, spring_parameters, turned_by
+from cortado.scene.springs import ends_of, spring_parameters
 from cortado.solvers.contacts import Contacts, Touching
 from cortado.solvers.obstacles import (
     FINE,
@@ -379,10 +380,11 @@ def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch,
         return None
     spacing, touching, periods = scene.discretisation.spacing, _touching(scene, discrete), discrete.periods
     pushes: list[Callable[[FreeSolidsPart], Push]] = [lambda part: Contacts(part, touching, spacing, periods, layout)]
-    springs, turned = ends_of(scene.spring, moving(scene.solid)), turned_by(scene.hinge, moving(scene.solid))
+    springs, joints = ends_of(scene.spring, moving(scene.solid)), joints_of(scene.hinge, moving(scene.solid))
+    turned, joined = ([one for one in joints if one.turns], [one for one in joints if one.against >= 0])
     if springs or turned:
         pushes.append(lambda part: Springs(part, springs, turned, layout))
-    return FreeSolids(tables, scene.dimension, search, pushes)
+    return FreeSolids(tables, scene.dimension, search, pushes, joined)
 
 
 def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:

@@ -32,9 +32,9 @@ from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Layout, State, StateField
+from cortado.scene.hinges import Hold, Joint, inertia_about
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, rotation_name, velocity_name
 from cortado.scene.parameters import Axis
-from cortado.scene.springs import Hold, inertia_about
 from cortado.sph.moving_solids import free_module, hold_functions, hold_numbers, rotations
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 
@@ -208,6 +208,8 @@ class FreeSolids:
     """The search for neighbours that has the walls of the bodies."""
     pushes: "Sequence[Callable[[FreeSolidsPart], Push]]"
     """Make the objects that push bodies besides fluid and gravity: contacts, springs."""
+    joints: Sequence[Joint] = ()
+    """The hinges between bodies and other solids, which the solver keeps together."""
 
     @property
     def walls(self) -> MovingWalls:

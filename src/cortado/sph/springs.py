@@ -15,7 +15,9 @@ One that is slack only pulls: max(k (l - l_0) + s C n . (w' - w), 0), with s fro
 l_0. The derivative there is that of one side.
 
 About its hinge with the axis a, a body that is turned by the angle phi from how the scene begins gets the torque T -
-k (phi - phi_0) - C a . W, with the motor's torque T. At a half turn phi goes on from -pi.
+k (phi - phi_0) - C (a . (W - W') - s), with the motor's torque T and speed s, and the other solid the opposite. Of a
+hinge to another solid, which turns with W', a is an axis of that one, and phi is seen from it. At a half turn phi goes
+on from -pi.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,7 +32,8 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.particles.moving_walls import matrix_of, resting_pose
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout, Parameters, padded
-from cortado.scene.springs import Ends, Turned
+from cortado.scene.hinges import Joint
+from cortado.scene.springs import Ends
 from cortado.sph.free_solids import Changes, FreeSolidsPart, given_to
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
@@ -38,7 +41,7 @@ TAUT = 0.01
 """By which part of its rest length a slack spring is longer where it is damped in full."""
 OWN = ("before", "turns_before", "after", "turns")
 NUMBERS = ("stiffness", "rest_length", "damping")
-TURNING = ("stiffness", "rest_angle", "damping", "torque")
+TURNING = ("stiffness", "rest_angle", "damping", "torque", "speed")
 
 
 @cache
@@ -113,15 +116,39 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
         t = tension(stiffness_i, rest_length_i, damping_i, time_step_i, d, moved, slack)
         return vector(t, wp.sqrt(wp.dot(d, d) + tiny), no)
 
-    @TypesByName(real, {vector: "W axis", matrix: "turns begun"})
+    @wp.func
+    def about(Q: matrix) -> vector:
+        """Return twice the sine of the angle of a rotation, along its axis."""
+        return vector(Q[2, 1] - Q[1, 2], Q[0, 2] - Q[2, 0], Q[1, 0] - Q[0, 1])
+
+    matrices = "turns_before other_turns_before other_turns begun other_begun"
+
+    @TypesByName(real, {vector: "W axis", matrix: matrices, bool: "is_free"})
     def twist(
-        time_step_i, stiffness_i, rest_angle_i, damping_i, torque_i, turns_before_i, W_i, axis, begun, cell
-    ) -> vector:
-        Q = turns_before_i * wp.transpose(begun)
-        across = vector(Q[2, 1] - Q[1, 2], Q[0, 2] - Q[2, 0], Q[1, 0] - Q[0, 1])
-        angle = wp.atan2(wp.dot(axis, across), Q[0, 0] + Q[1, 1] + Q[2, 2] - one)
-        torque = torque_i - stiffness_i * (angle - rest_angle_i) - damping_i * wp.dot(axis, W_i)
-        return (time_step_i * torque / cell) * axis
+        time_step_i,
+        stiffness_i,
+        rest_angle_i,
+        damping_i,
+        torque_i,
+        speed_i,
+        turns_before_i,
+        W_i,
+        other_turns_before_i,
+        other_turns_i,
+        axis,
+        begun,
+        other_begun,
+        cell,
+        is_free,
+    ) -> tuple[vector, vector]:
+        P = other_turns_before_i * wp.transpose(other_begun)
+        Q, a = wp.transpose(P) * turns_before_i * wp.transpose(begun), P * axis
+        angle = wp.atan2(wp.dot(axis, about(Q)), Q[0, 0] + Q[1, 1] + Q[2, 2] - one)
+        turned = about(other_turns_i * wp.transpose(other_turns_before_i)) / (real(2.0) * time_step_i)
+        rate = wp.dot(a, W_i - turned) - speed_i
+        torque = torque_i - stiffness_i * (angle - rest_angle_i) - damping_i * rate
+        found = (time_step_i * torque / cell) * a
+        return found, wp.where(is_free, -one, no) * found
 
     modules, poses = (
         [kernel_module(f"springs_derivative_{precision.name}")] * 3,
@@ -141,11 +168,11 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
         precision,
         modules,
         lambda _: twist,
-        ["twisted:twisted"],
-        numbers=["axis", "begun", "cell"],
-        written=["turns_before"],
-        told=["torque"],
-        turned={"turns_before": "turned_before"},
+        ["twisted:twisted", "twisted_other:twisted_other"],
+        numbers=["axis", "begun", "other_begun", "cell", "is_free"],
+        written=["turns_before", "other_turns_before", "other_turns"],
+        told=["torque", "speed"],
+        turned=turned,
     )
     return pulls, reads, twists
 
@@ -153,29 +180,34 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
 class Springs:
     """The springs and turned hinges of one solver, which push its free bodies."""
 
-    def __init__(self, part: FreeSolidsPart, springs: Sequence[Ends], turned: Sequence[Turned], layout: Layout):
+    def __init__(self, part: FreeSolidsPart, springs: Sequence[Ends], turned: Sequence[Joint], layout: Layout):
         self.part, self.springs, self.turned, self.layout = part, springs, turned, layout
         self.pull, self.read, self.twist = spring_kernels(layout.precision)
         self.vectors = {"dtype": layout.precision.vector, "device": layout.device}
         self._rest = resting_pose(layout)
 
+    def ends(self, of: Ends | Joint) -> Named:
+        """Return the poses of both solids, with their tangents, by the names that kernels have."""
+        each = self.part.made_of.walls.each
+        other = self._rest if of.against < 0 else each[of.against]
+        return {**each[self.number(of.body)], **{f"other_{name}": array for name, array in other.items()}}
+
     def poses(self, spring: Ends) -> tuple[Named, ...]:
-        """Return the poses of both solids with their tangents, and what is constant, by the names that kernels have."""
-        each, vector = self.part.made_of.walls.each, self.layout.precision.vector
-        other = self._rest if spring.against < 0 else each[spring.against]
-        named = {**each[self.number(spring.body)], **{f"other_{name}": array for name, array in other.items()}}
+        """Return the poses of both solids of a spring, and what is constant, by the names that kernels have."""
+        vector = self.layout.precision.vector
         own, anchor = (vector(*padded(place[None])[0]) for place in (spring.point, spring.anchor))
-        return named, {"own": own, "anchor": anchor, "slack": spring.slack, "is_free": spring.other >= 0}
+        return self.ends(spring), {"own": own, "anchor": anchor, "slack": spring.slack, "is_free": spring.other >= 0}
 
     def number(self, body: int) -> int:
         """Return the number of a free body among the solids that move."""
         return self.part.bodies[body].table.number
 
-    def known(self, of: Turned) -> tuple[Named, ...]:
+    def known(self, of: Joint) -> tuple[Named, ...]:
         """Return what kernels know of a body that is turned about a hinge."""
-        axis, body = self.layout.precision.vector(*of.axis), self.part.bodies[of.body]
-        begun = matrix_of(self.layout.precision)(*of.begun.ravel())
-        return {"axis": axis, "begun": begun}, body.before, body.constants
+        matrix, body = matrix_of(self.layout.precision), self.part.bodies[of.body]
+        begun, other_begun = (matrix(*one.turn.ravel()) for one in of.begun)
+        constants = {"axis": self.layout.precision.vector(*of.axis), "begun": begun, "other_begun": other_begun}
+        return self.ends(of), constants, {"is_free": of.other >= 0}, body.before
 
     def look(self, step: StepContext) -> None:
         """Add the momenta that bodies get in a step."""
@@ -185,7 +217,7 @@ class Springs:
             step.launch(self.pull.forward, given_to(bodies, spring.body, spring.other), *known, threads=threads)
         for of in self.turned:
             known = numbers_of(step.parameters, of.name, TURNING), *self.known(of)
-            step.launch(self.twist.forward, bodies[of.body].given, *known, threads=threads)
+            step.launch(self.twist.forward, given_to(bodies, of.body, of.other), *known, threads=threads)
 
     def tangent(self, changes: Sequence[Changes]) -> "SpringsTangent":
         """Return forward mode of `look`."""
@@ -218,13 +250,13 @@ class SpringsTangent:
             step.launch(own.pull.tangent, given, *dots, *known, threads=threads)
         for of in own.turned:
             known = numbers_of(step.parameters, of.name, TURNING), *own.known(of)
-            change = self._changes[of.body]
-            rates = numbers_of(dot.parameters, of.name, TURNING, "_dot"), sizes, change.before
-            step.launch(own.twist.tangent, change.given, *rates, *known, threads=threads)
+            rates = numbers_of(dot.parameters, of.name, TURNING, "_dot"), sizes, self._changes[of.body].before
+            given = given_to(self._changes, of.body, of.other)
+            step.launch(own.twist.tangent, given, *rates, *known, threads=threads)
 
 
 class PoseBars:
-    """Adjoints of the poses of both ends of a spring, which go to those of the solids."""
+    """Adjoints of the poses of both ends of a spring or a hinge, which go to those of the solids."""
 
     def __init__(self, springs: Springs):
         names = [f"{name}_bar" for name in ("before", "turned_before", "after", "turned")]
@@ -232,11 +264,13 @@ class PoseBars:
         members, vectors = springs.layout.members, springs.vectors
         self.named = {f"{way}{name}": wp.zeros(members, **vectors) for way in ("", "other_") for name in names}
 
-    def add(self, spring: Ends, bar: Adjoints) -> None:
-        """Add what a kernel has written to the adjoints of the solids' poses."""
-        for way, number in (("", self._springs.number(spring.body)), ("other_", spring.against)):
+    def add(self, of: Ends | Joint, bar: Adjoints) -> None:
+        """Add what a kernel has written to the adjoints of the solids' poses, and set it to 0."""
+        for way, number in (("", self._springs.number(of.body)), ("other_", of.against)):
             if number >= 0:
                 bar.solids.add_whole(number, **{name: self.named[f"{way}{name}"] for name in self._names})
+        for array in self.named.values():
+            array.zero_()
 
 
 class SpringsAdjoint:
@@ -244,7 +278,6 @@ class SpringsAdjoint:
 
     def __init__(self, springs: Springs, changes: Sequence[Changes]):
         self._springs, self._changes, self._poses = springs, changes, PoseBars(springs)
-        self._turned = {"turned_before_bar": wp.zeros(springs.layout.members, **springs.vectors)}
 
     def look(self, step: StepContext, bar: Adjoints) -> None:
         """Go on from the adjoints of the momenta that bodies get to those of their poses and of all numbers."""
@@ -258,10 +291,10 @@ class SpringsAdjoint:
             self._poses.add(spring, bar)
         for of in own.turned:
             known = numbers_of(step.parameters, of.name, TURNING), *own.known(of)
-            change = self._changes[of.body]
-            shares = numbers_of(bar.parameters, of.name, TURNING, "_bar"), sizes, change.before, self._turned
-            step.launch(own.twist.adjoint, change.given, *shares, *known, threads=threads)
-            bar.solids.add_whole(own.number(of.body), **self._turned)
+            shares = numbers_of(bar.parameters, of.name, TURNING, "_bar"), sizes, self._changes[of.body].before
+            given = given_to(self._changes, of.body, of.other)
+            step.launch(own.twist.adjoint, given, *shares, self._poses.named, *known, threads=threads)
+            self._poses.add(of, bar)
 
 
 def springs_in(solver: Any) -> Iterator[tuple[Springs, Ends]]:

@@ -10,6 +10,7 @@ from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.particles.state import Layout, zeros
 from cortado.solvers.projection.body_kernels import body_kernels, motion_kernels
+from cortado.solvers.projection.joints import Joints, JointsAdjoint, JointsTangent
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
@@ -79,11 +80,19 @@ class Bodies:
         self.part, self.layout = part, layout
         self.kernels, self.motion = body_kernels(discretisation), motion_kernels(layout.precision)
         self.held = [Held(body, layout, Start.of(body)) for body in part.bodies]
+        self.joints = Joints(part, part.made_of.joints, layout)
         self.drift = wp.zeros(layout.all_particles, dtype=layout.precision.real, device=layout.device)
 
+    @property
+    def velocities(self) -> list[Arrays]:
+        """Return V, L, W, V - V_0 and W - W_0 of each body in an iteration."""
+        return [{**held.moved, **held.faster} for held in self.held]
+
     def at_rest(self) -> "Bodies":
-        """Return these bodies beginning at rest, pushed by pressures alone: `drifted` is linear in the pressures."""
+        """Return these bodies beginning at rest, pushed by pressures alone, and without hinges between them: `drifted`
+        is linear in the pressures."""
         other = copy(self)
+        other.joints = Joints(self.part, (), self.layout)
         other.held, other.drift = [held.at_rest() for held in self.held], wp.zeros_like(self.drift)
         return other
 
@@ -95,6 +104,7 @@ class Bodies:
     def begin(self, context: StepContext, around: Arrays, k: wp.array) -> None:
         """Find which particles bodies push in a step, and add the bodies' part to the pressure matrix' diagonal; find
         what the pressures ``k`` of the step before would give to bodies without slip."""
+        self.joints.begin(context)
         for held in self.held:
             context.launch(self.kernels.hold.forward, *self.known(context, held), edge=around["edge"])
             context.launch(self.kernels.measure.forward, *self.known(context, held))
@@ -117,17 +127,29 @@ class Bodies:
 
     def drifted(self, context: StepContext, drift: wp.array, y: wp.array) -> wp.array:
         """Return the drift of walls where bodies have the velocities that pressures y give them."""
+        self.join(context, y)
         for held in self.held:
-            self.move(context, held, y, held.moved)
             known = self.known(context, held)
             context.launch(self.motion.carry.forward, *known, drift_in=drift, drift=self.drift)
             drift = self.drift
         return drift
 
+    def loosen(self, context: StepContext, y: wp.array) -> list[Arrays]:
+        """Write the velocities that pressures y give to bodies without the hinges between them, and return the sums of
+        `move` of each."""
+        return [self.move(context, held, y, held.moved) for held in self.held]
+
+    def join(self, context: StepContext, y: wp.array) -> None:
+        """Write the velocities that pressures y give to bodies on their hinges."""
+        self.loosen(context, y)
+        self.joints.join(context, self.velocities)
+
     def settle(self, context: StepContext, y: wp.array) -> None:
         """Write the velocities that pressures y give to bodies as those at the end of the step."""
+        self.join(context, y)
         for held in self.held:
-            self.move(context, held, y, held.body.moved)
+            for name, array in held.body.moved.items():
+                wp.copy(array, held.moved[name])
 
 
 class BodiesTangent:
@@ -136,13 +158,13 @@ class BodiesTangent:
     def __init__(self, bodies: Bodies, changes: list[Changes]):
         self._bodies, self._changes = bodies, changes
         self._held = [Held(own.body, bodies.layout, Start.of(own), "_dot") for own in changes]
-        self.drift = wp.zeros_like(bodies.drift)
+        self._joints, self.drift = JointsTangent(bodies.joints), wp.zeros_like(bodies.drift)
 
     def at_rest(self, bodies: Bodies) -> "BodiesTangent":
         """Return the tangent of ``bodies`` that begin at rest."""
         other = copy(self)
         other._bodies, other._held = bodies, [own.at_rest() for own in self._held]
-        other.drift = wp.zeros_like(self.drift)
+        other._joints, other.drift = JointsTangent(bodies.joints), wp.zeros_like(self.drift)
         return other
 
     def _known(self, context: StepContext, dot: Tangents, k: int) -> tuple[Named, ...]:
@@ -162,6 +184,7 @@ class BodiesTangent:
         """Apply the tangent of `Bodies.begin`, given the pressures of the step before and their tangents."""
         kernels = self._bodies.kernels
         edges = {"edge": around["edge"], "edge_dot": around_dot["edge_dot"]}
+        self._joints.begin(context, dot)
         for k, own in enumerate(self._held):
             context.launch(kernels.hold.tangent, *self._known(context, dot, k), edges)
             context.launch(kernels.measure.tangent, *self._known(context, dot, k))
@@ -172,25 +195,31 @@ class BodiesTangent:
                 for total, pressed in zip(own.sums().values(), self._changes[k].pressed.values(), strict=True):
                     wp.copy(pressed, total)
 
-    def _move(
-        self, context: StepContext, dot: Tangents, k: int, y: tuple[wp.array, wp.array], moved: Arrays, out: Arrays
-    ) -> None:
+    def _join(self, context: StepContext, dot: Tangents, y: wp.array, y_dot: wp.array) -> None:
+        """Write the velocities that pressures y give to bodies on their hinges, and the tangents of these."""
+        bodies = self._bodies
+        for k in range(len(self._held)):
+            self._move(context, dot, k, (y, y_dot))
+        dots = [{**own.moved, **own.faster} for own in self._held]
+        self._joints.join(context, dot, bodies.velocities, dots)
+
+    def _move(self, context: StepContext, dot: Tangents, k: int, y: tuple[wp.array, wp.array]) -> None:
         bodies, held, own = self._bodies, self._bodies.held[k], self._held[k]
-        sums = bodies.move(context, held, y[0], moved)
+        sums = bodies.move(context, held, y[0], held.moved)
         known = self._known(context, dot, k)
         context.launch(bodies.kernels.pull.tangent, *known, y=y[0], y_dot=y[1])
         sums_dot = own.sums()
         for given, total in zip(own.start.given.values(), sums_dot.values(), strict=False):
             add(given, total)
-        context.launch(bodies.motion.move.tangent, sums, sums_dot, moved, out, *known, threads=bodies.layout.members)
+        out = held.moved, own.moved
+        context.launch(bodies.motion.move.tangent, sums, sums_dot, *out, *known, threads=bodies.layout.members)
 
     def drifted(
         self, context: StepContext, dot: Tangents, drift_dot: wp.array, y: wp.array, y_dot: wp.array
     ) -> wp.array:
         """Return the tangent of the drift of walls by `Bodies.drifted`."""
-        for k, own in enumerate(self._held):
-            moved = self._bodies.held[k].moved
-            self._move(context, dot, k, (y, y_dot), moved, own.moved)
+        self._join(context, dot, y, y_dot)
+        for k in range(len(self._held)):
             drifts = {"drift_in_dot": drift_dot, "drift_dot": self.drift}
             context.launch(self._bodies.motion.carry.tangent, drifts, *self._known(context, dot, k))
             drift_dot = self.drift
@@ -198,8 +227,12 @@ class BodiesTangent:
 
     def settle(self, context: StepContext, dot: Tangents, y: wp.array, y_dot: wp.array) -> None:
         """Write the tangents of the free bodies' new velocities, as `Bodies.settle` writes the velocities."""
-        for k, held in enumerate(self._bodies.held):
-            self._move(context, dot, k, (y, y_dot), held.body.moved, self._changes[k].moved)
+        self._join(context, dot, y, y_dot)
+        for held, own, changes in zip(self._bodies.held, self._held, self._changes, strict=True):
+            for name, array in held.body.moved.items():
+                wp.copy(array, held.moved[name])
+            for name, array in changes.moved.items():
+                wp.copy(array, own.moved[name])
 
 
 class BodiesAdjoint:
@@ -211,8 +244,10 @@ class BodiesAdjoint:
         self._held = [Held(own.body, layout, Start.of(own), "_bar") for own in changes]
         self.drift_bar = wp.zeros_like(bodies.drift)
         """The adjoint of the drift of one iteration."""
-        self._turned = [{"turned_bar": wp.zeros_like(own.turned_end)} for own in changes]
-        self._none = {f"{name}_bar": wp.zeros_like(changes[0].turned_end) for name in "VWL"}
+        self._turned, self._joints = (
+            [{"turned_bar": wp.zeros_like(own.turned_end)} for own in changes],
+            JointsAdjoint(bodies.joints),
+        )
         shares = layout.arrays("_bar", whole=layout.precision.pair, density=layout.precision.real)
         self._weighed, self._sum = shares, {name: layout.sum_of(array.dtype) for name, array in shares.items()}
         vectors = {"dtype": layout.precision.vector, "device": layout.device}
@@ -228,33 +263,39 @@ class BodiesAdjoint:
         """Return the adjoint of ``bodies`` that begin at rest."""
         other = copy(self)
         other._bodies, other._held = bodies, [own.at_rest() for own in self._held]
+        other._joints = JointsAdjoint(bodies.joints)
         return other
 
     def begin(self) -> None:
         """Set the adjoints of the bodies' arrays to 0 at the beginning of a step back."""
+        self._joints.begin()
         for own in self._held:
             for array in own.known.values():
                 array.zero_()
 
-    def _move(
-        self, context: StepContext, bar: Adjoints, k: int, y: wp.array, moved: Arrays, bars: Named, y_bar: wp.array
-    ) -> None:
-        """Turn the adjoints of V, W and L of a body, and of V - V_0 and W - W_0, into that of the pressures y."""
-        bodies, held = self._bodies, self._bodies.held[k]
-        sums = bodies.move(context, held, y, moved)
-        known = self._known(context, bar, k)
-        context.launch(bodies.motion.move.adjoint, bars, sums, *known, threads=bodies.layout.members)
-        for total, given in zip(self._sums_bar.values(), self._held[k].start.given.values(), strict=False):
-            add(total, given)
-        context.launch(bodies.kernels.pull.adjoint, *known, y=y, y_bar=y_bar)
+    def _loosen(self, context: StepContext, bar: Adjoints, y: wp.array, y_bar: wp.array) -> None:
+        """Turn the adjoints of V, W and L of bodies, and of V - V_0 and W - W_0, into that of the pressures y."""
+        bodies, bars = self._bodies, [{**own.moved, **own.faster} for own in self._held]
+        sums = bodies.loosen(context, y)
+        self._joints.join(context, bar, bodies.velocities, bars, self._turned)
+        for k in range(len(bodies.held)):
+            known = self._known(context, bar, k)
+            context.launch(bodies.motion.move.adjoint, bars[k], sums[k], *known, threads=bodies.layout.members)
+            for total, given in zip(self._sums_bar.values(), self._held[k].start.given.values(), strict=False):
+                add(total, given)
+            context.launch(bodies.kernels.pull.adjoint, *known, y=y, y_bar=y_bar)
 
     def settle(self, context: StepContext, bar: Adjoints, y: wp.array, y_bar: wp.array) -> None:
         """Apply the adjoint of `Bodies.settle`, which wrote the bodies' new velocities."""
-        for k, held in enumerate(self._bodies.held):
-            own = self._held[k]
+        for own, changes in zip(self._held, self._changes, strict=True):
+            for name, array in own.moved.items():
+                wp.copy(array, changes.moved[name])
             for array in own.faster.values():
                 array.zero_()
-            self._move(context, bar, k, y, held.body.moved, {**self._changes[k].moved, **own.faster}, y_bar)
+        self._loosen(context, bar, y, y_bar)
+        for own in self._held:
+            for array in own.moved.values():
+                array.zero_()
 
     def drifted(self, context: StepContext, bar: Adjoints, drift_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
         """Apply the adjoint of `Bodies.drifted` to ``self.drift_bar``, add it to ``drift_bar`` and set it to 0."""
@@ -265,14 +306,14 @@ class BodiesAdjoint:
     def carried(self, context: StepContext, bar: Adjoints, carried_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
         """Apply the adjoint of the part that `Bodies.drifted` adds to the drift."""
         bodies = self._bodies
+        bodies.join(context, y)
         for k, held in enumerate(bodies.held):
-            bodies.move(context, held, y, held.moved)
             faster = self._held[k].faster
             shares = dict(zip(faster, held.shares.values(), strict=True))
             context.launch(bodies.motion.carry.adjoint, shares, *self._known(context, bar, k), drift_bar=carried_bar)
             for array, total in zip(faster.values(), held.sums().values(), strict=True):
                 wp.copy(array, total)
-            self._move(context, bar, k, y, held.moved, {**faster, **self._none}, y_bar)
+        self._loosen(context, bar, y, y_bar)
 
     def release(
         self,
@@ -299,6 +340,7 @@ class BodiesAdjoint:
         """Apply the adjoint of `Bodies.begin`: add to the adjoints of particles, surroundings and poses."""
         bodies, a_bar = self._bodies, around_bar["a_bar"]
         edges = {"edge": around["edge"], "edge_bar": around_bar["edge_bar"]}
+        self._joints.finish(context, bar, self._turned)
         for k, held in enumerate(bodies.held):
             known = self._known(context, bar, k)
             context.launch(bodies.kernels.weigh.adjoint, self._weighed, *known, a_bar=a_bar)

@@ -1,0 +1,241 @@
+"""Hinges between free bodies and other solids in a step of the projection, with derivatives.
+
+A hinge keeps a point of a body A at a point of another solid B. In A's frame the point is at a, so that in a step it is
+on an arm R a from A's middle at first, and on R' a where A would go. Whatever gives the bodies new velocities, those
+by which they are faster, V - V_0 and W - W_0 (`cortado.sph.free_solids`), are to be such that at the end of the step
+
+    b = (V - V_0)_A + (W - W_0)_A x R'_A a_A - (the same of B) + (p'_A - p'_B) / dt = 0,
+
+where p' = c' + R' a is where the points would go. For this A gets the momentum lambda at R_A a_A, and B gets - lambda.
+So momentum is kept, and angular momentum too, as both act at one point. What is left of the gap is of the order of
+dt^4, and the next step takes it away. In space a hinge with the axis n keeps two of the three angles as well: with P =
+I - n n^T A gets the angular momentum P lambda, B the opposite, and
+
+    b = P ((W - W_0)_A - (W - W_0)_B) + n x (n'_A - n'_B) / dt = 0.
+
+Each of both is a row, and rows with the same body depend on each other: b is b_0 + K lambda with the blocks K_kl of
+three by three numbers, and a step solves K lambda = - b_0 once for each pressure by an elimination of blocks. A body
+that a prescribed solid holds gets all, as that has a motion of its own. So what pressures move are bodies on their
+hinges, beside fluid too; the coarse grid alone, which only has to come near, sees them loose.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from cortado.device.modules import Kernels, by_name, kernel_module
+from cortado.device.precision import Precision, TypesByName
+from cortado.particles.moving_walls import matrix_of
+from cortado.particles.particle_kernels import pointwise_kernels
+from cortado.sph.moving_solids import hold_functions
+
+POSES = ("turns_before", "after", "turns")
+ROW = ("give", "take", "other_give", "other_take", "apart")
+"""What a row has: see `joint_kernels`."""
+
+
+@cache
+def joint_kernels(precision: Precision) -> SimpleNamespace:
+    """Make the kernels of hinges, with a thread for each scene.
+
+    The kernels ``point`` and ``lean`` give the four matrices and the gap over the time step of a row: ``give`` makes
+    the moment of lambda on a body, and ``take`` the part of its W - W_0 in b. Then ``weigh`` adds to a block of K what
+    one body does, ``read`` gives b of velocities, and ``push`` adds to velocities what lambda does. Of whole systems
+    ``factor`` eliminates, ``solve`` gives lambda = - K^-1 b or the same of the transpose of K, ``lengthen`` adds K'
+    lambda to a tangent of b, and ``spread`` the outer product of the adjoint of b and lambda to the adjoint of K."""
+    real, vector, matrix, holds = precision.real, precision.vector, matrix_of(precision), hold_functions(precision)
+    spin, held = holds.spin, holds.kind
+    module = kernel_module(f"joints_derivative_{precision.name}")
+    no, one = wp.constant(real(0.0)), wp.constant(real(1.0))
+    matrices = "turns_before turns other_turns_before other_turns begun other_begun inertia inverse"
+    typed = TypesByName(
+        real,
+        {
+            vector: "place middle other_middle after other_after axis apart push faster turned_faster",
+            matrix: f"{matrices} take give other_take",
+            held: "hold",
+            bool: "is_free",
+        },
+    )
+    row = tuple[matrix, matrix, matrix, matrix, vector]
+
+    @typed
+    def point(
+        time_step_i,
+        place_i,
+        turns_before_i,
+        after_i,
+        turns_i,
+        other_turns_before_i,
+        other_after_i,
+        other_turns_i,
+        middle,
+        begun,
+        other_middle,
+        other_begun,
+    ) -> row:
+        own, other = wp.transpose(begun) * (place_i - middle), wp.transpose(other_begun) * (place_i - other_middle)
+        reach, other_reach = turns_i * own, other_turns_i * other
+        apart = (after_i + reach - other_after_i - other_reach) / time_step_i
+        return (
+            wp.skew(turns_before_i * own),
+            wp.skew(-reach),
+            wp.skew(other_turns_before_i * other),
+            wp.skew(-other_reach),
+            apart,
+        )
+
+    @typed
+    def lean(
+        time_step_i,
+        turns_before_i,
+        turns_i,
+        other_turns_before_i,
+        other_turns_i,
+        axis,
+        begun,
+        other_begun,
+    ) -> row:
+        own, other = wp.transpose(begun) * axis, wp.transpose(other_begun) * axis
+        n = turns_before_i * own
+        across = wp.identity(n=3, dtype=real) - wp.outer(n, n)
+        apart = wp.cross(n, turns_i * own - other_turns_i * other) / time_step_i
+        return across, across, across, across, apart
+
+    @wp.func
+    def turned(R: matrix, inertia: matrix, inverse: matrix, P: vector, T: vector, hold: held) -> vector:
+        """Return the change of W by a momentum and its moment, for a density of 1."""
+        return spin(R, inertia, inverse, T - wp.cross(R * hold.arm, P), hold)
+
+    @wp.func
+    def gone(R: matrix, P: vector, W: vector, volume: real, hold: held) -> vector:
+        """Return the change of V by a momentum, with that of W, for a density of 1."""
+        return wp.cw_mul(hold.moving, P) / volume - wp.cross(W, R * hold.arm)
+
+    @wp.func
+    def column(M: matrix, k: int) -> vector:
+        return vector(M[0, k], M[1, k], M[2, k])
+
+    @typed
+    def weigh(
+        density_i, turns_i, take_i, give_i, volume, inertia, inverse, hold, row_share, share, sign, guard, along
+    ) -> matrix:
+        x, y, z = vector(share, no, no), vector(no, share, no), vector(no, no, share)
+        X = turned(turns_i, inertia, inverse, x, column(give_i, 0), hold)
+        Y = turned(turns_i, inertia, inverse, y, column(give_i, 1), hold)
+        Z = turned(turns_i, inertia, inverse, z, column(give_i, 2), hold)
+        went = wp.matrix_from_cols(
+            gone(turns_i, x, X, volume, hold), gone(turns_i, y, Y, volume, hold), gone(turns_i, z, Z, volume, hold)
+        )
+        found = (sign / density_i) * (row_share * went + take_i * wp.matrix_from_cols(X, Y, Z))
+        unit = wp.identity(n=3, dtype=real)
+        return found + wp.trace(found) * (guard * unit + along * (unit - give_i))
+
+    @typed
+    def read(
+        apart_i,
+        take_i,
+        other_take_i,
+        faster_i,
+        turned_faster_i,
+        other_faster_i: vector,
+        other_turned_faster_i: vector,
+        share,
+        is_free,
+    ) -> vector:
+        against = wp.where(is_free, one, no) * (share * other_faster_i + other_take_i * other_turned_faster_i)
+        return apart_i + share * faster_i + take_i * turned_faster_i - against
+
+    @typed
+    def push(
+        density_i, turns_i, give_i, push_i, share, sign, volume, inertia, inverse, hold
+    ) -> tuple[vector, vector, vector, vector, vector]:
+        P, T = (sign * share) * push_i, sign * (give_i * push_i)
+        W = turned(turns_i, inertia, inverse, P, T, hold) / density_i
+        V = gone(turns_i, P / density_i, W, volume, hold)
+        return V, T - wp.cross(turns_i * hold.arm, P), W, V, W
+
+    whole = {wp.array2d(dtype=matrix): "blocks factors inverses blocks_dot blocks_bar"}
+    arrays = TypesByName(wp.array2d(dtype=vector), {**whole, int: "rows transposed"})
+
+    def kernel(function: Any) -> Any:
+        return wp.kernel(arrays(function), module=module, enable_backward=False)
+
+    @kernel
+    def factor(rows, blocks, factors, inverses):
+        b = wp.tid()
+        for k in range(rows * rows):
+            factors[k, b] = blocks[k, b]
+        for k in range(rows):
+            inverse = wp.inverse(factors[k * rows + k, b])
+            inverses[k, b] = inverse
+            for i in range(k + 1, rows):
+                part = factors[i * rows + k, b] * inverse
+                factors[i * rows + k, b] = part
+                for j in range(k + 1, rows):
+                    factors[i * rows + j, b] = factors[i * rows + j, b] - part * factors[k * rows + j, b]
+
+    @kernel
+    def solve(rows, transposed, factors, inverses, wanted, pushes):
+        b = wp.tid()
+        for i in range(rows):
+            x = wanted[i, b]
+            for j in range(i):
+                if transposed == 1:
+                    x = x - wp.transpose(factors[j * rows + i, b]) * pushes[j, b]
+                else:
+                    x = x - factors[i * rows + j, b] * pushes[j, b]
+            if transposed == 1:
+                x = wp.transpose(inverses[i, b]) * x
+            pushes[i, b] = x
+        for n in range(rows):
+            i = rows - 1 - n
+            x = pushes[i, b]
+            for j in range(i + 1, rows):
+                if transposed == 1:
+                    x = x - wp.transpose(factors[j * rows + i, b]) * pushes[j, b]
+                else:
+                    x = x - factors[i * rows + j, b] * pushes[j, b]
+            if transposed == 0:
+                x = inverses[i, b] * x
+            pushes[i, b] = x
+        for i in range(rows):
+            pushes[i, b] = -pushes[i, b]
+
+    @kernel
+    def lengthen(rows, blocks_dot, pushes, wanted_dot):
+        b = wp.tid()
+        for i in range(rows):
+            x = wanted_dot[i, b]
+            for j in range(rows):
+                x = x + blocks_dot[i * rows + j, b] * pushes[j, b]
+            wanted_dot[i, b] = x
+
+    @kernel
+    def spread(rows, wanted_bar, pushes, blocks_bar):
+        b = wp.tid()
+        for i in range(rows):
+            for j in range(rows):
+                k = i * rows + j
+                blocks_bar[k, b] = blocks_bar[k, b] + wp.outer(wanted_bar[i, b], pushes[j, b])
+
+    def made(function: Any, results: Sequence[str], **names: Any) -> Kernels:
+        return pointwise_kernels(precision, [module] * 3, lambda _: function, results, **names)
+
+    turns, ends = {"turns": "turned", "turns_before": "turned_before"}, ["begun", "other_begun"]
+    turns |= {f"other_{name}": f"other_{turn}" for name, turn in turns.items()}
+    poses = [*POSES, *(f"other_{name}" for name in POSES)]
+    rotations, places = [name for name in poses if "turns" in name], ["middle", "other_middle"]
+    own, velocities = ["volume", "inertia", "inverse", "hold", "share", "sign"], ("V", "L", "W")
+    moved = [f"{name}:{name}" for name in (*velocities, "faster", "turned_faster")]
+    return SimpleNamespace(
+        point=made(point, ROW, numbers=[*places, *ends], written=poses, turned=turns),
+        lean=made(lean, ROW, numbers=["axis", *ends], written=rotations, turned=turns),
+        weigh=made(weigh, ["block:block"], numbers=[*own, "row_share", "guard", "along"], turned=turns),
+        read=made(read, ["wanted"], numbers=["share", "is_free"]),
+        push=made(push, moved, numbers=own, turned=turns),
+        **vars(by_name(factor, solve, lengthen, spread)),
+    )
