@@ -163,7 +163,7 @@ def of_vectors(x, v, w: wp.array(dtype=wp.vec3)):
         (whole, np.ones(7), "has the array w without indices"),
         (one, np.ones((2, 2, 2, 2)), "must have one with one to 3 axes"),
         (one, np.ones((3, 0)), "must have one with one to 3 axes"),
-        (of_vectors, np.ones(7), "which its annotation says otherwise"),
+        (of_vectors, np.ones(7), "with an annotation that does not fit"),
         (one, np.array([1.0, np.nan, 1.0, 1.0]), "one.w has a value that is not finite, but must be numbers"),
         (one, np.ones(4) * 1j, "made of complex numbers"),
         (one, [1.0, "a", 2.0, 3.0], "one.w is"),

@@ -306,7 +306,7 @@ class Consistency(ShortRepr):
 
     @property
     def gaps(self) -> np.ndarray:
-        """Relative distances (tried - 1, sample_steps) of central differences of successive h, with their round-off.
+        """Relative distances (tried - 1, sample_steps) of central differences of one h and the next, with round-off.
 
         At every sample step it is the greatest up to there.
         """

@@ -380,7 +380,8 @@ def _estimators(axes: Any, alignment: Alignment | None) -> None:
         return
     for k, judged in enumerate(alignment.estimators):
         axes.barh(-k, judged.cosine, color=PALETTE[k], height=0.42)
-        axes.text(-1.0, -k + 0.25, f"{judged.estimator}: {judged.cosine:.2f}, size x {judged.size:.2g}", va="bottom")
+        words = f"{judged.estimator}: {judged.cosine:.2f}, size x {judged.size:.2g}"
+        axes.text(-1.0, -k + 0.25, words, va="bottom", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0})
     axes.axvline(0.0, color=FAINT, linewidth=1.0)
     axes.set(title="Gradients against the smoothed one", xlabel="cosine", xlim=(-1.02, 1.02), yticks=[])
     axes.set_ylim(0.6 - len(alignment.estimators), 0.6)

@@ -1,6 +1,6 @@
-"""The values that sensors read of a run on its device. They are quantities of each step, which captured steps keep, and
-sums over particles (`cortado.runs.particle_sums`) of all states of a chunk. The sums are launched behind the chunk, in
-float64 and a fixed order."""
+"""The values that sensors read of a run on its device. Captured steps keep quantities of each step. Sums over particles
+(`cortado.runs.particle_sums`) are launched after a chunk of steps, for all of its states, in float64 and a fixed
+order."""
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial

@@ -220,8 +220,8 @@ def _shapes(what: str, function: FunctionType, values: Mapping[str, Any], inputs
             raise InputError(f"{what} has the array {name} of shape {shape}, but must have one with {wanted}.")
         entries = getattr(annotation, "dtype", Any)
         if entries not in (Any, float, wp.float32, wp.float64) or getattr(annotation, "ndim", len(shape)) != len(shape):
-            found_one = f"{what} has the array {name} of shape {shape}, which its annotation says otherwise"
-            raise InputError(f"{found_one}, but must be said to be of floats with so many axes.")
+            found_one = f"{what} has the array {name} of shape {shape}, with an annotation that does not fit"
+            raise InputError(f"{found_one}, but must be annotated as floats with {len(shape)} axes.")
         found[name] = shape
     if sum(map(prod, found.values())) > MOST_NUMBERS:
         raise InputError(f"{what} has arrays of more than {MOST_NUMBERS} numbers together, but must have fewer.")

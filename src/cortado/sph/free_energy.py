@@ -269,9 +269,9 @@ def stable_substeps(
 
     dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian on the lattice,
 
-    with the mobility M, the width eps and the curvature max f'' of the free energy. Beside a particle that is so many
-    times as heavy a light one diffuses up to (1 + ratio) / 2 times as fast. Raises `OutOfRangeError` for more than
-    `MOST_SUBSTEPS`."""
+    with the mobility M, the width eps and the curvature max f'' of the free energy. Beside a particle that is
+    ``ratio`` times as heavy, a light one diffuses up to (1 + ratio) / 2 times as fast. Raises `OutOfRangeError`
+    for more than `MOST_SUBSTEPS`."""
     mixture, cut, densities = scene.mixture, scene.discretisation, rest_density
     rate = laplacian_rate(smoothing_kernel(cut.kernel), cut.spacing, cut.support_radius, scene.dimension)
     rate *= 0.5 * (1.0 + float(np.max(densities) / np.min(densities)))

@@ -137,7 +137,7 @@ class Numbers:
 
 
 class Tables:
-    """The arrays of a user's function as one table in each scene, with its tangent and its adjoint."""
+    """One table for each scene that holds all arrays of a user's function, with its tangent and its adjoint."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
         self._layout = layout

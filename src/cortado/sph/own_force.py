@@ -1,7 +1,8 @@
 """Forces, and laws of viscosity, that are one function of a user's.
 
-`Body` is the acceleration a_i = f(x_i, v_i, t, theta) [m/s2] of each particle. Its adjoint is Warp's own of the product
-f . a_bar; its tangent is put together of the gradients of its components, so that both are exact.
+`Body` is the acceleration a_i = f(x_i, v_i, t, theta) [m/s2] of each particle. Both
+derivatives are exact. The adjoint is that which Warp makes of the product f . a_bar, and the tangent is the sum of the
+gradients of the components.
 
 `Pair` is a force between neighbours: the force [N], in 2-D per metre, on a particle from each
 neighbour within the support is (W(x_ij) / W(0)) f(x_ij, v_ij, t, theta), so that

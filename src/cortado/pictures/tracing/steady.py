@@ -102,8 +102,8 @@ def find_means(first, own, s, reach, means, bodies):
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def find_ways(first, own, others, width, touching, indices, ways):
-    """Find how far the fluid in each block, of a width in spacings, is from where it is in other frames, in spacings;
-    which block of theirs it is; and which blocks touch it."""
+    """For each block, of a ``width`` in spacings: find how far its fluid has moved in other frames [spacings], which
+    block of theirs it is, and which blocks touch it."""
     n = first + wp.tid()
     at = block_at(own.b, own.blocks[n])
     for k in range(TOUCHING):
