@@ -181,6 +181,18 @@ def test_positions_have_bounds_from_zero_on():
     assert datasets._ends(np.array([[[0.1, 2.0], [0.2, 0.1]]])) == {"upper": [0.2, 2.0]}
 
 
+def test_particles_that_would_jump_are_refused():
+    """Particles that drains took, and those that emitters have in reserve, rest metres away."""
+    tap = {"phase": "water", "outlet": [0.8, 0.3], "radius": 0.1, "flow_rate": 0.1}
+    hole = {"shape": "box", "name": "hole", "lower": [0.6, 0.0]}
+    column = cortado.Scene(**loads(SCENE), emitter=[tap])
+    datasets.bounds_of(column)
+    with pytest.raises(InputError, match=r"\[\[drain\]\] is given, but must be left out"):
+        datasets.bounds_of(cortado.Scene(**loads(SCENE), drain=[hole]))
+    with pytest.raises(InputError, match=r"emitter\[0\] has particles in reserve, .* a length of 1.6 m has room"):
+        datasets.bounds_of(column.lasting(time=2.0))
+
+
 def test_what_crosses_a_period_moves_the_shorter_way():
     positions = np.array([[[0.9, 0.0]], [[1.1, 0.1]], [[-0.5, 0.3]]])
     origin, periods = np.array([-0.5, 0.0]), np.array([2.0, 0.0])

@@ -178,7 +178,9 @@ def _asked(member: Member) -> dict[str, Any]:
     with unwarned():
         ends = [[f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()] for end in (0, 1)]
         for end in ends:
-            load_scene(member.file, [*member.overrides, *end]).solver.fixed_time_step("a data set")
+            one = load_scene(member.file, [*member.overrides, *end])
+            one.solver.fixed_time_step("a data set")
+            bounds_of(one.lasting(steps=table.steps))
         for k, key in enumerate(table.vary):
             others = [*ends[0][:k], *ends[0][k + 1 :]]
             if ends[0][k] != ends[1][k] and _are_one(member, [*others, ends[0][k]], [*others, ends[1][k]]):
@@ -187,7 +189,6 @@ def _asked(member: Member) -> dict[str, Any]:
         if key in ("solver.time_step", "dimension", "discretisation.spacing") or key.startswith("container."):
             raise InputError(f"vary has {key}, which must be the same in all runs of a data set.")
     scene = _scene(member)
-    bounds_of(scene)
     if len(scene.phase) > (most := KINDS - MORE_FLUID + 1):
         raise InputError(f"The scene has {len(scene.phase)} phases, but a data set has types for at most {most}.")
     asked = {"scene": json.loads(scene.to_json()), "dataset": table.model_dump(mode="json")}

@@ -212,10 +212,20 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
 
 def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where the bounds of a data set begin in the scene, how long they are, and the periods of its axes, 0 of
-    those without one, each (d,) [m]. Walls are within; raises `InputError` without a container."""
+    those without one, each (d,) [m]. Walls are within; raises `InputError` without a container, and where particles
+    rest far outside of it before they come in or once they are out."""
     ends, (_, periods) = scene.container.extent(), scene.periods
     if ends is None:
         raise InputError("container.shape is 'none', but must be 'box' or 'cylinder', as a data set has bounds.")
+    if scene.drain:
+        raise InputError("[[drain]] is given, but must be left out, as a data set keeps every particle to the end.")
+    spacing = scene.discretisation.spacing
+    for index, emitter in enumerate(scene.emitter):
+        if (layers := emitter.supply(spacing)) > emitter.layers(spacing):
+            raise InputError(
+                f"emitter[{index}] has particles in reserve, but a data set has every particle from the start: a "
+                f"length of {layers * spacing:.4g} m has room for all of them, or take fewer steps."
+            )
     room = np.where(periods > 0.0, 0.0, MARGIN * scene.discretisation.spacing)
     return ends[0] - room, ends[1] - ends[0] + 2.0 * room, np.asarray(periods, dtype=np.float64)
 
