@@ -84,6 +84,16 @@ def test_a_table_of_time_steps(cortado_command):
 
 
 @pytest.mark.usefixtures("scene")
+def test_what_drains_took_is_no_part_of_the_centre_of_mass(cortado_command):
+    """It rests metres away. What is left are the two columns of particles on the left."""
+    Path("scene.toml").write_text(TINY_SCENE + '\n[[drain]]\nshape = "box"\nname = "side"\nlower = [0.2, 0.0]\n')
+    assert cortado_command("sweep", "scene.toml", "--set", "solver.time_step=0.002,0.001,0.0005", "--steps", 4)[0] == 0
+    table = json.loads(cortado_command("convergence", "runs/sweep", "--json")[1])
+    (place,) = [row for row in table["rows"] if row["name"] == "centre of mass, x"]
+    assert place["values"] == pytest.approx([0.1] * 3, abs=0.01)
+
+
+@pytest.mark.usefixtures("scene")
 def test_a_number_of_ones_own_is_in_the_table(cortado_command, tmp_path):
     (tmp_path / "own.py").write_text(
         "def lowest(trajectory):\n    return trajectory.positions[-1, :, 1].min()\n\n\n"

@@ -17,6 +17,7 @@ import numpy as np
 
 from cortado.cli.existing_runs import OwnQuantity, named_runs
 from cortado.errors import InputError, shown, warn
+from cortado.pictures.film import is_out
 from cortado.pictures.run_pictures import beside_measured
 from cortado.runs.run_folder import RunFolder, differences, read_json
 from cortado.runs.sensor import MeasuredColumn, measured_beside, summary
@@ -255,7 +256,9 @@ class Resolved:
         self.mass = float(masses.sum()) * float(self.scene["discretisation"]["spacing"]) ** last.dimension
         """Of all fluid [kg], in 2-D of a layer 1 m thick."""
         numbers = {f"{kind} energy": ("J", float(result["energy"]["last"][kind])) for kind in ("kinetic", "potential")}
-        centre = masses @ last.positions[0].astype(np.float64) / masses.sum()
+        if self.scene.get("emitter") or self.scene.get("drain"):  # what is in none of them counts
+            masses = masses * is_out(folder.read_scene(), last[0].others, len(masses))
+        centre = masses @ last.positions[0].astype(np.float64) / (masses.sum() or np.nan)
         numbers |= {f"centre of mass, {axis}": ("m", float(x)) for axis, x in zip("xyz", centre, strict=False)}
         readings = folder.read_sensors()
         for name, columns in summary(readings).items():
