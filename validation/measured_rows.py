@@ -52,7 +52,8 @@ class Row:
         values = iter(values)
 
         def rounded(figure: str) -> str:
-            return f"{next(values):,.{len(figure.partition('.')[2])}f}".replace("-0.0", "0.0")
+            digits = len(figure.partition(".")[2])
+            return f"{round(next(values), digits) + 0.0:,.{digits}f}"  # which is never -0.0
 
         def group(found: re.Match[str]) -> str:
             return "{" + ", ".join(map(rounded, found[1].split(", "))) + "}"
