@@ -12,8 +12,9 @@ import pytest
 import cortado
 import cortado.environments
 from cortado import InputError, Simulation
-from cortado.environments import FluidEnv, make_vec, scenes, side_by_side
+from cortado.environments import FluidEnv, make_vec, scenes
 from cortado.environments.catalogue import TASKS, Carry
+from cortado.environments.scenes import parts_of
 
 
 class Timed(Carry):
@@ -189,15 +190,15 @@ def test_batches_that_are_cut_for_the_cores_have_the_bits_of_single_ones(name, m
 
 
 def test_a_batch_is_cut_where_it_is_too_large_for_a_graph_and_too_small_for_a_launch_of_many_cores(monkeypatch):
-    monkeypatch.setattr(side_by_side, "usable_cores", lambda: 2)
+    monkeypatch.setattr(scenes, "usable_cores", lambda: 2)
     cpu, gpu = SimpleNamespace(is_cpu=True), SimpleNamespace(is_cpu=False)
 
     def parts(scenes, particles=144, device=cpu):
-        return side_by_side.parts_of(SimpleNamespace(batch=scenes, particles=particles, device=device))
+        return parts_of(SimpleNamespace(batch=scenes, particles=particles, device=device))
 
     assert [parts(scenes) for scenes in (1, 8, 27, 28, 32, 64, 432, 433)] == [1, 1, 1, 2, 2, 4, 16, 1]
     assert parts(64, device=gpu) == parts(4, particles=4000) == 1
-    monkeypatch.setattr(side_by_side, "usable_cores", lambda: 1)
+    monkeypatch.setattr(scenes, "usable_cores", lambda: 1)
     assert parts(64) == 1
 
 

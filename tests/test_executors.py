@@ -17,7 +17,7 @@ import pytest
 import cortado
 from cortado import ComputationError, CortadoWarning, DivergedError, InputError, Problem, Simulation, executors
 from cortado.cli.arguments import Where
-from cortado.device import worker_calls as calls
+from cortado.device import threads as calls
 from cortado.device.threads import usable_cores
 from cortado.errors import OutOfRangeError
 from cortado.executors import Distributed, InProcess, local_workers

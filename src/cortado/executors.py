@@ -20,8 +20,7 @@ from uuid import uuid4
 from cortado.arrays import require_arguments, require_function, require_whole
 from cortado.calls import counted, face
 from cortado.device.modules import VISIBLE, visible_gpus
-from cortado.device.threads import CORES, usable_cores
-from cortado.device.worker_calls import Answer, Lacking, Payload, call, in_words, pickled
+from cortado.device.threads import CORES, Answer, Lacking, Payload, call, in_words, pickled, usable_cores
 from cortado.errors import ComputationError, InputError, shown, warn
 from cortado.files.terminal import Hold
 

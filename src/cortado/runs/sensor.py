@@ -107,6 +107,20 @@ def checked_sensor(sensor: Any) -> Sensor:
     return sensor
 
 
+def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict[str, Sensor]:
+    """Return sensors by name; raises `InputError` for names that are ``taken`` and for anything but sensors."""
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise InputError(f"sensors is {shown(given)}, but must be a table of sensors by name, {{'gauge': sensor}}.")
+    for name in given:
+        if not isinstance(name, str) or name in taken:
+            raise InputError(
+                f"sensors has the name {shown(name)}, but must have texts other than {', '.join(sorted(taken))}."
+            )
+    return {name: checked_sensor(sensor) for name, sensor in given.items()}
+
+
 def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
     """Return the reading (k,) of a sensor; raise `InputError` unless it has one number for each of its columns."""
     what, columns = f"value of the sensor {type(sensor).__name__}", len(sensor.columns(at.dimension))
