@@ -86,6 +86,8 @@ def test_one_phase_loads_what_it_needs_and_no_more(tmp_path):
     assert first == FIRST
     assert both - first == BACK
     assert all(COMPILING.fullmatch(line + "\n") for line in err.splitlines()) and err.count("\n") == 2
+    names = [folder.name.rpartition("_")[0] for folder in tmp_path.rglob("wp_cortado_*") if folder.is_dir()]
+    assert len(set(names)) == len(names) == len(both)  # of which none got kernels after it was compiled
 
 
 def test_two_processes_start_cold_at_once(tmp_path):

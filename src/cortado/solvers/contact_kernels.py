@@ -71,7 +71,7 @@ class ContactKernels:
 def contact_kernels(precision: Precision) -> ContactKernels:
     """Make the kernels of contacts between bodies and solids in a precision."""
     real, vector, matrix, pair = precision.real, precision.vector, matrix_of(precision), precision.pair
-    modules, stiffness = [free_module(precision)] * 3, wp.constant(real(STIFFNESS))
+    modules, stiffness = [free_module(precision, "contacts")] * 3, wp.constant(real(STIFFNESS))
 
     @wp.func
     def vec(a: wp.vec3f) -> vector:

@@ -12,7 +12,7 @@ from cortado.particles.wall_terms import SolidShares
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import WithinBar
 from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent
-from cortado.sph.parts import Adjoints, Carried, Shares, StepContext, Tangents, begin_adjoint_kernel
+from cortado.sph.parts import Adjoints, Carried, Shares, StepContext, Tangents
 
 
 class ParticleTangent:
@@ -125,7 +125,7 @@ class ParticleAdjoint:
         """Write the adjoints of the fields of a step that ends with x' = x + dt v', given the result of `unsort`. v' is
         the ``v_star`` of an explicit prediction; earlier values are overwritten."""
         scene = {"x_scene_bar": free_bar.positions, "v_scene_bar": free_bar.velocities}
-        context.launch(begin_adjoint_kernel(self._solver.layout.precision), *self.bar.named, v_star=v_star, **scene)
+        context.launch(self._solver.integration.begin_adjoint, *self.bar.named, v_star=v_star, **scene)
 
     def predict(self, context: StepContext, within: WithinBar | None = None) -> None:
         """Apply the adjoint of a prediction v* = v + dt a, taken from the adjoint of velocities at that point, and of

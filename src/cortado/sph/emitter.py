@@ -94,7 +94,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
     and velocities. Of each scene, (members,), ``outlet`` is q_n [m], ``drift`` the velocity of prescribed particles
     [m/s], and ``emitted`` l at the end of the step [m]. ``path`` and ``flow`` have a row for each step."""
     real, vector, nozzle_of = precision.real, precision.vector, nozzle_type(precision)
-    module, derivatives = integration_module(precision, True, taped), integration_module(precision, False)
+    module, derivatives = (integration_module(precision, *one, topic="emitter") for one in ((True, taped), (False,)))
     numbers, remaining = ["nozzle", "particles"], remaining_function(precision)
     own = {nozzle_of: "nozzle", wp.array2d(dtype=vector): "path", wp.array2d(dtype=real): "flow"}
     own |= {wp.int32: "step", wp.float64: "emitted serial"}
@@ -230,7 +230,7 @@ def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
     """Make the kernel that marks, in scene order, the particles which the drains of a nozzle hold, and the kernel that
     gives those which join its column their places in line. ``before`` counts the marked particles before each."""
     real, nozzle_of, remaining = precision.real, nozzle_type(precision), remaining_function(precision)
-    module = integration_module(precision, True, taped)
+    module = integration_module(precision, True, taped, "emitter")
     typed = TypesByName(real, {nozzle_of: "nozzle", wp.float64: "serial emitted", wp.int32: "held before"})
 
     @particle_kernel(module, "held", numbers=["nozzle", "particles"])

@@ -47,7 +47,7 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     flat, rotation, hold = rotations(precision, dimension), rotations(precision, 3).rotation, hold_functions(precision)
     rate, freed, spin, held = hold.rate, hold.freed, hold.spin, hold.kind
-    angle, begun_rotation, modules = flat.angle, flat.rotation, [free_module(precision)] * 3
+    angle, begun_rotation, modules = flat.angle, flat.rotation, [free_module(precision, f"bodies_{dimension}d")] * 3
 
     if dimension == 2:
 

@@ -227,7 +227,7 @@ def row_kernels(precision: Precision) -> SimpleNamespace:
     of the time step. ``take`` begins from velocities, the adjoint of the impulse, of which ``heed`` writes what they
     leave in r; ``answer`` adds those by the solution, and what they give to the adjoint of the time step."""
     real, vector, matrix, six = precision.real, precision.vector, matrix_of(precision), precision.six
-    module, hold = free_module(precision), hold_functions(precision)
+    module, hold = free_module(precision, "rows"), hold_functions(precision)
     spin = hold.spin
     kinds = {vector: "V W pushed twisted", matrix: "turns", wp.int32: "going", hold.kind: "hold"}
     typed = TypesByName(real, {**kinds, six: "r rise p y product load impulse first"})

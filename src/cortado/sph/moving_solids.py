@@ -121,9 +121,10 @@ def hold_functions(precision: Precision) -> SimpleNamespace:
     return SimpleNamespace(kind=hold, rate=rate, freed=freed, spin=spin, root=root)
 
 
-def free_module(precision: Precision) -> Any:
-    """Return the Warp module of kernels of free bodies that need no smoothing kernel."""
-    return kernel_module(f"free_bodies_derivative_{precision.name}")
+def free_module(precision: Precision, topic: str = "bodies") -> Any:
+    """Return the Warp module of kernels of free bodies that need no smoothing kernel, or of a ``topic`` that not all
+    bodies need: a module with other kernels than before is compiled anew."""
+    return kernel_module(f"free_{topic}_derivative_{precision.name}")
 
 
 @cache
@@ -240,7 +241,8 @@ def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
     def end(rotation_i, scale_i, place_i, displacements_i, turns_told_i) -> tuple[vector, angle, angle, real]:
         return place_i + displacements_i, turns_told_i, rotation_i, scale_i
 
-    modules, told = [integration_module(precision, False)] * 3, ["displacements", "turns_told"]
+    topic, told = f"moving_solids_{dimension}d", ["displacements", "turns_told"]
+    modules = [integration_module(precision, False, topic=topic)] * 3
     turned = {"turns": "turned", "turns_before": "turned_before"}
     poses, written = ["before", "turns_before", "after", "turns", "scales"], ["position", "turn"]
     ends, kept = [f"{name}_new" for name in FIELDS], {f"{name}_new": name for name in ("rotation", "scale")}

@@ -338,9 +338,10 @@ def order_kernels(dtype: Any, module: Any) -> SimpleNamespace:
     return by_name(sort, unsort)
 
 
-def integration_module(precision: Precision, forward: bool, taped: bool = False) -> Any:
-    """Return the Warp module of kernels without a smoothing kernel; ``taped`` forward ones get Warp's own adjoint."""
-    return kernel_module(f"integration_{kind_of(forward, taped)}_{precision.name}", forward and taped)
+def integration_module(precision: Precision, forward: bool, taped: bool = False, topic: str = "integration") -> Any:
+    """Return the Warp module of kernels without a smoothing kernel; ``taped`` forward ones get Warp's own adjoint. What
+    only some scenes need has a ``topic`` of its own: a module with other kernels than before is compiled anew."""
+    return kernel_module(f"{topic}_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 
 @cache
@@ -416,7 +417,8 @@ def integration_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
         i = wp.tid()
         m_scene_bar[order[i]] = m_scene_bar[order[i]] + m_bar[i]
 
-    return by_name(sort, unsort, predict, predict_tangent, acceleration_adjoint, collect_masses)
+    begin_adjoint = begin_adjoint_kernel(precision)
+    return by_name(sort, unsort, predict, predict_tangent, acceleration_adjoint, collect_masses, begin_adjoint)
 
 
 @cache

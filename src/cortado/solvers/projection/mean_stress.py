@@ -198,7 +198,7 @@ def _mirror_work(d: Discretisation) -> Any:
 @cache
 def pressed_kernels(precision: Precision) -> Kernels:
     """Make the kernels of a pressure p = k / dt from its impulse k."""
-    real, modules = precision.real, [integration_module(precision, False)] * 3
+    real, modules = precision.real, [integration_module(precision, False, topic="impulses")] * 3
 
     def pressed(time_step: real, impulse_i: real) -> real:
         return impulse_i / time_step

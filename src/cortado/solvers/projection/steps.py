@@ -128,7 +128,7 @@ def following_kernels(d: Discretisation, dimension: int) -> Kernels:
 def moving_kernels(precision: Precision) -> Kernels:
     """Make the kernels of the positions before the first repair, whose adjoint stands where that of delta is
     written."""
-    modules = [integration_module(precision, forward) for forward in (True, False, False)]
+    modules = [integration_module(precision, forward, topic="moving") for forward in (True, False, False)]
     real, vector = precision.real, precision.vector
 
     def move(time_step: real, x_i: vector, v_new_i: vector, delta_i: vector) -> vector:
