@@ -25,9 +25,12 @@ from floating_bodies import (
     added_mass,
     disc_in_a_round_tank,
     floating_box,
+    heeled_box,
+    rolling_under_oil,
     settling_ball,
     settling_disc,
     stopping_cylinder,
+    swinging_box,
 )
 from held_water import MESHES, cup_turned, meshes, stirred
 
@@ -96,7 +99,7 @@ def disc(density: float, across: int, iterations: int) -> np.ndarray:
 
 
 def cases(device: str) -> dict[str, Callable[[], object]]:
-    """By name; the cavity and the piston run on the device."""
+    """By name; the cavity, the piston, and bodies that settle, swing and roll run on the device."""
     found: dict[str, Callable[[], object]] = {}
     for reynolds, across, duration in ((100, 50, 15.0), (400, 50, 50.0), (400, 100, 50.0)):
         for follow, name in ((False, ""), (True, ", velocities follow")):
@@ -122,6 +125,20 @@ def cases(device: str) -> dict[str, Callable[[], object]]:
         "settling-ball, b/a = 4, 12 across": partial(settling_ball, 12, 4.0, 1.73e-4, 0.15, device),
         "floating-box, 16 particles long": lambda: floating_box(16),
         "floating-box, 32 particles long": lambda: floating_box(32),
+        **{
+            f"{name}, {long} particles long": partial(measure, long, device=device)
+            for long in (16, 32, 64)
+            for name, measure in (
+                ("heaving-box", partial(swinging_box, rolls=False)),
+                ("rolling-box", partial(swinging_box, rolls=True, duration=8.0)),
+                ("heeled-box", heeled_box),
+            )
+        },
+        **{f"rolling-disc, {across} across": partial(rolling_under_oil, across, device=device) for across in (8, 16)},
+        **{
+            f"rolling-ball, {across} across": partial(rolling_under_oil, across, flat=False, device=device)
+            for across in (8, 12)
+        },
         "added-mass, a sphere 8 across, 20 deep, 2 iterations": lambda: added_mass(8, 20, 100, 2),
         "added-mass, a sphere 8 across, 20 deep, 2 iterations, 10 steps": lambda: added_mass(8, 20, 100, 2, steps=10),
         "added-mass, a sphere 8 across, 20 deep, 16 iterations": lambda: added_mass(8, 20, 100, 16),
@@ -173,7 +190,7 @@ ROWS = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="cases whose names begin so")
-    parser.add_argument("--device", default="cpu", help="of the cavity and the piston")
+    parser.add_argument("--device", default="cpu", help="of cavity, piston, settling, swinging and rolling bodies")
     rows.Printer.add_to(parser)
     given = parser.parse_args()
     rows.run_cases(cases(given.device), ROWS, given)
