@@ -153,6 +153,17 @@ def test_a_run_is_played_and_gone_through(scene):
         assert shown.slider.value > 0
 
 
+def test_what_drains_took_is_not_shown(scene):
+    """It rests metres away, and its density is next to nothing."""
+    scene.write_text(TINY_SCENE + '\n[[drain]]\nshape = "box"\nname = "side"\nlower = [0.2, 0.0]\n')
+    with window(scene, PORT + 5) as shown:
+        shown.tick()
+        assert (np.ravel(shown._state["drained"]) > 0.0).any() and points(shown).max() < 0.5
+        assert shown.window._shown.quantities["density"]().min() < 500.0
+        assert len(np.unique(coloured(shown, "density"), axis=0)) > 3
+        assert "<span>704" in shown.window.legend.content
+
+
 def test_the_field_of_a_part_colours_particles(scene):
     simulation = cortado.Simulation("scene.toml", forces=[Memory()])
     recorded = RecordedView(simulation.scene, simulation.run(3), lambda: simulation, PORT + 3)

@@ -20,6 +20,7 @@ from cortado.errors import CortadoError, InputError, unwarned
 from cortado.files.image_encoding import to_srgb
 from cortado.files.terminal import keeping, say
 from cortado.losses.loss import ADJOINT_FIELDS
+from cortado.pictures.film import drawn_for_each
 from cortado.pictures.painter import colours_of
 from cortado.pictures.particle_view import container_outline, outline
 from cortado.pictures.shown_solids import ShownSolid, own_faces, own_lines, shown_solids, turn_in_space
@@ -103,8 +104,8 @@ class Window:
 
     def show(self, shown: Shown) -> None:
         """Draw particles instead of those before, along a periodic axis within the period."""
-        domain = self.scene.domain
-        self._shown = replace(shown, positions=domain.wrapped(shown.positions))
+        self._drawn = drawn_for_each(self.scene, shown.positions)
+        self._shown = replace(shown, positions=self.scene.domain.wrapped(shown.positions))
         self._draw()
 
     def place_solids(self, scene: Scene) -> None:
@@ -121,7 +122,7 @@ class Window:
     def _draw(self) -> None:
         assert self._shown is not None
         self._stale = False
-        points, colours = self._space(self._shown.positions), self._colours(self._shown)
+        points, colours = self._space(self._shown.positions[self._drawn]), self._colours(self._shown)
         if self._cloud is None:
             size = 2.0 * RADIUS * self.scene.discretisation.spacing
             style = {"point_size": size, "point_shape": "circle", "precision": "float32"}
@@ -134,12 +135,12 @@ class Window:
         """Return sRGB colours (n, 3); the legend says their range, or why there are none."""
         from matplotlib import colormaps
 
-        name, own = self.colour.value, to_srgb(shown.colours[None])[0]
+        name, own = self.colour.value, to_srgb(shown.colours[None])[0][self._drawn]
         if name == "phase":
             self.legend.content = ""
             return own
         try:
-            values = np.asarray(shown.quantities[name]())
+            values = np.asarray(shown.quantities[name]())[self._drawn]
         except CortadoError as error:
             self.legend.content = in_words(str(error))
             return own

@@ -33,6 +33,7 @@ from cortado.runs.frames import Film, Pace, SolidMotions, posed, sized, solid_mo
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.appearance import Moment, Picture, View
 from cortado.scene.emitter_table import emitted_name, outlet_name, samples, waits
+from cortado.scene.fluid_particles import resting_places
 from cortado.scene.parameters import sizes
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
@@ -278,6 +279,17 @@ def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[n
     for _, first, sample in () if found.any() else samples(scene, particles):
         found[first : first + sample.layer] = True
     return found & (np.ravel(others["drained"]) == 0.0) if "drained" in others else found
+
+
+def drawn_for_each(scene: Scene, positions: NDArray) -> NDArray[np.int64]:
+    """Return which particle (n,) a viewer draws for each at positions (n, d) [m]: itself, or the first of the others
+    if it rests far away, in reserve of an emitter or taken by a drain."""
+    count = len(positions)
+    if not (scene.drain or scene.emitter):
+        return np.arange(count)
+    off = np.abs(positions - resting_places(scene, count)).max(axis=1)
+    there = ~(off <= scene.discretisation.spacing)  # places are NaN where all axes are periodic
+    return np.where(there, np.arange(count), np.argmax(there))
 
 
 def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
