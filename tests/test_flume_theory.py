@@ -2,39 +2,47 @@
 
 import runpy
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-FOLDER = Path(__file__).parents[1] / "examples" / "wave_flume"
+from flume_scripts import FOLDER, names_of
 
 
 @pytest.fixture(scope="module")
 def body():
     """The names of `body.py`, with coarse panels, and a flume of them."""
-    before = dict(sys.modules)
-    sys.path.insert(0, str(FOLDER))
-    try:
-        names = runpy.run_path(str(FOLDER / "body.py"))
-    finally:
-        sys.path.remove(str(FOLDER))
+    names = names_of("body.py")
     theory = names["LinearFlume"].__init__.__globals__
     theory.update(COARSE=0.08, FINE=0.05, HIGHEST=1.2)
-    names["flume"] = names["LinearFlume"]([3.0, 5.5, 5.6, 8.5])
-    for name in set(sys.modules) - set(before):
-        if name in ("panels", "wave_flume"):
-            del sys.modules[name]
+    names["flume"] = names["LinearFlume"]([3.0], names["MEASURED"])
     return {**names, "theory": theory}
+
+
+@pytest.mark.parametrize("turns", [1, -1])
+@pytest.mark.parametrize("lean", [0.0, 0.3])
+def test_a_trapezium_displaces_what_its_closed_form_says(body, lean, turns):
+    """Half as broad as ``a + s y`` at a height y, its middle at ``lean y``; corners either way round, keel at -1."""
+    a, s, draught, kg = 0.1, 0.4, 0.2, 0.12
+    corners = np.array([[-a, 0.0], [a, 0.0], [a + 0.3 * (s + lean), 0.3], [-a + 0.3 * (lean - s), 0.3]])
+    section = body["MEASURED"].__class__((corners - [0.0, 1.0])[::turns], draught, 5.0)
+    area = draught * (2.0 * a + s * draught)
+    up = draught**2 * (a + 2.0 / 3.0 * s * draught) / area
+    assert section.area == pytest.approx(area) and section.mass == pytest.approx(1000.0 * area)
+    assert section.buoyancy_centre == pytest.approx([lean * up, up])
+    beam, off = 2.0 * (a + s * draught), lean * (draught - up)
+    turn = beam**3 / 12.0 + beam * off**2 + area * (up - kg)
+    assert section.stiffness(kg) == pytest.approx(np.array([[beam, beam * off], [beam * off, turn]]))
+    assert section.corners.min(axis=0) == pytest.approx([5.0 + corners[:, 0].min(), 1.0 - draught])
 
 
 def test_panels_send_the_waves_of_a_flap(body):
     """Without a section the surface is that of the sum of modes, to what coarse panels can do."""
     theory, times = body["theory"], np.arange(0.0, 20.0, 0.02)
-    flume = body["LinearFlume"]([3.0], has_section=False)
+    flume = body["LinearFlume"]([3.0])
     stroke = 0.01 * np.minimum(times / 4.0, 1.0) * np.sin(2.0 * np.pi * times / 1.2)
     found = flume.series(flume.surfaces[:, 0, 0] * flume.spectrum(stroke), len(times))
-    exact = runpy.run_path(str(FOLDER / "wave_flume.py"))["theory"](times, stroke, np.array([3.0]))[:, 0]
+    exact = names_of("wave_flume.py")["theory"](times, stroke, np.array([3.0]))[:, 0]
     late = times > 12.0
     one, other = (theory["swing"](times[late], each[late], 1.2) for each in (found, exact))
     assert abs(one / other) == pytest.approx(1.0, abs=0.02) and abs(np.angle(one / other)) < 0.15

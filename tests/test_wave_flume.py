@@ -1,17 +1,18 @@
 """The numerical flume of `examples/wave_flume`: its theory, its fit, and a short run beside what was measured."""
 
+import re
 import runpy
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cortado.pictures.image_files import read_picture
+from flume_scripts import FOLDER, names_of
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "wave_flume" / "wave_flume.py"
-FLUME = runpy.run_path(str(EXAMPLE))
+FLUME = names_of("wave_flume.py")
+OWN = ["--hull", "hull.csv", "--draught", "0.15", "--at", "1", "--centre", "0.12", "--gyration", "0.14"]
 
 
 @pytest.mark.parametrize("period", [0.897, 1.158, 1.5])
@@ -46,19 +47,68 @@ def test_the_bar_of_a_gain_holds_what_a_model_lacks():
 def test_waves_come_to_the_probes_as_they_were_measured(monkeypatch, tmp_path, capsys):
     """With 12 particles in the depth; a flap that moved the other way would be 180 degrees off."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), "--deep", "12", "--begin", "9", "--end", "13"])
-    runpy.run_path(str(EXAMPLE), run_name="__main__")
-    rows = [line.split() for line in capsys.readouterr().out.splitlines()[2:6]]
+    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.setattr(sys, "argv", ["wave_flume.py", "--deep", "12", "--begin", "9", "--end", "13"])
+    runpy.run_path(str(FOLDER / "wave_flume.py"), run_name="__main__")
+    left_out, _, _, *rows = [line.split() for line in capsys.readouterr().out.splitlines()[:7]]
+    assert left_out[-2:] == ["8.5", "m"]
     places, ratios, phases = np.array([[float(row[n]) for n in (0, 4, 5)] for row in rows]).T
     assert places.tolist() == [3.0, 4.95, 5.2, 5.5]
     assert (np.abs(ratios - 0.95) < 0.15).all() and (np.abs(phases) < 25.0).all()
     assert np.ptp(read_picture(tmp_path / "wave_flume.png")) > 0.5
 
 
-def test_a_flap_makes_waves_meet_where_they_shall(monkeypatch):
+@pytest.fixture
+def own_case(monkeypatch, tmp_path):
+    """A record of a flap alone, with an offset, and a hull, in the current folder."""
+    monkeypatch.chdir(tmp_path)
+    times = np.arange(0.0, 10.0, 0.04)
+    rows = [f"{one + 1.0},{0.001 + 0.01 * np.sin(6.0 * one)}" for one in times]
+    (tmp_path / "flap.csv").write_text("\n".join(["time_s,wavemaker_m", *rows]))
+    (tmp_path / "hull.csv").write_text("x_m,y_m\n-0.2,0.3\n-0.1,0\n0.1,0\n0.2,0.3\n")
+    (tmp_path / "crossed.csv").write_text("x_m,y_m\n0,0\n1,1\n1,0\n0,1\n")
+
+
+def test_a_flap_and_a_hull_of_ones_own_need_no_measurements(monkeypatch, own_case, capsys):
+    """A few steps with coarse panels; the record begins at neither 0 m nor 0 s, and one probe is on the beach."""
+    monkeypatch.setitem(FLUME["read"].__globals__, "SHORTEST", 0.05)
+    monkeypatch.setitem(FLUME["LinearFlume"].__init__.__globals__, "COARSE", 0.1)
+    monkeypatch.setitem(FLUME["LinearFlume"].__init__.__globals__, "HIGHEST", 1.2)
+    few = ["--deep", "10", "--long", "4", "--begin", "0", "--end", "0.1", "--probes", "0.5", "3", "1.6"]
+    monkeypatch.setattr(sys, "argv", ["wave_flume.py", "flap.csv", *OWN, *few])
+    FLUME["main"]()
+    said = capsys.readouterr().out
+    assert "1 mm and 1 s" in said and "probes left out" in said and "3 m\n" in said
+    assert "37.50 kg for each metre" in said and "correlation" not in said
+    assert [line.split()[0] for line in said.splitlines()[-5:]] == ["0.50", "1.60", "sway_m:", "heave_m:", "roll_rad:"]
+    assert "nan" not in said and np.ptp(read_picture("wave_flume.png")) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        (["hull.csv"], "has no column time_s"),
+        (["gone.csv"], "gone.csv not found"),
+        (["flap.csv", *OWN, "--hull", "crossed.csv"], "no polygon"),
+        (["flap.csv", *OWN, "--draught", "0.3"], "would not float"),
+        (["flap.csv", *OWN, "--at", "7.9"], "not between the flap and 8 m"),
+        (["flap.csv", *OWN[:4]], "--at and --centre and --gyration are wanted"),
+        (["flap.csv", *OWN[2:]], "--hull HULL.csv"),
+        (["flap.csv", "--probes", "7"], "No probe is left"),
+        (["flap.csv", "--begin", "7"], "4 s or more"),
+    ],
+)
+def test_what_is_wrong_with_a_case_is_said_in_a_sentence(monkeypatch, own_case, capsys, options, wanted):
+    monkeypatch.setattr(sys, "argv", ["wave_flume.py", "--begin", "2", *options])
+    with pytest.raises(SystemExit) as end:
+        FLUME["arguments"]()
+    sentence = capsys.readouterr().err.splitlines()[-1]
+    assert end.value.code == 2 and re.search(re.escape(wanted), sentence) and sentence.endswith(".")
+
+
+def test_a_flap_makes_waves_meet_where_they_shall():
     """In linear theory, whose derivative it is, one round is enough: the crest is as high as was asked, and in time."""
-    monkeypatch.syspath_prepend(str(EXAMPLE.parent))
-    backward = runpy.run_path(str(EXAMPLE.with_name("backward.py")))
+    backward = names_of("backward.py")
     names = backward["found"].__globals__
     names["simulated"] = lambda times, stroke, places, asked: stroke
     names["surface"] = lambda stroke, times, places: FLUME["theory"](times, stroke, np.array(places))

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from wave_flume import BEACH, BEGIN, END, draw, period, simulated, surface, swing, theory
+from case import BEGIN, END, period, record_of, swing
+from wave_flume import BEACH, draw, simulated, surface, theory
 
 EVERY, STEADY, SMOOTH = 5, 0.3, 1.0  # samples between knots; weights [m per m] of their places and second differences
 PLACE, FOCUS, CREST = 5.0, 14.0, 0.036  # where [m] and when [s] waves meet, and how high [m]
@@ -114,8 +115,7 @@ def arguments():
 def main():
     """Find the motion of a flap, print how good it is, and draw it."""
     asked = arguments()
-    record = np.genfromtxt(asked.record, delimiter=",", names=True)
-    times = record["time_s"]
+    times, _, record = record_of(asked.record)
     aim = recorded(record, times, asked) if asked.aim == "flap" else focused(times)
     others = [place for place in (5.2, 5.5, 8.5) if place < asked.long - BEACH] if asked.aim == "flap" else []
     stroke, here = found(times, aim, asked, others)

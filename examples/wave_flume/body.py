@@ -10,13 +10,15 @@ discrepancy, a Gaussian process over time of each motion. The last is the one to
 """
 
 import argparse
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
-from panels import BESIDE, LinearFlume
+from case import BEGIN, END, MOTIONS, PROBES, period, record_of, swing
+from panels import LinearFlume
 from scipy.optimize import least_squares, minimize
-from wave_flume import BEGIN, END, MOTIONS, PROBES, TOLD, Rig, draw, on_section, period, simulated, swing
+from section import MEASURED, Rig
+from wave_flume import draw, on_section, simulated
 
 EVERY, SINCE, DRAWS = 5, 3.0, 1000  # one sample in so many; the first that counts [s]; how often blocks are drawn
 NAMES = "centre of gravity [m]", "radius of gyration [m]", "springs [N/m]", "damping [N s/m]"
@@ -108,9 +110,8 @@ def compared(name, times, motions, measured, long):
 
 
 def read(path):
-    record = np.genfromtxt(path, delimiter=",", names=True)
-    times, stroke = record["time_s"], -record["wavemaker_m"]
-    return times, stroke, np.stack([record[name] for name in MOTIONS], axis=1), period(times, stroke)
+    times, way, record = record_of(path)
+    return times, -way, np.stack([record[name] for name in MOTIONS], axis=1), period(times, -way)
 
 
 def arguments():
@@ -129,9 +130,9 @@ def arguments():
 def main():
     """Find the numbers, print them with bars, and say what they make of another run."""
     asked = arguments()
-    flume = LinearFlume([*PROBES.values(), BESIDE])
+    flume = LinearFlume(PROBES.values(), MEASURED)
     times, stroke, measured, long = read(asked.record)
-    told = [*astuple(TOLD), 0.2, 1.07, 0.05, *([0.35] if asked.dry else [])]
+    told = [*astuple(MEASURED.rig), 0.2, 1.07, 0.05, *([0.35] if asked.dry else [])]
     first, best, bars, left = fitted(flume, times, stroke, measured, long, np.log(told))
     print(f"{asked.record.stem}: sway, heave and roll are left with {np.round(left, 2)} of their deviations")
     print("number, told, least squares, of noise, by blocks, with a discrepancy, its bar, in bars from told")
@@ -147,9 +148,9 @@ def main():
         compared(f"{path.stem} by found numbers", times, motions, measured, long)
         if asked.check:
             asked.deep = asked.check
-            rig, gain = Rig(*np.exp(best[:4])), np.exp(best[5])
-            run = simulated(times, gain * stroke, [5.5], asked, True, rig, often=0.04)
-            motions = np.stack([np.interp(times, *one) for one in on_section(run, False, True).values()], axis=1)
+            section, gain = replace(MEASURED, rig=Rig(*np.exp(best[:4]))), np.exp(best[5])
+            run = simulated(times, gain * stroke, [5.5], asked, section, often=0.04)
+            motions = np.stack([np.interp(times, *one) for one in on_section(run, section).values()], axis=1)
             motions = motions[times <= asked.end]
             compared(f"{path.stem} simulated", times[: len(motions)], motions, measured[: len(motions)], long)
         rows = {name: (one[: len(motions)], own) for name, one, own in zip(MOTIONS, measured.T, motions.T, strict=True)}

@@ -8,37 +8,19 @@ At the surface q is w^2 / g of the potential; at the end -i k of it, so that wav
 it their speed; the floor is a mirror. So waves go to and fro between flap and section as often as they do in the flume.
 """
 
-import argparse
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
-from wave_flume import (
-    BEAM,
-    BEGIN,
-    BILGE,
-    BREADTH,
-    DEPTH,
-    DRAUGHT,
-    END,
-    GAUGE,
-    GRAVITY,
-    HINGE,
-    LOADS,
-    MOTIONS,
-    PROBES,
-    SECTION,
-    TOLD,
-    hull,
-    period,
-    swing,
-)
+from case import parser_of, period, read, swing
+from section import DENSITY, DEPTH, GAUGE, GRAVITY, HINGE
 
-DENSITY, LEAVE, COARSE, FINE = 1000.0, 10.0, 0.04, 0.015  # [kg/m3], end of the water, panels, those of the section [m]
+LEAVE, COARSE, FINE = 10.0, 0.04, 0.015  # least way to the end of the water, panels, those of the section [m]
 WINDOW, FADE, HIGHEST, STEP = 80.0, 4.0, 2.0, 0.02  # series [s], how they fade in it, frequencies [Hz], samples [s]
-GUIDES, SLOW = 0.303, 2e-3  # what moves across with the section [kg]; where dry friction turns round [m/s]
-NEAR, BESIDE, BEHIND = 5.5, 5.6, 8.5  # where waves before and behind the section are told apart [m]
-AREA = BEAM * DRAUGHT - (2.0 - 0.5 * np.pi) * BILGE**2  # of the section under water [m2]
+SLOW, ASIDE, APART = (
+    2e-3,
+    1.5,
+    0.1,
+)  # where dry friction turns round [m/s]; where waves are told apart, of the place [m]
 
 
 def split(corners, length):
@@ -48,13 +30,12 @@ def split(corners, length):
     return np.concatenate([*parts, [corners[-1]]])
 
 
-def outline(has_section):
+def outline(section, length):
     """The ends (2, n, 2) of all panels, counter-clockwise around the water, and what each of them is."""
-    corner = [(LEAVE, DEPTH), (0.0, DEPTH)]
-    lines = [("end", split([(LEAVE, 0.0), corner[0]], COARSE))]
-    if has_section:
-        under = [(SECTION + 0.5 * BEAM, DEPTH), *[one for one in hull()[::-1] if one[1] < DEPTH and one[0] > SECTION]]
-        line = under + [(2.0 * SECTION - x, y) for x, y in under[::-1]]
+    corner = [(length, DEPTH), (0.0, DEPTH)]
+    lines = [("end", split([(length, 0.0), corner[0]], COARSE))]
+    if section:
+        line = section.wet[::-1] + section.keel
         lines += [("top", split([corner[0], line[0]], COARSE)), ("hull", split(line, FINE))]
         lines += [("top", split([line[-1], corner[1]], COARSE))]
     else:
@@ -94,19 +75,23 @@ class LinearFlume:
     ``loads`` (n, 3, 4) [N, N m] are those on the section, about its keel, and ``surfaces`` (n, places, 4) [m].
     """
 
-    def __init__(self, places, has_section=True):
-        self.places = list(places)
+    def __init__(self, places, section=None):
+        self.section, self.places = section, list(places)
+        if section:  # waves before and behind it
+            near = max(section.place - ASIDE, 0.5 * (section.place + section.left))
+            self.places += [near, near + APART, section.place + ASIDE]
+        length = max(LEAVE, max(self.places) + ASIDE)
         count = round(WINDOW / STEP)
         above = 2.0 * np.pi * np.fft.rfftfreq(count, STEP)
         self.rates = above[above < 2.0 * np.pi * HIGHEST] - 1j * FADE / WINDOW
         self.k = np.array([wave_number(w) for w in self.rates])
-        (start, end), kinds = outline(has_section)
+        (start, end), kinds = outline(section, length)
         middle, size = 0.5 * (start + end), np.hypot(*(end - start).T)
         along = (end - start) / size[:, None]
         normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
         of_q, of_potential = influence(start, along, normal, size, middle)
         flap = np.where(kinds == "flap", -np.maximum(middle[:, 1] - HINGE, 0.0) / (DEPTH - HINGE), 0.0)
-        x, y = (middle - [SECTION, DEPTH - DRAUGHT]).T
+        x, y = (middle - (section.keel if section else 0.0)).T
         modes = np.stack([*normal.T, x * normal[:, 1] - y * normal[:, 0]], axis=1) * (kinds == "hull")[:, None]
         moved, top = np.concatenate([flap[:, None], modes], axis=1), np.flatnonzero(kinds == "top")
         order = top[np.argsort(middle[top, 0])]
@@ -115,7 +100,9 @@ class LinearFlume:
         for n, (w, k) in enumerate(zip(self.rates, self.k, strict=True)):
             factor = np.where(kinds == "top", w**2 / GRAVITY, np.where(kinds == "end", -1j * k, 0.0))
             potential = np.linalg.solve(of_potential - of_q * factor, of_q @ (1j * w * moved))
-            self.loads[n] = -DENSITY * 1j * w * BREADTH * (modes * size[:, None]).T @ potential
+            self.loads[n] = (
+                -DENSITY * 1j * w * (section.breadth if section else 1.0) * (modes * size[:, None]).T @ potential
+            )
             here = -1j * w / GRAVITY * potential[order]
             self.surfaces[n] = np.stack([np.interp(self.places, middle[order, 0], one) for one in here.T], axis=1)
 
@@ -136,17 +123,19 @@ class LinearFlume:
 
     def response(self, rig, roll_damping=0.0):
         """What 1 N or 1 N m on a floating section moves it by, and what the flap pushes it with, at its centre."""
-        lever = np.eye(3)
-        lever[2, 0] = rig.gravity_centre
+        section, lever = self.section, self.lever(rig)
         around = lever @ self.loads[:, :, 1:] @ lever.T
-        mass = DENSITY * AREA * BREADTH
-        corners = 2.0 * BILGE**2 * (0.5 * BILGE - 0.25 * np.pi * BILGE + BILGE / 3.0)
-        buoyancy_centre = (0.5 * BEAM * DRAUGHT**2 - corners) / AREA
-        stable = BEAM**3 / 12.0 + AREA * (buoyancy_centre - rig.gravity_centre)
-        inertia = np.diag([mass + GUIDES, mass, mass * rig.gyration**2])
-        held = np.diag([rig.stiffness, DENSITY * GRAVITY * BREADTH * BEAM, DENSITY * GRAVITY * BREADTH * stable])
+        inertia = np.diag([section.mass + section.guides, section.mass, section.mass * rig.gyration**2])
+        held = np.diag([rig.stiffness, 0.0, 0.0])
+        held[1:, 1:] = DENSITY * GRAVITY * section.stiffness(rig.gravity_centre)
         w, damped = self.rates[:, None, None], np.diag([rig.damping, rig.damping, roll_damping])
         return np.linalg.inv(held + 1j * w * damped - w**2 * inertia - around), self.loads[:, :, 0] @ lever.T
+
+    def lever(self, rig):
+        """The matrix (3, 3) that turns loads about the keel into those about the centre of gravity."""
+        lever = np.eye(3)
+        lever[2, :2] = rig.gravity_centre, -self.section.buoyancy_centre[0]
+        return lever
 
     def motions(self, stroke, rig, roll_damping=0.0, friction=0.0):
         """Sway, heave and roll (times, 3) of a floating section, with drift and the dry friction [N] of its guides."""
@@ -159,19 +148,34 @@ class LinearFlume:
             push = push + self.spectrum(rubbed(free, self.series(1j * self.rates * answer[:, 0, 0], count), friction))
         return self.series(linear + answer[:, :, 0] * push[:, None], count)
 
+    def surface(self, flap, keel):
+        """The surface (n, places) [m] of amplitudes of the flap (n,) and of the section about its keel (n, 3)."""
+        return np.einsum("npj,nj->np", self.surfaces, np.concatenate([flap[:, None], keel], axis=1))
+
+    def answers(self, stroke):
+        """The surface (times, places) [m] that a stroke makes, and loads on the section (times, 3), or its motions."""
+        flap, count, section = self.spectrum(stroke), len(stroke), self.section
+        still, places = np.zeros((len(self.rates), 3)), len(self.places) - (3 if section else 0)
+        if section and section.rig:
+            answer, pushed = self.response(section.rig)
+            moved = np.einsum("nij,nj->ni", answer, pushed * flap[:, None]) @ self.lever(section.rig)
+            return self.series(self.surface(flap, moved)[:, :places], count), self.motions(stroke, section.rig)
+        about_gauge = np.array([[1.0, 0.0, GAUGE], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        loads = self.series(self.loads[:, :, 0] @ about_gauge * flap[:, None], count)
+        return self.series(self.surface(flap, still)[:, :places], count), loads
+
     def drift(self, flap, linear, rig, count):
         """The slow force (times,) [N] across: the momentum that waves lose at the section (Longuet-Higgins 1977)."""
-        keel = linear + np.stack([rig.gravity_centre * linear[:, 2], *np.zeros((2, len(linear)))], axis=1)
-        surface = np.einsum("npj,nj->np", self.surfaces, np.concatenate([flap[:, None], keel], axis=1))
-        near, beside, behind = (surface[:, self.places.index(place)] for place in (NEAR, BESIDE, BEHIND))
-        turn, way = np.exp(-1j * self.k * (BESIDE - NEAR)), np.exp(-1j * self.k * (SECTION - NEAR))
+        surface = self.surface(flap, linear @ self.lever(rig))
+        near, beside, behind = surface[:, -3:].T
+        turn, way = np.exp(-1j * self.k * APART), np.exp(-1j * self.k * (self.section.place - self.places[-3]))
         onward = (beside - near / turn) / (turn - 1.0 / turn)
         waves = np.stack([onward * way, (near - onward) / way, behind / way], axis=1)
         waves[np.abs(self.rates) < 2.0] = 0.0
         sent, back, passed = (np.abs(self.analytic(waves, count)) ** 2).T
         k = self.k[np.argmax(np.abs(flap))].real
         depth = 1.0 + 2.0 * k * DEPTH / np.sinh(2.0 * k * DEPTH)
-        return 0.25 * DENSITY * GRAVITY * depth * BREADTH * (sent + back - passed)
+        return 0.25 * DENSITY * GRAVITY * depth * self.section.breadth * (sent + back - passed)
 
 
 def rubbed(free, kick, friction):
@@ -190,31 +194,24 @@ def rubbed(free, kick, friction):
 
 def main():
     """Print what linear theory makes of a record beside what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("record", type=Path, help="a CSV file")
-    parser.add_argument("--gain", type=float, default=1.0, help="the flap moves by so many times its record")
+    parser = parser_of(__doc__)
     asked = parser.parse_args()
-    record = np.genfromtxt(asked.record, delimiter=",", names=True)
-    times, stroke, names = record["time_s"], -asked.gain * record["wavemaker_m"], record.dtype.names
-    flume = LinearFlume([*PROBES.values(), BESIDE], has_section="fz_n" in names or "heave_m" in names)
-    flap, moved = flume.spectrum(stroke), np.zeros((len(flume.rates), 3))
-    rows = {}
-    if "heave_m" in names:
-        answer, pushed = flume.response(TOLD)
-        moved = np.einsum("nij,nj->ni", answer, pushed * flap[:, None])
-        rows = dict(zip(MOTIONS, flume.motions(stroke, TOLD).T, strict=True))
-        moved = moved + np.stack([TOLD.gravity_centre * moved[:, 2], *np.zeros((2, len(moved)))], axis=1)
-    if "fz_n" in names:
-        loads = flume.loads[:, :, 0] @ np.array([[1.0, 0.0, GAUGE], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) * flap[:, None]
-        rows = dict(zip(LOADS, flume.series(loads, len(times)).T, strict=True))
-    surface = np.einsum("npj,nj->np", flume.surfaces, np.concatenate([flap[:, None], moved], axis=1))
-    rows |= dict(zip(PROBES, flume.series(surface, len(times)).T, strict=False))
-    long, late = period(times, stroke), (times >= BEGIN) & (times <= END)
+    try:
+        case = read(asked).within()
+    except (OSError, ValueError) as wrong:
+        parser.error(str(wrong))
+    names, times, late = [*case.on_section, *case.probes], case.times, case.late
+    surface, on_section = LinearFlume(case.probes.values(), case.section).answers(case.stroke)
+    found = np.concatenate([on_section, surface] if case.section else [surface], axis=1)
+    long = period(times, case.stroke)
     print(f"linear theory, waves of {long:.3f} s; amplitude, measured amplitude, ratio, phase after measured [deg]")
-    for name, each in rows.items():
-        own, true = (swing(times[late], one[late], long) for one in (each, record[name]))
+    for name, one, other in zip(names, found.T, case.columns(names).T, strict=True):
+        own, true = (swing(times[late], each[late], long) for each in (one, other))
+        print(f"{name:10} {abs(own):9.4g}", end="")
         print(
-            f"{name:10} {abs(own):9.4g} {abs(true):9.4g} {abs(own / true):6.3f} {np.degrees(np.angle(true / own)):6.1f}"
+            f" {abs(true):9.4g} {abs(own / true):6.3f} {np.degrees(np.angle(true / own)):6.1f}"
+            if np.isfinite(true)
+            else ""
         )
 
 
