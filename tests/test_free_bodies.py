@@ -254,6 +254,16 @@ def test_a_box_lies_on_a_slope_or_slides_as_friction_says():
     assert np.polyfit(1e-3 * np.arange(100), sliding[101:], 1)[0] == pytest.approx(1.0 - 0.2 / np.tan(0.3), rel=0.01)
 
 
+def test_a_belt_takes_a_box_along_by_friction():
+    """With mu g until the box goes as fast as the surface of the belt."""
+    belt = box([-0.1, 0.3], [1.1, 0.5], name="belt", surface_velocity=[0.5, 0.0])
+    body = box([0.1, 0.5], [0.2, 0.6], name="body", motion="free", density=500.0, friction=0.3)
+    scene = plane(belt, body, fluid=[FAR_AWAY], solver=SOLVER)
+    speeds = Simulation(scene, precision="float64").run(300, record_every=1).solids["body"].velocities[:, 0]
+    assert np.polyfit(1e-3 * np.arange(80), speeds[20:100], 1)[0] == pytest.approx(0.3 * 9.81, rel=0.02)
+    assert speeds[-50:] == pytest.approx(0.5, rel=1e-3)
+
+
 def test_bodies_touch_across_a_period():
     """One that has left the box where it began meets images: of a body, of a pillar, and of the floor."""
     raft = box([0.8, 0.5], [0.9, 0.6], name="raft", motion="free", density=500.0, velocity=[2.0, 0.0])
