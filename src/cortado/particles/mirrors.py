@@ -1,12 +1,13 @@
-"""Mirrors: flat walls whose images of the fluid stand in place of wall particles.
+"""Mirrors: flat walls that act on fluid by mirror images of the fluid instead of wall particles.
 
-An image of particle j is what a flat wall mirrors, or two or three sides of the container that meet. A reflection of
-the container has a bit for each side: 1, 2 and 4 for those at the lower ends of the axes, 8, 16 and 32 for the upper
-ones. Beyond these numbers, from `FACES` on, are the flat faces of solids that move. A reflection is x -> R x + o, with
-R diagonal at the container. Seen from particle i, the image of j is where the image of i sees j, so that every image
-that i can see is one of its neighbours, or its own. In lists of neighbours the image of j by a reflection has the
-number ``reflections j + reflection``. A wall mirrors fluid in front of it, for particles in front of it, and not a
-column that waits behind it to come out of an opening. A face mirrors nothing that is beyond its ends.
+An image of particle j is its reflection by a flat wall, or by two or three sides of the container that meet. A
+reflection of the container has a bit for each side: 1, 2 and 4 for those at the lower ends of the axes, 8, 16 and 32
+for the upper ones. Beyond these numbers, from `FACES` on, are the flat faces of solids that move. A reflection is x ->
+R x + o, with R diagonal at the container. The separation from i to the image of j is the mirrored separation from the
+image of i to j. So every image within reach of i is an image of a neighbour of i, or of i. In lists of neighbours the
+image of j by a reflection has the number ``reflections j + reflection``. A wall mirrors only fluid in front of it, for
+particles in front of it, not the column that waits behind it for an emitter's opening. A face mirrors no particle
+beyond its ends.
 
 A solid takes the points x of a face to x' from c_0 + Q (x - c) = x - D(x), with its middle c, at c_0 before the step,
 and Q = R_0 R^T. An image moves by R u + (D(R x + o) - R D(x)) / dt where its particle moves by u: the second part,
@@ -24,22 +25,24 @@ import warp as wp
 from cortado.device.precision import Precision
 
 FACES, MOST_FACES = 64, 64
-"""Number of the first face's reflection, one above all bits of the container's; and how many faces there may be."""
+"""Number of the first face's reflection, greater than all reflections of the container; and the greatest number of
+faces."""
 NUMBERS = 2**31
-"""Images have numbers below it."""
+"""Numbers of images are below this bound."""
 CONTAINER = -1
-"""Number of the container in place of a solid's."""
+"""Number used for the container in place of a solid's number."""
 NOTHING = ALL_WALLS = -NUMBERS
-"""A number that no solid has. It stands in its place for nothing, or for the walls of all solids and the container."""
+"""A number that no solid has. In place of a solid's number it means no solid, or the walls of all solids and the
+container."""
 
 
 def reflections(moving: bool) -> int:
-    """Return a number above those of all reflections, where solids move or where none does."""
+    """Return a number above those of all reflections, in scenes with or without ``moving`` solids."""
     return FACES + MOST_FACES * moving
 
 
 def most_imaged(moving: bool) -> int:
-    """Return how many particles may have images with numbers of their own."""
+    """Return the greatest number of particles whose images can be numbered."""
     return (NUMBERS - 1) // reflections(moving)
 
 
@@ -52,7 +55,7 @@ OVER_IMAGES = """\
         _x_ij = _separation(_x_i, _turned(_R, x[_j]) + _offset, s)
         {body}
 """
-"""The text of a loop over images, see `cortado.particles.pair_sums`."""
+"""Source text of a loop over images, see `cortado.particles.pair_sums`."""
 OF_IMAGES = {
     "direct": "_separation(_x_i, x[_j], s)",
     "direct_dot": "_x_dot_i - x_dot[_j]",
@@ -60,18 +63,19 @@ OF_IMAGES = {
     "swept_dot": "_swept_dot(_one, x[_j], x_dot[_j], _member, s)",
     "owned": "wp.where(_mirrors_by(_one, solid, s), _real(1.0), _real(0.0))",
 }
-"""Names of an image's data in terms of images, with their texts."""
+"""Names of an image's data in terms of images, with their source texts."""
 
 
 def mirror_functions(precision: Precision, moving: bool, neighbourhood: Any) -> dict[str, Any]:
-    """Make Warp functions of mirrors by name, in scenes where solids move or where none does, for positions in scene
+    """Make Warp functions of mirrors by name, in scenes with or without moving solids, for positions in scene
     ``member``.
 
-    ``sides`` has the bits of the container's sides that a position is in front of and within reach of. ``sees`` tells
-    whether it is so of the walls of a reflection, ``shows`` whether it is in front of them; ``last_reflection`` is the
-    last that it may see, or 0. ``reflection`` has R and o, and ``turned`` R a. ``mirror_of`` numbers the walls that
-    mirror about a position, ``mirrors_in`` tells whether a wall particle is theirs, and ``mirrors_by`` whether a
-    reflection is by a solid. ``swept``, ``image_dot``, ``turned_dot`` and ``swept_dot`` are there where solids move.
+    ``sides`` returns the bits of the container's sides that a position is in front of and within reach of. ``sees``
+    tests whether a position is in front of, and within reach of, the walls of a reflection; ``shows`` tests only
+    whether it is in front of them. ``last_reflection`` is the last reflection that a position may see, or 0.
+    ``reflection`` returns R and o, and ``turned`` R a. ``mirror_of`` returns a number of the walls that mirror about a
+    position, ``mirrors_in`` tests whether a wall particle belongs to them, and ``mirrors_by`` whether a reflection is
+    by a solid. ``swept``, ``image_dot``, ``turned_dot`` and ``swept_dot`` exist only if solids move.
     """
     container = _container(precision, neighbourhood)
     own = (_with_faces if moving else _without)(precision, neighbourhood, container)
@@ -107,7 +111,8 @@ def _container(precision: Precision, neighbourhood: Any) -> SimpleNamespace:
 
     @wp.func
     def reflects(bits: int, near: int) -> bool:
-        """Test that bits are those of a reflection in near walls; opposite walls do not mirror each other's images."""
+        """Test that bits are those of a reflection in near walls; walls at both ends of one axis do not mirror each
+        other's images."""
         return (bits & near) == bits and (bits & (bits >> 3)) == 0
 
     @wp.func
@@ -181,7 +186,8 @@ def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNames
 
     @wp.func
     def place_at(x: vector, f: int, member: int, s: neighbourhood) -> vector:
-        """Return how far a position is in front of a face, and how far from its middle along it."""
+        """Return the distance of a position in front of a face, and its distances from the face's middle along the
+        face."""
         k = s.face_solids[f]
         own = wp.transpose(s.turns[member, k]) * (x - s.after[member, k])
         return s.face_frames[f] * (own - s.scales[member, k] * s.face_places[f])
@@ -235,7 +241,8 @@ def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNames
 
     @wp.func
     def mirror_of(x: vector, member: int, s: neighbourhood) -> int:
-        """Return 1 near the container's mirrors, and twice the number of the nearest face in reach, from 1 on."""
+        """Return the sum of 1 near the container's mirrors, and twice the number, counted from 1, of the nearest face
+        in reach."""
         found, face, nearest = wp.where(near_mirrors(x, s) > 0, 1, 0), int(0), real(s.reach)
         for f in range(s.faces):
             if before_face(x, f, nearest, member, s):
@@ -251,7 +258,7 @@ def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNames
 
     @wp.func
     def carried(x: vector, k: int, member: int, s: neighbourhood) -> vector:
-        """Return D, how far the step has taken the point of a solid that is at x now."""
+        """Return D, the displacement in the step of the solid's point that is at x now."""
         back = s.turns_before[member, k] * (wp.transpose(s.turns[member, k]) * (x - s.after[member, k]))
         return x - s.before[member, k] - back
 

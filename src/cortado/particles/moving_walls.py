@@ -1,12 +1,12 @@
-"""Wall particles as a search for neighbours is given them, and those of solids that move.
+"""Wall particles as arguments of a search for neighbours, and the wall particles of solids that move.
 
-Of solids that move they tell where they are at the end of a step, sorted by cell, and how fast the point of the surface
-above each gets there. Where a solid turns that is not as fast as the particle.
+Wall particles of moving solids have their positions at the end of a step, sorted by cell, and the velocity of the
+surface point above each. If the solid turns, this velocity differs from that of the wall particle.
 
-A solid may be stretched about its middle by a scale sigma. Its wall particles stay as deep beneath the surface as they
-are. In the frame of the solid, one has the place r, the foot f = q - r to the point q of the surface, and the weight w.
-In space it is at c + R (sigma q - f) and has the foot R f and the weight sigma^(d - 1) w, as its part of the surface
-grows by that. So flat walls keep the weights that were found for them.
+A solid may be stretched about its middle by a scale sigma. Its wall particles keep their depth beneath the surface. In
+the frame of the solid, one has the place r, the foot f = q - r to the point q of the surface, and the weight w. In
+space it is at c + R (sigma q - f) and has the foot R f and the weight sigma^(d - 1) w, as its part of the surface grows
+by that. So flat walls keep the weights that were found for them.
 """
 
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ class WallArrays(Rows):
     """Wall particles, in any order."""
 
     positions: np.ndarray
-    """(b, 3) [m]; of solids that move in their own frames"""
+    """(b, 3) [m]; for moving solids in the frame of the solid"""
     weights: np.ndarray
     """(b,) weight of each in the density, a fluid particle being 1 [-]"""
     grips: np.ndarray
@@ -39,18 +39,18 @@ class WallArrays(Rows):
     feet: np.ndarray
     """(b, 3) from each to the surface [m]"""
     slides: np.ndarray
-    """(b, 3) how fast their surface slides along the solid [m/s]"""
+    """(b, 3) velocity with which the surface slides along the solid [m/s]"""
     solid: np.ndarray
     """(b,) number of each particle's solid: from 0 on for solids that move, from -2 on downwards for solids at rest; -1
     for the container"""
     faces: np.ndarray
-    """(b,) number of the flat face that each is behind, of those that mirror the fluid, or -1"""
+    """(b,) number of the mirroring flat face in front of each wall particle, or -1"""
 
 
 def pose_arrays(members: int, solids: int, precision: Precision, device: Any) -> dict[str, wp.array]:
     """Make arrays (members, solids) of the poses of solids before and after a step, with tangents, by kernels' names:
     positions of their middles [m], rotations from the frame of a solid to space, and scales. The tangent of a rotation
-    is the rotation vector by which a solid turns further, over the change."""
+    is the rotation vector by which the solid turns further, per unit of the change."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     kinds = {"before": vector, "turns_before": matrix, "after": vector, "turns": matrix}
     kinds |= dict.fromkeys(("before_dot", "turned_before_dot", "after_dot", "turned_dot"), vector)
@@ -61,7 +61,7 @@ def pose_arrays(members: int, solids: int, precision: Precision, device: Any) ->
 
 
 def resting_pose(layout: Layout) -> dict[str, wp.array]:
-    """Make the arrays (members,) of `pose_arrays` for what rests at the origin and is not turned."""
+    """Make the arrays (members,) of `pose_arrays` for a solid that rests at the origin and is not turned."""
     made = pose_arrays(layout.members, 1, layout.precision, layout.device)
     for name in ("turns", "turns_before"):
         made[name].fill_(matrix_of(layout.precision)(*np.eye(3).ravel()))
@@ -76,8 +76,8 @@ def matrix_of(precision: Precision) -> Any:
 
 @cache
 def turn_functions(precision: Precision) -> tuple[Any, Any]:
-    """Make two Warp functions of a rotation R: the adjoint of a further turn of it, given that of its entries; and an
-    adjoint of the entries that stands for one of a further turn."""
+    """Make two Warp functions of a rotation R: the adjoint of a further turn of it, given that of its entries; and, in
+    reverse, an adjoint of R's entries that has a given adjoint of the further turn."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
 
     @wp.func
@@ -129,7 +129,8 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def place_of(b: int, scale: real, of: own_of) -> vector:
-        """Return a wall particle's place in its solid's frame; with a scale of 1 its own place to the last bit."""
+        """Return a wall particle's place in the frame of its scaled solid; with a scale of 1 the unscaled place bit for
+        bit."""
         return of.own[b] + (scale - real(1.0)) * (of.own[b] + of.own_feet[b])
 
     @wp.func
@@ -215,21 +216,21 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
 
 
 class MovingWalls:
-    """The moving wall particles of one search for neighbours, which stand behind those at rest in its arrays."""
+    """The moving wall particles of one search for neighbours; in its arrays they follow the wall particles at rest."""
 
     def __init__(self, walls: WallArrays, first: int, solids: int, dimension: int, grid: Grid, layout: Layout):
         """Take the ``walls`` of ``solids`` moving solids; in the search's arrays they have numbers from ``first``
         on."""
         precision, device, count = layout.precision, layout.device, len(walls)
         self.solids, self.named = solids, pose_arrays(layout.members, solids, precision, device)
-        """How many solids, and their poses by the names of kernels' arguments, which somebody else writes."""
+        """The number of solids, and their poses by the names of kernel arguments; parts of a step write these poses."""
         self.sizes = sizes_type(precision)()
         self.sizes.scales, self.sizes.scales_dot = self.named["scales"], self.named["scales_dot"]
         self.sizes.power = precision.real(dimension - 1)
         self.each = [{name: array[:, k] for name, array in self.named.items()} for k in range(solids)]
-        """Of each solid, views (members,) of these."""
+        """For each solid, views (members,) of these arrays."""
         self.slides = wp.zeros(solids, dtype=precision.vector, device=device)
-        """How fast the surfaces of solids slide along them, in their own frames [m/s]."""
+        """Velocities with which surfaces of solids slide along the solids, in the solids' own frames [m/s]."""
         slides = np.zeros((solids, 3))
         slides[walls.solid] = walls.slides
         self.slides.assign(slides)
@@ -248,7 +249,7 @@ class MovingWalls:
         }
         self._sort = CellSort(grid, count, precision, device, layout.members)
         self.grid = cell_grid_type(precision)()
-        """As kernels that look for neighbours see it: cells begin with numbers in the arrays of the search."""
+        """The grid for kernels that look for neighbours; its cells begin with indices into the arrays of the search."""
         for name in ("origin", "frequency", "shape"):
             setattr(self.grid, name, getattr(self._sort.grid, name))
         self.grid.starts = wp.zeros_like(self._sort.grid.starts)
@@ -264,7 +265,7 @@ class MovingWalls:
         launch(write, self._all, self._device, self._own, self.named, known, walls)
 
     def write_tangent(self, time_step: wp.array, time_step_dot: wp.array, walls: Mapping[str, wp.array]) -> None:
-        """Write the tangents of the wall particles that `write` has written last."""
+        """Write the tangents of the wall particles of the last `write`."""
         lengths = {"time_step": time_step, "time_step_dot": time_step_dot}
         known = {"first": self._first, "order": self._sort.order, **lengths}
         launch(self._kernels[3], self._all, self._device, self._own, known, self.named, walls)

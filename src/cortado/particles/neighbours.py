@@ -1,19 +1,20 @@
 """Neighbours: particles sorted by cell, and a symmetric list that the step keeps.
 
-The list reaches a little beyond the support radius (`SKIN`), because the density is also taken at predicted positions.
-Without it a pair that comes into touch within the step would count or not depending on which side of the support it
-started. The map from one state to the next would jump there, and lattices start with pairs at just that distance.
+The list reaches a little beyond the support radius (`SKIN`), because the density is also computed at predicted
+positions. Without this skin a pair that comes within the support during the step would count only if its distance was
+below the support at the start. The next state would depend on the state discontinuously there, and lattices start with
+pairs at just that distance.
 
 The list holds j for i exactly when it holds i for j, because |x_i - x_j| is computed with the same bits from both
 sides.
 
-Candidates are the particles in the cells around one's own that are within reach. They come in the order of the cells,
+Candidates are the particles in a particle's own cell and in the cells around it. They come in the order of the cells,
 rows along x one after the other. Within a cell they come in the order of the particles, whether one thread or the lanes
 of a particle look for them.
 
-One thread compares 32 candidates, keeps a bit for each, and then appends those within reach: on a GPU threads that
-compare go side by side, and threads that append wait for one another. Many lanes take the candidates of all rows as one
-range, so that no lane waits for where the next row begins, or is idle at the end of a row.
+One thread compares 32 candidates, stores a bit for each, and then appends those within reach: on a GPU comparisons of
+threads run in parallel, but appending threads wait for one another. Many lanes treat the candidates of all rows as one
+range, so that no lane is idle at the end of a row.
 """
 
 from functools import cache
@@ -37,12 +38,12 @@ BITS = 32
 ROWS = 9
 """Most rows of cells to visit."""
 LEAST_AT_ONCE = 8
-"""Lanes that take the rows at once; fewer take one after the other. Measured on an H200."""
+"""Least number of lanes that treat all rows as one range; fewer lanes visit rows one by one. Measured on an H200."""
 
 
 @cache
 def append_function(discretisation: Discretisation) -> Any:
-    """Make the Warp function that appends the particles which lanes have found to a list, in their order."""
+    """Make the Warp function that appends the particles found by the lanes to a list, in the order of the particles."""
     neighbourhood = discretisation.types[2]
     lanes = lane_functions(discretisation.precision, discretisation.lanes)
     vote, ones, before = lanes.vote, lanes.ones, lanes.before
@@ -113,7 +114,8 @@ def scan_by_bits(discretisation: Discretisation) -> Any:
 
 @cache
 def scan_by_lanes(discretisation: Discretisation) -> Any:
-    """Make the Warp function for several lanes that appends particles first ... last - 1 within reach but ``own``."""
+    """Make the Warp function for several lanes that appends particles first ... last - 1 within reach, without particle
+    ``own``."""
     separation = pair_functions(discretisation).separation
     load = loads(discretisation.precision, discretisation.taped).load_vector
     LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
@@ -243,8 +245,8 @@ def fill_kernel(discretisation: Discretisation) -> Any:
     @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
     @typed.arrays
     def fill(s, grid, wall_grid, moving_grid, near_walls, bad_step, x, fluid_count, filling, count, all_count, needed):
-        """List neighbours; ``needed``, for each range, becomes the longest list, also where there is no room for it.
-        Scenes that have lost a particle, in ``bad_step``, get empty lists. ``near_walls`` comes from `_near_walls`."""
+        """List neighbours; ``needed`` becomes the greatest length in each range, even without room for it. Scenes that
+        have lost a particle, by ``bad_step``, get empty lists. ``near_walls`` comes from `_near_walls`."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if bad_step[member] >= 0:
@@ -296,7 +298,7 @@ def image_kernel(discretisation: Discretisation) -> Any:
     @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
     @TypesByName(wp.int32, {neighbourhood: "s", vector: "x"}).arrays
     def fill_images(s, bad_step, x, all_count, needed):
-        """Append images to lists; ``needed`` becomes the longest list, as in `fill_kernel`."""
+        """Append images to lists; ``needed`` becomes the greatest length of a list, as in `fill_kernel`."""
         i = s.first + wp.tid() // LANES
         x_i, limit, found = x[i], s.reach * s.reach, int(s.count[i])
         member = i // s.particles
@@ -335,10 +337,10 @@ def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
 
 
 class NeighbourSearch:
-    """A search that sorts particles by cell and lists their neighbours, on one device and without a host read.
+    """A search that sorts particles by cell and lists their neighbours, on one device and without reading from it.
 
-    The list is stored [particle][neighbour] on a CPU and [neighbour][particle] on a GPU, whichever a device reads
-    fastest; kernels index it [neighbour, particle] on both.
+    For speed the list is [particle][neighbour] in the memory of a CPU and [neighbour][particle] on a GPU; kernels index
+    it [neighbour, particle] on both.
     """
 
     def __init__(
@@ -352,9 +354,9 @@ class NeighbourSearch:
         dimension: int = 3,
         mirrored: bool = False,
     ):
-        """Allocate the search. ``walls`` at rest are shared by all scenes of a batch; moving ones stand behind them,
-        scene by scene, and are written by `MovingWalls.write`, of so many ``solids`` in a ``dimension``. Lists of
-        ``mirrored`` fluid have images."""
+        """Allocate the search. ``walls`` at rest are shared by all scenes of a batch. After them come the walls of
+        ``solids`` moving solids in a ``dimension``, scene by scene, which `MovingWalls.write` writes. Lists include
+        images if fluid is ``mirrored``."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         if mirrored and particles > (most := most_imaged(discretisation.moving)):
             raise InputError(
@@ -381,13 +383,13 @@ class NeighbourSearch:
         self.walls = {
             f"wall_{name}": wp.zeros(sizes[name], dtype=kind, device=device) for name, kind in {**kinds, **own}.items()
         }
-        """What kernels know of wall particles, those at rest first; no tangents where no solid moves."""
+        """Arrays of wall particles by kernel arguments' names, those at rest first; tangents only if solids move."""
         self.walls["wall_faces"].fill_(-1)
         self._write_walls(still)
         self._wall_sort = CellSort(grid, len(still), precision, device)
         self._unsorted_walls: WallArrays | None = still
         self.moving = MovingWalls(moving, len(still), solids, dimension, grid, layout) if solids else None
-        """Those of solids that move."""
+        """The walls of solids that move."""
         self._grid, self._near_walls = grid, wp.zeros(grid.cells, dtype=wp.bool, device=device)
         self.allocate(capacity)
 
@@ -423,8 +425,8 @@ class NeighbourSearch:
         self._near_walls.assign(_near_walls(self._grid, self._wall_sort.grid.starts.numpy()))
 
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:
-        """List the neighbours of sorted positions (members n,) [m], but none where the ``bad_step`` (members,) of a
-        scene is not -1; `needed` tells whether the lists were long enough."""
+        """List the neighbours of sorted positions (members n,) [m]. Scenes whose ``bad_step`` (members,) is not -1 get
+        empty lists; `needed` tells whether lists were long enough."""
         given = {"s": neighbourhood, "bad_step": bad_step, "x": positions, "needed": self._needed}
         grids = {"grid": self._sort.grid, "wall_grid": self._wall_sort.grid, "near_walls": self._near_walls}
         lists = {
@@ -440,7 +442,7 @@ class NeighbourSearch:
 
     @property
     def needed(self) -> int:
-        """Return the length of the longest list since `forget_needed`; it is more than a capacity that is too small."""
+        """Return the length of the longest list since `forget_needed`; a capacity below it was too small."""
         return int(self._seen.read().max())
 
     def forget_needed(self) -> None:

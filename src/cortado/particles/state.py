@@ -1,7 +1,7 @@
-"""The inputs of a step as Warp arrays by name: the state before it, whose fields solvers and their parts declare, the
-sorted particles, and the parameters.
+"""The inputs of a step as Warp arrays by name: the state before the step, the sorted particles, and the parameters.
+Solvers and their parts declare the fields of states.
 
-Vectors have three components on a device, z is 0 in 2-D.
+Vectors have three components on a device; in 2-D z is 0.
 """
 
 from collections.abc import Iterable, Mapping
@@ -31,29 +31,30 @@ class Entry(Enum):
 
 @dataclass(frozen=True)
 class StateField:
-    """An array that a step reads and writes, as a solver or a part of one declares it. What the next step reads of the
-    last one must be such a field: a run goes on, and is restarted, from its state alone."""
+    """An array of the state that a step reads and writes, declared by a solver or by a part. Every value that a step
+    reads from the previous step must be such a field, because a run continues and restarts from its state alone."""
 
     name: str
     unit: str
     """In SI; empty for a plain number."""
     entry: Entry
     axis: Axis = Axis.PARTICLE
-    """PARTICLE, in the scene's order, or SCALAR for one entry."""
+    """PARTICLE for an entry per particle, in the scene's order; SCALAR for one entry."""
     first: str | None = None
-    """The parameter that gives its first value, of one over time the first row; None for a field that begins at 0."""
+    """The parameter that gives the first value, of a parameter over time its first row; None for a field that begins at
+    0."""
     is_constant: bool = False
-    """True where no step changes it: the states of a run share the array."""
+    """True if no step changes the field: then all states of a run share its array."""
 
     def shape(self, particles: int, dimension: int, phases: int) -> tuple[int, ...]:
-        """Return the shape of the field's values as NumPy has them."""
+        """Return the shape of the field's values as a NumPy array."""
         own = {Entry.VECTOR: (dimension,), Entry.FRACTIONS: (phases,)}.get(self.entry, ())
         return (particles if self.axis is Axis.PARTICLE else 1, *own)
 
 
 def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -> None:
-    """Raise `TypeError` for fields of one name, and for one that begins as an unknown parameter or as one without a
-    value for each of its entries."""
+    """Raise `TypeError` if two fields have one name, or if the parameter with a field's first value is unknown or lacks
+    a value for each entry."""
     names: set[str] = set()
     for field in fields:
         if field.name in names:
@@ -77,7 +78,7 @@ def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -
 
 
 def first_values(fields: Iterable[StateField], parameters: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """Return the first values of fields by name, where these begin as one of the given parameters."""
+    """Return, by name, the first values of the fields that begin as one of the given parameters."""
     found = {}
     for field in fields:
         if field.first is not None and field.first in parameters:
@@ -103,8 +104,8 @@ def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array
 
 
 def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
-    """Return the memory of numbers, vectors or matrices, and that of their adjoints, as an array of numbers of a shape,
-    which keeps it alive."""
+    """Return an array of numbers of a shape that views the memory of an array of numbers, vectors or matrices, and of
+    its adjoint. The view keeps this memory alive."""
     real = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
     view = wp.array(ptr=array.ptr, dtype=real, shape=shape, device=array.device)
     view._ref = array
@@ -133,14 +134,15 @@ class Arrays(Staying):
         return list(self._arrays.values())
 
     def named(self, suffix: str = "") -> dict[str, wp.array]:
-        """Return the arrays by the names of kernels' arguments, ``drag_k`` for ``drag.k``: "_dot" behind the name of a
-        tangent, "_bar" of an adjoint."""
+        """Return the arrays by the names of kernel arguments, ``drag_k`` for ``drag.k``. The ``suffix`` "_dot" makes
+        names of tangents, "_bar" names of adjoints."""
         if suffix not in self._named:
             self._named[suffix] = {argument(name) + suffix: array for name, array in self._arrays.items()}
         return self._named[suffix]
 
     def assign(self, other: Self) -> None:
-        """Copy the arrays of another collection on this device, without a host round trip; shared arrays stay."""
+        """Copy the arrays of another collection on this device, without a copy to the host; arrays that both share are
+        left alone."""
         for own, source in zip(self.arrays(), other.arrays(), strict=True):
             if own is not source:
                 wp.copy(own, source)
@@ -162,7 +164,7 @@ def zeros(kinds: Mapping[str, tuple[Any, Any]], device: Any, requires_grad: bool
 
 
 class Fields(Arrays):
-    """Sorted particles within a step. Also the type of tangents and adjoints.
+    """The fields of sorted particles within a step. Tangents and adjoints of them have this type too.
 
     ``x`` (n,) positions [m]; ``v`` (n,) velocities [m / s]; ``n`` (n,) number densities [-], 1 on the rest lattice.
     ``m`` (n,) masses over the volume on the rest lattice [kg / m3], so that the density is m n. ``rho_0`` (n,) rest
@@ -177,12 +179,11 @@ class Fields(Arrays):
 
 
 class State(Arrays):
-    """All that a step depends on besides parameters, by the names of the fields that the solver declares. Also the type
-    of its derivatives.
+    """The arrays on which a step depends besides parameters, by the names of the fields that the solver declares.
+    Tangents and adjoints of states have this type too.
 
     Every state has ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s] and ``mass_fractions`` (n,) of
-    as many numbers as there are phases [-], in the scene's order of particles. In a batch of scenes one scene stands
-    behind the other.
+    as many numbers as there are phases [-], in the scene's order of particles. In a batch the scenes are concatenated.
     """
 
     def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array], batch: int | None = None):
@@ -211,12 +212,13 @@ class State(Arrays):
         return type(self)(self.fields, zero, self.batch)
 
     def following(self) -> Self:
-        """Make a later state of this run that is still to be written; it shares arrays of constant fields."""
+        """Make an uninitialised later state of this run; it shares the arrays of constant fields."""
         new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
         return type(self)(self.fields, new, self.batch)
 
     def copy(self, earlier: Self | None = None) -> Self:
-        """Copy this state to arrays of its own; an ``earlier`` state of the run gives those that no step changes."""
+        """Copy this state to new arrays; arrays that no step changes are shared with an ``earlier`` state of the run if
+        one is given."""
         kept = {} if earlier is None else {f.name: earlier[f.name] for f in self.fields if f.is_constant}
         own = {name: kept[name] if name in kept else wp.clone(self[name], requires_grad=False) for name in self.names}
         return type(self)(self.fields, own, self.batch)
@@ -230,7 +232,8 @@ class State(Arrays):
 
     def numbers(self, name: str) -> wp.array:
         """Return a field as a Warp array of numbers, vectors (n, 3), fractions (n, phases), in a batch (batch, n, ...),
-        that shares its memory. Libraries that speak DLPack, such as PyTorch and JAX, take it without a copy."""
+        that shares the field's memory. Libraries with DLPack, such as PyTorch and JAX, use this array without a
+        copy."""
         field = self[name]
         shape = (len(field),) if self.batch is None else (self.batch, len(field) // self.batch)
         return components(field, (*shape, *getattr(field.dtype, "_shape_", ())))
@@ -249,7 +252,7 @@ class State(Arrays):
         return {name: array.copy() for name, array in self.views(dimension, only).items()}
 
     def views(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Return fields as `numpy` does, of a state on the host as views of its arrays."""
+        """Return fields as `numpy` does; for a state on the host they are views of the state's arrays."""
         names, lead = set(self.names if only is None else only), () if self.batch is None else (self.batch, -1)
         arrays = {f: self[f.name].numpy() for f in self.fields if f.name in names}
         narrow = {f.name: a[:, :dimension] if f.entry is Entry.VECTOR else a for f, a in arrays.items()}
@@ -257,10 +260,11 @@ class State(Arrays):
 
 
 class StateSeries:
-    """States of one run, one behind the other in shared arrays, which are copied all at once."""
+    """States of one run, concatenated in shared arrays, so that one copy per field copies all states."""
 
     def __init__(self, like: State, length: int):
-        """Allocate ``length`` states of the fields and sizes of one, to be written; constant fields are shared."""
+        """Allocate ``length`` uninitialised states with the fields and sizes of the state ``like``; constant fields are
+        shared."""
         self._like, self._length = like, length
         changed = {field.name: like[field.name] for field in like.fields if not field.is_constant}
         self._whole = {name: wp.empty(length * len(a), dtype=a.dtype, device=a.device) for name, a in changed.items()}
@@ -273,11 +277,11 @@ class StateSeries:
         return State(self._like.fields, arrays, self._like.batch)
 
     def whole(self, name: str) -> wp.array:
-        """Return a field of all states, one behind the other, as an array."""
+        """Return one array with a field of all states, one state after the other."""
         return self._whole.get(name, self._like[name])
 
     def like(self) -> Self:
-        """Allocate a series of equal length, still to be written."""
+        """Allocate an uninitialised series of equal length."""
         return type(self)(self._like, self._length)
 
     def assign(self, other: Self) -> None:
@@ -287,16 +291,18 @@ class StateSeries:
 
 
 class Parameters(Arrays):
-    """The inputs of steps besides the state, by the names of parameters. Also the type of its derivatives.
+    """The inputs of steps besides the state, by the names of parameters. Tangents and adjoints of them have this type
+    too.
 
-    A parameter over time is (members, steps) vectors or numbers, one of phases (members, phases) numbers, an array
-    (members, ...) numbers, any other (members,) numbers or vectors, with one member for each scene of a batch.
+    A parameter over time has the shape (members, steps), of vectors or numbers; a parameter of phases (members,
+    phases), an array (members, ...), and any other (members,). There is one member for each scene of a batch.
     """
 
     def __init__(self, arrays: Mapping[str, wp.array]):
         super().__init__(arrays)
         self._written: dict[str, np.ndarray | wp.array] = {}
-        """What `set` has written last, and need not write again; of what it copied on the device the copy."""
+        """The values that `set` has written last, and need not write again. For values copied on the device this is the
+        copy."""
 
     @property
     def written(self) -> Mapping[str, np.ndarray | wp.array]:
@@ -305,8 +311,8 @@ class Parameters(Arrays):
 
     def set(self, values: Mapping[str, Any]) -> None:
         """Write some parameters by name, for all members or with an axis of members: a vector (d,) or vectors (steps,
-        d); numbers or arrays of them; or a Warp array like the own one. Nothing else may write to arrays that are set
-        again."""
+        d); numbers or arrays of numbers; or a Warp array of the parameter's own shape and type. Only `set` and
+        `set_row` may write to arrays that are set again."""
         for name, value in values.items():
             array, last = self[name], self._written.get(name)
             if isinstance(value, wp.array):
@@ -342,8 +348,8 @@ class Parameters(Arrays):
 
 @dataclass(frozen=True)
 class Layout:
-    """The sizes of the arrays of one solver, and their device: those of one scene, or of several in one launch, one
-    behind the other. A kernel has one thread for each particle of all of them."""
+    """The sizes of the arrays of one solver, and their device. Arrays of a batch contain several scenes, one after the
+    other, and one launch has a thread for each particle of all scenes."""
 
     particles: int
     """Number of particles of one scene."""
@@ -351,9 +357,9 @@ class Layout:
     precision: Precision
     device: Any
     batch: int | None = None
-    """Number of scenes; None for a single one, whose arrays have no axis for it."""
+    """Number of scenes; None for a single scene, whose arrays have no axis for scenes."""
     known: Known = REGISTRY
-    """The parameters of the scenes."""
+    """The parameters that the scenes have."""
 
     @property
     def members(self) -> int:

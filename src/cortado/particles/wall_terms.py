@@ -1,22 +1,22 @@
 """The effect of the walls of one solid, or of all walls, on each particle by one term of a step, with its derivatives.
-The adjoint of such a sum also gives derivatives by the place and the size of solids that move.
+The adjoint of such a sum also gives derivatives with respect to the pose and the size of moving solids.
 
-A term is told by its work W, a number that is linear in a vector ``bar`` of particle i. Its sum over wall particles b,
-such as the acceleration by them, is
+A term is defined by its work W, a number that is linear in a vector ``bar`` of particle i. Its sum over wall particles
+b, such as the acceleration by walls, is
 
     A_i = sum_b w_b dW / dbar_i.
 
 Warp makes the gradients of W. Component k of the tangent of A is the change of w_b W for the k-th unit vector as
-``bar``, and the adjoint is the gradient of W for the adjoint of A as ``bar``. With that, particle i gives to wall
-particle b
+``bar``, and the adjoint is the gradient of W for the adjoint of A as ``bar``. With that adjoint particle i adds to the
+adjoints of wall particle b
 
     x_b^ = -w_b dW / dx_ib,   foot_b^ = w_b dW / dfoot_b,   v_b^ = w_b dW / dv_b,
 
-made by Warp from W. The point of the surface above it is s_b = c + R q_b, and it is at x_b = s_b - foot_b, with a foot
-that R has turned too. Its velocity is that of s_b, which is (s_b - s_b^0) / dt + R u from s_b^0 = c_0 + R_0 q_b at the
-start of the step. A scale sigma has made q_b so many times as long, and w_b sigma^(d - 1) times as large. A solid moves
-by c', turns further by w', and grows by g' = sigma' / sigma, and its pose at the start of the step changed by c_0' and
-w_0'. So it has the work f . c' + t . w' + f_0 . c_0' + t_0 . w_0' + g g' with
+which Warp derives from W. The point of the surface above the wall particle is s_b = c + R q_b, and the wall particle is
+at x_b = s_b - foot_b; R has turned the foot too. The wall particle has the velocity of s_b, (s_b - s_b^0) / dt + R u,
+with s_b^0 = c_0 + R_0 q_b at the start of the step. A scale sigma multiplies q_b by sigma, and w_b by sigma^(d - 1).
+Let a solid move by c', turn further by w' and grow by g' = sigma' / sigma, and let its pose at the start of the step
+change by c_0' and w_0'. Then the work is f . c' + t . w' + f_0 . c_0' + t_0 . w_0' + g g' with
 
     f = sum x_b^ + v_b^ / dt,    t = sum (x_b - c) x x_b^ + R q_b x v_b^ / dt + foot_b x foot_b^ + R u x v_b^,
     f_0 = -sum v_b^ / dt,        t_0 = -sum R_0 q_b x v_b^ / dt,
@@ -45,7 +45,7 @@ from cortado.particles.state import Layout, zeros
 NAMES = ("force", "torque", "force_before", "torque_before", "growth")
 """f, t, f_0, t_0 and g / sigma."""
 BARS = [f"{name}_bar" for name in ("after", "turned", "before", "turned_before", "scales")]
-"""The adjoints, of poses and of the scale, that these are."""
+"""Names of the adjoints of poses and of the scale to which the values `NAMES` are added."""
 LOOP = """\
 _x_i = at.x[i]
     _mirrors = _mirror_of(_x_i, i // s.particles, s)
@@ -74,7 +74,7 @@ WorkMaker = Callable[[Discretisation], Callable[..., Any]]
 
 @dataclass(frozen=True)
 class _Loop:
-    """The text of a loop over the wall particles of a term."""
+    """Source text of a loop over the wall particles of a term."""
 
     term: Term
     d: Discretisation
@@ -82,7 +82,7 @@ class _Loop:
 
     @property
     def read(self) -> list[str]:
-        """Return the names of arrays but x of which the loop reads the entry of particle i."""
+        """Return the names of the arrays, other than x, whose entry of particle i the loop reads."""
         parameters = self.term.parameters
         return [name for name in self.term.arrays if name != "x" and {f"{name}_i", f"{name}_ij"} & parameters.keys()]
 
@@ -92,11 +92,13 @@ class _Loop:
 
     @property
     def gradients(self) -> str:
-        """Return the line that assigns the derivative of the work W by each parameter to ``_by_parameter``."""
+        """Return the source line that assigns the derivative of the work W with respect to each parameter to
+        ``_by_parameter``."""
         return f"{', '.join(f'_by_{name}' for name in self.term.parameters)} = wp.grad(_work)({self.arguments})"
 
     def text(self, given: Iterable[str], own: Iterable[str], body: Iterable[str]) -> str:
-        """Return the loop with lines before it and within it; it reads entries of arrays that are not ``given``."""
+        """Return the source of the loop, with lines before and inside the loop; it reads entries of arrays that are not
+        ``given``."""
         entries = [f"_{name}_i = at.{name}[i]" for name in self.read if name not in given]
         return LOOP.format(
             own="\n    ".join((*entries, *own)),
@@ -117,7 +119,8 @@ class _Loop:
 
 @dataclass(frozen=True)
 class WallTerm:
-    """A term of the forces by walls in a discretisation; ``make(discretisation)`` gives its work."""
+    """A term of the forces by walls in a discretisation; ``make(discretisation)`` returns the function of its work
+    W."""
 
     discretisation: Discretisation
     topic: str
@@ -131,7 +134,8 @@ class WallTerm:
     @property
     def kernels(self) -> Kernels:
         """Return kernels of the sum A, which is ``total``, of its tangent ``total_dot``, and of its adjoint, the array
-        ``bar`` of the term. They know the ``constants`` of the work and the number ``solid``, or `ALL_WALLS`."""
+        ``bar`` of the term. Their arguments include the ``constants`` of the work and ``solid``, the number of a solid
+        or `ALL_WALLS`."""
         return _kernels(self)
 
     def solid_kernel(self) -> Any:
@@ -215,7 +219,7 @@ class SolidShares:
         self._sums = [{name: layout.sum_of(kinds[name]) for name in NAMES} for _ in solids]
         whole = {name: (layout.members, kinds[name]) for name in NAMES}
         self._whole = [zeros(whole, device) for _ in solids]
-        """What was given by others than particles."""
+        """Terms of the adjoints that were not added by particles."""
 
     def add(
         self,
@@ -226,8 +230,8 @@ class SolidShares:
         over: int = ALL_WALLS,
         **arrays: Any,
     ) -> None:
-        """Add the shares of a sum by the kernel that ``kernel()`` makes, which is called where solids move; of a sum
-        ``over`` the walls of one solid, to that one alone."""
+        """Add the shares of a sum by the kernel that ``kernel()`` makes; ``kernel`` is called only if solids move. For
+        a sum ``over`` the walls of one solid, add to this solid alone."""
         if self._walls is None:
             return
         own = {"power": self._walls.sizes.power, "slides": self._walls.slides, "constants": self._pair(*constants)}
@@ -237,7 +241,7 @@ class SolidShares:
                 launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
 
     def of(self, solid: int) -> dict[str, wp.array]:
-        """Return the particles' shares (n,) of one solid's adjoints so far, by the names that kernels have for them."""
+        """Return the particles' shares (n,) of one solid's adjoints so far, by the names of kernel arguments."""
         return {f"{name}_bar": array for name, array in self._arrays[solid].items()}
 
     def collect(self, solid: int) -> dict[str, wp.array]:
@@ -249,7 +253,7 @@ class SolidShares:
         return dict(zip(BARS, found.values(), strict=True))
 
     def add_whole(self, solid: int, **given: wp.array) -> None:
-        """Add to some of the adjoints `BARS` (members,) of one solid, by name, apart from particles."""
+        """Add values (members,) that do not come from particles to adjoints `BARS` of one solid, by name."""
         for bar, one in given.items():
             add(one, self._whole[solid][NAMES[BARS.index(bar)]])
 
@@ -274,10 +278,10 @@ def solid_kernel(
 ) -> Any:
     """Make the kernel of one sum, for `SolidShares.add`, in the Warp module of a ``topic``.
 
-    ``make(discretisation)`` gives W, a term of walls (as of `pair_sums`) that returns a number, of functions
-    that Warp can differentiate; it knows entries of arrays of particle i, ``v_ij`` or ``v_j``, and ``constants``. As
-    those of walls, a sum that ``rubs`` has nothing of walls that slip freely. A ``looped`` one is of iteration k, and
-    leaves out scenes that make fewer ``rounds``.
+    ``make(discretisation)`` returns W, a term of walls (see `pair_sums`) that returns a number and calls only functions
+    that Warp can differentiate. Its parameters are entries of arrays of particle i, ``v_ij`` or ``v_j``, and
+    ``constants``. A sum that ``rubs`` leaves out walls that slip freely. The kernel of a ``looped`` sum is for
+    iteration k, and skips scenes that make fewer ``rounds``.
     """
     d = replace(discretisation, lanes=1, taped=True)
     precision, term = d.precision, Term.of(make(d))

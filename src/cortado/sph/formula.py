@@ -1,5 +1,5 @@
-"""A user's Python function as kernels call it: compiled by Warp in either precision, with its derivatives. Its
-parameters are one vector, theta: time, numbers and vectors, one behind the other."""
+"""A user's Python function, compiled by Warp in either precision, with its derivatives. Kernels pass its parameters as
+one vector theta, in which time, numbers and vectors are concatenated."""
 
 import ast
 import inspect
@@ -51,7 +51,7 @@ class Packed:
         self._theta = wp.zeros(members, **options, requires_grad=taped)
         self._theta_dot = wp.zeros(members, **options)
         self.shares = wp.zeros(layout.all_particles, **options)
-        """(n,) for what every particle adds to the adjoint of theta in a step."""
+        """(n,) the terms that every particle adds to the adjoint of theta in a step."""
         self._sum = layout.sum_of(self.dtype) if own else None
 
     def theta(self, step: StepContext) -> wp.array:
@@ -76,7 +76,8 @@ class Packed:
 
 
 def theta_of(precision: Precision, ranks: Sequence[int]) -> Any:
-    """Return the Warp vector type that holds parameters of these ranks; of one number where there are none."""
+    """Return the Warp vector type that holds parameters of these ranks. Without parameters the vector has one
+    number."""
     return precision.fractions(max(sum(WIDTH[rank] for rank in ranks), 1))
 
 
@@ -89,7 +90,7 @@ class Inputs:
     kind: str = "vector"
     """"vector" or "number": the type of the inputs and of the function's result."""
     fields: tuple[str, ...] = ()
-    """Names of what else of a particle it may take, after these and time."""
+    """Names of further quantities of a particle that a function may take after the inputs and time."""
     arrays: bool = False
     """Whether parameters may be arrays."""
 
@@ -97,43 +98,45 @@ class Inputs:
 TIME = "t", "time"
 """Names of an argument that is the time."""
 MOST_TURNS, MOST_AXES = 256, 3
-"""Greatest number of turns of a loop, which is written out turn by turn, and of axes of an array."""
+"""Greatest number of iterations of a loop, because loops are unrolled, and greatest number of axes of an array."""
 TYPES = re.compile(r"'[^']*' \(aka '[^']*'\)")
-"""Finds the types of vectors and numbers as a compiler writes them."""
+"""Pattern that finds the types of vectors and numbers in a compiler's messages."""
 INPUTS = {
     "Body": Inputs(("x", "v"), fields=("density", FRACTIONS, "shear_rate", "velocity_gradient"), arrays=True),
     "Pair": Inputs(("x_ij", "v_ij")),
     "Rheology": Inputs(("shear_rate", "viscosity"), "number"),
 }
-"""By the name of a kind of force in messages."""
+"""The first arguments of each kind of force, by the kind's name in messages."""
 
 
 @dataclass(frozen=True)
 class Formula:
-    """A user's function as kernels call it. Two are equal where their texts and the numbers from outside are."""
+    """A user's function in the form that kernels call. Two formulas are equal if their texts and the outside numbers
+    they use are equal."""
 
     name: str
     text: str
-    """Its definition, with types of the precision and with numbers from outside written out."""
+    """Source text of the function, in which types of the precision and numbers from outside are written out."""
     inputs: tuple[str, ...]
-    """Its first arguments: two vectors or numbers, and time if there is a third."""
+    """Names of the function's first arguments: two vectors or numbers, and possibly time as the third."""
     fields: tuple[str, ...]
-    """Its arguments between these and the parameters: what else it takes of a particle."""
+    """Names of the arguments between inputs and parameters: further quantities of a particle."""
     kind: str
     """"vector" or "number": the type of the first two inputs and of the result."""
     parameters: tuple[str, ...]
-    """Its arguments after the inputs, without arrays."""
+    """Names of the arguments after the inputs, without arrays."""
     arrays: tuple[str, ...]
-    """Its arguments that are arrays, which the text reads from a table (`cortado.sph.own_arrays`)."""
+    """Names of the arguments that are arrays, which the text reads from a table (`cortado.sph.own_arrays`)."""
     outside: str
-    """A text of everything that `text` refers to: the functions under ``@wp.func`` that it calls, and values."""
+    """A text of everything that `text` refers to: values, and functions under ``@wp.func``."""
     scope: Mapping[str, Any] = field(compare=False, repr=False)
     """Values of the names in the text."""
     phases: int = 0
-    """Number of mass fractions that it takes."""
+    """Number of mass fractions that the function takes."""
 
     def of_phases(self, what: str, phases: int) -> "Formula":
-        """Return it for a scene of so many phases; raise `InputError` for mass fractions that this has not."""
+        """Return the formula for a scene with so many phases. Raise `InputError` if it takes mass fractions that the
+        scene lacks."""
         if FRACTIONS not in self.fields:
             return self
         if phases == 1:
@@ -146,7 +149,8 @@ class Formula:
         return replace(self, phases=phases)
 
     def function(self, precision: Precision, types: tuple[Any, ...], module: Any) -> Any:
-        """Make the Warp function in a precision, with the types of its parameters; it has the name of the user's."""
+        """Make the Warp function in a precision, with the types of its parameters, under the name of the user's
+        function."""
         real, vector = precision.real, precision.vector
         scope = {**self.scope, **meanings(precision), REAL: real, VECTOR: vector}
         if self.arrays:
@@ -161,24 +165,25 @@ class Formula:
         return wp.Function(func=made, key=self.name, namespace="", module=module, source=self.text)
 
     def fractions(self, precision: Precision) -> Any:
-        """Return the type of mass fractions; of one number where it takes none."""
+        """Return the vector type of mass fractions. If the function takes no mass fractions, the vector has one
+        number."""
         return precision.fractions(max(self.phases, 1))
 
     def takes(self, precision: Precision) -> dict[str, Any]:
-        """Return the types of its fields by name."""
+        """Return the types of the formula's `fields` by name."""
         kinds = {"velocity_gradient": matrix_type(precision), FRACTIONS: self.fractions(precision)}
         return {name: kinds.get(name, precision.real) for name in self.fields}
 
     def reads(self, precision: Precision) -> dict[str, Any]:
-        """Return the types, by name, of the last arguments of the compiled function, by which it reads arrays."""
+        """Return the types, by name, of the last arguments of the compiled function; it uses them to read arrays."""
         return dict(zip(READ_OF, (precision.real, table_type(precision), int, int), strict=True)) if self.arrays else {}
 
 
 def formula(
     kind: str, function: FunctionType, source: str, parameters: Mapping[str, Any]
 ) -> tuple[Formula, dict[str, Any]]:
-    """Read a user's function with its text, called ``kind`` in messages, and return it with its parameters' values:
-    those given, and its defaults for others. Raises `InputError`."""
+    """Read a user's function with its text, called ``kind`` in messages. Return it with the values of its parameters:
+    those given, otherwise the function's defaults. Raises `InputError`."""
     what = f"{kind} function {function.__name__}"
     taken, values = _arguments(what, function, parameters, INPUTS[kind])
     inputs = tuple(name for name in taken if name not in INPUTS[kind].fields)
@@ -205,7 +210,8 @@ def formula(
 
 
 def _shapes(what: str, function: FunctionType, values: Mapping[str, Any], inputs: Inputs) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the parameters that are arrays: by their annotation, or where they are no vectors."""
+    """Return the shapes of the parameters that are arrays: those annotated as arrays, and those whose values are not
+    vectors."""
     found = {}
     for name, value in values.items():
         annotation = function.__annotations__.get(name)
@@ -232,8 +238,8 @@ def _arguments(
     what: str, function: FunctionType, given: Mapping[str, Any], first: Inputs
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Return names of the inputs, and the parameters' values in the order of the function's arguments. The first two
-    inputs may have any names; those of ``first``, and t, stand for nothing else. A third one is the time only where its
-    name says so, as it may be a parameter whose value was forgotten."""
+    inputs may have any names; the names in ``first``, and t, are reserved for inputs. A third input is the time only if
+    its name says so: it may be a parameter whose value was forgotten."""
     signature, known = inspect.signature(function, follow_wrapped=False).parameters, (*first.names, "t")
     for argument in signature.values():
         if argument.kind is not argument.POSITIONAL_OR_KEYWORD:
@@ -264,8 +270,8 @@ def _arguments(
 
 
 def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> None:
-    """Compile a module with a user's function, which returns a vector or a number; raise `InputError` with the first
-    message of Warp's compiler where it fails."""
+    """Compile a module with a user's function, which returns a vector or a number. If that fails, raise `InputError`
+    with the first message of Warp's compiler."""
     with TemporaryFile() as said:
         try:
             with c_stderr_to(said.fileno()):
@@ -286,8 +292,8 @@ def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> N
 
 
 def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
-    """Make the Warp function of two vectors or numbers theta, and those of `Formula.takes` and
-    `Formula.reads`, that calls a user's function; in 2-D vectors lose their z."""
+    """Make the Warp function that calls a user's function. It takes two vectors or numbers, theta, and the arguments of
+    `Formula.takes` and `Formula.reads`; in 2-D it drops the z of vectors."""
     timed, of_numbers = len(text.inputs) == 3, text.kind == "number"
     types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
     terms, first = [], 0

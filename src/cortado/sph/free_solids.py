@@ -1,17 +1,18 @@
 """Rigid bodies that fluid and gravity move, as a part of a step, with their rotation and motion.
 
-The part puts walls where bodies would go and writes where they end. What makes them faster in between, the solver does,
-which leaves V, W and L of the end in `FreeBody.moved`.
+The part puts walls at the poses that bodies would reach with their present velocities, and writes the poses at the end
+of the step. In between the solver accelerates the bodies and stores V, W and L of the end in `FreeBody.moved`.
 
-A body's rotation is R = Q R(w_0) for the rotation w_0 that it began with. A state has how far the ends of the three
-unit axes of its frame have moved since, the columns of Q - I.
+A body's rotation is R = Q R(w_0) for the rotation w_0 that it began with. A state stores the columns of Q - I: how far
+the tips of the three unit axes of its frame have moved since the start.
 
-A step has kernels with a thread for each scene. In it the centre of mass of a body with the density rho is at c, and
-the body is turned by R. It has the velocities V and W and the angular momentum L = rho R I R^T W, for its inertia I at
-a density of 1; volumes are in those of a particle. Where a scene says its mass, that is rho, and I the inertia of a
-mass of 1. A step begins by where it would go, c' = c + dt V and R' = R(dt W) R, where its walls are. What fluid,
-gravity and contact give it leads to V_1 and L_1. It ends at c + dt V_1, turned by R(dt W_1) R, with W_1 = R' I^-1 R'^T
-L_1 / rho. It turns with the angular velocity that L_1 gives it there, so that both momenta are kept.
+Kernels of a step have a thread for each scene. At the start of the step the centre of mass of a body with the density
+rho is at c, and the body is turned by R. It has the velocities V and W and the angular momentum L = rho R I R^T W,
+where I is its inertia at a density of 1. Volumes are in units of a particle's volume. If the scene gives a mass, rho is
+the mass and I the inertia of a mass of 1. The step first puts the walls at the predicted pose, c' = c + dt V and R' =
+R(dt W) R. Fluid, gravity and contact then change V and L to V_1 and L_1. The body ends at c + dt V_1, turned by R(dt
+W_1) R, with W_1 = R' I^-1 R'^T L_1 / rho, the angular velocity that belongs to L_1 at the predicted pose. So both
+momenta are conserved.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,9 +42,9 @@ from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepCont
 
 @cache
 def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
-    """Make the kernels of a free body in 2 or 3 dimensions, with a thread for each scene. The first give the pose of
-    its walls, with V, W and L, the second the state after the step, from V_1, W_1 and L_1. The adjoint of this state
-    stands where the adjoint of the state before is written."""
+    """Make the kernels of a free body in 2 or 3 dimensions, with a thread for each scene. The first kernels compute the
+    pose of its walls, with V, W and L; the second compute the state after the step from V_1, W_1 and L_1. The adjoint
+    of the state before the step overwrites the adjoint of this state."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     flat, rotation, hold = rotations(precision, dimension), rotations(precision, 3).rotation, hold_functions(precision)
     rate, freed, spin, held = hold.rate, hold.freed, hold.spin, hold.kind
@@ -75,7 +76,7 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
 
     @wp.func
     def evened(Q: matrix) -> matrix:
-        """Return Q - I of a Q without round-off that would make its axes longer or let them lean."""
+        """Return Q - I after correcting round-off in Q, by which its axes would change their lengths or angles."""
         return real(0.5) * Q * (real(3.0) * wp.identity(n=3, dtype=real) - wp.transpose(Q) * Q) - wp.identity(
             n=3, dtype=real
         )
@@ -163,7 +164,7 @@ NAMES = {
     "velocity": velocity_name,
     "angular_velocity": angular_velocity_name,
 }
-"""Names of a body's state fields that begin as parameters, by the names that kernels have for them."""
+"""Names of the body's state fields whose first values are parameters, by the names of kernel arguments."""
 MOTION = ("V", "W", "L")
 GIVEN = ("pushed", "twisted")
 
@@ -174,25 +175,26 @@ class FreeTable:
 
     name: str
     number: int
-    """Number among the solids that move."""
+    """Number of the body among the solids that move."""
     weight: str
-    """Name of the parameter that is its density, or its mass."""
+    """Name of the parameter for the body's density or mass."""
     mass: Mass
-    """Mass and inertia if this parameter is 1, in volumes of a particle."""
+    """Mass and inertia of the body for a value 1 of this parameter, in units of a particle's volume."""
     hold: Hold
     """How the body is held."""
     sticks: bool = False
-    """True where fluid has no slip along it."""
+    """True if fluid has no slip along the body."""
 
     @property
     def inertia(self) -> np.ndarray:
-        """Return the inertia (3, 3) about what the body turns about, its centre of mass or its hinge."""
+        """Return the inertia (3, 3) about the hinge of the body, or about its centre of mass if it has no hinge."""
         return inertia_about(self.hold, self.mass)
 
     @property
     def bounds(self) -> dict[str, float]:
-        """Return by kernels' names the volume by which pressures push the body, infinite if its middle is held, and the
-        greatest inverse of its inertia, 0 if it does not turn. Both are bounds of the values of a held body."""
+        """Return two numbers by the names of kernel arguments: the volume by which pressures push the body, infinite if
+        its middle is held, and the greatest inverse of its inertia, 0 if it does not turn. Both are bounds of the
+        values of a held body."""
         goes, turns = any((*self.hold.moving, *self.hold.arm)), self.hold.turning > 0
         greatest = np.linalg.eigvalsh(np.linalg.pinv(self.mass.inertia)).max()
         return {"pushed_volume": self.mass.volume if goes else np.inf, "greatest": float(greatest) if turns else 0.0}
@@ -209,7 +211,7 @@ class FreeSolids:
     pushes: "Sequence[Callable[[FreeSolidsPart], Push]]"
     """Make the objects that push bodies besides fluid and gravity: contacts, springs."""
     joints: Sequence[Joint] = ()
-    """The hinges between bodies and other solids, which the solver keeps together."""
+    """The hinges between bodies and other solids; the solver enforces these constraints."""
 
     @property
     def walls(self) -> MovingWalls:
@@ -224,21 +226,23 @@ class FreeSolids:
 
 
 class Push(Protocol):
-    """What pushes free bodies besides fluid and gravity, once poses are known: it adds to `FreeBody.given`."""
+    """An object that pushes free bodies besides fluid and gravity, once poses are known: it adds to
+    `FreeBody.given`."""
 
     def look(self, step: StepContext) -> None:
         """Add the momenta that bodies get."""
 
     def tangent(self, changes: "Sequence[Changes]") -> Any:
-        """Return the tangent of this, whose ``look(step, dot)`` adds to `Changes.given`."""
+        """Return the tangent of this object; its method ``look(step, dot)`` adds to `Changes.given`."""
 
     def adjoint(self, changes: "Sequence[Changes]") -> Any:
-        """Return the adjoint of this, whose ``look(step, bar)`` goes on from `Changes.given`."""
+        """Return the adjoint of this object; its method ``look(step, bar)`` reads the adjoints in `Changes.given`."""
 
 
 def given_to(each: "Sequence[FreeBody | Changes]", body: int, other: int) -> dict[str, wp.array]:
-    """Return the momenta that a body and another one get, or their changes: ``pushed_bar`` of the other one is
-    ``pushed_other_bar``. Where ``other`` is -1, what it gets is 0, and may be added to the body itself."""
+    """Return the momenta that two bodies get, or the tangents or adjoints of these: the second body's ``pushed_bar`` is
+    called ``pushed_other_bar``. If ``other`` is -1, kernels give the second body 0, and the first body's own arrays
+    take its place."""
     others = each[body if other < 0 else other].given
     return {**each[body].given, **{name.replace("ed", "ed_other", 1): array for name, array in others.items()}}
 
@@ -253,32 +257,33 @@ class FreeBody:
         units = {"position": "m", "rotation": "rad", "velocity": "m/s", "angular_velocity": "rad/s"}
         self.names = {label: name(table.name) for label, name in NAMES.items()}
         self.names |= {label: f"{table.name}.{label}" for label in AXES}
-        """Of fields of a state, by what kernels call them."""
+        """Names of the body's fields of a state, by the names of kernel arguments."""
         begun = (
             StateField(self.names[label], unit, angles.get(label, Entry.VECTOR), Axis.SCALAR, self.names[label])
             for label, unit in units.items()
         )
         self.fields = (*begun, *(StateField(self.names[label], "", Entry.VECTOR, Axis.SCALAR) for label in AXES))
         self.begun = layout.state(self.fields)
-        """What a step began from."""
+        """Values at the start of the step."""
         matrix = matrix_of(layout.precision)
         inertia, inverse = table.inertia, np.linalg.pinv(table.inertia)
         self.constants: dict[str, Any] = {**poses, "inertia": matrix(*inertia.ravel())}
-        """Its poses too, which a step writes."""
+        """Constants of the body, and its poses, which a step overwrites."""
         self.constants |= {"inverse": matrix(*inverse.ravel()), "volume": table.mass.volume}
         self.constants |= {"solid": table.number, "hold": hold_numbers(table.hold, layout.precision)}
         self.constants |= table.bounds
         self.given = {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in GIVEN}
-        """Momentum that it gets from contacts, springs and fluid that rubs it, and its moment."""
+        """Momentum, and its moment, that the body gets from contacts, springs and friction with fluid."""
         self.pressed = {name: wp.zeros_like(array) for name, array in self.given.items()}
-        """Those that the pressures of the step before would give it; of bodies without slip alone."""
+        """Momentum and moment that the pressures of the previous step would give the body; only for bodies without
+        slip."""
         self.before, self.moved = (
             {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in MOTION} for _ in range(2)
         )
         """V, W and L at the start of a step, and V_1, W_1 and L_1."""
 
     def state(self, state: State, suffix: str = "") -> dict[str, wp.array]:
-        """Return the body's fields of a state by the names that kernels have for them."""
+        """Return the body's fields of a state by the names of kernel arguments."""
         return {f"{label}{suffix}": state[name] for label, name in self.names.items()}
 
     def known(self, step: StepContext) -> tuple[Named, ...]:
@@ -332,7 +337,7 @@ class Changes:
         self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
         self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
         self.turned_end = wp.zeros(**vectors)
-        """The adjoint of a further turn of R, by the end of the step."""
+        """The part, from the end of the step, in the adjoint of a further turn of R."""
 
     def clear(self) -> None:
         """Set all of the body's tangents or adjoints to 0."""

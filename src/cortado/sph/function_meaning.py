@@ -1,5 +1,6 @@
-"""A user's function means the same in Warp as in Python. Numbers get the precision of the run, and operators that Warp
-understands otherwise are replaced by Warp functions with Python's meaning. Anything that cannot be replaced is refused.
+"""Rewrites a user's function so that it computes the same in Warp as in Python. Numbers get the precision of the run.
+Operators with another meaning in Warp are replaced by Warp functions with Python's meaning; what cannot be replaced is
+refused.
 """
 
 import ast
@@ -19,7 +20,7 @@ from cortado.errors import InputError
 from cortado.sph.function_text import counts_of
 
 REMAINDER, QUOTIENT, NEAREST, WHOLE = "cortado_remainder", "cortado_quotient", "cortado_nearest", "cortado_whole"
-"""What compiled texts call a % b, a // b, round(a) and int(a)."""
+"""Names, in compiled texts, of the functions for a % b, a // b, round(a) and int(a)."""
 
 
 @cache
@@ -55,36 +56,36 @@ def meanings(precision: Precision) -> dict[str, Any]:
 
 
 REAL, VECTOR = "cortado_real", "cortado_vector"
-"""What the compiled text calls the types of a number and of a vector."""
+"""Names, in compiled texts, of the types of a number and of a vector."""
 PLACE, READ, READ_OF = "cortado_place", "cortado_read", ("cortado_e", "cortado_w", "cortado_member", "cortado_row")
-"""What compiled texts call the functions that read arrays, and what these take before an index."""
+"""Names, in compiled texts, of the functions that read arrays, and the arguments of these functions before an index."""
 _TYPES = {float: REAL, wp.float32: REAL, wp.float64: REAL, wp.vec3f: VECTOR, wp.vec3d: VECTOR}
 _OPERATORS: Mapping[type[ast.operator], str] = {ast.Mod: REMAINDER, ast.FloorDiv: QUOTIENT}
 _CALLS = {"round": NEAREST, "int": WHOLE}
 FRACTIONS = "mass_fractions"
-"""The argument that has as many numbers as a scene has phases, which is known when a force is made for a scene."""
+"""The argument with as many numbers as the scene has phases; this count is known once a force is made for a scene."""
 Lines = ast.AST | list[ast.stmt]
 
 
 class InPrecision(ast.NodeTransformer):
     """A rewriting of a function's text for a precision: numbers and types become those of the precision, and values
-    from outside are written out, which makes the text complete. Whole numbers stay as indices alone: loops are
-    unrolled, with the value of each index."""
+    from outside are written out, so that the text is complete. Whole numbers remain only as indices; loops are unrolled
+    with the value of each index."""
 
     def __init__(
         self, what: str, scope: Mapping[str, Any], local: set[str], arrays: Mapping[str, tuple[int, ...]] | None = None
     ):
-        """Take what the function is called, the values of names from outside, and its own names, with the shapes of
-        those that are arrays."""
+        """Take the function's name for messages, the values of outside names, the function's own names, and the shapes
+        of its arrays."""
         self._what, self._scope, self._local = what, scope, local
         shapes = arrays or {}
         sizes = [prod(shape) for shape in shapes.values()]
         self._arrays = {name: (sum(sizes[:k]), shape) for k, (name, shape) in enumerate(shapes.items())}
-        """Arrays, with where each begins in the table of all."""
+        """Arrays, each with the index of its first number in the table of all arrays."""
         self._counts: dict[str, int] = {}
-        """What loops count with, where the text has come to."""
+        """Values of the loop counters at the present place of the text."""
         self._given = set[str]()
-        """Arguments, of which vectors have three components."""
+        """Arguments; vectors among them have three components."""
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
         self._given = {one.arg for one in node.args.args} - {FRACTIONS}
@@ -120,7 +121,8 @@ class InPrecision(ast.NodeTransformer):
         return node
 
     def _read(self, node: ast.Subscript, first: int, shape: tuple[int, ...]) -> ast.AST:
-        """Return the call that reads a number of an array: indices known here are checked, others where it runs."""
+        """Return the call that reads a number of an array. Indices known here are checked now, others during the
+        run."""
         parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         if len(parts) != len(shape) or any(isinstance(part, (ast.Slice, ast.Starred)) for part in parts):
             found = f"{self._what} has {ast.unparse(node)}"
@@ -189,7 +191,7 @@ class InPrecision(ast.NodeTransformer):
         return ast.Call(self.visit(node.func), given, keywords)
 
     def _index(self, node: ast.expr) -> int:
-        """Return the whole number of an index as Python computes it; raise `InputError` where it is none."""
+        """Return the whole number of an index as Python computes it; raise `InputError` if it is not a whole number."""
         number = self._whole(node)
         if number is None:
             found = f"{self._what} has the index {ast.unparse(node)}"
@@ -211,7 +213,7 @@ class InPrecision(ast.NodeTransformer):
         return None
 
     def _resolved(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        """Replace a name from outside by the number or the type of the precision that it stands for, if it does."""
+        """Replace an outside name by its number or its type in the precision, if it refers to one."""
         try:
             value = self._value(node)
         except (KeyError, AttributeError):
@@ -251,8 +253,8 @@ MATH = (
 
 
 def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
-    """Raise `InputError` for a call of anything but functions and types of Warp, as Warp would take its own of that
-    name."""
+    """Raise `InputError` for a call of anything but Warp's functions and types: Warp would call its own function of
+    that name."""
     for node in ast.walk(function):
         if not isinstance(node, ast.Call):
             continue
@@ -288,8 +290,8 @@ def check_truths(what: str, function: ast.FunctionDef) -> None:
 
 
 def check_helper(what: str, function: ast.FunctionDef) -> None:
-    """Raise `InputError` for code in a function under ``@wp.func``, whose numbers have types of their own, that means
-    something else in Python."""
+    """Raise `InputError` for code in a function under ``@wp.func`` that has another meaning in Python. Numbers in such
+    a function have types of their own."""
     check_truths(what, function)
     wholes = set(counts_of(function))
     for node in ast.walk(function):

@@ -1,8 +1,8 @@
-"""A user's function as a text: its source, which Warp compiles, and its meaning, which is another where the function
-computes something else. The source is checked against the function itself, with the values of the names from outside as
-they are when the force is made. It is refused where Warp cannot differentiate it.
+"""A user's function as two texts: the source, which Warp compiles, and the meaning, which differs if the function
+computes something else. The source is checked against the function itself, with the values of outside names at the time
+when the force is made. Code that Warp cannot differentiate is refused.
 
-The meaning, also of objects, is the code with the numbers, functions and objects that it reads.
+The meaning, also that of an object, consists of the code and of the numbers, functions and objects that the code reads.
 """
 
 import ast
@@ -28,9 +28,9 @@ from cortado.device.modules import kernel_module
 from cortado.errors import InputError, shown
 
 _SENT: WeakKeyDictionary[FunctionType, str] = WeakKeyDictionary()
-"""Texts of functions that came from other processes."""
+"""Source texts of functions that were received from other processes."""
 _LEFT_OUT = ("CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "PUSH_NULL", "RESUME")
-"""Instructions that do not matter for the meaning of a code."""
+"""Bytecode instructions that do not change what code computes."""
 
 
 def plain_function(kind: str, function: Any) -> FunctionType:
@@ -45,14 +45,14 @@ def plain_function(kind: str, function: Any) -> FunctionType:
 
 
 def check_bare(what: str, function: Any) -> None:
-    """Raise `InputError` for a function that a decorator has put around another one."""
+    """Raise `InputError` for a function that a decorator has wrapped around another function."""
     if hasattr(function, "__wrapped__"):
         found = f"{what} is one that a decorator has put around another, which Warp would compile without it"
         raise InputError(f"{found}, but must have no decorator other than wp.func.")
 
 
 def source_of(what: str, function: FunctionType) -> str:
-    """Return the source text of a function; raise `InputError` where it is not to be found."""
+    """Return the source text of a function; raise `InputError` if it cannot be found."""
     if function in _SENT:
         return _SENT[function]
     try:
@@ -63,13 +63,13 @@ def source_of(what: str, function: FunctionType) -> str:
 
 
 def keep_source(function: FunctionType, source: str) -> None:
-    """Keep the text that a function came with from another process, where it may stand in no file."""
+    """Store the source text that another process sent with a function, because no file may contain it."""
     _SENT[function] = source
 
 
 def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDef:
-    """Parse the text of a function, without annotations, defaults and decorators. Raises `InputError` where the text
-    defines another function, as where its file has changed since it was imported."""
+    """Parse the text of a function, without annotations, defaults and decorators. Raises `InputError` if the text
+    defines another function, for example if its file has changed since the import."""
     try:
         found: ast.AST = ast.parse(source).body[0]
     except (SyntaxError, IndexError):  # a lambda on one of several lines, or lines that have moved
@@ -92,7 +92,8 @@ def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDe
 
 
 def _compiled(found: ast.FunctionDef, of: CodeType) -> CodeType | None:
-    """Compile a definition inside one that has the names from around it; None where Python finds no such code."""
+    """Compile a definition inside a function that defines the names of the enclosing scope; None if Python finds no
+    such code."""
     doc = found.body[0]
     if isinstance(doc, ast.Expr) and isinstance(doc.value, ast.Constant) and isinstance(doc.value.value, str):
         doc.value.value = of.co_consts[0] if of.co_consts else None  # its indentation is no matter
@@ -107,7 +108,7 @@ def _compiled(found: ast.FunctionDef, of: CodeType) -> CodeType | None:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Test whether two code objects or constants are equal in what they do."""
+    """Test whether two code objects or constants compute the same."""
     if not isinstance(one, CodeType) or not isinstance(other, CodeType):
         return type(one) is type(other) and repr(one) == repr(other)
     found, wanted = _instructions(one), _instructions(other)
@@ -117,7 +118,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _instructions(code: CodeType) -> list[tuple[str, Any]]:
-    """Return the instructions of a code, without those that depend on which names are those of imported modules."""
+    """Return the instructions of a code object, without those that depend on which names are imported modules."""
     steps = [step for step in dis.get_instructions(code) if step.opname not in _LEFT_OUT]
     places = [step.offset for step in steps]
     found = []
@@ -129,18 +130,19 @@ def _instructions(code: CodeType) -> list[tuple[str, Any]]:
 
 
 class Frozen:
-    """The scope of a function and of all that it calls, frozen: numbers, vectors, and attributes of modules and objects
-    that it reads are copies. So are functions under ``@wp.func``, whose scopes are frozen too."""
+    """The frozen scope of a function and of all functions that it calls. Numbers, vectors, attributes read from modules
+    and objects, and functions under ``@wp.func`` are copied; the scopes of these functions are frozen too."""
 
     def __init__(self, what: str, function: FunctionType):
-        """Freeze the scope of a function; raise `InputError` where a function it calls is not as its text says."""
+        """Freeze the scope of a function; raise `InputError` if a function that it calls differs from its source
+        text."""
         self._what, self._made = what, dict[Any, Any]()
         self.helpers: list[Any] = []
-        """The copies of functions of Warp's users, in each of their forms."""
+        """Copies of the user's functions under ``@wp.func``, one for each overload."""
         self.scope = self._scope(function)
-        """What names stand for."""
+        """Values of the names, by name."""
         self.words = "\n".join(words(self.scope))
-        """All of it as a text, which other processes have too."""
+        """The whole frozen scope as a text that is the same in every process."""
 
     def _scope(self, function: FunctionType) -> dict[str, Any]:
         return {name: self._value(value, names_in(function)) for name, value in read_by(function).items()}
@@ -181,7 +183,7 @@ class Frozen:
         return made
 
     def _function(self, helper: Any) -> FunctionType:
-        """Return the Python function of a Warp helper, with a scope that is frozen."""
+        """Return the Python function of a Warp helper with a frozen scope."""
         function, what = helper.func, f"the function {helper.func.__name__} that {self._what} calls"
         check_bare(what, function)
         definition(what, function, helper.adj.source)
@@ -193,11 +195,11 @@ class Frozen:
 
 
 class DerivativeCheck(ast.NodeVisitor):
-    """A check that refuses code which Warp would differentiate wrongly without a word: loops that it does not unroll,
-    and vectors that are changed in part."""
+    """A check that refuses code which Warp would silently differentiate wrongly: loops that Warp does not unroll, and
+    vectors of which single components are changed."""
 
     def __init__(self, what: str, most: int = wp.config.max_unroll):
-        """Take what the function is called, and the greatest number of turns of a loop."""
+        """Take the function's name for messages, and the greatest number of iterations of a loop."""
         self._what, self._most = what, most
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
@@ -251,7 +253,8 @@ def _returns(body: list[ast.stmt]) -> bool:
 
 
 def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
-    """Raise `InputError` for an unknown name, or a name of arrays and lists, of which Warp takes none."""
+    """Raise `InputError` for an unknown name, and for the name of an array or list from outside: Warp functions cannot
+    read them."""
     for node in ast.walk(function):
         if not isinstance(node, ast.Name) or node.id in own:
             continue
@@ -289,11 +292,11 @@ class SizesWritten(ast.NodeTransformer):
 
 
 KEPT = ("builtins", "jax", "math", "numpy", "scipy", "torch", "warp")
-"""Packages that do not change, whose functions and objects count by name alone."""
+"""Packages that do not change: only the names of their functions and objects enter the meaning."""
 PYTHON = sysconfig.get_path("stdlib")
 """Folder of Python's standard modules, and sometimes of installed ones."""
 SNIPPETS = ("native_snippet", "adj_native_snippet", "replay_snippet")
-"""Attributes of Warp functions that hold their C++ texts."""
+"""Attributes of Warp functions that contain C++ source."""
 
 
 def code_words(value: Any) -> str:
@@ -302,8 +305,9 @@ def code_words(value: Any) -> str:
 
 
 def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | None = None) -> list[str]:
-    """Return lines equal in every process, and different where a value computes something else. Objects and a user's
-    modules count by attributes with these ``names``, as the reading code has them; by all if left out."""
+    """Return lines that are equal in every process, and that differ if the value computes something else. Of objects
+    and of a user's modules only the attributes in ``names``, those that the reading code names, are included; by
+    default all are."""
     value, seen = _parts(value), set() if seen is None else seen
     if isinstance(value, (bool, int, float, complex, str, bytes, range, slice, type(None))):
         return [repr(value)]
@@ -325,7 +329,7 @@ def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | Non
 
 
 def _parts(value: Any) -> Any:
-    """Return the parts that tell a value from others: itself, or a list of its contents."""
+    """Return the parts by which a value differs from others: the value itself, or a list of its contents."""
     if isinstance(value, wp.Function) and value.func:
         forms = [*value.user_overloads.values(), *value.user_templates.values()] or [value]
         more = ("func", "custom_grad_func", "custom_replay_func", *SNIPPETS)

@@ -1,22 +1,22 @@
-"""Solids that move: those that are told, by a part of a step that puts their walls where they are at its end; and how
-free bodies go and turn by the momenta that they get, also where they are held or on a hinge.
+"""Solids that move. A part of a step puts the walls of solids with prescribed paths where they are at its end. Kernels
+here also compute how free bodies move and turn by their momenta, also if axes are fixed or the body has a hinge.
 
 A free body's velocities are V = D (V_0 + dt g + F / (rho K)) + W x s and W = G L. D is 0 along held axes. A hinge is at
-the arm a from the centre of mass in the body's frame, so that the centre is at s = - R a from the hinge, which stays
-where it is: D is 0, L is the angular momentum about the hinge, and I the inertia about it. Without a hinge s is 0.
+the arm a from the centre of mass in the body's frame, so that the centre is at s = - R a from the hinge. The hinge does
+not move: D is 0, L is the angular momentum about the hinge, and I the inertia about it. Without a hinge s is 0.
 
 G is the inverse of the inertia J = R I R^T on the free axes A, G = A (A^T J A)^-1 A^T: J^-1 if all are free; a a^T / (a
 . J a) for one axis a; J^-1 - (J^-1 b) (J^-1 b)^T / (b . J^-1 b) where b alone is held; 0 if none is free. Of an angular
-velocity that a scene says counts the part along the free axes. What pressures do to the body, -G and D / (rho K), is so
-the transpose of what its velocity does to the fluid, as that of a body that nothing holds.
+velocity given in a scene only the part along the free axes is used. So the effect of pressures on the body, -G and D /
+(rho K), is the transpose of the effect of its velocity on the fluid, as for a body that nothing holds.
 
 A solid begins at the position c_0 with the rotation R(w_0). At the end of a step it is displaced by d and turned by w.
-A wall particle with the place r in its frame is then at c_0 + d + R(w) R(w_0) r. Its velocity leads there from its
-place before, over the time step. States have the position c, the turn w, w_0, and the scale by which it is stretched
-(`cortado.particles.moving_walls`).
+A wall particle with the place r in its frame is then at c_0 + d + R(w) R(w_0) r. Its velocity is the way from its
+previous place to this one, divided by the time step. States have the position c, the turn w, w_0, and the scale by
+which it is stretched (`cortado.particles.moving_walls`).
 
-A rotation R(w) by the vector w, in the plane by an angle, turns by |w| about w (Rodrigues). Where w changes by w', it
-turns further by J(w) w': R(w + w') = R(J(w) w') R(w) to first order, with
+A rotation R(w) by the vector w, in the plane by an angle, turns by |w| about w (Rodrigues). If w changes by w', the
+rotation turns further by J(w) w': R(w + w') = R(J(w) w') R(w) to first order, with
 
     J(w) = I + (1 - cos |w|) / |w|^2 [w] + (|w| - sin |w|) / |w|^3 [w]^2,
 
@@ -51,13 +51,13 @@ def hold_type(precision: Precision) -> Any:
 
     class HoldNumbers:
         moving: vector
-        """1 along the axes along which the body may go, else 0."""
+        """1 along the axes along which the body may move, 0 along the others."""
         arm: vector
         """a, from the centre of mass to the hinge, in the body's frame [m]."""
         axis: vector
-        """The axis about which it turns, if that is one; that about which it does not, if they are two."""
+        """If the body turns about one axis: that axis. If it turns about two: the axis about which it does not turn."""
         turning: wp.int32
-        """Number of axes about which it turns."""
+        """Number of axes about which the body turns."""
 
     HoldNumbers.__name__ = HoldNumbers.__qualname__ = f"HoldNumbers_{precision.name}"
     return wp.struct(HoldNumbers)
@@ -122,16 +122,16 @@ def hold_functions(precision: Precision) -> SimpleNamespace:
 
 
 def free_module(precision: Precision, topic: str = "bodies") -> Any:
-    """Return the Warp module of kernels of free bodies that need no smoothing kernel, or of a ``topic`` that not all
-    bodies need: a module with other kernels than before is compiled anew."""
+    """Return the Warp module of kernels of free bodies that need no smoothing kernel. Kernels that not all bodies need
+    have a ``topic`` of their own, because Warp recompiles a whole module if its kernels differ."""
     return kernel_module(f"free_{topic}_derivative_{precision.name}")
 
 
 @cache
 def move_kernels(precision: Precision) -> Kernels:
     """Make the kernels of V, L and W of a body by gravity and by the sums of momenta that it gets, with a thread for
-    each scene. They also give the velocity changes V - V_0 and W - W_0, ``faster`` and ``turned_faster``. Adjoints of
-    the sums are written."""
+    each scene. They also compute the velocity changes V - V_0 and W - W_0, ``faster`` and ``turned_faster``. Adjoints
+    of the sums are written."""
     real, vector, matrix, hold = precision.real, precision.vector, matrix_of(precision), hold_functions(precision)
     spin, vectors = hold.spin, "gravity V W L pulled twisted"
 
@@ -171,13 +171,13 @@ def move_kernels(precision: Precision) -> Kernels:
 
 
 SMALL = 1e-3
-"""|w|^2 below which the factors of J are series, to which three terms are enough."""
+"""|w|^2 below which the factors of J are computed by series; three terms are enough."""
 
 
 @cache
 def rotations(precision: Precision, dimension: int) -> SimpleNamespace:
     """Make the type ``angle`` of angles, numbers in 2 dimensions and vectors in 3, and the Warp function ``rotation``,
-    R(w), of which Warp knows the derivative by J."""
+    R(w), whose derivative Warp takes from J."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
 
     @wp.func
@@ -218,7 +218,7 @@ def rotations(precision: Precision, dimension: int) -> SimpleNamespace:
 
 
 FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_name, "scale": scale_name}
-"""Names of a solid's state fields, by the names that kernels have for them."""
+"""Names of a solid's state fields, by the names of kernel arguments."""
 
 
 @cache
@@ -290,10 +290,10 @@ class MovingSolidsPart(Part):
                 StateField(scale_name(name), "", Entry.NUMBER, Axis.SCALAR, scale_name(name)),
             )
         )
-        """Where they are, how far they are turned from how they began, how that was, and how large they are."""
+        """Positions, turns since the start, rotations at the start, and scales of the solids."""
         self.poses, self.ends = pose_kernels(layout.precision, made_of.dimension)
         self.begun = layout.state(self.fields)
-        """What a step began from."""
+        """Values at the start of the step."""
 
     def begin(self, step: StepContext, state: State) -> None:
         walls, search = self.made_of.walls, self.made_of.search
@@ -310,11 +310,11 @@ class MovingSolidsPart(Part):
             step.launch(self.ends.forward, *known, threads=self.layout.members)
 
     def state(self, state: State, name: str, suffix: str = "") -> dict[str, wp.array]:
-        """Return a solid's fields of a state by the names that kernels have for them."""
+        """Return a solid's fields of a state by the names of kernel arguments."""
         return {f"{label}{suffix}": state[name_of(name)] for label, name_of in FIELDS.items()}
 
     def told(self, parameters: Parameters, name: str, suffix: str = "") -> dict[str, wp.array]:
-        """Return the parameters of a solid's given path by the names that kernels have for them."""
+        """Return the parameters of a solid's given path by the names of kernel arguments."""
         told = {"place": position_name(name), "displacements": displacement_name(name), "turns_told": turn_name(name)}
         return {f"{label}{suffix}": parameters[parameter] for label, parameter in told.items()}
 
@@ -349,7 +349,8 @@ class MovingSolidsTangent(PartTangent):
 
 
 class MovingSolidsAdjoint(PartAdjoint):
-    """The adjoint of solids with given paths, from what particles have added to the adjoints of poses."""
+    """The adjoint of solids with given paths, computed from the terms that particles have added to the adjoints of
+    poses."""
 
     def __init__(self, part: MovingSolidsPart):
         self._part = part

@@ -1,13 +1,13 @@
 """Arrays as parameters of a user's function, such as the weights of a network or a field on a grid, which kernels read
 number by number.
 
-All arrays of a force stand one behind the other in a table w (members, numbers). What is read for a particle is
+All arrays of a force are concatenated in a table w (members, numbers). The value read for a particle is
 
     w_k + e w_dot_k,   with e = 0,
 
-so that the tangent along w_dot is the derivative by e, as if that were a number of the particle. The adjoint of w is a
-sum over particles without atomics: a thread takes every so manieth particle of a scene, one after the other, and adds
-to a row of its own. The rows are summed in a fixed order.
+so that the tangent along w_dot is the derivative with respect to e, which is treated as a number of the particle. The
+adjoint of w is a sum over particles without atomics: a thread takes every so manieth particle of a scene, one after the
+other, and adds to a row of its own. The rows are summed in a fixed order.
 """
 
 from collections.abc import Sequence
@@ -26,14 +26,14 @@ from cortado.scene.parameters import Axis, Parameter
 from cortado.sph.parts import Adjoints, StepContext
 
 WIDTH = (1, 3)
-"""How many numbers a parameter takes that is no array, by its rank."""
+"""By rank, the count of numbers in a parameter that is not an array."""
 MOST_NUMBERS = 2**24
-"""Greatest number of numbers of a force's arrays, so that float32 has each whole index."""
+"""Greatest total size of a force's arrays: float32 represents every whole index up to it exactly."""
 ROWS, MOST_PARTIAL = {"cpu": 16, "cuda": 2**15}, 2**24
 """Rows of a scene on a device, and the number of numbers in all rows above which there are fewer."""
 
 READ_AS = {"e": "_no", "member": "i // particles", "row": "_row"}
-"""Texts in pointwise kernels of what `Reading.read` takes besides the table and the place."""
+"""Source texts, in pointwise kernels, of the arguments of `Reading.read` besides the table and the place."""
 
 
 @cache
@@ -59,7 +59,8 @@ def reading(precision: Precision, taped: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def place(k: real, size: real) -> real:
-        """Return an index, from the end where it is negative, for an axis of a size; NaN where there is no place."""
+        """Return an index into an axis of a size. A negative index counts from the end; an index out of range gives
+        NaN."""
         found = k
         if k < none:
             found = k + size
@@ -69,7 +70,7 @@ def reading(precision: Precision, taped: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def read(e: real, w: table, member: int, row: int, k: real) -> real:
-        """Return a number of the table, NaN where there is none."""
+        """Return a number of the table; NaN if the index is out of range."""
         found = nothing
         if k >= none:
             found = w.values[member, int(k)]

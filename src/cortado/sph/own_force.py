@@ -1,17 +1,16 @@
-"""Forces, and laws of viscosity, that are one function of a user's.
+"""Forces and viscosity laws that a user gives as one Python function.
 
-`Body` is the acceleration a_i = f(x_i, v_i, t, theta) [m/s2] of each particle. Both
-derivatives are exact. The adjoint is that which Warp makes of the product f . a_bar, and the tangent is the sum of the
-gradients of the components.
+`Body` is the acceleration a_i = f(x_i, v_i, t, theta) [m/s2] of each particle. Both derivatives are exact. The adjoint
+is Warp's gradient of the product f . a_bar. The tangent is the sum of the gradients of the components of f.
 
 `Pair` is a force between neighbours: the force [N], in 2-D per metre, on a particle from each
 neighbour within the support is (W(x_ij) / W(0)) f(x_ij, v_ij, t, theta), so that
 
 a_i = 1 / (m_i s^d) sum_j (W_ij / W_0) f(x_ij, v_ij, t, theta)
 
-ends smoothly at the support; m_i s^d is the mass of a particle, with the spacing s. Momentum is kept where f is odd,
-f(-x, -v) = -f(x, v), and angular momentum where f is along x too. A particle exerts none on itself, and walls have no
-part in it.
+ends smoothly at the support; m_i s^d is the mass of a particle, with the spacing s. Momentum is conserved if f is odd,
+f(-x, -v) = -f(x, v), and angular momentum if f is also parallel to x. A particle exerts no such force on itself, and
+walls exert none.
 
 `Rheology` is the viscosity of a generalised Newtonian fluid, whose viscous force is a stress.
 """
@@ -50,8 +49,8 @@ from cortado.sph.viscous_stress import ViscousStress, stress_of
 
 
 class OverTime:
-    """A parameter of a force that changes while a scene runs: linear between the times, constant before the first and
-    after the last. Its row of a step is that at the middle of the step; a search may have a row for each step.
+    """A parameter of a force that changes in time: linear between the given times, constant before the first and after
+    the last. A step uses the value at its middle; a search may use one value for each step.
 
     Example: ``k = cortado.forces.OverTime([0.0, 0.5], [2.0, 8.0])``
     """
@@ -84,15 +83,15 @@ class OverTime:
 
 @fixed
 class OwnFunction(ABC):
-    """A force whose formula is one function of a user's, given to `Simulation`; see `cortado.forces`."""
+    """A force, for `Simulation`, whose formula is one Python function of a user's; see `cortado.forces`."""
 
     kind: ClassVar[str]
     """Name of the kind of force in messages."""
 
     def __init__(self, function: Callable[..., Any], /, name: str | None = None, **parameters: Any):
-        """Take a ``function`` made by ``def`` and ``parameters``: a value for each of its arguments but the first ones,
-        a number, a vector (d,), an `OverTime`, or of `Body` an array. An argument ``k`` becomes the parameter
-        ``name.k``; by default the name is that of the function. Raises `InputError`."""
+        """Take a ``function`` defined by ``def``, and ``parameters``: values for all of its arguments after the inputs.
+        A value is a number, a vector (d,) or an `OverTime`; `Body` takes arrays too. An argument ``k`` becomes the
+        parameter ``name.k``; the default name is the function's. Raises `InputError`."""
         self._function = plain_function(self.kind, function)
         self._source = source_of(f"{self.kind} function {self._function.__name__}", self._function)
         self._formula, values = formula(self.kind, self._function, self._source, parameters)
@@ -102,7 +101,7 @@ class OwnFunction(ABC):
         self._values = {argument: self._value(argument, value) for argument, value in values.items()}
         own = tuple(self._parameter(argument, value) for argument, value in self._values.items())
         self.parameters = ((TIME,) if len(self._formula.inputs) == 3 else ()) + own
-        """Those of the function, in its order, behind time if it takes that."""
+        """The parameters of the function in its order. If the function takes time, time comes first."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the force by the arguments that it was made from, with the text of the function."""
@@ -153,12 +152,12 @@ class OwnFunction(ABC):
 
     @property
     def _ranks(self) -> tuple[int, ...]:
-        """Return the ranks of the parameters that are no arrays, and of time if the function takes that."""
+        """Return the ranks of the parameters that are not arrays, and the rank of time if the function takes time."""
         return tuple(p.rank for p in self.parameters if p.axis is not Axis.ARRAY)
 
 
 class OwnForce(OwnFunction):
-    """A user's function that returns a force or an acceleration, with kernels for it alone."""
+    """A user's function that returns a force or an acceleration; it has kernels of its own."""
 
     @abstractmethod
     def kernels(self, discretisation: Discretisation, dimension: int, phases: int = 1) -> Kernels:
@@ -188,7 +187,7 @@ class FunctionForce:
         self._gradients = VelocityGradients(setting) if takes_gradients else None
 
     def compile(self, kernel: Any) -> Any:
-        """Compile a kernel and return it; raise `InputError` where Warp cannot."""
+        """Compile a kernel and return it; raise `InputError` if Warp cannot compile it."""
         compiled(self._what, kernel.module, self._device)
         return kernel
 
@@ -244,7 +243,7 @@ def _dimension(dimension: int, phases: int) -> int:
 
 
 def _size(source: Source, value: np.ndarray) -> np.ndarray:
-    """Return the sizes of numbers, by which they are scaled; 1 for numbers that are 0."""
+    """Return the absolute values of numbers, used as scales; 1 for numbers that are 0."""
     return np.where(value == 0.0, 1.0, np.abs(value))
 
 
@@ -254,7 +253,7 @@ def _usual(source: Source, value: np.ndarray) -> float:
 
 
 def _length(source: Source, value: np.ndarray) -> float:
-    """Return the length of a vector, of several the greatest; 1 where it is 0."""
+    """Return the length of a vector, or the greatest length of several vectors; 1 where it is 0."""
     return float(np.linalg.norm(np.atleast_2d(value), axis=-1).max()) or 1.0
 
 
@@ -298,13 +297,14 @@ FIELDS = {
     "velocity_gradient": ("gradient(M_i, A_i)", ("M_i", "A_i")),
     "shear_rate": ("rate(M_i, A_i)", ("M_i", "A_i")),
 }
-"""What a function may take of a particle, with its text in a kernel and the entries of arrays in this."""
+"""Quantities of a particle that a function may take, each with its source text in a kernel and the array entries in
+this text."""
 
 
 class Body(OwnForce):
-    """A force on each particle: ``function(x, v, t, ...)`` returns its acceleration [m/s2], as gravity is one, from the
-    position [m], the velocity [m/s] and the time [s] of the particle. Time may be left out. After it come, by their
-    names, what else it takes: ``density`` [kg/m3], ``mass_fractions`` [-], ``shear_rate`` [1/s], ``velocity_gradient``
+    """A force on each particle: ``function(x, v, t, ...)`` returns the acceleration [m/s2] of a particle from its
+    position [m], its velocity [m/s] and the time [s]. The time may be left out. Further arguments with these names are
+    quantities of the particle: ``density`` [kg/m3], ``mass_fractions`` [-], ``shear_rate`` [1/s], ``velocity_gradient``
     [1/s].
 
     Example::
@@ -324,7 +324,8 @@ class Body(OwnForce):
 def term(
     discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int, module: Any
 ) -> Callable[..., Any]:
-    """Make the Warp function of a pair's share in a particle's acceleration times its volume, by a user's function."""
+    """Make the Warp function of one pair's term in a particle's acceleration times its volume, from a user's
+    function."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     theta_type, weight = theta_of(precision, ranks), pair_functions(discretisation).weight
     force = applied(text, precision, ranks, dimension, module)
@@ -360,9 +361,9 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
 
 class Pair(OwnForce):
     """A force between neighbours: ``function(x_ij, v_ij, t, ...)`` returns the force [N], in 2-D per metre, on a
-    particle from a neighbour, from how far [m] and how fast [m/s] the particle is from it. Time may be left out. It is
-    weighted with W(x_ij) / W(0), which is 1 at no distance and 0 at the support. Momentum is kept where
-    f(-x, -v) = -f(x, v). Walls exert none.
+    particle from a neighbour. x_ij [m] and v_ij [m/s] are the particle's position and velocity relative to the
+    neighbour. The time may be left out. The force is multiplied by W(x_ij) / W(0), which is 1 at distance 0 and 0 at
+    the support. Momentum is conserved if f(-x, -v) = -f(x, v). Walls exert no such force.
 
     Example::
 
@@ -379,9 +380,9 @@ class Pair(OwnForce):
 
 
 class Rheology(OwnFunction):
-    """A law of viscosity: ``function(shear_rate, viscosity, ...)`` returns the viscosity [Pa s] at a shear rate
-    sqrt(2 D : D) [1/s]. Here ``viscosity`` [Pa s] is that of the phase and D the symmetric velocity gradient. It takes
-    the place of the viscous force of a scene, whose viscosity is "stress".
+    """A law of viscosity: ``function(shear_rate, viscosity, ...)`` returns the viscosity [Pa s] at a shear rate sqrt(2
+    D : D) [1/s]. Here ``viscosity`` [Pa s] is the viscosity of the phase and D the symmetric velocity gradient. The
+    force by this law replaces the viscous force of the scene, whose key ``viscosity`` must be "stress".
 
     Example::
 
@@ -393,11 +394,11 @@ class Rheology(OwnFunction):
 
     kind = "Rheology"
     replaces = "cortado.sph.viscosity"
-    """The module of the scene's force that does not act beside it."""
+    """The module of the scene's force that this law replaces."""
 
     def force(self, setting: Setting) -> ViscousStress:
-        """Make the viscous force with this law; raise `InputError` for a function that Warp cannot compile, or that
-        returns a viscosity that is negative or not finite."""
+        """Make the viscous force with this law. Raise `InputError` if Warp cannot compile the function, or if a
+        viscosity that the function returns is negative or not finite."""
         check_form(setting.scene)
         made = stress_of(setting.scene)(setting, self._law(setting.scene), self.parameters)
         made.compile(self._what)
@@ -421,8 +422,8 @@ class Rheology(OwnFunction):
         check_law(self._what, self._law(scene), viscosities, thetas, precision, device)
 
     def _thetas(self, values: Arrays, time_step: float) -> np.ndarray:
-        """Return the function's parameters (k, numbers) for these values at every time at which one changes: with a row
-        for each step, at the beginning of each."""
+        """Return the function's parameters (k, numbers) at every time at which one of them changes. Values with a row
+        for each step change at the beginning of each step."""
         known = {one.name: one for one in self.parameters}
         own = {name: values.get(f"{self.name}.{name}", value) for name, value in self._values.items()}
         steps = max((len(v) for n, v in values.items() if n in known and v.ndim > known[n].rank), default=0)
@@ -438,7 +439,7 @@ class Rheology(OwnFunction):
 
 
 def check_form(scene: Scene) -> None:
-    """Raise `InputError` for a scene whose viscous force is no stress."""
+    """Raise `InputError` for a scene whose key ``viscosity`` is not "stress"."""
     if scene.forces.viscosity != "stress":
         found = f"forces.viscosity is {scene.forces.viscosity!r}"
         raise InputError(f"{found}, but must be 'stress' where the viscosity depends on the shear rate.")

@@ -1,22 +1,22 @@
-"""The parts of a step, such as forces, the mixture and the nozzle: what they are given, and when they act.
+"""The parts of a step, such as forces, the mixture and the nozzle: their arguments, and the order in which a step calls
+them.
 
-A part reads the sorted particles and the parameters, and adds to adjoints: nothing that it is given is overwritten.
+A part reads the sorted particles and the parameters, and adds to adjoints. It never overwrites its arguments.
 
 Besides accelerating particles a part may keep fields from step to step, and work at the beginning and at the end of a
-step. The mixture, the emitter, and forces that remember are parts; a solver knows only their list.
+step. The mixture, the emitter, and forces with state are parts; a solver only has a list of parts.
 
-A step goes through its parts in their order at each of the times below, forward and in forward mode, and in the reverse
-order in reverse mode. A method that a part has not does nothing. Kernels find at the `begin` of a part the parameters
-and the number of the step, and at `sort` also the order of particles and x, v and m. From `settle` on they find
-neighbours and n as well, and at `end` everything that a step knows.
+For each method below a step calls all parts in their order; reverse mode calls them in the reverse order. A part may
+omit any method. In `begin` kernels can read the parameters and the number of the step, in `sort` also the order of
+particles and x, v and m. From `settle` on neighbours and n exist as well, and in `end` all arrays of the step.
 
-A derivative takes a step again from its state, but not its end. So what a tangent or an adjoint needs of a step has to
-stand in arrays that `begin`, `sort` or `settle` write.
+A derivative replays a step from its state, without calling `end`. So `begin`, `sort` or `settle` must store all values
+that the tangent or the adjoint needs.
 
 A solver too carries fields of particles from step to step, such as the pressure that the next step begins with. A state
-has them in the scene's order of particles, a step works on sorted ones. The adjoint of sorting is the way back.
+stores particles in the scene's order, and a step works on sorted particles. The adjoint of sorting is unsorting.
 
-Last come the kernels of the integration in time, semi-implicit Euler, and of sorting, with derivatives.
+At the end of this module are the kernels of time integration (semi-implicit Euler) and of sorting, with derivatives.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -48,8 +48,8 @@ from cortado.scene.scene import Scene
 class StepContext:
     """A step as its parts see it. Kernels find in it, by name, the fields of the particles, the parameters, ``s`` (what
     lies around each particle) and ``order`` (sorted -> scene). They find ``step`` (members,), the number of the step,
-    and ``cell``, the volume of a particle [m^d]. A scene has so many ``particles``: particle i belongs to scene i //
-    particles of a batch."""
+    and ``cell``, the volume of a particle [m^d]. ``particles`` is the number of particles of one scene: in a batch
+    particle i belongs to scene i // particles."""
 
     launcher: KernelLauncher
     particles: int
@@ -59,13 +59,13 @@ class StepContext:
     cell: float
     fields: Fields
     fractions: wp.array
-    """Mass fractions of the sorted particles, of which the rest of the step is made: after its diffusion."""
+    """Mass fractions of the sorted particles after the step's diffusion; the rest of the step uses them."""
     parameters: Parameters
     bodies: Sequence[Any] = ()
     """The free bodies of the solver, each a `cortado.sph.free_solids.FreeBody`."""
     kick: wp.array | None = None
-    """(n,) vectors: what pressure added to velocities of sorted particles in the step before [m/s]; None of a solver
-    whose steps do not begin with it."""
+    """(n,) vectors: the velocity change of sorted particles by pressure in the previous step [m/s]; None if the solver
+    does not carry it."""
 
     @cached_property
     def _known(self) -> tuple[Named, ...]:
@@ -73,19 +73,21 @@ class StepContext:
         return {**own, "cell": self.cell, "fractions": self.fractions}, self.fields.named(), self.parameters.named()
 
     def launch(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
-        """Launch a kernel over the particles; what is not among ``arguments`` and ``groups`` is the step's.
+        """Launch a kernel over the particles; arguments missing from ``arguments`` and ``groups`` are taken from the
+        step by name.
 
-        A kernel that takes ``s`` takes it first and works on particle ``s.first + wp.tid()``, as its launch may be cut
-        into ranges of particles; ``threads`` is for kernels without it.
+        A kernel that takes ``s`` takes it first and works on particle ``s.first + wp.tid()``, because its launch may be
+        split into ranges of particles. ``threads`` is for kernels without ``s``.
         """
         self.launcher(kernel, *groups, *self._known, threads=threads, **arguments)
 
     def aside(self) -> AbstractContextManager[None]:
-        """Let launches within run beside those that come after, until `join`: neither needs anything of the other."""
+        """Let the launches inside run concurrently with later launches until `join`; the two groups must be
+        independent."""
         return self.launcher.aside()
 
     def join(self) -> None:
-        """Let later launches wait for all that went `aside`; a step ends with it."""
+        """Let later launches wait for all launches made `aside`; every step ends with this call."""
         self.launcher.join()
 
 
@@ -102,18 +104,18 @@ class Tangents:
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """Return the tangents as kernels call them: ``x_dot``, ``viscosity_dot`` and so on."""
+        """Return the tangents under the names of kernel arguments: ``x_dot``, ``viscosity_dot`` and so on."""
         return self.fields.named("_dot"), {"fractions_dot": self.fractions}, self.parameters.named("_dot")
 
 
 class Shares(Arrays):
-    """The adjoints of parameters in which every particle has a share, kept particle by particle until they are added
-    up: (n,) numbers or vectors, of a parameter of phases (n,) of one for each phase."""
+    """Adjoints of parameters to which every particle adds a share, stored per particle until they are summed. They are
+    (n,) numbers or vectors; for a parameter of phases each entry has one number for each phase."""
 
     def __init__(self, names: Iterable[str], layout: Layout):
         """Allocate shares of the parameters of these names, all 0; raise `TypeError` for one that cannot be shared."""
         precision, self.known = layout.precision, layout.known
-        """Of which parameters some are shared."""
+        """The parameters of the simulation, some of which are shared."""
         of_phases = precision.fractions(layout.phases)
         dtypes = {Axis.SCALAR: (precision.real, precision.vector), Axis.PHASE: (of_phases, of_phases)}
         used = [self.known[name] for name in self.known.run]
@@ -135,11 +137,13 @@ class Shares(Arrays):
 
 @dataclass(frozen=True)
 class Adjoints:
-    """The adjoints that parts of a step add to: of sorted particles, of parameters, and particles' shares of these."""
+    """The adjoints to which parts of a step add: those of sorted particles and of parameters, and each particle's
+    shares of the latter."""
 
     fields: Fields
     fractions: wp.array
-    """The mixture adds what forces have added to the adjoint of the new fractions, and sets it to 0."""
+    """Forces add to this adjoint of `StepContext.fractions`; the mixture then turns it into that of the old fractions
+    and sets it to 0."""
     parameters: Parameters
     shares: Shares
     solids: SolidShares
@@ -150,8 +154,8 @@ class Adjoints:
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """Return adjoints as kernels call them: ``x_bar`` and so on; sums, (members, steps), of parameters over time;
-        and particles' shares of the parameters that a part names in its ``shares``."""
+        """Return adjoints under the names of kernel arguments, such as ``x_bar``. Parameters over time have sums,
+        (members, steps); parameters in a part's ``shares`` have the particles' shares."""
         over_time = [name for name in self.parameters.names if self.shares.known[name].axis is Axis.STEP]
         whole = {f"{argument(name)}_bar": self.parameters[name] for name in over_time}
         fractions = {"fractions_bar": self.fractions}
@@ -160,8 +164,8 @@ class Adjoints:
 
 @dataclass(frozen=True)
 class Setting:
-    """The arguments from which a force is made. A module that the registry of parameters names has a
-    ``force(setting)``, which makes it, or returns None where nothing acts."""
+    """The arguments from which a force is made. A module named in the registry of parameters has a function
+    ``force(setting)``, which makes its force, or returns None where none acts."""
 
     scene: Scene
     discretisation: Discretisation
@@ -171,13 +175,14 @@ class Setting:
 
 
 class Force(Protocol):
-    """An explicit force. A step adds up the accelerations [m / s2] of its forces, one after the other. One that says
-    ``batches = True`` runs in batches: its kernels read the parameters of scene i // particles for particle i."""
+    """An explicit force. A step adds up the accelerations [m / s2] of its forces, one after the other. ``batches =
+    True`` declares that the force runs in batches: its kernels read, for particle i, the parameters of scene i //
+    particles."""
 
     shares: tuple[str, ...]
-    """Parameters, numbers or those of phases, to whose adjoints every particle adds a share: an adjoint kernel sees
-    these adjoints with an entry for each particle, (n,), those of parameters over time as sums, (members, steps), and
-    no others."""
+    """Parameters, numbers or per phase, to whose adjoints every particle adds a share. An adjoint kernel gets these
+    adjoints with an entry for each particle, (n,), those of parameters over time as sums, (members, steps), and no
+    others."""
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         """Write ``after`` = ``before`` + this force's acceleration, both (n,) vectors."""
@@ -186,19 +191,20 @@ class Force(Protocol):
         """Write ``after`` = ``before`` + the tangent of this force's acceleration along ``dot``, both (n,) vectors."""
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array | None:
-        """Add to the adjoints ``bar`` of the force's inputs, given that of the acceleration, (n,) vectors. A force
-        whose own acceleration depends on ``before`` returns the adjoint of that; it says ``is_last = True``, and comes
-        after all others. One that solves a system of equations has what does so as ``solve``: see
-        `cortado.solvers.loop`. One with which walls act on fluid has what they do, a `cortado.sph.density.WallAction`,
-        as ``wall_action``, or loads on solids lack it. Where that does not act at the particle, ``wall_couple`` is
-        another one, of the sum of y x a, with which a acts at x_i - y."""
+        """Add to the adjoints ``bar`` of the force's inputs, given the adjoint of the acceleration, (n,) vectors. A
+        force whose acceleration depends on ``before`` has ``is_last = True``, comes after all others, and returns the
+        adjoint of ``before``. A force that solves a system of equations has the solver as its attribute ``solve``, see
+        `cortado.solvers.loop`. A force by which walls act on fluid has this action, a `cortado.sph.density.WallAction`,
+        as ``wall_action``; without it loads on solids lack this force. If walls act at x_i - y instead of at the
+        particle, ``wall_couple`` is a second `WallAction`: the sum of y x a."""
 
 
 class PartTangent:
     """The tangent of a part of a step, for forward mode."""
 
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Apply the tangent of `Part.begin` to the state's tangent before the step; ``dot`` has the parameters'."""
+        """Apply the tangent of `Part.begin` to the state's tangent before the step; ``dot`` has the parameters'
+        tangents."""
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         """Apply the tangents of `Part.sort` and `Part.settle`, given the tangent ``state_dot`` of the state before the
@@ -214,7 +220,7 @@ class PartAdjoint:
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
         """Apply the adjoint of a part with a `Part.target`: turn the adjoint of positions and velocities after the part
-        into the adjoint before it, which is returned. It adds to ``bar``; sorted particles have no adjoints yet."""
+        into the adjoint before the part, return that, and add to ``bar``. Sorted particles have no adjoints yet."""
         return moved_bar
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
@@ -231,14 +237,14 @@ class Part:
     fields: tuple[StateField, ...] = ()
     """Fields that the part keeps from step to step, as arrays of the state."""
     shares: tuple[str, ...] = ()
-    """Parameters to whose adjoints every particle adds a share, as those of a `Force`."""
+    """Parameters to whose adjoints every particle adds a share; see `Force.shares`."""
 
     def set_substeps(self, substeps: int) -> None:
         """Take ``substeps`` explicit substeps of diffusion in each step from now on."""
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Begin a step, before anything else, with its first state, which stays as it is. The part keeps what `end`
-        needs of this state, as the state at the end of the step may have the same arrays."""
+        """Begin a step, before anything else, from its first state, which must not change. Copy the arrays of this
+        state that `end` needs: the state at the end of the step may be in the same arrays."""
 
     def sort(self, step: StepContext, state: State) -> None:
         """Take part in the step once the order of the sorted particles is known."""
@@ -247,13 +253,13 @@ class Part:
         """Take part in the step once neighbours and densities are known."""
 
     def target(self, moved: State) -> State:
-        """Return the state in which the part finds positions and velocities at its `end`, given the one to which it
-        writes them. A part that changes some has room of its own, as nothing is changed in place."""
+        """Return the state from which the part's `end` reads positions and velocities, given the state to which it
+        writes them. A part that changes any returns a state of its own, because nothing is changed in place."""
         return moved
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
-        """Write the part's fields of ``state``, that at the end of the step. If it has a `target` of its own, write all
-        positions and velocities of ``moved`` from those that it finds in its target."""
+        """Write the part's fields of ``state``, the state at the end of the step. If the part has a `target` of its
+        own, read positions and velocities from the target and write them all to ``moved``."""
 
     def new_tangent(self) -> PartTangent:
         """Make the tangent of the part, with arrays of its own; raise `MissingDerivativeError` if it has none."""
@@ -272,11 +278,11 @@ class PartMaker(Protocol):
 
 
 class Carried:
-    """A set of fields that a solver carries from step to step, such as a pressure, for sorted particles; or their
-    tangents or adjoints."""
+    """Fields of sorted particles that a solver carries from step to step, such as a pressure; or the tangents or
+    adjoints of such fields."""
 
     def __init__(self, fields: Iterable[StateField], layout: Layout, requires_grad: bool = False):
-        """Allocate the fields' arrays; raise `TypeError` for a field that has not an entry for each particle."""
+        """Allocate the fields' arrays; raise `TypeError` for a field without an entry for each particle."""
         fields = tuple(fields)
         for field in fields:
             if field.axis is not Axis.PARTICLE:
@@ -339,8 +345,9 @@ def order_kernels(dtype: Any, module: Any) -> SimpleNamespace:
 
 
 def integration_module(precision: Precision, forward: bool, taped: bool = False, topic: str = "integration") -> Any:
-    """Return the Warp module of kernels without a smoothing kernel; ``taped`` forward ones get Warp's own adjoint. What
-    only some scenes need has a ``topic`` of its own: a module with other kernels than before is compiled anew."""
+    """Return the Warp module of kernels without a smoothing kernel; ``taped`` forward kernels get Warp's own adjoint.
+    Kernels that only some scenes need have a ``topic`` of their own, because Warp recompiles a whole module if its
+    kernels differ."""
     return kernel_module(f"{topic}_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 
