@@ -1,29 +1,29 @@
 """Helmholtz free energies F(c) = alpha f(c) of a mixture, and how mobile its phases are (Yang et al. 2015).
 
-    double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: phases separate, into pure ones (Lee and Kim 2015)
-    miscible     f = sum_k c_k^2 / 2: phases mix, by Fick's law
+    double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: the mixture separates into pure phases (Lee and Kim 2015) miscible
+    f = sum_k c_k^2 / 2: phases mix, by Fick's law
 
     constant     m = 1
     degenerate   m = (z + sqrt(z^2 + delta^2)) / 2,   z = sum_(k<l) c_k c_l: where phases touch
 
 For two phases the double well is c_1^2 c_2^2. The other generalisation, sum_(k < l) c_k^2 c_l^2, pulls a third phase
-into the interface of two, and lets equal parts of three or more stay mixed.
+into the interface of two phases, and leaves equal parts of three or more phases mixed.
 
-delta keeps the mobility positive, and smooth, where a fraction strays out of [0, 1]: a negative one would feed the
-excursion. It leaves a pure phase delta / 2, and z <= 1 / 4 for two phases is hardly touched.
+delta keeps the mobility positive and smooth if a fraction strays out of [0, 1]: a negative mobility would amplify the
+excursion. A pure phase has the mobility delta / 2; mixtures of two phases, with z <= 1 / 4, are hardly affected.
 
-The phases of a mixture diffuse by them (Cahn-Hilliard diffusion, after Yang et al. 2015):
+With energy and mobility the phases of a mixture diffuse (Cahn-Hilliard diffusion, after Yang et al. 2015):
 
     chi_k,i = alpha P f'(c_i)_k - (eps^2 / m_i) B(m; c_k)_i,         P u = u - (1 / phases) sum_l u_l
     c'_k,i  = c_k,i + (dt / m_i) B(m M; chi_k)_i,                    M_i = M_0 m(c_i)
     B(w; u)_i = V sum_j (w_i / n_j + w_j / n_i) (u_i - u_j) F_ij,    F = x . G / (|x|^2 + 0.01 h^2)
 
-chi is the chemical potential. B is antisymmetric in i and j: each phase keeps its mass, sum_i m_i c_k,i, to round-off,
-and sum_k c_k stays what it was, by P. The same B in both lines makes the discrete free energy
+chi is the chemical potential. The terms of B are antisymmetric in i and j, so that each phase keeps its mass, sum_i m_i
+c_k,i, to round-off. P keeps sum_k c_k constant. The same B in both lines makes the discrete free energy
 
     E = V sum_i m_i alpha f(c_i) - (eps^2 V^2 / 4) sum_ij (m_i / n_j + m_j / n_i) F_ij |c_i - c_j|^2
 
-fall along the flow on particles at rest (F <= 0). Nothing is clipped: that would break both.
+decrease in time on particles at rest (F <= 0). Fractions are not clipped: that would break conservation and decrease.
 """
 
 from collections.abc import Callable
@@ -55,15 +55,16 @@ FLOOR = 1e-3
 @public
 @dataclass(frozen=True)
 class FreeEnergy:
-    """A free energy f(c) of mass fractions c (phases,), for kernels and for NumPy. Users may make their own."""
+    """A free energy f(c) of mass fractions c (phases,), for kernels and for NumPy. Users may define their own
+    energies."""
 
     name: str
-    """Name that tells kernels of one energy from those of another."""
+    """Name by which kernels of different energies are told apart."""
     value: Callable[[np.ndarray], np.ndarray]
     """Function f of fractions (n, phases) -> (n,)."""
     curvature: float
-    """The greatest eigenvalue of the Hessian of f, without its part along (1, ..., 1), for fractions in [0, 1]: it
-    bounds the time step."""
+    """The greatest eigenvalue of the Hessian of f, without its part along (1, ..., 1), for fractions in [0, 1]. This
+    eigenvalue bounds the time step."""
     functions: Callable[[Precision, int], Any]
     """Warp functions of fractions, for a number of phases: ``gradient`` (grad f) and ``hessian_product`` (H u)."""
 
@@ -76,7 +77,7 @@ class FreeEnergy:
             raise InputError(f"FreeEnergy {self.name}'s curvature is {self.curvature}, but must be at least 0.")
 
     def check(self, precision: Precision, phases: int, device: Any) -> None:
-        """Raise `InputError` where the energy's ``functions`` fail, or return no functions of so many fractions."""
+        """Raise `InputError` if the energy's ``functions`` fail, or do not return functions of so many fractions."""
         what = f"FreeEnergy {self.name}'s functions"
         try:
             found = self.functions(precision, phases)
@@ -250,10 +251,11 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
 
 
 SAFETY = 0.5
-"""Part of the lattice's limit on a step of diffusion that is taken. The rest is for particles off the lattice and for
-fractions that stray out of [0, 1]. On random particles eigenvalues were at most 1.08 times those of the lattice."""
+"""The ratio of a substep of diffusion to its stability limit on the lattice. The margin is for particles off the
+lattice and for fractions that stray out of [0, 1]. On random particles eigenvalues were at most 1.08 times those of the
+lattice."""
 MOST_SUBSTEPS = 10_000
-"""Most explicit steps of diffusion in a time step; with more the mobility is taken for a mistake."""
+"""Most explicit substeps of diffusion in a time step; if more are needed, the mobility is refused as a mistake."""
 
 
 def stable_substeps(
@@ -304,8 +306,8 @@ class Diffusion:
 
 @cache
 def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
-    """Make the kernels of a substep of diffusion: ``potential`` and ``flux``, whose adjoint is two kernels, of the
-    scale of the sum and of the sum itself."""
+    """Make the kernels of a substep of diffusion: ``potential`` and ``flux``. The adjoint of ``flux`` is two kernels:
+    of the factor of its sum, and of the sum itself."""
     discretisation, phases = diffusion.discretisation, diffusion.phases
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     fractions = precision.fractions(phases)
@@ -317,7 +319,7 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
 
     module, tangent_module, adjoint_module = diffusion.modules
     of_c, of_chi = {"w": "m", "u": "c"}, {"u": "chi"}
-    """What the sum is of in the potential and in the flux."""
+    """Arrays that the sums of the potential and of the flux read as w and u."""
 
     @wp.func
     def project(u: fractions) -> fractions:

@@ -1,18 +1,18 @@
 """Free bodies without slip in the implicit viscous solve, with derivatives: see `cortado.sph.friction_kernels`.
 
-Their velocities are unknowns of the solve beside those of particles (Weiler, Koschier, Brand and Bender 2018). With the
-momenta M of a body, a force F(u, U) on it and the velocities U of the start of the step with gravity and contact,
+The velocities of bodies are further unknowns of the solve (Weiler, Koschier, Brand and Bender 2018). With the momenta M
+of a body, a force F(u, U) on it and the velocities U of the start of the step with gravity and contact,
 
     U' = U + M^-1 J,   J = dt F(u', U'),
 
 are further rows of the operator B (`cortado.sph.viscous_stress`), which is symmetric in the product weighted with the
-masses of particles and M. J comes to the momenta that contact gives, before pressures do. So a light body neither
-swings nor needs smaller steps.
+masses of particles and M. J is added to the momenta by contact before pressures act. So a light body neither oscillates
+nor needs smaller steps.
 
-What friction resists are velocities before pressures have come to them, which hold fluid and bodies against gravity. So
-gravity is left out of u, and U has what the pressures of the step before gave. A u with the kicks of these pressures
-would do better where they are right. But of pressures that viscosity smooths away iterations take up less in a step, so
-that a disc 24 particles across, at nu dt = 11 s^2, got ever faster.
+Friction resists velocities before pressures act on them, but pressures hold fluid and bodies against gravity. So
+gravity is left out of u, and U includes the change by the pressures of the previous step. Adding these pressures' kicks
+to u as well would be better if they were right. But pressure iterations recover less in a step of pressures that
+viscosity smooths away: a disc 24 particles across, at nu dt = 11 s^2, got ever faster.
 """
 
 from collections.abc import Iterator
@@ -40,7 +40,7 @@ SUMS = ("pulled_sum", "twisted_sum")
 
 
 def begun(body: FreeBody | Changes) -> Arrays:
-    """Return the velocities at the start of a step, or their changes, as `move_kernels` know them."""
+    """Return the velocities at the start of a step, or their changes, by the argument names of `move_kernels`."""
     return {f"{name[0]}_0{name[1:]}": array for name, array in body.before.items()}
 
 
@@ -57,15 +57,16 @@ class BodyFriction:
         self._sum = layout.sum_of(six)
         kinds = {f"{name}{suffix}": (layout.members, vector) for name in VELOCITIES}
         self.motion = zeros(kinds, layout.device)
-        """V and W of the start with gravity and contact, and after the solve those of its end."""
+        """V and W at the start of the step with gravity and contact added; after the solve V and W at its end."""
         self.turned = wp.zeros(layout.members, dtype=vector, device=layout.device)
-        """The adjoint of a further turn."""
+        """The adjoint of a further turn of the body."""
         self.none_total = wp.zeros(layout.members, dtype=real, device=layout.device)
         """A total that nobody reads."""
         self.momenta = {
             f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=layout.device) for name in SUMS
         }
-        """What a body gets by contact and friction and has got by pressures, as `move_kernels` know it."""
+        """Momenta of the body from contact, friction, and pressures of the previous step, by the argument names of
+        `move_kernels`."""
         self.impulse = {"impulse": wp.zeros(layout.members, dtype=six, device=layout.device)}
         """J."""
 
@@ -91,9 +92,9 @@ class BodyRows:
         self.arrays = zeros({name: (layout.members, kind) for name, kind in kinds.items()}, layout.device)
         self.kernels, self._members = row_kernels(layout.precision), layout.members
         self.known: tuple[Named, ...] = ()
-        """What kernels know of the body in the present step."""
+        """Kernel arguments that describe the body in the present step."""
         self.load: Any = None
-        """The load by p, as the particles have written it."""
+        """The load by p that the particles have written."""
 
     def launch(self, step: StepContext, kernel: Any, *groups: Named, **arrays: Any) -> None:
         """Launch a kernel with a thread for each scene."""
@@ -137,13 +138,13 @@ class FreeFriction:
         self.dots, self.bars = FrictionTangent(self), FrictionAdjoint(self)
 
     def each(self, step: StepContext) -> Iterator[tuple[FreeBody, BodyFriction, BodyRows]]:
-        """Yield the bodies that rub, with their arrays and rows."""
+        """Yield the bodies without slip, with their arrays and rows."""
         for body in step.bodies:
             if body.table.sticks:
                 yield body, self.own[body.table.name], self._rows[body.table.name]
 
     def begin(self, step: StepContext) -> None:
-        """Write H, Y, N and r of a step, and the lift, which is that of this step also after it."""
+        """Write H, Y, N and r of a step, and the lift, which keeps the value of this step."""
         if self.rows:
             step.launch(self.lifts.forward, self.lift, threads=self.layout.members)
         for body, own, rows in self.each(step):
@@ -157,13 +158,14 @@ class FreeFriction:
             step.launch(self.kernels.lean.forward, own.known, sums, body.before)
 
     def hang(self, step: StepContext, u: wp.array) -> None:
-        """Take the gravity of the step from velocities u of particles, as pressures hold these against it."""
+        """Subtract the step's velocity change by gravity from the velocities u of particles, because pressures balance
+        gravity."""
         if self.rows:
             step.launch(self.kernels.hang.forward, self.lift, u=u)
 
     def start(self, step: StepContext) -> None:
-        """Write the velocities of bodies by gravity, by the momenta that they have got so far, and by the pressures of
-        the step before."""
+        """Compute and store the velocities of bodies from gravity, the momenta given to them so far, and the pressures
+        of the previous step."""
         for body, own, _ in self.each(step):
             own.add_up(body)
             self.launch(step, self.move.forward, own, body)
@@ -174,7 +176,7 @@ class FreeFriction:
         step.launch(kernel, *known, threads=self.layout.members)
 
     def pull(self, step: StepContext, *known: Named, v: wp.array) -> None:
-        """Add to A and T of velocities v beside bodies with their velocities of now."""
+        """Add the terms of bodies, at their present velocities, to A and T of velocities v."""
         for _, own, _ in self.each(step):
             step.launch(self.kernels.pull, own.known, own.motion, self.constants, *known, v=v)
 
@@ -187,31 +189,32 @@ class FreeFriction:
             wp.copy(rows.arrays["r"], own.whole())
 
     def rub(self, step: StepContext, own: BodyFriction, *known: Named, v: wp.array) -> None:
-        """Write the accelerations and the couples by a body with its velocities of now."""
+        """Write the accelerations and couples of particles by a body at its present velocities."""
         step.launch(self.kernels.rub.forward, own.known, own.found, own.motion, self.constants, *known, v=v)
 
     def multiply(self, step: StepContext, known: tuple[Named, ...], p: wp.array, found: Named) -> None:
-        """Add to B p and its share of the product p . B p, and write the loads of the bodies' rows."""
+        """Add to B p and to each particle's share of the product p . B p, and write the loads of the bodies' rows."""
         for _, own, rows in self.each(step):
             velocities = {"v": p, **{name: rows.arrays[name] for name in "VW"}}
             step.launch(self.kernels.push, own.known, own.load, self.constants, found, *known, velocities)
             rows.load = own.whole()
 
     def lean(self, step: StepContext, known: tuple[Named, ...], p: wp.array) -> None:
-        """Add to A and T of p beside bodies that move by the rows of p."""
+        """Add to A and T of p the terms of bodies that move with the rows of p."""
         for _, own, rows in self.each(step):
             velocities = {"v": p, **{name: rows.arrays[name] for name in "VW"}}
             step.launch(self.kernels.pull, own.known, self.constants, *known, velocities)
 
     def finish(self, step: StepContext) -> None:
-        """Give bodies the impulses that the solve has found, and write their velocities at its end."""
+        """Add the impulses found by the solve to the bodies' momenta, and write the bodies' velocities at the end of
+        the step."""
         for body, own, rows in self.each(step):
             rows.launch(step, rows.kernels.give, body.given, own.impulse)
         self.start(step)
 
     def act(self, step: StepContext, solid: int, name: str, total: wp.array, now: Named) -> None:
-        """Add to the sum over the walls of a solid, or of all, what bodies do to particles after the step: ``rub`` or
-        ``couple``. ``now`` has the arrays of the resisted velocities."""
+        """Add the action of bodies on particles after the step, ``rub`` or ``couple``, to the sum over the walls of a
+        solid, or of all solids. ``now`` has the arrays of the resisted velocities."""
         for body, own, _ in self.each(step):
             if solid in (ALL_WALLS, body.table.number):
                 self.rub(step, own, now, v=now["v"])
@@ -219,7 +222,7 @@ class FreeFriction:
 
 
 class FrictionChanges:
-    """The changes of the friction with free bodies by a derivative, with a ``suffix`` of names."""
+    """Tangents or adjoints of the friction with free bodies, whose names end in ``suffix``."""
 
     suffix: str
 
@@ -234,7 +237,8 @@ class FrictionChanges:
     def _each(
         self, step: StepContext, of: Tangents | Adjoints
     ) -> Iterator[tuple[Changes, BodyFriction, BodyFriction, BodyRows]]:
-        """Yield the bodies that rub: their changes, those of their arrays, their arrays, and their rows."""
+        """Yield, for each body without slip: tangents or adjoints of the body and of its arrays, its arrays, and its
+        rows."""
         changes = (one for one in of.bodies if one.body.table.sticks)
         for (body, own, rows), change in zip(self._friction.each(step), changes, strict=True):
             yield change, self._own[body.table.name], own, rows
@@ -272,8 +276,7 @@ class FrictionTangent(FrictionChanges):
             step.launch(kernels.lean.tangent, *known, change.before, change.body.before)
 
     def start(self, step: StepContext, dot: Tangents) -> None:
-        """Write the tangents of the bodies' velocities at the end, by those of the momenta that they have got so
-        far."""
+        """Write the tangents of the bodies' velocities at the end, from the tangents of the momenta given so far."""
         of = self._friction
         for change, dots, own, _ in self._each(step, dot):
             dots.add_up(change)
@@ -305,7 +308,8 @@ class FrictionTangent(FrictionChanges):
         step.launch(self._friction.kernels.rub.tangent, dots.found, *groups)
 
     def finish(self, step: StepContext, dot: Tangents) -> None:
-        """Write the tangents of what bodies get by the solution, and of their velocities at the end."""
+        """Write the tangents of the impulses that bodies get by the solution, and of the bodies' velocities at the
+        end."""
         for change, dots, _, rows in self._each(step, dot):
             given = {name.removesuffix("_dot"): array for name, array in change.given.items()}
             rows.launch(step, rows.kernels.give, given, dots.impulse)
@@ -341,17 +345,18 @@ class FrictionAdjoint(FrictionChanges):
                     array.zero_()
 
     def take(self, step: StepContext, bar: Adjoints) -> None:
-        """Begin the solve from the adjoints of what the solution gave to bodies, which are velocities."""
+        """Begin the solve from the adjoints of the impulses on bodies; these adjoints are velocities."""
         for change, _, _, rows in self._each(step, bar):
             rows.launch(step, rows.kernels.take, change.given)
 
     def heed(self, step: StepContext, bar: Adjoints) -> None:
-        """Write what these velocities leave in the residual of the bodies' rows, given the loads by them."""
+        """Write the residual that these velocities leave in the bodies' rows, given the loads by the velocities."""
         for _, _, _, rows in self._each(step, bar):
             rows.launch(step, rows.kernels.heed, load=rows.load)
 
     def push(self, step: StepContext, bar: Adjoints, acceleration_bar: wp.array, *known: Named) -> None:
-        """Apply the adjoint of `FreeFriction.push`, given that of the accelerations, and the solution of the rows."""
+        """Apply the adjoint of `FreeFriction.push`, given the adjoint of the accelerations and the solution of the
+        rows."""
         kernels, sizes = self._friction.kernels, {"time_step_bar": bar.parameters["time_step"]}
         for _, bars, own, rows in self._each(step, bar):
             solution = {"load_sum_bar": rows.arrays["first"]}
@@ -384,13 +389,14 @@ class FrictionAdjoint(FrictionChanges):
             add(self._sum(share), motion_bar[name])
 
     def lean(self, step: StepContext, bar: Adjoints, A_bar: wp.array, *known: Named) -> None:
-        """Go back from the adjoint of A of the velocities at the end."""
+        """Apply the adjoint of `FreeFriction.lean`, given the adjoint of A of the velocities at the end."""
         for _, bars, own, _ in self._each(step, bar):
             groups = *known, bars.known, *bar.named, own.known, own.motion
             self._shared(step, self._friction.kernels.lean.adjoint, bars.motion, {"A_bar": A_bar}, *groups)
 
     def gather(self, step: StepContext, bar: Adjoints, sums_bar: Named) -> None:
-        """Go back from the adjoints of M, A and R of the velocities at the start."""
+        """Apply the adjoint of `FreeFriction.gather`, given the adjoints of M, A and R of the velocities at the
+        start."""
         kernels = self._friction.kernels
         for change, bars, own, _ in self._each(step, bar):
             groups = sums_bar, bars.known, *bar.named, own.known
@@ -398,8 +404,8 @@ class FrictionAdjoint(FrictionChanges):
             self._shared(step, kernels.lean.adjoint, change.before, *groups, change.body.before)
 
     def finish(self, step: StepContext, bar: Adjoints, u_bar: wp.array) -> None:
-        """Go back from the adjoints of the bodies' velocities at the end and of H, Y, N and r, and from that of the
-        particles' velocities at the end to that of gravity."""
+        """Apply the adjoints of the bodies' velocities at the end and of H, Y, N and r. Add to the adjoint of gravity
+        from ``u_bar``, the adjoint of the particles' velocities at the end."""
         of = self._friction
         if of.rows:
             share, sizes = self._shares["V_bar"], {"time_step_bar": bar.parameters["time_step"]}

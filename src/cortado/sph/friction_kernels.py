@@ -1,9 +1,9 @@
 """Viscous friction between fluid and a free body without slip, by sums of each particle over the body's walls.
 
-A wall of the body is a neighbour at the point of its surface below particle i, as other walls without slip are
-(`cortado.sph.stress_forces`), and moves with the body there. Its wall particles b have weights s_b, vectors y_b lead
-from the surface to the particle, and r leads there from the body's middle c'. Then that point is at c' + r - y_b and
-has the velocity V + W x (r - y_b). So all that the body does to the particle follows from three sums,
+As with other walls without slip (`cortado.sph.stress_forces`), the body acts like a neighbour at the point of its
+surface below particle i, here with the velocity of the body. Its wall particles b have weights s_b, y_b is the vector
+from the surface to particle i, and r the vector from the body's middle c' to particle i. So the surface point is at c'
++ r - y_b and has the velocity V + W x (r - y_b). Then the body's whole effect on the particle follows from three sums,
 
     H = sum_b s_b,   Y = sum_b s_b y_b,   N = sum_b s_b y_b y_b^T,
 
@@ -13,9 +13,9 @@ z Y^T + [W] N, and the acceleration and its couple about the particle are
     m_i a_i = -(T_i Y + C mu_i (H z + W x Y)),
     m_i c_i = -(ax(T_i N) + C mu_i (Y x z + (tr N - N) W)),   ax(B) = (B_zy - B_yz, B_xz - B_zx, B_yx - B_xy).
 
-The body gets the force F = -sum_i m_i a_i and the torque -sum_i m_i (r x a_i - c_i) about c'. They are minus half the
-derivatives of the dissipation by V and by W, as m_i a_i is by v_i. So momentum and angular momentum are kept, and
-nothing is dissipated where body and fluid turn as a whole.
+The body gets the force F = -sum_i m_i a_i and the torque -sum_i m_i (r x a_i - c_i) about c'. F and the torque are
+minus half the derivatives of the dissipation with respect to V and W, as m_i a_i is with respect to v_i. So momentum
+and angular momentum are conserved, and rigid rotation of body and fluid together dissipates nothing.
 """
 
 from functools import cache
@@ -39,8 +39,8 @@ from cortado.sph.stress_kernels import fluidity_function, traction_function
 
 @cache
 def friction_functions(precision: Precision) -> SimpleNamespace:
-    """Make the Warp functions of the part ``lean`` of a body in A, of the acceleration and the couple ``rub``, and of
-    the force and torque on the body, six numbers, by those: ``bear``."""
+    """Make three Warp functions: ``lean``, a body's term in A; ``rub``, acceleration and couple of a particle; and
+    ``bear``, which turns these two into force and torque on the body, six numbers."""
     real, vector, matrix, six = precision.real, precision.vector, matrix_of(precision), precision.six
     typed = TypesByName(real, {vector: "v arm Y V W rub couple", matrix: "T N"})
 
@@ -67,10 +67,9 @@ def friction_functions(precision: Precision) -> SimpleNamespace:
 @cache
 def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
     """Make the kernels of friction with a body in 2 or 3 dimensions. The kernels ``hold`` give the sums H, Y and N and
-    r, ``hang`` a ``lift`` that is added to velocities u, and ``thicken`` the parts in M and R. Others are ``lean``,
-    ``rub`` and ``bear`` of `friction_functions`. The kernel ``pull`` adds to A and T of some velocities. Finally
-    ``push`` adds to B v of the implicit viscosity and to shares in the product with v, and writes the load of the body,
-    as solves do it."""
+    r, ``hang`` a ``lift`` that is added to velocities u, and ``thicken`` the parts in M and R. ``lean``, ``rub`` and
+    ``bear`` apply `friction_functions`. ``pull`` adds to A and T of given velocities. In a solve ``push`` adds to B v
+    of the implicit viscosity and to the particles' shares in the product with v, and writes the load of the body."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     matrix, six, known = matrix_of(precision), precision.six, moment_functions(precision, dimension)
     contact, cross_terms = contact_functions(discretisation), cross_terms_function(precision)
@@ -206,8 +205,7 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
 
 @cache
 def lift_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of the velocity by which gravity changes in a step, with its sign turned, with a thread for each
-    scene."""
+    """Make the kernels of minus the velocity change by gravity in a step, -dt g, with a thread for each scene."""
     real, vector = precision.real, precision.vector
 
     def lift(time_step_i: real, gravity_i: vector) -> vector:
@@ -218,14 +216,16 @@ def lift_kernels(precision: Precision) -> Kernels:
 
 @cache
 def row_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of a body's rows in a solve, with a thread for each scene, of momenta, six numbers each.
-    ``rise`` are the velocities by those in r, of a body that may be held (`cortado.sph.moving_solids`), and V and W
-    those by p.
+    """Make the kernels of a body's rows in a solve, with a thread for each scene; a row is a momentum of six numbers.
+    ``rise`` are the velocities that the momenta in r give the body, which may be held (`cortado.sph.moving_solids`),
+    and V and W are the velocities by p.
 
     `Rows` of `cortado.sph.moment_functions` need ``lift``, ``begin``, ``multiply``, ``descend`` and ``turn``. ``give``
-    adds the impulse by the solution to the momenta that a body gets. ``lengthen`` adds to the tangent of a load by that
-    of the time step. ``take`` begins from velocities, the adjoint of the impulse, of which ``heed`` writes what they
-    leave in r; ``answer`` adds those by the solution, and what they give to the adjoint of the time step."""
+    adds the impulse of the solution to the momenta that a body gets. ``lengthen`` adds the time step's tangent to the
+    tangent of a load. ``take`` begins the adjoint solve from velocities, which are the adjoint of the impulse, and
+    ``heed`` writes the residual r that they leave. ``answer`` adds the velocities of the solution, and adds to the
+    adjoint of the time step.
+    """
     real, vector, matrix, six = precision.real, precision.vector, matrix_of(precision), precision.six
     module, hold = free_module(precision, "rows"), hold_functions(precision)
     spin = hold.spin
@@ -241,7 +241,7 @@ def row_kernels(precision: Precision) -> SimpleNamespace:
 
     @kernel
     def lift(r, density, volume: real, inertia: matrix, inverse: matrix, hold, turns, rise, total):
-        """Write velocities by the momenta r, and add the product of both to a total."""
+        """Write the velocities that belong to the momenta r, and add the product of both to a total."""
         b = wp.tid()
         P, arm = vector(r[b][0], r[b][1], r[b][2]), turns[b] * hold.arm
         L = vector(r[b][3], r[b][4], r[b][5]) - wp.cross(arm, P)

@@ -1,13 +1,13 @@
 """The second moment M = -V sum_j grad W_ij x_ij^T of a particle's neighbours, whose inverse corrects gradients (Bonet
-and Lok 1999), and how full the neighbourhood is by it.
+and Lok 1999), and a measure computed from M of how full the neighbourhood is.
 
 With the invariants of M, I_2 and I_3, fullness is H = 3 I_3 / I_2, in the plane 2 det M / tr M. It is 1 inside, about
-0.6 at a flat surface, and 0 where neighbours lie on a line or are missing. On a line I_2 and I_3 are nothing but
-rounding: `ROUNDING` (tr M)^2 is added to I_2, so that H is 0 there in float32 too.
+0.6 at a flat surface, and 0 where neighbours lie on a line or are missing. On a line I_2 and I_3 are pure round-off. So
+`ROUNDING` (tr M)^2 is added to I_2, and H is 0 there in float32 too.
 
-The method of conjugate gradients (Hestenes and Stiefel 1952) is for B y = r, of numbers or vectors of particles.
-B is symmetric and positive with respect to the product sum_i w_i a_i . b_i with weights w, in which everything is
-measured here. Each scene of a batch goes on until |r| has fallen to a part of the first, and stays as it is then.
+The method of conjugate gradients (Hestenes and Stiefel 1952) here solves B y = r for numbers or vectors of particles. B
+is symmetric and positive definite in the product sum_i w_i a_i . b_i with weights w, which defines all norms here. Each
+scene of a batch iterates until |r| has fallen to a given part of the first |r|, and is not changed after that.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,8 +49,8 @@ def cross_terms_function(precision: Precision) -> Any:
 
 @cache
 def symmetric(precision: Precision) -> SimpleNamespace:
-    """Make what kernels need of symmetric matrices as six numbers that neighbours load: diagonal and entries yz, xz and
-    xy. ``kind`` is their Warp type, ``pack`` makes one of a 3 x 3 matrix, ``times`` is the product with a vector."""
+    """Make types and functions for symmetric matrices stored as six numbers: diagonal and entries yz, xz and xy.
+    ``kind`` is the Warp type, ``pack`` converts a 3 x 3 matrix to it, ``times`` is the product with a vector."""
     vector, matrix, six = precision.vector, matrix_type(precision), precision.six
 
     @wp.func
@@ -83,12 +83,14 @@ def moment_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.func
     def whole(diagonal: vector, others: vector) -> matrix:
-        """Return M from its diagonal and its other entries; in the plane M_zz is 1, which changes nothing in it."""
+        """Return M from its diagonal and its other entries; in the plane M_zz is 1, which has no effect on in-plane
+        results."""
         return change(diagonal + vector(real(0.0), real(0.0), plane), others)
 
     @wp.func
     def fullness(M: matrix) -> real:
-        """Return the fullness H by the moments M; tiny covers particles without neighbours, where H is 0."""
+        """Return the fullness H from the moments M; ``tiny`` avoids 0 / 0 for particles without neighbours, where H is
+        0."""
         product = M[0, 0] * M[1, 1] + M[1, 1] * M[2, 2] + M[2, 2] * M[0, 0]
         I_2 = product - M[0, 1] * M[0, 1] - M[1, 2] * M[1, 2] - M[0, 2] * M[0, 2]
         I_3, trace = wp.determinant(M), wp.trace(M)
@@ -117,9 +119,9 @@ def moment_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
 @cache
 def solve_kernels(precision: Precision, kind: Any) -> SimpleNamespace:
-    """Make the kernels of conjugate gradients for numbers or vectors; ``going`` (members,) is 1 for a scene to go on.
-    ``begin`` and ``start`` begin a solve; ``descend`` takes a step along p, ``turn`` gives the next p, and ``decide``
-    which scenes go on."""
+    """Make the kernels of conjugate gradients for numbers or vectors; ``going`` (members,) is 1 for a scene that still
+    iterates. ``begin`` and ``start`` begin a solve, ``descend`` takes a step along p, ``turn`` computes the next p, and
+    ``decide`` finds the scenes that go on."""
     real = precision.real
     module = kernel_module(f"conjugate_gradients_{type_name(kind)}")
     typed = TypesByName(real, {kind: "r p y product", wp.int32: "count going active"})
@@ -183,13 +185,13 @@ def solve_kernels(precision: Precision, kind: Any) -> SimpleNamespace:
 
 
 def round_off(precision: Precision) -> float:
-    """Return the part of the first residual |r| below which a solve in a precision gets no better."""
+    """Return the ratio |r| / first |r| below which a solve in a precision improves no further."""
     return 3e-7 if precision is FLOAT32 else 1e-14
 
 
 class Rows(Protocol):
-    """Further unknowns of a solve, a few for each scene, beside those of particles. Each method but `begin` acts in
-    scenes that are ``going``, and adds to a sum (members,) over particles what the rows add to it."""
+    """Further unknowns of a solve, a few for each scene, beside those of particles. Each method except `begin` acts in
+    scenes that are ``going``, and adds the rows' terms to a sum (members,) over particles."""
 
     def begin(self, step: StepContext, total: wp.array) -> None:
         """Begin with the unknowns at 0, and add the square of the residual."""
@@ -198,7 +200,8 @@ class Rows(Protocol):
         """Write the rows of B p, and add their part of the product p . B p."""
 
     def descend(self, step: StepContext, scene: Named, total: wp.array) -> None:
-        """Take a step along p, and add the square of the new residual; ``scene`` has what kernels know of a scene."""
+        """Take a step along p, and add the square of the new residual; ``scene`` has kernel arguments with a value per
+        scene."""
 
     def turn(self, step: StepContext, scene: Named, total: wp.array) -> None:
         """Write the next p."""
@@ -233,8 +236,8 @@ class ConjugateGradients:
     ) -> None:
         """Write to ``y`` the solution of B y = r, (n,) both, with weights ``w``, and overwrite ``r``.
 
-        ``multiply`` launches what writes B p, for ``p``, its first argument, to the ``product`` of its second, and the
-        w p B p of each particle to the ``share``. Further ``rows`` of B are solved along.
+        ``multiply`` takes p and a dictionary of arrays: it launches kernels that write B p to ``product`` and each
+        particle's w p B p to ``share``. Further ``rows`` of B are part of the same system.
         """
         kernels, members, (sum_shares, sum_curvatures) = self._kernels, self._layout.members, self._sums
         n = self._layout.all_particles

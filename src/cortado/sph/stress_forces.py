@@ -1,19 +1,19 @@
-"""The sum over neighbours of viscosity as a stress, m_i a_i of `cortado.sph.stress_kernels`; mu is that of the stress.
-A wall without slip is a neighbour at the point of its surface below the particle, at rest.
+"""The sum over neighbours m_i a_i in `cortado.sph.stress_kernels`, for viscosity as a stress with that module's mu. A
+wall without slip acts like a neighbour at rest at the point of its surface below the particle.
 
 With the normal n of the wall, the distance d of particle i from its surface, and a particle b of the wall at x_b,
 
     y_ib = d n,   s_w = w_b s_ib max(n . x_ib, 0) / max(d, e),
 
-for the weight s_ib of two particles of the fluid (`cortado.sph.stress_kernels`), as if velocities went on behind the
-wall with their sign turned (Morris, Fox and Zhu 1997). Behind the surface d is 0, and e is a distance, ``least``,
-closer than which a wall pulls no harder. The product n . x_ib is below 0 where b belongs to the other side of a thin
-wall, or to another face of an edge. Such a b does not count: with a weight below 0 it would drive the particle on. At
-all three the derivative has a corner. Functions know n by the ``foot``, the vector from x_b to the surface.
+for the weight s_ib of two particles of the fluid (`cortado.sph.stress_kernels`), as if velocities continued behind the
+wall with opposite sign (Morris, Fox and Zhu 1997). Behind the surface d is 0. Below the distance e, called ``least``,
+the pull of a wall does not increase further. The product n . x_ib is negative if b belongs to the other side of a thin
+wall, or to another face at an edge. Such particles b are left out: a negative weight would accelerate the particle. At
+these three limits the derivative jumps. Functions compute n from the ``foot``, the vector from x_b to the surface.
 
-Laws of viscosity say how the viscosity of a fluid follows from its shear rate: a user's function, one of those that
-scenes name (`cortado.scene.model`), or the constant of a Newtonian fluid. Before a run begins each law is tried, as
-Warp compiles it, at shear rates that fluids have.
+A viscosity law returns the viscosity of a fluid from its shear rate. It is a user's function, a law named in a scene
+(`cortado.scene.model`), or the constant of a Newtonian fluid. Before a run each law, compiled by Warp, is evaluated at
+usual shear rates.
 """
 
 import inspect
@@ -90,8 +90,8 @@ def contact_functions(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace:
-    """Make the sums of the viscous acceleration, ``force`` and ``force_tangent``, and from its adjoint those of the
-    rows of T and of mu, ``traction_back``, and of x, v and m, ``force_back``. Walls have no slip if fluid ``sticks``;
+    """Make four sums: ``force`` and ``force_tangent`` of the viscous acceleration; ``traction_back`` and ``force_back``
+    turn its adjoint into adjoints of T's rows and mu, and of x, v and m. Walls have no slip if fluid ``sticks``;
     ``control`` is C."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
@@ -115,7 +115,7 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
     def wall_force_tangent(
         x_ij, x_dot_ij, v_ij, v_dot_ij, m_i, m_dot_i, T_i, T_dot_i, mu_i, mu_dot_i, control, least, foot, turn_dot, s
     ) -> vector:
-        """Return the tangent of a wall's viscous pull; a wall that turns turns its pull."""
+        """Return the tangent of a wall's viscous pull; if the wall turns, the pull turns too."""
         w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
         u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
         w_dot = wp.dot(hold_gradient(x_ij, foot, least, s), rest) - w * m_dot_i / m_i
@@ -187,14 +187,14 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
 
 
 def work_types(precision: Precision) -> TypesByName:
-    """Return the Warp types, by name, of what the works of viscous stress on solids compute with."""
+    """Return the Warp types, by name, of the variables in the work functions of viscous stress on solids."""
     kinds = {precision.vector: "x v foot acceleration couple", matrix_type(precision): "T M A"}
     return TypesByName(precision.real, {**kinds, precision.pair: "constants", neighbourhood_type(precision): "s"})
 
 
 def stress_work(d: Discretisation) -> Any:
-    """Make the work of the viscous sum on solids, for the adjoint ``acceleration_bar``, with ``least`` and ``control``
-    as ``constants`` (`cortado.particles.wall_terms.solid_kernel`)."""
+    """Make the work function of the viscous sum over solids, for the adjoint ``acceleration_bar``, with ``constants``
+    ``least`` and ``control`` (`cortado.particles.wall_terms.solid_kernel`)."""
     precision, real, contact = d.precision, d.precision.real, contact_functions(d)
     fall, hold = contact.fall, contact.hold
 
@@ -238,7 +238,7 @@ class Law:
 
 
 def newtonian(shear_rate, viscosity):
-    """Return the viscosity as it is: it does not depend on the shear rate."""
+    """Return the viscosity unchanged: it does not depend on the shear rate."""
     return viscosity
 
 
@@ -271,7 +271,8 @@ def bingham(shear_rate, viscosity, yield_stress, regularisation):
 
 
 def herschel_bulkley(shear_rate, viscosity, yield_stress, regularisation, flow_index, least_shear_rate):
-    """Return a Herschel-Bulkley fluid's viscosity: a Bingham fluid's with a power law for the constant one."""
+    """Return a Herschel-Bulkley fluid's viscosity: Bingham's law with a power law in place of the constant
+    viscosity."""
     x = regularisation * shear_rate
     part = 1.0 - x / 2.0 + x * x / 6.0
     if x > 0.01:
@@ -281,11 +282,11 @@ def herschel_bulkley(shear_rate, viscosity, yield_stress, regularisation, flow_i
 
 
 LAWS: dict[str, Callable[..., Any]] = {law.__name__: law for law in (power_law, carreau, bingham, herschel_bulkley)}
-"""By the ``kind`` of the key ``rheology``."""
+"""Functions of the viscosity laws by the ``kind`` of a scene's key ``rheology``."""
 
 
 SHEAR_RATES = np.logspace(-6.0, 6.0, 601)
-"""[1/s]: no particle has a lower one (`cortado.sph.stress_kernels.SLOWEST`)."""
+"""[1/s] at which laws are tried; no particle has a lower shear rate (`cortado.sph.stress_kernels.SLOWEST`)."""
 
 
 @cache
@@ -306,8 +307,8 @@ def trial_kernel(precision: Precision, law: Law) -> Any:
 def check_law(
     what: str, law: Law, viscosities: Mapping[str, float], thetas: np.ndarray, precision: Precision, device: Any
 ) -> None:
-    """Raise `InputError` where a law returns no valid viscosity, for ``viscosities`` [Pa s] by the names of phases and
-    parameters ``thetas`` (k, numbers)."""
+    """Raise `InputError` if a law returns an invalid viscosity for any of the ``viscosities`` [Pa s], by names of
+    phases, and parameters ``thetas`` (k, numbers)."""
     kernel, rows = trial_kernel(precision, law), np.zeros((len(thetas), theta_of(precision, law.ranks)._length_))
     rows[:, : thetas.shape[1]] = thetas
     given = {"shear_rates": SHEAR_RATES, "viscosities": np.array(list(viscosities.values()))}

@@ -4,35 +4,35 @@ With s_ij = -V a_ij of grad W = a x, so that s_ij is not negative, the sums of p
 
     M_i = sum_j s_ij x_ij x_ij^T,   A_i = sum_j s_ij v_ij x_ij^T,   R_i = sum_j s_ij |x_ij|^2 / mu_j,
 
-of which A M^-1 is the velocity gradient, corrected so that it is exact where velocities are linear (Bonet and Lok
-1999). It is also the one that fits the velocities of the neighbours best, with weights s_ij. What it leaves of them,
-v_ij - G_i x_ij, is damped (Ganzenmueller 2015 damps it against modes that the gradient does not see):
+and G = A M^-1 is the velocity gradient, corrected so that it is exact for linear velocity fields (Bonet and Lok 1999).
+It is also the least-squares fit to the velocities of the neighbours with weights s_ij. The remainders v_ij - G_i x_ij
+are damped (as by Ganzenmueller 2015, against modes that the gradient does not contain):
 
     m_i a_i = -sum_j s_ij ((T_i + T_j) x_ij + C (mu_i + mu_j) v_ij),   T_i = 2 mu_i D_i M_i^-1 - C mu_i G_i.
 
-That is minus half the derivative by v_i of what is dissipated, sum_i mu_i (2 D_i : D_i + C sum_j s_ij |v_ij - G_i
-x_ij|^2), as the weighted sum of the remainders times x_ij is 0. So energy is never made; both parts are 0 where a body
-turns as a whole, whatever the order of its particles, so that linear and angular momentum are kept. On a lattice a
+That is minus half the derivative with respect to v_i of the dissipation sum_i mu_i (2 D_i : D_i + C sum_j s_ij |v_ij -
+G_i x_ij|^2), because the weighted sum of the remainders times x_ij is 0. So the force never adds energy. Both parts are
+0 in rigid rotation for any arrangement of particles, so that linear and angular momentum are conserved. On a lattice a
 shear wave of wave number k decays with mu k^2 (1 + (C / 4 - 1 / (3 m_2)) k^2 m_4 + ...). With the moments m_2 and m_4
-of s_ij along k, C = 4 / (3 m_2) takes the second term out, in every direction and for every kernel.
+of s_ij along k, C = 4 / (3 m_2) cancels the second term, in every direction and for every kernel.
 
 From M, A and R of one particle (`stress_of_particle`) follow
 
     G = A M^-1,   D = (G + G^T) / 2,   mu_m = 1 / (1 / (2 mu_i) + R / (2 tr M)),
     mu = S law(sqrt(2 D : D), mu_m).
 
-mu_m is the harmonic mean of the viscosities between i and its neighbours, which keeps the shear stress the same on both
-sides of a layer, and the law of a Newtonian fluid is mu_m.
+mu_m is the harmonic mean of the viscosities between i and its neighbours, by which the shear stress is equal on both
+sides of an interface of fluids. For a Newtonian fluid the law returns mu_m.
 
-S(M) is 1 where neighbours lie on all sides or on one side, and falls smoothly to 0 where they lie on a line or are
-missing: M has no inverse there, and the particle takes no part in the stress. With the invariants of M, I_2 and I_3,
+S(M) is 1 if neighbours lie on all sides or on one side, and falls smoothly to 0 if they lie on a line or are missing. M
+has no inverse there, and the particle has no viscous stress. With the invariants of M, I_2 and I_3,
 
     H = 3 I_3 / I_2 (in the plane 2 det M / tr M),   S = smoothstep((H - 0.2) / 0.3).
 
-H is 1 inside, about 0.6 at a flat surface and 0 on a line. Where S is not 0, det M is at least 0.008, so that the
-inverse needs no guard of its own.
+H is 1 inside, about 0.6 at a flat surface and 0 on a line. Wherever S > 0, det M is at least 0.008, so that the inverse
+needs no guard of its own.
 
-Functions of users may ask for velocity gradients, S G, with sums over fluid alone: exact where velocities are linear,
+Users' functions may take velocity gradients S G, with sums over fluid alone. They are exact for linear velocity fields,
 also at a free surface, and 0 in spray.
 
 Walls without slip: `cortado.sph.stress_forces`.
@@ -57,11 +57,12 @@ from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import Law, contact_functions, newtonian_law, stress_sums, stress_work, work_types
 
 LEAST_VISCOSITY = 1e-12
-"""The number added to viscosities [Pa s]: the mean of their reciprocals is finite where there is none."""
+"""The number added to viscosities [Pa s], so that the mean of their reciprocals is finite if a viscosity is 0."""
 SLOWEST = 1e-6
-"""Shear rate [1/s] that is added to that of the fluid, in squares: at rest a law has a derivative."""
+"""Shear rate [1/s] whose square is added to the squared shear rate of the fluid, so that a law has a derivative at
+rest."""
 EMPTY, FULL = 0.2, 0.5
-"""H below which a particle takes no part in the stress, and above which it takes part in all of it."""
+"""H below which a particle has no viscous stress (S = 0), and above which it has the full stress (S = 1)."""
 
 
 @cache
@@ -117,7 +118,7 @@ def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
 
 def stress_of_particle(precision: Precision, dimension: int, law: Law, module: Any) -> Callable[..., Any]:
     """Make the function of T and mu of a particle, in 2 or 3 dimensions, with a law of viscosity. mu follows from A,
-    and T from ``A_u``, that of the resisted velocities; ``control`` is C."""
+    and T from ``A_u``, the sum A of the resisted velocities; ``control`` is C."""
     real, matrix, fluidity = precision.real, matrix_type(precision), fluidity_function(precision)
     part, regular = part_functions(precision, dimension)
     inverse, traction = moment_functions(precision, dimension).inverse, traction_function(precision, dimension, module)
@@ -143,8 +144,8 @@ def stress_of_particle(precision: Precision, dimension: int, law: Law, module: A
 @cache
 def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
     """Make the Warp functions of the sums over neighbours of the diagonal of M, its entries yz, xz and xy, the rows of
-    A, and R, with walls without slip if fluid ``sticks``. The adjoint is from those of M, A and R to those of a
-    particle's x, v and mu."""
+    A, and R, with walls without slip if fluid ``sticks``. The adjoint function turns adjoints of M, A and R into
+    adjoints of a particle's x, v and mu."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
@@ -168,7 +169,7 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
 
     @wp.func
     def changes(w: real, w_dot: real, y: vector, u: vector, v: vector, v_dot: vector, thin: real, thin_dot: real):
-        """Return the changes of the terms, where y changes by u."""
+        """Return the changes of the terms if y changes by u."""
         z, z_dot, even = w * y, w_dot * y + w * u, w_dot * y + real(2.0) * w * u
         others = w_dot * cross_terms(y, y) + w * even_terms(y, u)
         x_row, y_row, z_row = v[0] * z_dot + v_dot[0] * z, v[1] * z_dot + v_dot[1] * z, v[2] * z_dot + v_dot[2] * z
@@ -187,7 +188,8 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
 
     @typed
     def wall_moments_tangent(x_ij, x_dot_ij, v_ij, v_dot_ij, mu_i, mu_dot_i, least, foot, turn_dot, s) -> six:
-        """Return the tangent of a wall particle's terms; a turning wall turns y, and the rest moves it."""
+        """Return the tangent of a wall particle's terms. The tangent of y comes from the wall's rotation and from
+        relative motion."""
         w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
         u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
         w_dot, thin = wp.dot(hold_gradient(x_ij, foot, least, s), rest), fluidity(mu_i)
@@ -228,8 +230,8 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
 
 
 def moments_work(d: Discretisation) -> Any:
-    """Make the work of the moments' sums on solids, for adjoints ``M_bar``, ``A_bar`` and ``R_bar``, with ``least`` the
-    first of the ``constants`` (`cortado.particles.wall_terms.solid_kernel`)."""
+    """Make the work function of the moments' sums over solids, for adjoints ``M_bar``, ``A_bar`` and ``R_bar``; the
+    first of its ``constants`` is ``least`` (`cortado.particles.wall_terms.solid_kernel`)."""
     precision, real, contact = d.precision, d.precision.real, contact_functions(d)
     fall, hold, fluidity = contact.fall, contact.hold, fluidity_function(precision)
 
@@ -245,12 +247,13 @@ def moments_work(d: Discretisation) -> Any:
 @cache
 def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> SimpleNamespace:
     """Make the kernels of the viscous stress in 2 or 3 dimensions, with a law of viscosity; with ``sticks`` walls have
-    no slip. ``moments`` are those of M, A and R. ``stress`` are those of T and mu from these: mu follows from A, and T
-    from ``A_u`` of resisted velocities. ``force`` are those of the acceleration, with two adjoints: that of T and mu,
-    and that of particles.
+    no slip. The kernels ``moments`` compute M, A and R. From these ``stress`` computes T and mu: mu follows from A, and
+    T from ``A_u`` of resisted velocities. ``force`` computes the acceleration, and has two adjoints: of T and mu, and
+    of particles.
 
-    ``control`` of kernels is C, ``eta`` the mu of the formulas above, as ``mu`` of a step is the viscosity of
-    the fluid, and ``theta`` are the parameters of the law."""
+    In kernels ``control`` is C, and ``theta`` are the parameters of the law. ``eta`` is the mu of the formulas above,
+    because ``mu`` in a step is the viscosity of the fluid.
+    """
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     modules = discretisation.modules(f"viscous_stress_{law.topic}{dimension}d" + "_no_slip" * sticks)
@@ -329,21 +332,21 @@ class VelocityGradients:
         self._sums = self._arrays("", setting.discretisation.taped)
 
     def measure(self, step: StepContext) -> dict[str, wp.array]:
-        """Write the sums of a step, and return them by the names of kernels' arguments."""
+        """Write the sums of a step, and return them by the names of kernel arguments."""
         step.launch(self._kernels.forward, self._sums, least=0.0)
         return self._sums
 
     def tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
-        """Write the tangents of the sums, and return these and the sums."""
+        """Write the tangents of the sums, and return the tangents together with the sums."""
         step.launch(self._kernels.tangent, self._sums, self._dots, *dot.named, least=0.0)
         return {**self._sums, **self._dots}
 
     def known(self) -> dict[str, wp.array]:
-        """Return the sums of the step that was taken last, and room for their adjoints."""
+        """Return the sums of the last step, and arrays for their adjoints."""
         return {**self._sums, **self._bars}
 
     def adjoint(self, step: StepContext, bar: Adjoints) -> None:
-        """Add to the adjoints of particles, given those of the sums."""
+        """Add to the adjoints of particles, given the adjoints of the sums."""
         step.launch(self._kernels.adjoint, self._bars, *bar.named, least=0.0)
 
     @cached_property
