@@ -1,4 +1,4 @@
-"""Scenes as users write them: their tables, checked and frozen, its parameters, and the particles it is cut into."""
+"""Scenes as users write them: their tables, checked and frozen, their parameters, and their particles."""
 
 from typing import TYPE_CHECKING
 

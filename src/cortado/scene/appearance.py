@@ -1,6 +1,6 @@
 """The looks of a scene in pictures: materials, lights, cameras, and the tables [picture] and [render].
 
-Nothing that is computed depends on it. Colours are linear, from 0 to 1.
+No simulation depends on the looks. Colours are linear, from 0 to 1.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,14 +35,14 @@ Numbers = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Liquid:
-    """A fluid's look in pictures: on a way L within it light is taken away by Beer and Lambert's law."""
+    """A fluid's look in pictures. Light on a path of length L in the fluid is dimmed by the Beer-Lambert law."""
 
     colour: Numbers
-    """Colour of scattered light, and of white light that has gone 1 / absorption through the fluid."""
+    """Colour of scattered light, and of white light after a path of length 1 / absorption through the fluid."""
     scattering: float
-    """[1/m]: the part exp(-scattering L) of the light goes straight on."""
+    """[1/m]: the fraction exp(-scattering L) of the light is not scattered on a path of length L."""
     absorption: float
-    """[1/m]: of that, the part colour^(absorption L) is left."""
+    """[1/m]: of the light that is not scattered, the fraction colour^(absorption L) is not absorbed."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class Finish:
 
     colour: Numbers
     transparency: float = 0.0
-    """The part of the light that goes through."""
+    """Fraction of the light that passes through."""
     reflectivity: float = 0.0
-    """The part of the light that it reflects as a mirror in its colour does."""
+    """Fraction of the light that the surface reflects like a mirror, tinted with its colour."""
 
 
 LIQUIDS = {
@@ -72,7 +72,7 @@ FINISHES = {
 
 
 class Coloured(Table):
-    """A table with a colour: its own, if one is given, or that of its material, or else a plain one."""
+    """A table with a colour: the given one; if left out, that of its material; without a material, a plain one."""
 
     materials: ClassVar[Mapping[str, Any]]
     plain: ClassVar[Numbers]
@@ -87,16 +87,16 @@ class Coloured(Table):
 
     @field_serializer("colour", check_fields=False)
     def _given_colour(self, colour: Colour, info: SerializationInfo) -> Colour | None:
-        """Return None for a colour not given, unless the context asks for all `colours`: materials have theirs."""
+        """Leave out (None) a colour not given, as the material has it; the context "colours" asks for every colour."""
         return colour if "colour" in self.model_fields_set or info.context == "colours" else None
 
 
 @dataclass(frozen=True)
 class Light:
-    """The light of a picture: a lamp, the sun, before a sky, and a weak strip opposite; colours are linear."""
+    """The light of a picture: a lamp (the sun), a sky, and a weak strip of light opposite. Colours are linear."""
 
     azimuth: float
-    """Azimuth of the sun, to the right of the camera where it begins, which looks from there [degrees]."""
+    """Azimuth of the sun, measured to the right from the direction of the camera at its starting place [degrees]."""
     elevation: float
     """Elevation of the sun above the floor [degrees]."""
     lamp: Numbers
@@ -104,13 +104,13 @@ class Light:
     strip: Numbers
     """Colour of the strip in reflections."""
     sunlight: Numbers
-    """The light of the sun that falls on a surface facing it, of which white reflects 1."""
+    """Light that falls from the sun on a surface facing it; a white surface reflects 1."""
     shadow: float
-    """The part of the light on the floor that is the sun's."""
+    """Fraction of the light on the floor that comes from the sun."""
     background: Numbers
-    """The horizon, if a picture does not say which."""
+    """Colour of the horizon, if a picture does not choose one."""
     zenith: Numbers
-    """The colour above, in parts of the horizon's."""
+    """Colour of the sky overhead, relative to that of the horizon."""
 
 
 LIGHTS = {
@@ -160,7 +160,7 @@ LIGHTS = {
 
 @dataclass(frozen=True)
 class View:
-    """The view of a camera: its place and the point that it looks at, in the scene's axes."""
+    """The view of a camera: where the camera is, and the point at which it looks, in the scene's axes."""
 
     eye: Points
     """(3,) [m]"""
@@ -170,37 +170,37 @@ class View:
 
 @dataclass(frozen=True)
 class Moment:
-    """The moment of a film at which a picture is taken, with the state of the run then."""
+    """The moment of a film at which a picture is taken, with the state of the run at this moment."""
 
     share: float
-    """The part of the film that is over, from 0 to 1."""
+    """Fraction of the film that is over, from 0 to 1."""
     time: float
     """[s] in the run"""
     up: Points
     """(3,) unit vector against gravity"""
     solids: Mapping[str, NDArray]
-    """(3,) where the middles of solids are now, by their names [m]"""
+    """(3,) the current centre of each solid, by name [m]"""
 
 
 class CameraPath(Table):
     """A path on which a camera moves."""
 
     goes_around: ClassVar[bool] = False
-    """True where it looks from all sides, and home has to be far enough off for that."""
+    """True if the camera looks from all sides, so that its home must be far enough away for all of them."""
     kind: str
     """Name of the path."""
 
     def view(self, home: View, moment: Moment) -> View:
-        """Return the view of the camera at a moment; ``home`` is its view if it does not move."""
+        """Return the camera's view at a moment; ``home`` is the view of a camera that does not move."""
         raise NotImplementedError
 
     def check_solids(self, names: Sequence[str], path: FieldPath = ()) -> None:
-        """Raise the error of this table, at a path, if it names a solid that is none of these names."""
+        """Raise this table's error, at a path in the scene, if it names a solid that is not among these names."""
 
 
 @public
 class Orbit(CameraPath):
-    """A camera path around the point that it looks at, at its height and its distance."""
+    """A camera path that circles the point at which the camera looks, at constant height and distance."""
 
     goes_around: ClassVar[bool] = True
     kind: Literal["orbit"] = "orbit"
@@ -217,12 +217,12 @@ class Orbit(CameraPath):
 
 @public
 class Dolly(CameraPath):
-    """A camera path straight towards the point that it looks at, or away from it, beginning and ending gently."""
+    """A camera path straight towards the point it looks at, or away from it, with a gentle start and end."""
 
     kind: Literal["dolly"] = "dolly"
     """Name of the path."""
     distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 0.6
-    """Distance at the end, in its distance at the start."""
+    """Distance at the end, as a multiple of the distance at the start."""
 
     def view(self, home: View, moment: Moment) -> View:
         factor = self.distance ** (moment.share * moment.share * (3.0 - 2.0 * moment.share))
@@ -231,16 +231,16 @@ class Dolly(CameraPath):
 
 @public
 class Keyframes(CameraPath):
-    """A camera path through places at given times of the run, on a smooth curve."""
+    """A camera path along a smooth curve through given places at given times of the run."""
 
     kind: Literal["keyframes"] = "keyframes"
     """Name of the path."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...]
-    """(k,) Times of the run, each greater than the one before [s]; before the first and after the last it rests."""
+    """(k,) Times of the run, increasing [s]; the camera rests before the first and after the last."""
     cameras: tuple[tuple[Length, ...], ...]
-    """(k, 3) Where the camera is at these times [m]."""
+    """(k, 3) Positions of the camera at these times [m]."""
     look_at: tuple[tuple[Length, ...], ...] | None = None
-    """(k, 3) Where it looks at these times [m]; where it looks at home, if left out."""
+    """(k, 3) Points at which the camera looks at these times [m]; if left out, the point at which it looks at home."""
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
@@ -265,14 +265,14 @@ class Keyframes(CameraPath):
 
 @public
 class Follow(CameraPath):
-    """A camera path that moves with a solid and looks at its middle, from a fixed direction and distance."""
+    """A camera path that moves with a solid and looks at its centre from a fixed direction and distance."""
 
     kind: Literal["follow"] = "follow"
     """Name of the path."""
     solid: Text
     """Name of the solid."""
     distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 1.0
-    """How far off it is, in its distance at home."""
+    """Distance of the camera from the solid, as a multiple of its distance at home."""
 
     def view(self, home: View, moment: Moment) -> View:
         middle = np.asarray(moment.solids[self.solid])
@@ -290,13 +290,13 @@ AnyCameraPath = Annotated[Orbit | Dolly | Keyframes | Follow, Field(discriminato
 COLOURS = ("phase", *NAMES, "age")
 """Values by which particles may be coloured."""
 SEARCHED_FRAMES = 121
-"""Frames of films of a search whose scene does not say how many."""
+"""Number of frames in films of a search, if the scene does not choose another."""
 Place = Annotated[tuple[Length, ...], components("x", "y", "z")]
 
 
 class Picture(Table):
-    """The stage for shaded pictures and films, which `cortado run`, `optimise` and `picture` write; what is left out
-    fits the scene."""
+    """Settings for the shaded pictures and films of `cortado run`, `optimise` and `picture`. Keys that are left out get
+    values that suit the scene."""
 
     width: Annotated[int, count(64, 7680)] = 1280
     """Columns of pixels."""
@@ -305,52 +305,52 @@ class Picture(Table):
     surface: Literal["liquid", "spheres"] = "liquid"
     """"liquid": the surface of the fluid; "spheres": a sphere for each particle, in 3-D."""
     quality: Literal["traced", "quick"] | None = None
-    """"traced" follows light through fluid, up to three times in and out; "quick" follows it once, on a coarser
-    surface, in about half of the time, in 3-D. If left out films of `cortado run` and `optimise` are quick, and all
-    else is traced."""
+    """"traced" follows light into the fluid and out again up to three times; "quick" follows it once, on a coarser
+    surface, in about half the time, in 3-D. If left out, films of `cortado run` and `optimise` are quick, and all other
+    pictures are traced."""
     camera: Place | None = None
-    """(3,) where the camera is [m], in 3-D; left out, it sees all of the container."""
+    """(3,) Position of the camera [m], in 3-D; if left out, the camera sees the whole container."""
     camera_path: AnyCameraPath | None = None
-    """How the camera moves over a run, in films and in single pictures, in 3-D; if left out it stays where it is."""
+    """How the camera moves during a run, in films and in single pictures, in 3-D; if left out, it stays in place."""
     look_at: Place | None = None
-    """(3,) the middle of the picture [m], in 3-D; that of the container if left out."""
+    """(3,) Point in the middle of the picture [m], in 3-D; if left out, the middle of the container."""
     field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=120.0)] = 28.0
     """The angle that the width of the picture spans [degrees], in 3-D."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
-    """The part of the light, from 0 to 1, that goes through fluid a tenth as thick as the container is long. If
-    left out 0.9 with one phase, and 0 with several or with another colour than theirs."""
+    """Fraction of the light, from 0 to 1, that passes through fluid a tenth as thick as the container is long. If left
+    out, it is 0.9 with one phase, and 0 with several phases or if another colour than that of the phases is shown."""
     floor: Flag = True
-    """Whether there is a floor, in 3-D."""
+    """Whether the picture shows a floor, in 3-D."""
     light: Annotated[str, OneOf(LIGHTS)] = "studio"
     """Sun and sky, in 3-D: "studio", "noon", "evening" or "overcast"."""
     background: Colour | None = None
-    """(3,) red, green and blue, linear, each from 0 to 1; that of the light if left out"""
+    """(3,) Colour behind the scene: red, green and blue, linear, each from 0 to 1; if left out, that of the light"""
     colour: Annotated[str, OneOf(COLOURS)] = "phase"
-    """What colours particles: "phase", their own colours, a quantity with its scale, or "age", the time since they
-    left an emitter or since the start."""
+    """What colours the particles: "phase", the colours of the phases; a quantity, shown on a colour scale; or "age",
+    the time since a particle left an emitter or since the start."""
     shaded: Flag = True
-    """Whether light and shadow fall on the fluid; without them its colours are those of the scale."""
+    """Whether the fluid is drawn with light and shadow; if false, its colours are exactly those of the scale."""
     film_frames: Annotated[int, count(0, 1_000_000)] | None = None
-    """Frames of a film, evenly chosen from those that were recorded; 25 in each of its seconds if left out, and no film
-    if 0. A search records as many for its films, 121 if left out."""
+    """Number of frames of a film, evenly chosen from the recorded states; if left out, 25 a second, and with 0 there is
+    no film. A search records as many states for its films, 121 if left out."""
     film_speed: Annotated[float, quantity(gt=0.0)] | None = None
-    """Seconds of the run in a second of its film: 1 is real time. If left out real time, or what makes the film 4 to
-    10 s long."""
+    """Seconds of the run that one second of the film shows; 1 is real time. If left out, the film runs in real time, or
+    at a speed that makes the film 4 to 10 s long."""
 
     @property
     def sun_and_sky(self) -> Light:
-        """Return the light by its numbers, with the background that is shown."""
+        """Return the numbers of the light, with the background that the picture shows."""
         light = LIGHTS[self.light]
         return light if self.background is None else replace(light, background=self.background)
 
     @property
     def for_films(self) -> "Picture":
-        """Return this table for films that a command draws without being asked to: quick, unless it says how."""
+        """Return this table for films that a command draws by default: quick, unless the table sets a quality."""
         return self.model_copy(update={"quality": self.quality or "quick"})
 
     @property
     def searched_frames(self) -> int:
-        """Return the number of states that a search records for its films, at most."""
+        """Return the maximum number of states that a search records for its films."""
         return SEARCHED_FRAMES if self.film_frames is None else self.film_frames
 
     @field_validator("look_at")
@@ -376,24 +376,24 @@ Pixels = Annotated[tuple[Annotated[int, count(8, 4096)], ...], components("colum
 
 
 class Render(Table):
-    """The view of a differentiable picture, and for a view of the volume its camera."""
+    """The view of a differentiable picture, and the camera of a view of the volume."""
 
     view: Literal["top", "volume", "plane"] = "top"
     """"top": from above; "volume": through a camera; "plane": the plane itself, in 2-D, where it is the default."""
     resolution: Pixels = (128, 128)
-    """(2,) columns and rows of pixels"""
+    """"top": seen from above; "volume": seen through a camera; "plane": the plane itself, the default in 2-D."""
     background: Colour = (1.0, 1.0, 1.0)
     """(3,) red, green and blue, each from 0 to 1"""
     extinction: Annotated[float, quantity("1/m", gt=0.0)] | None = None
-    """How quickly light fades in fluid [1/m]; chosen by the renderer if left out."""
+    """How quickly light fades in fluid [1/m]; if left out, the renderer chooses a value."""
     position: Place | None = Field(default=None, validate_default=True)
-    """(3,) where the camera is [m]; for a view of the volume, which needs it"""
+    """(3,) Position of the camera [m]; needed for a view of the volume"""
     look_at: Place | None = Field(default=None, validate_default=True)
-    """(3,) the middle of the picture [m]; for a view of the volume, which needs it"""
+    """(3,) Point in the middle of the picture [m]; needed for a view of the volume"""
     field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=170.0)] | None = Field(
         default=None, validate_default=True
     )
-    """The angle that the width of the picture spans [degrees]; for a view of the volume, 40 if left out."""
+    """Angle that the width of the picture spans [degrees], for a view of the volume; 40 if left out."""
 
     @field_validator("position", "look_at", "field_of_view")
     @classmethod
@@ -414,7 +414,7 @@ class Render(Table):
         return self
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """Return this table with the view for 2 or 3 dimensions; raise a field's error where it does not fit."""
+        """Return this table with the view for 2 or 3 dimensions; raise the error of a field that does not fit."""
         if dimension == 2 and "view" not in self.model_fields_set:
             return self.model_copy(update={"view": "plane"})
         if (self.view == "plane") != (dimension == 2):

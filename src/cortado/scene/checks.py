@@ -1,4 +1,4 @@
-"""Checks of a scene as a whole: its names, its sizes, and where the fluid is. Each check raises a `field_error`."""
+"""Checks of a scene as a whole: its names, its sizes, and where its fluid is. Each raises a `field_error`."""
 
 from itertools import product
 from typing import Any
@@ -35,15 +35,14 @@ from cortado.scene.stability import chosen_limits
 from cortado.scene.tables import MISSING, FieldPath, field_error, field_name
 
 DEEPEST = 0.25
-"""In spacings: depth to which bodies may begin in walls and in each other."""
+"""In spacings: largest depth to which bodies may overlap walls and each other at the start."""
 FINE, MOST = 0.5, 40
-"""In spacings: how far apart the points are by which a body is looked at, of which there are at most so many along an
+"""In spacings: distance between the points at which a body's overlap is tested; and the most such points along an
 axis."""
 
 
 def check_free(scene: SceneTables) -> None:
-    """Check that free bodies begin outside of walls and each other, and that the projection, which moves them, is
-    used."""
+    """Check that free bodies start outside of walls and of each other, and that the solver is the projection."""
     bodies = free(scene.solid)
     if not bodies:
         return
@@ -74,7 +73,7 @@ def check_free(scene: SceneTables) -> None:
 
 
 def check_sheets(scene: SceneTables) -> None:
-    """Check that a scene with sheets has nothing that does not know of them."""
+    """Check that a scene with sheets uses no feature that does not work with sheets."""
     name = next((table.name for table in scene.solid if table.is_sheet), None)
     if name is None:
         return
@@ -92,30 +91,30 @@ def check_sheets(scene: SceneTables) -> None:
 
 
 def _nearest_images(points: Points, middle: Points, lengths: Points) -> Points:
-    """Return the images of points (n, d) nearest to a middle (d,), for periods (d,), 0 along axes without one."""
+    """Return the periodic images of points (n, d) nearest to a point (d,); the periods (d,) are 0 along other axes."""
     periods = np.where(lengths > 0.0, lengths, np.inf)
     return points - np.where(lengths > 0.0, lengths * np.round((points - middle) / periods), 0.0)
 
 
 def _points_within(solid: Solid, step: float) -> Points:
-    """Return the corners of a solid, and points of a lattice in it, (n, d)."""
+    """Return the corners of a solid, and the lattice points inside the solid, (n, d)."""
     sides = [np.linspace(a, b, min(int((b - a) / step) + 2, MOST)) for a, b in zip(*solid.extent(), strict=True)]
     points = np.stack([axis.ravel() for axis in np.meshgrid(*sides, indexing="ij")], axis=-1)
     return np.concatenate([solid.faces(step).vertices, points[solid.distance(points) < 0.0]])
 
 
 NEAREST = 0.5
-"""In spacings: particles that start nearer to each other overlap."""
+"""In spacings: two particles that start closer than this overlap."""
 OVERLAPPING = NEAREST * (1.0 - 1e-6)
 DENSEST = 0.9
-"""Part of the number density within a fluid: a particle that starts where another body has so much is inside of it,
-however the two lattices lie. In a corner of the other body, half a spacing away, there is at most 7/8 of it."""
+"""Fraction of the number density within a fluid. If another body has at least this density where a particle starts, the
+particle is inside it, however the lattices lie. In its corners, half a spacing outside, the fraction is at most 7/8."""
 SUPPORT, NEIGHBOURS = 2.0, 40
-"""By which the number density is computed: the support [spacings], and more particles than there are within it."""
+"""For number densities: the support [spacings], and a number that exceeds the count of particles within the support."""
 
 
 def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
-    """Check that the points of a file do not overlap each other; those of a lattice cannot."""
+    """Check that the points of a file do not overlap each other; the particles of a lattice cannot."""
     if not isinstance(fluid, PointsFluid) or fluid.count(spacing) < 2:
         return
     points = fluid.points()
@@ -130,7 +129,7 @@ def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
 
 
 def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, spacing: float) -> None:
-    """Check that no body overlaps another one, or the periodic images of any; ``lengths`` (d,) of a period [m]."""
+    """Check that no body overlaps another one or a periodic image of any; ``lengths`` (d,) are the periods [m]."""
     paths, bodies = zip(*placed, strict=True)
     lower, upper = np.swapaxes([body.extent(spacing) for body in bodies], 0, 1)
     shifts = [np.array(s) * lengths for s in product(*[(0, -1, 1) if length else (0,) for length in lengths])]
@@ -144,7 +143,7 @@ def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, s
 
 
 def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float) -> Points | None:
-    """Return a place (d,) where a particle of one body is too near to the other body, shifted; None if nowhere."""
+    """Return a point (d,) where a particle of one body is too near to the other, shifted; None without such a point."""
     from scipy.spatial import cKDTree
 
     one = _near(first.particles(spacing), np.array(second.extent(spacing)) + shift, spacing)
@@ -164,13 +163,13 @@ def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float)
 
 
 def _near(points: Points, extent: Any, spacing: float) -> Points:
-    """Return the points (n, d) that are in a box or within the support of a particle in it."""
+    """Return the points (n, d) that are inside a box, or within the support of a particle inside the box."""
     reach = SUPPORT * spacing
     return points[((points > extent[0] - reach) & (points < extent[1] + reach)).all(axis=1)]
 
 
 def _density(tree: Any, points: Points, spacing: float) -> np.ndarray:
-    """Return the number density (n,) of a tree's particles at points (n, d), over that within a fluid."""
+    """Return the number density (n,) of a tree's particles at points (n, d), relative to the density within a fluid."""
     dimension = points.shape[1]
     distances = tree.query(points, k=NEIGHBOURS, distance_upper_bound=SUPPORT * spacing)[0]
     return spacing**dimension * CUBIC_SPLINE.weight(distances, dimension, SUPPORT * spacing).sum(axis=1)
@@ -183,11 +182,11 @@ def _overlap(other: str, place: Points, spacing: float) -> tuple[Words, str]:
 
 MOST_PARTICLES = 2e8
 FURTHEST = 1e9
-"""In spacings from the origin; further away, neighbours would not have distinct positions in float64."""
+"""In spacings from the origin; beyond, neighbouring particles would not have distinct positions in float64."""
 
 
 def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
-    """Check that a solid is so thick that there is room for the particles of its walls."""
+    """Check that a solid is thick enough for its wall particles."""
     least = solid.least_thickness * spacing
     if solid.side == "outside" and (thickness := solid.thinnest(spacing)) < least * (1.0 - 1e-6):
         found, of = Words(f"only {thickness:g} m thick"), "one spacing" if least == spacing else "half a spacing"
@@ -195,7 +194,7 @@ def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
 
 
 def check_scene(scene: SceneTables) -> None:
-    """Run all checks of a scene, those that guard others first."""
+    """Run all checks of a scene. Checks on which others rely come first."""
     spacing = scene.discretisation.spacing
     if not (scene.fluid or scene.emitter):
         found = Words("empty") if "fluid" in scene.model_fields_set else MISSING
@@ -248,13 +247,13 @@ def check_bounded(scene: SceneTables) -> None:
 
 
 def _bodies(scene: SceneTables) -> list[tuple[FieldPath, FluidBody]]:
-    """Return all bodies with particles, in their order, each with its path in the scene."""
+    """Return all bodies with particles, in order, each with its path in the scene."""
     fluids: list[tuple[FieldPath, FluidBody]] = [(("fluid", index), fluid) for index, fluid in enumerate(scene.fluid)]
     return [*fluids, *((("emitter", index), emitter) for index, emitter in enumerate(scene.emitter))]
 
 
 def _check_names(scene: SceneTables) -> None:
-    """Check that names, which begin those of arrays in files of runs, are no paths."""
+    """Check that names are not file paths: arrays in files of runs have names that begin with them."""
     for key in ("solid", "emitter", "drain", "spring", "hinge", "sensor"):
         for index, table in enumerate(getattr(scene, key)):
             if "/" in (table.name or ""):
@@ -327,7 +326,7 @@ def _check_files(scene: SceneTables) -> None:
 
 
 def _check_mesh(scene: SceneTables, path: FieldPath, table: MeshShape, reach: float | None) -> None:
-    """Check that a mesh can be read, and fits beside the particles; ``reach`` is the support of a solid's [m]."""
+    """Check that a mesh can be read and fits the particles; ``reach`` is the support radius of a solid's walls [m]."""
     try:
         read_mesh(table.file, table.scale, scene.discretisation.spacing, reach, scene.container.extent())
     except InputError as error:
@@ -350,7 +349,7 @@ def _check_counts(scene: SceneTables) -> None:
 
 
 def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
-    """Check that a box between corners, each (d,) [m], is not too far from the origin."""
+    """Check that a box with these corners, each (d,) [m], is not too far from the origin."""
     furthest = np.abs(ends).max()
     if furthest > FURTHEST * spacing:
         wanted = f"within {FURTHEST:g} spacings of {spacing:g} m"
@@ -358,8 +357,8 @@ def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
 
 
 def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
-    """Check that a body is inside of the container. Containers are convex: if the corners of a box around the particles
-    are inside, all are. A body that is too long along an axis is refused before any of its particles is made."""
+    """Check that a body is inside the container. Containers are convex, so all particles are inside if the corners of a
+    box around them are. A body that is too long along an axis is refused before any particles are made."""
     spacing = scene.discretisation.spacing
     if scene.container.contains(fluid.box_corners(spacing), 1e-6 * spacing).all():
         return
@@ -391,10 +390,10 @@ def _outside(index: int, place: Points) -> PydanticCustomError:
 
 
 def _check_outlet(scene: SceneTables, path: FieldPath, emitter: EmitterTable) -> None:
-    """Check that the opening is inside, also along its path, and that fluid comes in through it. Upstream of it the
-    column may be outside, but along a periodic axis, where what is outside comes in again on the other side.
+    """Check that an emitter's opening is inside the container, also along its path, and that fluid enters through it.
+    The column upstream may be outside, but not along a periodic axis, where it would come in on the other side.
 
-    Containers are convex: if the opening is inside at two times it is in between.
+    Containers are convex, so an opening that is inside at two times is inside between them.
     """
     spacing, lengths = scene.discretisation.spacing, scene.periods[1]
     tolerance, outlet, opening = 1e-6 * spacing, np.array(emitter.outlet), emitter.opening(spacing)
@@ -429,7 +428,7 @@ def _check_outlet(scene: SceneTables, path: FieldPath, emitter: EmitterTable) ->
 
 
 def _check_schedule(scene: SceneTables) -> None:
-    """Check that scheduled things exist."""
+    """Check that the scene has each parameter that the schedule changes, and that the first gravity agrees."""
     courses = scene.schedule.courses
     for name in courses:
         if not BY_NAME[name].present(scene):

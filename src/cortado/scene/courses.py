@@ -1,5 +1,5 @@
-"""Values over time: steady ones, and those between values at some times, which a scene or a CSV file gives; and whether
-the keys by which a solid is moved fit together."""
+"""Values over time: at a steady rate, or interpolated between values that a scene or a CSV file gives. Also the checks
+that the keys of a solid's motion fit together."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ from cortado.scene.tables import GREATEST, MISSING, FieldPath, field_error, quan
 Interpolation = Literal["linear", "spline"]
 Ramp = Annotated[float, quantity("s", gt=0.0)]
 WITHIN = np.minimum(np.arange(9) / 8.0, 1.0 - 1e-9)
-"""Parts of the way from one time to the next at which a curve is looked at."""
+"""Fractions of the interval between two times at which a curve is sampled."""
 RAMP_PARTS = 16
-"""Number of parts into which a ramp is cut to be looked at."""
+"""Number of parts into which a ramp is cut for sampling."""
 
 
 @dataclass(frozen=True, eq=False)
 class Steady:
-    """A quantity that is 0 at time 0 and grows by the same in every second."""
+    """A quantity that is 0 at time 0 and grows at a constant rate."""
 
     rate: NDArray[np.float64]
-    """() or (components,), a second"""
+    """() or (components,), change per second"""
 
     def at(self, times: NDArray) -> NDArray:
         """Return values (n,) or (n, components) at times (n,) [s]."""
@@ -44,9 +44,9 @@ class Steady:
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """A quantity between values at some times, constant before the first and after the last: on straight lines, or on
-    a cubic spline (C2) that is at rest at both ends. With a ramp, its way from where it begins is multiplied by
-    10 s^3 - 15 s^4 + 6 s^5, where s goes from 0 to 1 with the time."""
+    """A quantity interpolated between values at given times, and constant before the first and after the last. The
+    curve is piecewise linear, or a cubic spline (C2) with zero slope at both ends. A ramp multiplies the difference
+    from ``begun`` by 10 s^3 - 15 s^4 + 6 s^5, where s grows from 0 to 1 with time."""
 
     times: NDArray[np.float64]
     """(k,) [s]"""
@@ -55,9 +55,9 @@ class Knots:
     interpolation: Interpolation = "linear"
     """How values are found between the times."""
     ramp: float = 0.0
-    """How long the ramp is, from time 0 on [s]; 0 is none."""
+    """Duration of the ramp, from time 0 on [s]; 0 means no ramp."""
     begun: Any = 0.0
-    """Value where the ramp begins."""
+    """Value at the start of the ramp."""
 
     def at(self, times: NDArray) -> NDArray:
         """Return values (n,) or (n, components) at times (n,) [s]."""
@@ -65,7 +65,7 @@ class Knots:
         return found if not self.ramp else self.begun + self._weights(times)[0] * (found - self.begun)
 
     def rates(self, times: NDArray) -> NDArray:
-        """Return the time derivatives, (n,) or (n, components), at times (n,) [s]; at a knot, those just after it."""
+        """Return the time derivatives, (n,) or (n, components), at times (n,) [s]; at a knot, just after it."""
         found = self._slopes(times)
         if not self.ramp:
             return found
@@ -73,19 +73,19 @@ class Knots:
         return weights * found + growth * (self._curve(times) - self.begun)
 
     def greatest(self) -> float:
-        """Return the size of the greatest rate."""
+        """Return the greatest size of the rate of change."""
         return float(fastest([(1.0, self)], self.breaks).max())
 
     @cached_property
     def breaks(self) -> NDArray[np.float64]:
-        """Return the times (m,) [s] between which it has no corner: its own, and some along a ramp."""
+        """Return times (m,) [s] between which the curve has no corner: its knots, and some times along a ramp."""
         along = np.linspace(0.0, self.ramp, RAMP_PARTS + 1) if self.ramp else self.times[:1]
         return np.unique(np.concatenate([self.times, along]))
 
     @property
     def seen(self) -> NDArray[np.float64]:
-        """Return values (m,) or (m, components) between which it has no others: those of the table if it has straight
-        lines and no ramp, and many more else."""
+        """Return values (m,) or (m, components) that cover the curve's range: the table's own for straight lines
+        without a ramp, otherwise many samples of the curve."""
         straight = self.interpolation == "linear" and not self.ramp
         return self.values if straight else self.at(np.append(_within(self.breaks).ravel(), self.breaks[-1]))
 
@@ -96,7 +96,7 @@ class Knots:
         return CubicSpline(self.times, self.values, bc_type="clamped")
 
     def _curve(self, times: NDArray) -> NDArray:
-        """Return values without the ramp."""
+        """Return the values, without the ramp."""
         if self.interpolation == "spline" and len(self.times) > 1:
             return np.asarray(self._spline(np.clip(times, self.times[0], self.times[-1])))
         columns = self.values.reshape(len(self.times), -1).T
@@ -104,7 +104,7 @@ class Knots:
         return found.reshape(len(times), *self.values.shape[1:])
 
     def _slopes(self, times: NDArray) -> NDArray:
-        """Return time derivatives without the ramp."""
+        """Return the time derivatives, without the ramp."""
         if self.interpolation == "spline" and len(self.times) > 1:
             found = np.asarray(self._spline(times, 1)).T
             return np.where((times >= self.times[0]) & (times < self.times[-1]), found, 0.0).T
@@ -113,14 +113,14 @@ class Knots:
         return slopes[np.searchsorted(self.times, times, side="right") - 1]
 
     def _weights(self, times: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the factor of the ramp and its time derivative [1/s], each (n,) or (n, 1) as values are."""
+        """Return the factor of the ramp and its time derivative [1/s], each (n,) for numbers or (n, 1) for vectors."""
         s = np.clip(np.asarray(times) / self.ramp, 0.0, 1.0).reshape(-1, *(1,) * (self.values.ndim - 1))
         return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * (s * (1.0 - s)) ** 2 / self.ramp
 
 
 def fastest(moved: Iterable[tuple[float, Knots]], times: NDArray) -> NDArray[np.float64]:
-    """Return for each of the times (k,) [s] the greatest speed until the next one, and 0 for the last: the sum of the
-    sizes of several rates, each times a factor."""
+    """Return for each of the times (k,) [s] the greatest speed until the next time; 0 for the last. The speed is the
+    sum of the sizes of several rates, each multiplied by a factor."""
     inner = _within(times).ravel()
     sizes = [factor * np.linalg.norm(one.rates(inner).reshape(len(inner), -1), axis=1) for factor, one in moved]
     most = sum(sizes, np.zeros(len(inner))).reshape(-1, len(WITHIN)).max(axis=1)
@@ -128,7 +128,7 @@ def fastest(moved: Iterable[tuple[float, Knots]], times: NDArray) -> NDArray[np.
 
 
 def _within(times: NDArray) -> NDArray[np.float64]:
-    """Return times (k - 1, parts) [s] between times (k,) [s]."""
+    """Return sample times (k - 1, parts) [s] in the intervals between times (k,) [s]."""
     return np.asarray(times[:-1, None] + np.diff(times)[:, None] * WITHIN)
 
 
@@ -143,23 +143,23 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0},
     "m/s2": {"m/s^2": 1.0, "m/s2": 1.0, "m/s²": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3, "g": 9.80665},
 }
-"""Factors of the units that columns of a file may have, by the unit in which a scene has them."""
+"""Factors of the units that columns of a file may use, by the unit that scenes use for the quantity."""
 MOST_BYTES = 2**25
-"""Most bytes of a file: half a million to a million lines."""
+"""Largest size of a file [byte]: room for half a million to a million lines."""
 Columns = tuple[tuple[str, str], ...]
-"""Names of columns, and the unit in which a scene has each."""
+"""Names of columns, each with the unit that scenes use for it."""
 
 
 def values_in_file(file: str, columns: Columns, needed: bool) -> tuple[NDArray, dict[str, NDArray]]:
     """Return the times (k,) [s] of a CSV file and its columns, each (k,), in the units of a scene.
 
-    Raises `InputError`, a sentence that names the file and the column, and says what was found and what was wanted.
+    Raises `InputError`, a sentence that names the file and the column, what was found there, and what was expected.
 
     Args:
-        file: with a line of names with units, such as ``time [s],x [mm],rotation [deg]``, and lines of numbers at times
-            that increase.
-        columns: those that it may have beside the time.
-        needed: whether it must have all of them, not just one.
+        file: a header of names with units, such as ``time [s],x [mm],rotation [deg]``, then rows of numbers at
+            increasing times.
+        columns: columns that the file may have besides the time.
+        needed: whether the file must have all of these columns, not just one.
     """
     try:
         stat = regular_file(file, MOST_BYTES)
@@ -170,7 +170,7 @@ def values_in_file(file: str, columns: Columns, needed: bool) -> tuple[NDArray, 
 
 @lru_cache(maxsize=8)
 def _values(file: str, columns: Columns, needed: bool, changed: int, size: int) -> tuple[NDArray, dict[str, NDArray]]:
-    """Read a version of a file, which is known by the time of its last change and its size, once."""
+    """Read one version of a file, identified by its time of change and its size, only once."""
     known, found = dict((("time", "s"), *columns)), dict[str, NDArray]()
     listed = ", ".join(f"{name} [{next(iter(UNITS[unit]))}]" for name, unit in known.items())
     for head, values in read_columns(file).items():
@@ -203,11 +203,11 @@ def _values(file: str, columns: Columns, needed: bool, changed: int, size: int) 
 
 
 WAYS = {2: ("x", "y", "rotation"), 3: ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")}
-"""Names of a body's ways to move, by the dimension of the scene: first those of its middle, then its turns."""
+"""Names of the coordinates of a body's motion, by the dimension of the scene: first displacements, then rotations."""
 
 
 def path_columns(dimension: int) -> Columns:
-    """Return the columns that a file with the path of a solid may have."""
+    """Return the columns that a file with a solid's path may have."""
     return tuple((way, "m" if k < dimension else "rad") for k, way in enumerate(WAYS[dimension]))
 
 
@@ -215,8 +215,8 @@ Rows = NDArray[np.float64]
 
 
 def path_of(solid: Any, dimension: int) -> tuple[Rows, Rows | None, Rows | None] | None:
-    """Return the times (k,) [s] of a solid's path, its displacements (k, d) [m] and rotations (k, 1) or (k, 3) [rad]
-    since the first of them; None for a solid without a path. Raises `InputError` for a file that cannot be used."""
+    """Return the times (k,) [s] of a solid's path, with displacements (k, d) [m] and rotations (k, 1) or (k, 3) [rad]
+    since the first time. Return None for a solid without a path. Raises `InputError` if the file cannot be used."""
     if solid.path is None:
         if solid.times is None:
             return None
@@ -234,7 +234,7 @@ def _since_first(rows: Any) -> Rows | None:
 
 
 def _stacked(found: Mapping[str, NDArray], names: Sequence[str], count: int) -> Rows | None:
-    """Return columns by name as rows (count, names), 0 for those that are not there; None where none is."""
+    """Return columns, given by name, as rows (count, names), with 0 for missing columns; None if all are missing."""
     if found.keys().isdisjoint(names):
         return None
     return np.stack([found.get(name, np.zeros(count)) for name in names], axis=1)
@@ -286,7 +286,7 @@ def _check_file(solid: Any, dimension: int, path: FieldPath) -> None:
 
 
 def _check_free(solid: Any, given: Sequence[str], path: FieldPath) -> None:
-    """Check the mass of a free body, and that nothing tells it where to go."""
+    """Check the mass of a free body, and that no key prescribes its motion."""
     if solid.mass is None and solid.density is None:
         raise field_error((*path, "density"), MISSING, 'a density in kg/m3, or a mass, as motion is "free"')
     if None not in (solid.mass, solid.density):
@@ -303,7 +303,7 @@ def _check_free(solid: Any, given: Sequence[str], path: FieldPath) -> None:
 
 
 def _check_inertia(solid: Any, dimension: int, path: FieldPath) -> None:
-    """Check that an inertia, if given, is that of a body that can be."""
+    """Check that an inertia, if given, is physically possible for a body."""
     numbers = solid.inertia
     if numbers is None:
         return
@@ -322,7 +322,7 @@ def _check_inertia(solid: Any, dimension: int, path: FieldPath) -> None:
 
 
 def _check_freedom(solid: Any, dimension: int, path: FieldPath) -> None:
-    """Check how a free body is held, and that it begins to move in ways that are free."""
+    """Check how a free body is held, and that its initial motion is along directions in which the body is free."""
     if solid.freedom is None:
         return
     ways, found = WAYS[dimension], Words(f"a list of {', '.join(map(repr, solid.freedom)) or 'nothing'}")
@@ -356,8 +356,8 @@ def _check_knots(solid: Any, dimension: int, path: FieldPath) -> None:
 
 
 def check_over_time(path: FieldPath, table: Any, values: str, constant: str) -> None:
-    """Check the ``times`` of a table, from 0 on, with as many ``values``, in place of the ``constant``; these are names
-    of its keys."""
+    """Check that a table has increasing ``times`` from 0 on and equally many ``values``, in place of the ``constant``.
+    All three arguments are names of keys of the table."""
     times: Sequence[float] = table.times or ()
     given = getattr(table, values)
     if len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):

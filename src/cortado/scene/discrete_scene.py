@@ -1,4 +1,4 @@
-"""A scene cut into particles: first particles, walls, and the constants of the lattice. NumPy in float64 throughout.
+"""The discretisation of a scene: first particles, walls, and the constants of the lattice. NumPy in float64 throughout.
 
 It is the same for every device, every precision and every engine.
 """
@@ -48,12 +48,12 @@ if TYPE_CHECKING:
     from cortado.device.precision import Precision
 
 WHOLE = 1e-6
-"""Relative length by which a solid may be shorter than a period that it fills."""
+"""Relative length by which a solid may fall short of a period and still count as filling it."""
 OFF_SHEETS = 0.25
-"""In spacings: how near to a sheet fluid begins at most. Particles on both sides of one that are nearer push each other
-away."""
+"""In spacings: least distance between a sheet and fluid at the start. Closer particles on its two sides would push each
+other away."""
 NEAREST_PLACE = 0.4
-"""In spacings: places that are looked at for the weights of walls are no nearer to any surface."""
+"""In spacings: least distance from any surface of the points at which weights of walls are fitted."""
 
 
 @dataclass(frozen=True)
@@ -63,25 +63,26 @@ class Walls(Rows):
     positions: Points
     """(b, d) [m], at the start"""
     weights: Points
-    """(b,) w_b [-]: weight of each in the density, a fluid particle being 1."""
+    """(b, d) vector from each particle to the nearest point of its surface [m]."""
     feet: Points
     """(b, d) from each to the nearest point of its surface [m]."""
     sticks: NDArray[np.bool_]
-    """(b,) true where fluid has no slip along a wall particle."""
+    """(b,) True for a wall particle along which fluid has no slip."""
     slides: Points
-    """(b, d) velocity of their surface sliding along the solid, in its own frame [m/s]"""
+    """(b, d) velocity with which the surface slides along the solid, in the solid's own frame [m/s]"""
     solid: NDArray[np.int64]
-    """(b,) solid of each: `wall_numbers` of solids; -1 for the container."""
+    """(b,) number of each particle's solid, from `wall_numbers`; -1 for the container."""
 
     @classmethod
     def of(cls, points: WallPoints, weights: Points, sticks: bool | NDArray[np.bool_]) -> "Walls":
-        """Make the container's wall particles of points and weights; ``sticks`` is a flag for all, or for each (b,)."""
+        """Build the container's wall particles from points and weights; ``sticks`` is one flag for all or (b,)
+        flags."""
         grips, solid = np.full(len(points), sticks), np.full(len(points), -1)
         return cls(points.positions, weights, points.feet, grips, 0.0 * points.feet, solid)
 
 
 def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Make the wall particles of a scene; raise `InputError` for a solid that no fluid can touch."""
+    """Build the wall particles of a scene; raise `InputError` for a solid that no fluid can touch."""
     container = _container(scene, layers, lattice)
     still = [_kept(scene, container, layers, lattice)]
     if container.room.solids:
@@ -99,14 +100,14 @@ def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
 
 
 def _container(scene: Scene, layers: WallLayers, lattice: RestLattice) -> ContainerWalls:
-    """Make the walls of the container as they are without solids, in layers of even particles."""
+    """Build the container's walls as they would be without solids, in evenly spaced layers."""
     points = _even_points(scene.container, scene.dimension, layers, lattice.spacing)
     solids = scene.container.solids(scene.dimension, lattice.support)
     return ContainerWalls(points, solids, scene.resting_room, lattice.spacing, lattice.support)
 
 
 def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Return the wall particles of the container that solids at rest leave."""
+    """Return the container's wall particles that remain beside solids at rest."""
     from scipy.spatial import cKDTree
 
     points, dimension = container.points.some(container.stay), scene.dimension
@@ -123,7 +124,7 @@ def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: 
 
 
 def _even_points(container: Container, dimension: int, layers: WallLayers, spacing: float) -> WallPoints:
-    """Return the wall particles of a container, in even layers."""
+    """Return the wall particles of a container, in evenly spaced layers."""
     particles = [container.walls(dimension, spacing, depth) for depth in layers.depths]
     positions = np.concatenate(particles)
     flat = np.repeat(layers.weights, [len(layer) for layer in particles])
@@ -132,7 +133,7 @@ def _even_points(container: Container, dimension: int, layers: WallLayers, spaci
 
 
 def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Make the wall particles of all solids at rest and of the container near them, where fluid can touch them."""
+    """Build the wall particles of all solids at rest, and of the container near them, where fluid can touch them."""
     room, (lower, _) = container.room, scene.periods
     resting = [solid for solid in thick(scene.solid) if not solid.moves]
     images = [room.images(solid) for solid in room.solids]
@@ -153,11 +154,11 @@ def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLa
 
 
 def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Make the wall particles of one solid that moves, as if nothing else were there, but for its own images where it
-    fills a period.
+    """Build the wall particles of one moving solid as if it were alone; one that fills a period also has its own
+    images.
 
-    They are found in its own frame, so that they do not depend on where it begins, nor, unless it fills a period, on
-    how it is turned.
+    The particles are found in the solid's own frame. So they do not depend on where it starts, nor on how it is turned,
+    unless it fills a period.
     """
     dimension, turn = len(periods), table.turn(len(periods))
     lower, upper = table.solid().extent()
@@ -184,8 +185,8 @@ def _beside_sheets(
     layers: WallLayers,
     lattice: RestLattice,
 ) -> list[Walls]:
-    """Make the wall particles on both sides of sheets in a room with other walls, in layers at the depths of those of
-    flat walls. Fluid sees those that are on the other side from it (`cortado.particles.sheets`)."""
+    """Build the wall particles on both sides of sheets in a room with other walls. Their layers have the depths of a
+    flat wall's layers. Fluid interacts only with those on the other side of the sheet (`cortado.particles.sheets`)."""
     if not tables:
         return []
     sheets, found = list[Sheet](), list[Walls]()
@@ -207,8 +208,8 @@ def _beside_sheets(
 def _weighed(
     surface: ExposedSurface, beside: Places, kept: Walls, layers: WallLayers, lattice: RestLattice
 ) -> tuple[WallPoints, Points]:
-    """Return wall particles beneath a surface, and their weights next to walls that are ``kept``, by places ``beside``
-    and those about solids."""
+    """Return wall particles beneath a surface, with weights fitted next to the ``kept`` walls, at the points ``beside``
+    and at points around the solids."""
     room, spacing, reach = surface.room, lattice.spacing, lattice.support
     points = surface.walls(layers, lattice)
     about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
@@ -219,8 +220,8 @@ def _weighed(
 
 
 def mirrors_of(scene: Scene) -> tuple[Points, Points]:
-    """Return coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite where
-    none does, as with solvers that know of no images."""
+    """Return the coordinates of flat walls that mirror the fluid, (3,) at the lower and at the upper ends [m]. They are
+    infinite where no wall mirrors the fluid, as with solvers without images."""
     nowhere = np.full(3, np.inf)
     if not isinstance(scene.solver, ProjectionSolver):
         return -nowhere, nowhere
@@ -240,9 +241,9 @@ class Lattice:
     self_weight: float
     """W(0) [1 / m^d]."""
     volume: float
-    """V_0 [m^d], with which the sums of the kernel over the lattice give the rest density; of sums of kernels alone."""
+    """V_0 [m^d], with which the kernel sums over the lattice give the rest density; used only in sums of kernels."""
     cell: float
-    """Volume of a particle [m^d], a cell of the lattice: its mass is the rest density times it."""
+    """Volume of a particle [m^d], that of a lattice cell; a particle's mass is this volume times the rest density."""
     stiffness: float
     """k [m2]: delta = k / dt^2 [Pa m3 / kg] (Solenthaler and Pajarola 2009) for a filled neighbourhood."""
     response: float
@@ -250,7 +251,7 @@ class Lattice:
     laplacian_correction: float
     """[-], see `cortado.discretise.smoothing.lattice_laplacian_correction`."""
     domain: Domain
-    """The axes along which it repeats, with their periods."""
+    """The axes along which the scene is periodic, with their periods."""
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int, domain: Domain) -> "Lattice":
@@ -270,7 +271,7 @@ class Lattice:
 
 @dataclass(frozen=True)
 class DiscreteScene:
-    """The particles, walls and constants that a solver starts from, besides the scene itself."""
+    """The particles, walls and constants from which a solver starts, besides the scene itself."""
 
     kernel: SmoothingKernel
     """The smoothing kernel W."""
@@ -279,13 +280,13 @@ class DiscreteScene:
     fluid: FluidSample
     """The first fluid particles."""
     masses: FluidMasses
-    """Masses of the first particles, and those that were asked for."""
+    """Masses of the first particles, and the masses that the scene asked for."""
     wall_layers: WallLayers
-    """Layers and drag of the walls; also for a scene without walls."""
+    """Layers and drag of the walls; present also for a scene without walls."""
     walls: Walls
-    """The wall particles; none without a container and solids."""
+    """The wall particles; empty without a container and solids."""
     periods: Points
-    """(d,) lengths of the period [m], 0 along an axis that is not periodic."""
+    """(d,) lengths of the periods [m], 0 along an axis that is not periodic."""
 
     @cached_property
     def near(self) -> Region:
@@ -295,8 +296,8 @@ class DiscreteScene:
 
 
 def discretise(scene: Scene) -> DiscreteScene:
-    """Cut a scene into particles. Raises `InputError` if a file with points is gone since the scene was read, or if
-    points are packed too densely; warns where the fluid has another mass than was asked for."""
+    """Discretise a scene into particles. Raises `InputError` if a file with points has vanished since the scene was
+    read, or if points are packed too densely. Warns if the mass of the fluid differs from the mass asked for."""
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     at_rest = RestLattice(kernel, spacing, support, dimension)
@@ -325,7 +326,7 @@ def discretise(scene: Scene) -> DiscreteScene:
 
 
 def _velocities(scene: Scene, fluid: FluidSample) -> Points:
-    """Return first velocities (n, d) [m/s]; those of a body that spins follow from the places of its particles."""
+    """Return first velocities (n, d) [m/s]; in a spinning body they depend on the positions of the particles."""
     found, ends = fluid.velocities.copy(), np.cumsum(fluid.sizes)
     for body, end, size in zip(scene.fluid, ends, fluid.sizes, strict=True):
         found[end - size : end] = body.velocities(fluid.positions[end - size : end])
@@ -333,7 +334,7 @@ def _velocities(scene: Scene, fluid: FluidSample) -> Points:
 
 
 def _off_sheets(scene: Scene, fluid: FluidSample) -> Points:
-    """Return first positions (n, d) [m]. Particles of a lattice that a sheet cuts are at least `OFF_SHEETS` from it."""
+    """Return first positions (n, d) [m]. Lattice particles that a sheet cuts are moved `OFF_SHEETS` away from it."""
     found, least = fluid.positions.copy(), OFF_SHEETS * scene.discretisation.spacing
     for table in scene.solid:
         about = table.own_solid()
@@ -345,7 +346,7 @@ def _off_sheets(scene: Scene, fluid: FluidSample) -> Points:
 
 
 def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Points, lengths: Points) -> FluidSample:
-    """Pack the particles of round bodies until they fill these at the rest density, and return the fluid."""
+    """Pack the particles of round bodies until they fill the bodies at the rest density, and return the fluid."""
     if not fluid.bodies:
         return fluid
     stays = ~fluid.is_packed
@@ -356,7 +357,7 @@ def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Point
 
 
 def check_distance(scene: Scene, discrete: DiscreteScene, precision: "Precision") -> None:
-    """Raise `InputError` where a scene is so far from the origin that positions are rounded to coarse steps."""
+    """Raise `InputError` if a scene is so far from the origin that positions would be rounded too coarsely."""
     spacing = scene.discretisation.spacing
     furthest = max(np.abs(discrete.near.lower).max(), np.abs(discrete.near.upper).max()) / spacing
     if furthest > precision.furthest:

@@ -1,4 +1,4 @@
-"""Drains, which take particles out of the fluid: their tables, and the parameters of those that suck."""
+"""Drains, which take particles out of the fluid: their tables, and the parameters of sinks."""
 
 from math import inf
 from typing import Annotated, Any, Literal, Self
@@ -15,20 +15,20 @@ from cortado.scene.shape_tables import File, check_order
 from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity
 
 PRESCRIBED, BLENDED = 3.0, 3.0
-"""In spacings: how thick the shell around a sink is in which fluid flows as it says, and that in which it comes to."""
+"""In spacings: thickness of the shell around a sink where the sink sets the flow, and of the transition beyond it."""
 
 
 class BoxDrain(Table):
-    """A box that takes every particle which comes into it."""
+    """A box that takes every particle which enters it."""
 
     shape: Literal["box"]
-    """Which drain it is."""
+    """Kind of the drain."""
     name: Text
     """Name of the drain."""
     lower: Vector[Length] | None = None
-    """(d,) lower corner of the box [m]; without an end there if left out."""
+    """(d,) Lower corner of the box [m]; if left out, the box has no lower end."""
     upper: Vector[Length] | None = None
-    """(d,) upper corner of the box [m]; without an end there if left out."""
+    """(d,) Upper corner of the box [m]; if left out, the box has no upper end."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         self.check_components(("lower", "upper"), dimension, path)
@@ -41,21 +41,21 @@ class BoxDrain(Table):
         return self
 
     def ends(self, dimension: int) -> Points:
-        """Return the corners (2, d) [m], infinite where there is no end."""
+        """Return the corners (2, d) [m], infinite where the box has no end."""
         none = np.full(dimension, np.inf)
         return np.array([-none if self.lower is None else self.lower, none if self.upper is None else self.upper])
 
     def middle(self, dimension: int) -> Points:
-        """Return the middle (d,) of the box [m], its end where it has one, and 0 where it has none."""
+        """Return the middle (d,) of the box [m]: along an axis with one end that end, without ends 0."""
         ends = self.ends(dimension)
         return np.where(np.isfinite(ends), ends, np.where(np.isfinite(ends[::-1]), ends[::-1], 0.0)).mean(axis=0)
 
 
 class PlaneDrain(Table):
-    """A plane that takes every particle which comes beyond it; one that points upwards is a level."""
+    """A plane that takes every particle which crosses it in its direction; one that points upwards sets a level."""
 
     shape: Literal["plane"]
-    """Which drain it is."""
+    """Kind of the drain."""
     name: Text
     """Name of the drain."""
     position: Vector[Length]
@@ -80,25 +80,24 @@ def flow_name(name: str) -> str:
 
 
 def count_name(drain: str) -> str:
-    """Return the name of the field of a state that is the number of particles which a drain has taken."""
+    """Return the name of the state field with the number of particles that a drain has taken."""
     return f"{drain}.count"
 
 
 class FlowTable(Table):
-    """A flow rate, by a number, over time or in a file."""
+    """A flow rate: one number, a table over time, or a file."""
 
     name: Text
-    """Name with which that of the parameter begins."""
+    """Name with which the name of the parameter begins."""
     flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)] | None = None
-    """Volume, in 2-D area, that flows in a second [m3/s (m2/s in 2-D)]."""
+    """Volume per second, in 2-D area per second [m3/s (m2/s in 2-D)]."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
-    """(k,) Times of `flow_rates`, from 0 on, each greater than the one before [s]; between them flow rates go in
-    straight lines."""
+    """(k,) Times of `flow_rates`, increasing from 0 on [s]; between them flow rates are interpolated linearly."""
     flow_rates: tuple[Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)], ...] | None = None
     """(k,) Flow rates at these times, in place of `flow_rate` [m3/s (m2/s in 2-D)]."""
     file: File | None = None
-    """CSV file in place of `times` and `flow_rates`, with the columns `time` and `flow_rate` and units in its head. A
-    relative name begins at the scene file."""
+    """CSV file in place of `times` and `flow_rates`, with the columns `time` and `flow_rate` and units in its header. A
+    relative path starts at the scene file's folder."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if self.file is not None:
@@ -110,7 +109,7 @@ class FlowTable(Table):
         return super().in_dimension(dimension, path)
 
     def _read(self, dimension: int, path: FieldPath) -> Self:
-        """Return this table with the times and flow rates of its file, which is read once and stays as it was."""
+        """Return this table with the times and flow rates of its file, read once; later changes have no effect."""
         for key in ("flow_rate", "times", "flow_rates"):
             if (found := getattr(self, key)) is not None:
                 raise field_error((*path, key), found, "left out, as there is a file")
@@ -130,7 +129,7 @@ class FlowTable(Table):
 
     @property
     def course(self) -> Knots | None:
-        """Return the flow rate over time; None where it is steady."""
+        """Return the flow rate over time; None if it is steady."""
         return None if self.times is None else Knots(np.array(self.times), np.array(self.flow_rates))
 
     @property
@@ -147,12 +146,12 @@ class FlowTable(Table):
         return np.full(len(times), self.begun) if self.course is None else self.course.at(times)
 
     def passed(self, time: float) -> float:
-        """Return the volume, in 2-D area, that flows until a time [s]."""
+        """Return the volume, in 2-D area, that has flowed up to a time [s]."""
         times = np.append(np.clip(self.times or 0.0, 0.0, time), time)
         return float(np.trapezoid(self._at(times), times))
 
     def time_for(self, volume: float) -> float:
-        """Return the time [s] until which a volume, in 2-D area, flows; infinite where it never does."""
+        """Return the time [s] at which a volume, in 2-D area, has flowed; infinite if this never happens."""
         last = float((self.times or (0.0,))[-1])
         times = np.union1d(self.times or 0.0, np.linspace(0.0, last, 1025))
         flows = self._at(times)
@@ -176,17 +175,17 @@ class FlowTable(Table):
 
 
 class SinkDrain(FlowTable):
-    """A sink, to which fluid flows from all sides with a given flow rate."""
+    """A sink, towards which fluid flows from all sides with a given flow rate."""
 
     shape: Literal["sink"]
-    """Which drain it is."""
+    """Kind of the drain."""
     name: Text
     """Name of the drain."""
     position: Vector[Length]
-    """(d,) its middle [m], in the fluid or on a wall."""
+    """(d,) Centre of the sink [m], in the fluid or on a wall."""
     radius: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Distance from the middle at which particles are taken [m]; two and a half spacings if left out. In a shell of
-    three spacings around it fluid flows as the flow rate says, and comes to that in another three."""
+    """Distance from the centre at which particles are taken [m]; two and a half spacings if left out. In a shell of
+    three spacings around this sphere the sink prescribes the flow; in another three spacings the flow adapts to it."""
 
     def middle(self, dimension: int) -> Points:
         """Return the position (d,) [m]."""
@@ -201,7 +200,7 @@ AnyDrain = Annotated[BoxDrain | PlaneDrain | SinkDrain, Field(discriminator="sha
 
 
 def check_drains(scene: Any) -> None:
-    """Check that drains are where fluid can come to, and that sinks have a solver which they work with."""
+    """Check that fluid can come to each drain, and that the solver supports sinks if the scene has any."""
     (ends, lengths), spacing = (scene.container.extent(), scene.periods[1]), scene.discretisation.spacing
     if scene.drain and (lengths > 0.0).all():
         wanted = "left out, as no axis is without a period, along which what it takes could be put aside"
@@ -229,7 +228,7 @@ def check_drains(scene: Any) -> None:
 
 
 def _is_open(scene: Any, drain: BoxDrain, ends: Points) -> bool:
-    """Test whether a part of a drain within the corners (2, d) of a container [m] is outside of solids at rest."""
+    """Test whether some part of a drain inside a container with corners (2, d) [m] is outside of solids at rest."""
     lower, upper = np.clip(drain.ends(scene.dimension), *ends)
     most = 512 if scene.dimension == 2 else 64
     cells = np.clip(np.ceil((upper - lower) / (0.5 * scene.discretisation.spacing)), 1, most).astype(int)
@@ -239,7 +238,7 @@ def _is_open(scene: Any, drain: BoxDrain, ends: Points) -> bool:
 
 
 def _check_reached(drain: BoxDrain | PlaneDrain, ends: Points, path: FieldPath) -> None:
-    """Check that a part of a drain is within the corners (2, d) of a container [m]."""
+    """Check that a part of a drain is inside a container with corners (2, d) [m]."""
     key, found = ("position", drain.position) if isinstance(drain, PlaneDrain) else ("lower", drain.lower)
     if isinstance(drain, PlaneDrain):
         way = np.array(drain.direction)
@@ -253,7 +252,7 @@ def _check_reached(drain: BoxDrain | PlaneDrain, ends: Points, path: FieldPath) 
 
 
 def sink_limit(scene: Any, values: Any) -> float:
-    """Return the longest step [s] in which no fluid goes further than 0.4 spacings where sinks take it."""
+    """Return the longest step [s] in which fluid near sinks moves at most 0.4 spacings."""
     longest, spacing = inf, scene.discretisation.spacing
     for drain in scene.drain:
         if isinstance(drain, SinkDrain):
@@ -287,14 +286,14 @@ def _place(sink: SinkDrain, spacing: float) -> Parameter:
 
 
 DIRECTIONS = 1024
-"""Number of directions in which it is looked for walls around a sink."""
+"""Number of directions in which walls around a sink are searched."""
 PARTS = 16
-"""Number of places along each of them; they are a third of a spacing apart."""
+"""Number of points tested along each of these directions, a third of a spacing apart."""
 
 
 def open_sphere(room: Room, place: Points, radius: float) -> float:
-    """Return the part of the unit sphere, in 2-D of the unit circle, around a place (d,) [m] in which no wall stands
-    up to a radius [m], as an angle [rad] or solid angle [sr]. So what is beyond a thin floor does not count as open."""
+    """Return the open part of the sphere, in 2-D of the circle, around a place (d,) [m], as an angle [sr] or [rad]. A
+    direction is open if no wall lies on it up to a radius [m]: space beyond a thin floor does not count."""
     k = np.arange(DIRECTIONS) + 0.5
     if len(place) == 2:
         turn = 2.0 * np.pi * k / DIRECTIONS

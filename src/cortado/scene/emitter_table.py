@@ -1,5 +1,5 @@
-"""Emitters: columns of particles that wait upstream of an opening, and come out of it with one speed; with their
-parameters."""
+"""Emitters: columns of particles that wait upstream of an opening and leave it at one speed. This module has their
+tables and parameters."""
 
 import math
 from dataclasses import dataclass, replace
@@ -22,27 +22,27 @@ from cortado.scene.tables import GREATEST, MISSING, FieldPath, Length, Text, Vec
 
 @dataclass(frozen=True)
 class EmitterSample:
-    """The particles of an emitter, m of them: layer after layer from the outlet upstream."""
+    """The m particles of an emitter, layer by layer from the outlet upstream."""
 
     offsets: Points
-    """(m, d) from the axis, perpendicular to it [m]"""
+    """(m, d) offsets from the axis, perpendicular to it [m]"""
     upstream: Points
-    """(m,) distance from the opening, against the direction [m]"""
+    """(m,) distance from the opening, against the direction of the flow [m]"""
     positions: Points
     """(m, d) [m]"""
     velocities: Points
     """(m, d) [m/s]"""
     speed: float
-    """At the start [m/s]."""
+    """Speed at the start [m/s]."""
     layer: int
-    """Particles in a layer; m is a multiple of it."""
+    """Number of particles in a layer; m is a multiple of it."""
     column: float
-    """Length of the column that waits in line [m]; what is further upstream is in reserve."""
+    """Length of the waiting column [m]; particles further upstream are in reserve."""
 
     def in_line(self, name: str, first: int, others: Any, particles: int) -> Points:
-        """Return how far each of a number of particles was upstream of the opening when the run began, or would have
-        been if it is given out again [m], from further fields of a state; 0 of one that is no part of this emitter,
-        whose own begin at ``first``."""
+        """Return the distance [m] of particles upstream of the opening at the start of the run. For a particle emitted
+        again it is the distance it would have had. It is 0 for particles outside this emitter, whose own begin at
+        ``first``. The distances are read from further fields of a state."""
         found = np.zeros(particles)
         found[first : first + len(self.upstream)] = self.upstream
         if (again := others.get(again_name(name))) is None:
@@ -51,15 +51,15 @@ class EmitterSample:
         return np.where(np.ravel(again) > 0.0, joined, found)
 
     def waits(self, name: str, first: int, others: Any, particles: int) -> NDArray[np.bool_]:
-        """Return a mask (n,) of the particles that wait in the emitter, from the same."""
+        """Return a mask (n,) of the particles that wait in the emitter, from further fields of a state."""
         emitted = float(np.ravel(others[emitted_name(name)])[0])
         return self.in_line(name, first, others, particles) > emitted
 
 
 OF_OPENINGS = ("emitted", "again", "drained", ".count")
-"""Endings of the names of fields of states that say which particles are in the fluid, and how many drains took."""
+"""Endings of the names of state fields that say which particles are in the fluid, and how many drains took."""
 COLUMN = 6.0
-"""Length of the column where none is given, in spacings: fluid at the opening has others behind it, and they too."""
+"""Default length of the column, in spacings: fluid at the opening has neighbours upstream, which have some too."""
 
 
 def path_name(emitter: str) -> str:
@@ -68,18 +68,18 @@ def path_name(emitter: str) -> str:
 
 
 def outlet_name(emitter: str) -> str:
-    """Return the name of the field of a state where the opening of an emitter is [m]."""
+    """Return the name of the state field with the position of an emitter's opening [m]."""
     return f"{emitter}.outlet"
 
 
 def emitted_name(emitter: str) -> str:
-    """Return the name of the field of a state that is the length of the column which has left an emitter [m]."""
+    """Return the name of the state field with the length of the column that has left an emitter [m]."""
     return f"{emitter}.emitted"
 
 
 def again_name(emitter: str) -> str:
-    """Return the name of the field of a state with the place in line, from 1 on, of each particle that an emitter gives
-    out again; 0 of others."""
+    """Return the name of the state field with each particle's place in an emitter's line, from 1 on. The field is 0 for
+    particles that this emitter does not emit again."""
     return f"{emitter}.again"
 
 
@@ -94,43 +94,43 @@ _PATH = Parameter(
     moment=1.0,
 )
 OutletPath: Any = course_table(_PATH)
-"""The table of the places of an emitter's opening over time."""
+"""The table of an emitter's opening positions over time."""
 
 
 class EmitterTable(FluidBody, FlowTable):
-    """An opening, round or rectangular, in 2-D a line, out of which a column of fluid comes with one speed."""
+    """An opening, round or rectangular, in 2-D a line, from which a column of fluid leaves at one speed."""
 
     name: Text = "nozzle"
-    """Name of the emitter, with which those of its parameters begin."""
+    """Name of the emitter; the names of its parameters begin with it."""
     outlet: Vector[Length]
     """(d,) Middle of the opening [m]."""
     direction: Vector[Annotated[float, quantity()]] = (0.0, -1.0, 0.0)
     """(d,) Direction of the flow; its length does not matter."""
     radius: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Radius of a round opening, in 2-D half the width [m]. The cells of the lattice that it holds are what fluid comes
-    through: its speed is the flow rate over their area, which `describe` says."""
+    """Radius of a round opening, in 2-D half its width [m]. Fluid passes through the lattice cells inside the opening.
+    Its speed is the flow rate divided by their area; `describe` prints the speed."""
     sides: tuple[Annotated[float, quantity("m", gt=0.0)], ...] | None = None
-    """(d - 1,) Widths of a rectangular opening, in place of `radius` [m]: in 3-D along the two axes, in their order,
-    that the direction is least along."""
+    """(d - 1,) Widths of a rectangular opening, in place of `radius` [m]. In 3-D they are along the two axes, in order,
+    to which the direction is most nearly perpendicular."""
     length: Annotated[float, quantity("m", gt=0.0)] | None = None
     """Length of the column that waits upstream of the opening [m]; six spacings if left out."""
     volume: Annotated[float, quantity("m3 (m2 in 2-D)", gt=0.0)] | None = None
-    """Volume, in 2-D area, that comes out in all [m3 (m2 in 2-D)]. If left out, commands such as `cortado run` have
-    enough for the run, and `Simulation` has what is in the column (`Scene.lasting`)."""
+    """Volume, in 2-D area, that the emitter gives in all [m3 (m2 in 2-D)]. If left out, commands such as `cortado run`
+    provide enough for the run, and `Simulation` provides only the column (`Scene.lasting`)."""
     fed_by: tuple[Text, ...] = ()
-    """Names of drains whose particles come out again: there are no others then but those of the column, and of a
-    `volume`. A drain feeds one emitter."""
+    """Names of drains whose particles this emitter emits again. Then its only other particles are those of the column,
+    and of a `volume` if given. A drain can feed only one emitter."""
     path: OutletPath | None = None
-    """Where the middle of the opening is over time; it stays at `outlet` if left out."""
+    """Middle of the opening over time; if left out, the opening stays at `outlet`."""
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """How far a particle is from its place in the lattice of its layer at most, along each axis of the opening and
-    in spacings, the same in every run. With the solver "projection" 0.05 if left out, as a stream on a lattice is
+    """Largest offset of a particle from its lattice place in its layer, along each axis of the opening and in spacings;
+    the same in every run. With the solver "projection" it is 0.05 if left out, because a stream on an exact lattice is
     too wide."""
 
     @field_validator("direction")
     @classmethod
     def _normalise(cls, direction: tuple[float, ...]) -> tuple[float, ...]:
-        """Normalise a direction; one that is normalised but for round-off stays, as JSON must bring it back."""
+        """Normalise a direction; one already normalised to round-off is kept, so that JSON gives the same scene."""
         size = math.hypot(*direction)
         if size < 1.0 / GREATEST:
             raise field_error((), direction, "a vector that is not zero")
@@ -150,42 +150,42 @@ class EmitterTable(FluidBody, FlowTable):
         return placed.model_copy(update={"path": self.path.in_dimension(dimension, (*path, "path"))})
 
     def layers(self, spacing: float) -> float:
-        """Return the number of layers of the column, with their middle within its length, or all if they are fewer: a
-        whole number that may be larger than any array."""
+        """Return the number of layers whose middles lie within the column's length, or of all layers if fewer. The
+        whole number returned may be larger than any array."""
         length = COLUMN * spacing if self.length is None else self.length
         within = float(max(math.ceil(length / spacing - 0.5 - ROUND_OFF), 0))
         return within if self.volume is None or self.fed_by else min(within, self.supply(spacing))
 
     def supply(self, spacing: float) -> float:
-        """Return the number of layers, with those in reserve."""
+        """Return the number of layers, including the reserve."""
         given = 0.0 if self.volume is None else self.volume / (self.area(spacing) * spacing)
         if self.volume is None or self.fed_by:
             given += self.layers(spacing)
         return float(max(math.ceil(given - ROUND_OFF), 1))
 
     def dry_after(self, spacing: float) -> float:
-        """Return the time when all fluid is out [s], which may be infinite."""
+        """Return the time at which the emitter runs out of fluid [s]; it may be infinite."""
         return math.inf if self.fed_by else self.time_for(self.supply(spacing) * spacing * self.area(spacing))
 
     def lasting(self, time: float, spacing: float) -> Self:
-        """Return this table with a volume, if it has none and the column is out before a time [s]: the column is whole
-        then."""
+        """Return this table with a volume if it has none and its column would run out before a time [s]. The column is
+        then complete."""
         if self.volume is not None or self.dry_after(spacing) >= time:
             return self
         column = self.layers(spacing) * spacing * self.area(spacing)
         return self.model_copy(update={"volume": self.passed(time) + column})
 
     def speed(self, spacing: float) -> float:
-        """Return the greatest speed of the flow [m/s], with which the volume of its particles is that of the flow
-        rate."""
+        """Return the greatest speed of the flow [m/s]. At this speed the particles carry the volume that the flow rate
+        prescribes."""
         return self.greatest / self.area(spacing)
 
     def area(self, spacing: float) -> float:
-        """Return the area of the cells that a layer of particles has across the flow [m2], in 2-D their width [m]."""
+        """Return the area of a layer's lattice cells across the flow [m2], in 2-D their width [m]."""
         return float(len(self._cross_section(spacing)) * spacing ** (len(self.outlet) - 1))
 
     def asked_area(self) -> float:
-        """Return the area of the opening [m2], in 2-D its width [m]."""
+        """Return the area of the opening as the table gives it [m2], in 2-D its width [m]."""
         if self.radius is None:
             return math.prod(self.sides or ())
         return 2.0 * self.radius if len(self.outlet) == 2 else float(np.pi * self.radius**2)
@@ -200,7 +200,7 @@ class EmitterTable(FluidBody, FlowTable):
         return np.array(self.outlet) + self._cross_section(spacing)
 
     def sample(self, spacing: float) -> EmitterSample:
-        """Return the particles on a lattice of the spacing [m], those in reserve in line behind the column."""
+        """Return the particles on a lattice of this spacing [m], with the reserve in line behind the column."""
         cross_section = self._cross_section(spacing)
         layers, speed = int(self.supply(spacing)), self.begun / self.area(spacing)
         upstream = np.repeat((np.arange(layers) + 0.5) * spacing, len(cross_section))
@@ -237,7 +237,7 @@ class EmitterTable(FluidBody, FlowTable):
         return np.maximum(whole_cells(np.array(sides), spacing), 1.0)
 
     def _cross_section(self, spacing: float) -> Points:
-        """Return offsets (n, d) of the particles of a layer from the axis [m]."""
+        """Return offsets (n, d) of a layer's particles from the axis [m]."""
         size = len(self.outlet) - 1
         points = lattice(self._cells(spacing), spacing) if self.radius is None else disc(self.radius, spacing, size)
         return points @ across(self.direction)
@@ -260,7 +260,7 @@ def _constant(value: Any, source: Any) -> Any:
 
 
 def check_fed(scene: Any) -> None:
-    """Check that the drains which feed emitters are there, and that there is one phase alone."""
+    """Check that the drains which feed emitters exist, and that such a scene has only one phase."""
     names, fed = [drain.name for drain in scene.drain], list[str]()
     for index, emitter in enumerate(scene.emitter):
         path = "emitter", index, "fed_by"
@@ -273,7 +273,7 @@ def check_fed(scene: Any) -> None:
 
 
 def check_columns(scene: Any) -> None:
-    """Check that no sheet begins across an emitter's column, or nearer than a spacing to its opening."""
+    """Check that at the start no sheet crosses an emitter's column or is closer than a spacing to its opening."""
     spacing = scene.discretisation.spacing
     for index, emitter in enumerate(scene.emitter):
         opening, ahead = emitter.opening(spacing), spacing * np.array(emitter.direction)
@@ -287,8 +287,8 @@ def check_columns(scene: Any) -> None:
 
 
 def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:
-    """Return the name of each emitter of a scene, the number of its first particle, of ``count`` particles in all, and
-    its particles."""
+    """Return for each emitter of a scene its name, the number of its first particle among ``count`` particles, and its
+    particles."""
     made = [emitter.sample(scene.discretisation.spacing) for emitter in scene.emitter]
     ends = count - np.cumsum([0, *(len(sample.upstream) for sample in made[::-1])])[::-1]
     names = [emitter.name for emitter in scene.emitter]
@@ -296,7 +296,7 @@ def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:
 
 
 def waits(scene: Any, others: Any, particles: int) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles that wait in emitters, given further fields of a state."""
+    """Return a mask (n,) of the particles that wait in emitters, from further fields of a state."""
     found = np.zeros(particles, dtype=bool)
     for name, first, sample in samples(scene, particles):
         if emitted_name(name) in others:
