@@ -1,6 +1,6 @@
-"""From a scene to its fluid particles, in float64.
+"""Fluid particles of a scene, in float64.
 
-Bodies whose surface cuts through cells of a lattice begin with as many particles as their volume holds, which are then
+Bodies whose surface cuts through cells of a lattice start with as many particles as fit their volume. These are then
 moved until the fluid is at rest everywhere: `cortado.discretise.packing`.
 """
 
@@ -20,22 +20,22 @@ from cortado.scene.fluids import ALIGNED, Fluid, PointsFluid, RegionFluid
 from cortado.scene.scene import Scene
 
 FINER = 4
-"""Number of parts of a cell at the surface along each axis, to measure a volume."""
+"""Number of parts along each axis into which cells at a surface are divided to measure a volume."""
 LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
-"""Particles that a round body lacks, over those in its outermost spacing near cells that are cut, and over all of its
-own. Particles off the lattice see each other as denser than the same number on it, by 4 % with the Wendland kernels and
-a support of 2 spacings."""
+"""Fraction of particles that a round body has too few: of those in its outermost spacing near cut cells, and at most of
+all of its own. Particles off the lattice see a density higher than on it, by 4 % with Wendland kernels and a support of
+2 spacings."""
 BESIDE = 2
-"""In cells: the greatest distance along each axis from a cell that is cut at which particles may be left out."""
+"""In cells: greatest distance along each axis from a cut cell at which particles may be left out."""
 FAR = 4.0
-"""In spacings: the greatest depth in a body that is told from others."""
+"""In spacings: depths in a body are computed up to this depth only."""
 DIGITS = 6
-"""Decimals of distances [spacings] by which particles are ordered: particles that differ by round-off stay in order."""
+"""Decimals of distances [spacings] by which particles are sorted, so that round-off does not change their order."""
 
 
 def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGuard[RegionFluid]:
-    """Test whether particles of a body may have another density than the lattice: where its own surface cuts cells, or
-    where it is no further than ``reach`` [m] from a solid."""
+    """Test whether a body's particles may be off the lattice: its own surface cuts cells, or it comes within ``reach``
+    [m] of a solid."""
     if not isinstance(fluid, RegionFluid) or fluid.cuts_cells(spacing):
         return isinstance(fluid, RegionFluid)
     return bool(len(room.solids) and (room.from_solids(fluid.particles(spacing), reach) < reach).any())
@@ -43,7 +43,7 @@ def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGua
 
 @dataclass(frozen=True)
 class CutBody:
-    """A body of fluid cut by the container and the solids that leave room for a part of it."""
+    """A body of fluid, cut by the container and by solids so that only a part of it has room."""
 
     fluid: RegionFluid
     room: Room
@@ -51,17 +51,17 @@ class CutBody:
     """[m]"""
 
     def distance(self, points: Points, reach: float) -> Points:
-        """Return distances (n,) [m] of points (n, d) [m] from the body, negative inside, with a reach as of
+        """Return the distances (n,) [m] of points (n, d) [m] from the body, negative inside. ``reach`` is as in
         `Room.from_solids`."""
         return np.maximum(self.fluid.distance(points, self.spacing, reach), self.room.distance(points, reach))
 
     def shares(self, points: Points) -> Points:
-        """Return the part (n,) of the cell around each of the points (n, d) [m] that is within the body."""
+        """Return the fraction (n,) of the cell around each point (n, d) [m] that lies within the body."""
         return np.clip(0.5 - self.distance(points, 0.5 * self.spacing) / self.spacing, 0.0, 1.0)
 
     def volume(self, depth: float = 0.0, beside_cuts: bool = False) -> float:
-        """Return the volume [m^d] of the part that is more than a depth [m] below the surface, of all cells or of those
-        beside cells that are cut."""
+        """Return the volume [m^d] of the part deeper than a depth [m] below the surface, in all cells or only in those
+        beside cut cells."""
         dimension, fine = self.room.dimension, self.spacing / FINER
         cells, reach = self.fluid.block(self.spacing).grown(1).points(), depth + self.spacing
         cells = cells[self._beside_cuts(cells)] if beside_cuts else cells
@@ -81,19 +81,19 @@ class CutBody:
 
     @cached_property
     def _held(self) -> float:
-        """Return the body's volume, as cells measure it [m^d]."""
+        """Return the volume [m^d] that the particles should have: the shape's, times the fraction that walls leave."""
         return self.volume()
 
     @cached_property
     def count(self) -> int:
-        """Return the number of its particles."""
+        """Return the number of the body's particles."""
         volume, outermost = self._held, self.volume(0.0, True) - self.volume(self.spacing, True)
         lacking = min(LOOSENESS * outermost, MOST_LOOSENESS * volume)
         return round((volume - lacking) / self.spacing**self.room.dimension)
 
     def particles(self) -> Points:
-        """Return the places (n, d) [m] where its particles begin: on the lattice, and beside cells that surfaces cut
-        the deepest points, `count` in all."""
+        """Return the first positions (n, d) [m] of the `count` particles: lattice points, and near cells that surfaces
+        cut the deepest ones."""
         if not self._cuts_cells():
             return self.fluid.particles_in(self.room, self.spacing)
         points = self.fluid.lattice(self.spacing, self.spacing)
@@ -102,14 +102,14 @@ class CutBody:
         return points[np.sort(np.argsort(depths, kind="stable")[: self.count])]
 
     def _beside_cuts(self, points: Points) -> Which:
-        """Test (n,) which points (n, d) [m] are within `BESIDE` cells of one that a surface cuts. Flat faces between
-        cells cut none, so that layers along them stay whole."""
+        """Test (n,) which points (n, d) [m] are within `BESIDE` cells of a cell that a surface cuts. Flat faces between
+        cells cut no cell, so that layers along such faces stay whole."""
         reach = (BESIDE + 0.5) * self.fluid.block(self.spacing).spacings.max()
         return np.asarray(self._cut.query(points, p=np.inf, distance_upper_bound=reach)[0] < reach)
 
     @cached_property
     def _cut(self) -> Any:
-        """Make a tree of the middles of cells that a surface cuts."""
+        """Build a tree of the centres of cells that a surface cuts."""
         from scipy.spatial import cKDTree
 
         lattice = self.fluid.block(self.spacing)
@@ -117,7 +117,7 @@ class CutBody:
         return cKDTree(cells[np.abs(self.distance(cells, self.spacing)) < (0.5 - ALIGNED) * lattice.spacings.min()])
 
     def _cuts_cells(self) -> bool:
-        """Return True where a surface goes through cells: that of the body, or that of a solid."""
+        """Return True if the surface of the body, or of a solid, cuts through cells."""
         if self.fluid.cuts_cells(self.spacing):
             return True
         from_solids = self.room.from_solids(self.fluid.particles(self.spacing), self.spacing)
@@ -126,7 +126,7 @@ class CutBody:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The surroundings of bodies that were cut: particles that stay where they are, air, and walls."""
+    """The surroundings of cut bodies: particles that stay in place, air, and walls."""
 
     bodies: tuple[CutBody, ...]
     staying: Points
@@ -137,14 +137,14 @@ class Surroundings:
     """(d,) the lengths of the period [m], 0 for axes without one"""
 
     def air(self, reach: float) -> tuple[Points, Points]:
-        """Return points (m, d) [m] of lattices around the bodies up to ``reach`` [m] from their surfaces, and the part
-        (m,) of the cell around each without fluid or wall."""
+        """Return lattice points (m, d) [m] around the bodies, up to ``reach`` [m] from their surfaces, and the fraction
+        (m,) of the cell around each that is neither fluid nor wall."""
         found = [self._air_around(body, reach) for body in self.bodies]
         points, shares = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return points[shares > 0.0], shares[shares > 0.0]
 
     def _air_around(self, body: CutBody, reach: float) -> tuple[Points, Points]:
-        """Return the air that is nearer to one body than to others, and no further from it than half a period."""
+        """Return the points of air closer to one body than to the others, and within half a period of it."""
         points = body.fluid.lattice(body.spacing, reach + body.spacing)
         middle = 0.5 * np.sum(body.fluid.extent(body.spacing), axis=0)
         within = ((self.lengths == 0.0) | (np.abs(points - middle) < 0.5 * self.lengths)).all(axis=1)
@@ -160,7 +160,7 @@ class Surroundings:
         return np.min([body.distance(points + shift, reach) for shift in body.room.shifts()], axis=0)
 
     def _shares(self, points: Points, spacing: float) -> Points:
-        """Return the part (n,) of the cell around each of the points that is fluid."""
+        """Return the fraction (n,) of the cell around each point that is fluid."""
         found = sum(body.shares(points + shift) for body in self.bodies for shift in body.room.shifts())
         reach = spacing * np.sqrt(points.shape[1])
         point, particle, _ = pairs_within(points, self.staying, reach, self.lower, self.lengths)
@@ -171,7 +171,7 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class FluidSample:
-    """Fluid particles, in the order in which the scene lists their fluids; those of emitters come last."""
+    """Fluid particles, in the order in which the scene lists its fluids; those of emitters come last."""
 
     positions: Points
     """(n, d) [m]"""
@@ -182,17 +182,17 @@ class FluidSample:
     sizes: tuple[int, ...]
     """Number of particles of each body of fluid, without those of emitters."""
     asked: tuple[float, ...]
-    """Volume [m^d] that each of these is to hold, less the walls' part; of points the volume that they hold."""
+    """Volume [m^d] that each body should have, without the walls' part; for points the volume of their particles."""
     bodies: tuple[CutBody, ...]
-    """Bodies whose particles are to be packed, in the order of the particles."""
+    """Bodies whose particles are still to be packed, in the order of the particles."""
     is_packed: NDArray[np.bool_]
     """(n,) true for a particle of one of these bodies."""
     is_placed: NDArray[np.bool_]
-    """(n,) true for a particle with a given place: a point of a file, or one in a nozzle."""
+    """(n,) true for a particle with a prescribed position: a point of a file, or a particle in an emitter."""
     emitters: tuple[tuple[str, int, EmitterSample], ...]
-    """Name of each emitter, number of its first particle, and its particles as they are along it."""
+    """For each emitter its name, the number of its first particle, and its particles with their places in line."""
     places: Points
-    """(n, d) at which particles rest that are in reserve, or in a drain [m]"""
+    """(n, d) where particles rest that are in reserve or were taken by a drain [m]"""
 
     def jittered(self, most: float) -> Points:
         """Return positions (n, d) [m] with coordinates changed by up to ``most`` [m], except placed ones."""
@@ -200,7 +200,7 @@ class FluidSample:
         return np.where(self.is_placed[:, None], self.positions, self.positions + moves)
 
     def some(self, kept: NDArray[np.int64]) -> "FluidSample":
-        """Return the sample of the particles with numbers (m,) in rising order, with all of emitters among them."""
+        """Return a sample of the particles numbered (m,), in rising order, which must include all of emitters."""
         names = "positions", "velocities", "phase", "is_packed", "is_placed", "places"
         arrays = {name: getattr(self, name)[kept] for name in names}
         ends = np.searchsorted(kept, np.cumsum(self.sizes))
@@ -223,8 +223,8 @@ class FluidSample:
 
 
 def fluid_particles(scene: Scene) -> FluidSample:
-    """Make the fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with points
-    is gone since the scene was read, or if walls leave no room for any particle of a fluid."""
+    """Build the fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with
+    points has vanished since the scene was read, or if walls leave no room for any particle of a fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
     room, reach = scene.room, scene.discretisation.support_radius
     bodies = [CutBody(body, room, spacing) if is_packed(body, room, reach, spacing) else None for body in scene.fluid]
@@ -265,8 +265,8 @@ def fluid_particles(scene: Scene) -> FluidSample:
 
 
 def resting_places(scene: Scene, count: int) -> Points:
-    """Return places (count, d) [m] for particles in reserve and those that drains took: beyond all else, and too far
-    from one another to touch. Along periods there are as many as these have room for; none where all axes have one."""
+    """Return positions (count, d) [m] for particles in reserve or taken by drains: outside of everything, and too far
+    apart to touch. A periodic axis has as many as fit its period; positions are NaN if all axes are periodic."""
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     boxes = [body.extent(spacing) for body in (*scene.fluid, *scene.emitter)]
     boxes += [solid.body().extent() for solid in scene.solid]
@@ -283,7 +283,7 @@ def resting_places(scene: Scene, count: int) -> Points:
 
 
 def _why_none(body: CutBody | None, spacing: float) -> str:
-    """Say why a body of fluid has no particles, and what to do, as the end of a sentence."""
+    """Explain why a body of fluid has no particles and what to do, as the end of a sentence."""
     if body is None:
         return (
             f" that is half a spacing, {0.5 * spacing:g} m, or more from all walls: it must be larger, or further "
@@ -298,9 +298,9 @@ class FluidMasses:
     """Masses of fluid by phase [kg]; in 2-D of a layer one metre thick."""
 
     given: Mapping[str, float]
-    """The mass of particles at the start, with those that wait in an emitter."""
+    """Mass of the particles at the start, including those that wait in an emitter."""
     asked: Mapping[str, float]
-    """The mass of the volume of bodies of fluid without the part that walls take, and of the emitter's fluid."""
+    """Mass of the bodies' volumes, without the part that walls take, plus the mass of the emitters' fluid."""
 
     @classmethod
     def of(cls, scene: Scene, fluid: FluidSample) -> Self:
@@ -316,7 +316,7 @@ class FluidMasses:
 
     @property
     def off(self) -> dict[str, str]:
-        """Return sentence parts, by phase, for phases whose mass differs from the asked one by more than `EXCESS`."""
+        """Return, by phase, words about each phase whose mass differs from the requested mass by more than `EXCESS`."""
         return {
             name: f"{given:.4g} kg of {name}, where {self.asked[name]:.4g} kg were asked for"
             for name, given in self.given.items()
@@ -325,7 +325,7 @@ class FluidMasses:
 
     @property
     def warning(self) -> str | None:
-        """Return a warning before a scene runs; None where all phases have the asked mass."""
+        """Return a warning to print before a scene runs; None if all phases have the requested mass."""
         if not self.off:
             return None
         return (

@@ -1,4 +1,4 @@
-"""The shapes that bodies of fluid may have, each with its particles."""
+"""The shapes of bodies of fluid, each with its particles."""
 
 from abc import abstractmethod
 from dataclasses import replace
@@ -35,7 +35,7 @@ from cortado.scene.tables import (
 )
 
 ALIGNED = 1e-3
-"""In spacings: by how much a surface may be off the faces of cells that it does not cut."""
+"""In spacings: largest distance of a surface from the faces of cells at which it counts as not cutting them."""
 
 
 class FluidBody(Table):
@@ -46,11 +46,11 @@ class FluidBody(Table):
 
     @abstractmethod
     def count(self, spacing: float) -> float:
-        """Return the number of particles or somewhat more, without making any."""
+        """Return the number of particles, or a slightly larger number, without creating any."""
 
     @abstractmethod
     def extent(self, spacing: float) -> tuple[Points, Points]:
-        """Return a box that holds all particles: lower and upper, each (d,) [m]."""
+        """Return a box around all particles: lower and upper corner, each (d,) [m]."""
 
     @abstractmethod
     def particles(self, spacing: float) -> Points:
@@ -63,15 +63,15 @@ class Fluid(FluidBody):
     velocity: Vector[Annotated[float, quantity("m/s")]] = (0.0, 0.0, 0.0)
     """(d,) Velocity at the start [m/s]."""
     angular_velocity: Turning | None = None
-    """How fast it spins about its middle at the start, not at all if left out: in 3-D a vector, in 2-D one number,
-    counterclockwise [rad/s]."""
+    """Angular velocity about its middle at the start [rad/s]; no spin if left out. In 3-D a vector, in 2-D one number,
+    counterclockwise."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         check_turn((*path, "angular_velocity"), self.angular_velocity, dimension)
         return super().in_dimension(dimension, path)
 
     def velocities(self, points: Points) -> Points:
-        """Return first velocities (n, d) [m/s] of its particles at points (n, d) [m], whose mean is its middle."""
+        """Return first velocities (n, d) [m/s] of the particles at points (n, d) [m], whose mean is the middle."""
         found = np.tile(np.array(self.velocity, dtype=np.float64), (len(points), 1))
         if self.angular_velocity is None:
             return found
@@ -81,7 +81,7 @@ class Fluid(FluidBody):
         return found + np.cross(self.angular_velocity, arms)
 
     def greatest_speed(self, spacing: float) -> float:
-        """Return the greatest speed of its particles at the start, or somewhat more [m/s]."""
+        """Return the greatest speed of the particles at the start, or a slightly larger speed [m/s]."""
         spin = np.linalg.norm(self.angular_velocity or 0.0)
         lower, upper = self.extent(spacing) if spin else (np.zeros(1), np.zeros(1))
         return float(np.linalg.norm(self.velocity) + 0.5 * spin * np.linalg.norm(upper - lower))
@@ -91,7 +91,7 @@ class Fluid(FluidBody):
         return corners(*self.extent(spacing))
 
     def witnesses(self, spacing: float) -> Points:
-        """Return particles (n, d) [m] that lie in a convex region only if all of them do."""
+        """Return test particles (n, d) [m]: a convex region that contains these contains all particles."""
         return self.particles(spacing)
 
     def particles_in(self, room: Room, spacing: float) -> Points:
@@ -100,11 +100,11 @@ class Fluid(FluidBody):
 
     @abstractmethod
     def volume(self, spacing: float) -> float:
-        """Return the volume [m^d] of its shape, to round-off, whatever cuts it; of points the volume that they hold."""
+        """Return the volume [m^d] of the whole shape, even if walls cut it; for points that of their particles."""
 
 
 class RegionFluid(Fluid):
-    """Fluid that fills a shape. Its particles are on a lattice of the spacing, or are packed from one before a run."""
+    """Fluid that fills a shape. Its particles lie on a lattice, or start from one and are packed before a run."""
 
     @abstractmethod
     def block(self, spacing: float) -> Block:
@@ -120,30 +120,30 @@ class RegionFluid(Fluid):
         return self.block(spacing).points()
 
     def particles_in(self, room: Room, spacing: float) -> Points:
-        """Return particles (n, d) [m] half a spacing or more from all walls; nearer ones would be compressed."""
+        """Return the particles (n, d) [m] at least half a spacing from all walls; nearer ones would be compressed."""
         everything = self.particles(spacing)
         return everything[room.contains(everything, (ROUND_OFF - 0.5) * self.block(spacing).spacings.min())]
 
     @abstractmethod
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
-        """Return how far (n,) points (n, d) [m] are outside of the filled region, of a box its whole cells, negative
-        inside [m]. A distance of a reach [m] or more may be any number of its sign of that size."""
+        """Return distances (n,) [m] of points (n, d) [m] from the filled region, negative inside; for a box from its
+        whole cells. Beyond a reach [m] only the sign and a size of at least the reach are sure."""
 
     def cuts_cells(self, spacing: float) -> bool:
-        """Return True where its surface goes through cells of the lattice."""
+        """Return True if the surface of the body cuts through cells of the lattice."""
         return False
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Return points (n, d) [m] of a lattice in the box around the shape and as far as ``reach`` [m] beyond it.
-        There is one for each cell of the spacing's volume, with whole layers between faces that are flat."""
+        """Return lattice points (n, d) [m] in the box around the shape, extended by ``reach`` [m]. Each stands for a
+        cell of the spacing's volume, and between flat faces layers are whole."""
         return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
 
 
 class Turnable(RegionFluid):
-    """A body that may be turned, which then cuts cells of the lattice: `cortado.scene.fluids`."""
+    """A body that may be rotated. A rotated body cuts cells of the lattice, see `cortado.scene.fluids`."""
 
     rotation: Rotation | None = None
-    """How it is turned about its middle [rad], not at all if left out: in 3-D a rotation vector, in 2-D one number,
+    """Rotation about its middle [rad]; not rotated if left out. In 3-D a rotation vector, in 2-D one number,
     counterclockwise."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
@@ -152,10 +152,10 @@ class Turnable(RegionFluid):
 
 
 class BoxFluid(BoxShape, Turnable):
-    """A box, filled with particles at ``lower + (i + 1/2) spacing``, or packed where it is turned. Where a side is no
-    whole multiple of the spacing, they are up to 3 % further apart along some axes and closer along others. The box
-    then has the mass of its volume within 0.3 %. Where no such lattice is, they are packed, which takes up to 0.8 % off
-    the mass; `describe` and a run then say both masses."""
+    """A box, filled with particles at ``lower + (i + 1/2) spacing``, or packed if rotated. If a side is no whole
+    multiple of the spacing, particles are up to 3 % further apart along some axes and closer along others. The mass is
+    then right within 0.3 %. Where no lattice fits that well, the particles are packed, and the mass is up to 0.8 % too
+    small; `describe` and a run then print both masses."""
 
     def block(self, spacing: float) -> Block:
         return block_filling(self.lower, self.upper, spacing)
@@ -179,8 +179,8 @@ class BoxFluid(BoxShape, Turnable):
 
 
 class RoundFluid(RegionFluid):
-    """A body of fluid whose surface cuts through cells of the lattice: its particles are packed before a run begins
-    (`cortado.discretise.packing`), and ``particles`` are whole cells, which tell roughly where they are."""
+    """A body of fluid whose surface cuts cells of the lattice. Its particles are packed before a run
+    (`cortado.discretise.packing`); ``particles`` returns whole cells, which show only roughly where the fluid is."""
 
     def particles(self, spacing: float) -> Points:
         points = self.block(spacing).points()
@@ -224,7 +224,7 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
         return Region.cylinder(np.array(self.base), self.radius, self.height, axis).distance(points)
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Return a lattice stretched along the axis to fill the height with whole layers, and narrowed across it."""
+        """Return a lattice stretched along the axis so that whole layers fill the height, and narrowed across it."""
         layers = max(round(self.height / spacing), 1)
         along = self.height / layers
         across = np.sqrt(spacing**3 / along)
@@ -236,12 +236,12 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
 
 
 class PointsFluid(Fluid):
-    """Fluid particles at the positions that a file holds."""
+    """Fluid particles at the positions that a file contains."""
 
     shape: Literal["points"] = "points"
     file: File
-    """An array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file, of which the first step is read. A relative name
-    begins at the scene file."""
+    """An array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file, of which only the first time step is read. A
+    relative path starts at the scene file's folder."""
 
     def points(self) -> Points:
         """Read the positions (n, d) [m] from the file; raise `InputError`."""
@@ -261,15 +261,15 @@ class PointsFluid(Fluid):
 
 
 class Filled(Turnable):
-    """A body of fluid that fills a solid shape; its particles are packed unless its surface goes along cells of the
-    lattice from the lower corner of the box around it."""
+    """A body of fluid that fills a solid shape. Its particles are packed, unless its surface follows cells of the
+    lattice that starts at the lower corner of the box around it."""
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the shape about its middle, not turned, and the middle by its measures, (d,) [m]."""
+        """Return the shape, unrotated and centred at the origin, and the middle that its own keys give, (d,) [m]."""
 
     def body(self) -> Placed:
-        """Return the shape in its place."""
+        """Return the shape at its position, with its rotation."""
         shape, middle = self.shape_about()
         return Placed(shape, middle, rotation_matrix(self.rotation or (0.0,) * (2 * len(middle) - 3)))
 
@@ -297,10 +297,10 @@ class Filled(Turnable):
 
 
 class FilledShape(Filled):
-    """A body of fluid that fills a shape, with a place of its own."""
+    """A body of fluid that fills a shape, and that may have a given position."""
 
     position: tuple[Length, ...] | None = None
-    """(d,) Where the centroid of its volume is [m]; left out, it is where its measures put it."""
+    """(d,) Position of the centroid of its volume [m]; if left out, the other keys of the shape determine it."""
 
     def body(self) -> Placed:
         placed = super().body()
@@ -324,7 +324,7 @@ class TurnedCylinder(Filled, CylinderFluid):
 
 
 def turned(fluid: Fluid) -> Fluid:
-    """Return a body of fluid as it is, or as a packed one where it has a rotation but a kind that can do without."""
+    """Return a body of fluid unchanged or, if its kind is usually on a lattice and it is rotated, a packed body."""
     kinds: dict[type[Fluid], type[Filled]] = {BoxFluid: TurnedBox, CylinderFluid: TurnedCylinder}
     kind = kinds.get(type(fluid))
     if kind is None or not isinstance(fluid, Turnable) or fluid.rotation is None:

@@ -1,6 +1,6 @@
-"""The tables of a scene together, and those that no other module has. SI units.
+"""The tables of a scene together, and the tables that no other module defines. SI units.
 
-Vectors have as many components as the scene has dimensions. Whatever is wrong raises a `SceneError`, one sentence.
+Vectors have as many components as the scene has dimensions. Any wrong value raises a `SceneError`, one sentence.
 """
 
 from collections.abc import Mapping
@@ -39,9 +39,9 @@ from cortado.scene.tables import (
 )
 
 SHORTEST = 40.0
-"""Regularisation [s] that a fluid with a yield stress has at least, if it is not given: what does not yield creeps at
-2.5 % of its depth in a second at most. Beside a longer one the edge of a plug is less sharp than 40 particles across
-resolve: its speed between plates is off by 0.8 % with 40 s, by 2.7 % with 100 s."""
+"""Least default regularisation [s] of a fluid with a yield stress: unyielded fluid then creeps at most 2.5 % of its
+depth per second. With larger values the edge of a plug is too sharp for 40 particles across: the speed between plates
+is wrong by 0.8 % with 40 s, by 2.7 % with 100 s."""
 
 
 class RheologyTable(Table):
@@ -51,11 +51,11 @@ class RheologyTable(Table):
     """Name of the law."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
-        """Return the parameters of the law, for the viscosity of the phase [Pa s]."""
+        """Return the parameters of the law for a phase of this viscosity [Pa s]."""
         return {name: value for name, value in self.model_dump().items() if name != "kind"}
 
     def thickest(self, viscosity: float) -> float:
-        """Return the greatest viscosity of the fluid [Pa s], for that of the phase."""
+        """Return the greatest viscosity of the fluid [Pa s] for a phase of this viscosity."""
         return viscosity
 
 
@@ -63,32 +63,32 @@ class Thinning(RheologyTable):
     """The base of laws of viscosity with a power of the shear rate."""
 
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
-    """n [-]: below 1 the fluid gets thinner where it is sheared, above 1 thicker."""
+    """n [-]: with n < 1 the fluid gets thinner where it is sheared, with n > 1 thicker."""
     least_shear_rate: Annotated[float, quantity("1/s", gt=0.0)] = 0.01
-    """Added to the shear rate in squares [1/s], so that the viscosity at rest is finite."""
+    """Shear rate [1/s] that is added to the actual one in squares, so that the viscosity at rest is finite."""
 
     def thickest(self, viscosity: float) -> float:
         return viscosity * max(self.least_shear_rate ** (self.flow_index - 1.0), 1.0)
 
 
 class PowerLaw(Thinning):
-    """The power law eta = viscosity (shear rate)^(flow_index - 1), of Ostwald and de Waele: viscosity is the
-    consistency, which is that at a shear rate of 1/s."""
+    """The power law of Ostwald and de Waele, eta = viscosity (shear rate)^(flow_index - 1). Here viscosity is the
+    consistency: the viscosity at a shear rate of 1/s."""
 
     kind: Literal["power_law"] = "power_law"
     """Name of the law."""
 
 
 class Carreau(RheologyTable):
-    """The law eta = infinite_viscosity + (viscosity - infinite_viscosity) (1 + (relaxation_time shear
-    rate)^2)^((flow_index - 1) / 2), of Carreau (1972): viscosity is that at rest."""
+    """The law of Carreau (1972), eta = infinite_viscosity + (viscosity - infinite_viscosity) (1 + (relaxation_time
+    shear rate)^2)^((flow_index - 1) / 2). Here viscosity is the value at rest."""
 
     kind: Literal["carreau"] = "carreau"
     """Name of the law."""
     relaxation_time: Annotated[float, quantity("s", ge=0.0)]
     """lambda [s]: the viscosity changes at shear rates beyond 1 / lambda."""
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
-    """n [-]."""
+    """n [-], the exponent: thinner under shear for n < 1."""
     infinite_viscosity: Annotated[float, quantity("Pa s", ge=0.0)] = 0.0
     """The viscosity at a large shear rate [Pa s]."""
 
@@ -100,10 +100,10 @@ class Yielding(RheologyTable):
     """The base of laws of viscosity with a yield stress."""
 
     yield_stress: Annotated[float, quantity("Pa", ge=0.0)]
-    """Below it the fluid hardly flows [Pa]."""
+    """Stress below which the fluid hardly flows [Pa]."""
     regularisation: Annotated[float, quantity("s", gt=0.0)] | None = None
-    """m of Papanastasiou (1987) [s]: at rest the viscosity is finite, yield_stress m more. Fluid that does not
-    yield creeps, at its depth / m at most. The longer of 40 s and 100 viscosity / yield_stress if left out."""
+    """m of Papanastasiou (1987) [s]: it makes the viscosity at rest finite, larger by yield_stress m. Unyielded fluid
+    creeps at a speed of at most its depth / m. If left out: the longer of 40 s and 100 viscosity / yield_stress."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
         growth = self.regularisation
@@ -116,8 +116,8 @@ class Yielding(RheologyTable):
 
 
 class Bingham(Yielding):
-    """The law eta = viscosity + yield_stress (1 - exp(-m shear rate)) / shear rate, of Bingham, as Papanastasiou (1987)
-    makes it smooth: viscosity is that of the fluid once it flows."""
+    """The law of Bingham, smoothed as by Papanastasiou (1987): eta = viscosity + yield_stress (1 - exp(-m shear rate))
+    / shear rate. Here viscosity is the value once the fluid flows."""
 
     kind: Literal["bingham"] = "bingham"
     """Name of the law."""
@@ -135,45 +135,45 @@ AnyRheology = Annotated[PowerLaw | Carreau | Bingham | HerschelBulkley, Field(di
 
 
 class MixtureTable(Table):
-    """The Cahn-Hilliard equation that the mass fractions follow (Yang et al. 2015); the scene's phases, in order."""
+    """The Cahn-Hilliard equation for the mass fractions (Yang et al. 2015), with the scene's phases in order."""
 
     free_energy: Literal["double_well", "miscible"] = "double_well"
-    """"double_well": phases separate, into pure ones; "miscible": they mix, by Fick's law."""
+    """"double_well": phases separate into pure ones; "miscible": phases mix by Fick's law."""
     strength: Annotated[float, quantity(gt=0.0)] = 1.0
     """Factor of the free energy, alpha."""
     mobility: Annotated[float, quantity("m2/s", ge=0.0)] = 0.0
-    """How fast phases diffuse, M [m2/s]; at 0 nothing diffuses, and each particle keeps its phase."""
+    """Mobility M [m2/s]: how fast phases diffuse. With 0 there is no diffusion, and each particle keeps its phase."""
     mobility_form: Literal["degenerate", "constant"] = "degenerate"
-    """"degenerate": phases exchange only where they touch; "constant": everywhere alike."""
+    """"degenerate": phases diffuse only where they touch; "constant": everywhere equally."""
     interface_width: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Width of an interface, epsilon [m]; one spacing if left out. From 10 % to 90 % it is 4.39 epsilon / sqrt(alpha)
-    wide."""
+    """Width epsilon of an interface [m]; one spacing if left out. The mass fraction changes from 10 % to 90 % over 4.39
+    epsilon / sqrt(alpha)."""
 
     def width(self, spacing: float) -> float:
-        """Return the interface width [m] of a scene of a spacing [m]."""
+        """Return the interface width [m] in a scene with this spacing [m]."""
         return spacing if self.interface_width is None else self.interface_width
 
 
 OTHER_TABLES = ("problem", "optimise", "fit", "dataset")
-"""Tables that a scene file may hold for other modules."""
+"""Tables of other modules that a scene file may contain."""
 
 
 class DiscretisationTable(Table):
-    """The spacing, the kernel and the lattice by which the fluid is cut into particles."""
+    """The spacing, the kernel and the lattice with which the fluid is divided into particles."""
 
     spacing: Annotated[float, quantity("m", gt=0.0)]
     """Distance between particles at rest [m]."""
     support: Annotated[float, quantity(ge=1.2, le=4.0)] = 2.0
-    """Distance within which particles act on each other: support radius / spacing. With the solver "projection" it is
-    2.6 if neither it nor the kernel is given."""
+    """Distance within which particles interact, as support radius / spacing. With the solver "projection" it is 2.6 if
+    neither it nor the kernel is given."""
     kernel: Literal["cubic_spline", "wendland_c2", "wendland_c4"] = "cubic_spline"
     """Name of the smoothing kernel. With the solver "projection" it is "wendland_c2" if neither it nor the support is
     given."""
 
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """How far a particle of a body is from its first place at most, along each axis and in spacings, the same in every
-    run. With the solver "projection" 0.05 if left out where all axes are periodic: a fluid on a lattice is stiffer than
-    one without order. Points of files stay where they are."""
+    """Largest offset of a particle from its first position, along each axis and in spacings; the same in every run.
+    With the solver "projection" and all axes periodic it is 0.05 if left out, because fluid on an exact lattice is too
+    stiff. Points of files are not moved."""
 
     @property
     def support_radius(self) -> float:
@@ -194,28 +194,27 @@ class Phase(Coloured):
     viscosity: Annotated[float, quantity("Pa s", ge=0.0)]
     """Dynamic viscosity [Pa s]."""
     rheology: AnyRheology | None = None
-    """How the viscosity depends on the shear rate; not at all if left out."""
+    """Dependence of the viscosity on the shear rate; constant if left out."""
     material: Annotated[str, OneOf(tuple(LIQUIDS))] | None = None
-    """What it looks like in pictures: its colour, and how far one sees into it. Nothing that is computed depends on
-    it."""
+    """Look of the phase in pictures: its colour, and how far one sees into it. No simulation depends on it."""
     colour: Colour | None = None
-    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light: half as bright is 0.5. That of
-    the material if left out, or [0.1, 0.3, 0.8] without one."""
+    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light: half as bright is 0.5. If left
+    out, the colour of the material, or [0.1, 0.3, 0.8] without a material."""
 
 
 class FixedForces(Table):
     """The forces that every scene has."""
 
     gravity: Vector[Annotated[float, quantity("m/s2")]] = (0.0, -9.81, 0.0)
-    """(d,) Acceleration that acts on all fluid [m/s2]; with schedule.gravity, the first row there, if given."""
+    """(d,) Acceleration of all fluid by gravity [m/s2]. With schedule.gravity, it must equal the first row there."""
     viscosity: Literal["stress", "pairwise", "none"] = "stress"
-    """Form of the viscous force. "stress" has the asked viscosity within 1 %, with 40 particles across a wave of
-    shear, and makes no force where fluid turns as a whole. "pairwise", with the solver "pcisph" alone, is
-    Monaghan's (2005): 0.6 to 1.4 times as viscous as asked for, by the direction of the shear."""
+    """Form of the viscous force. "stress" matches the given viscosity within 1 %, with 40 particles across a shear
+    wave, and exerts no force on fluid in rigid rotation. "pairwise", for the solver "pcisph" only, is that of Monaghan
+    (2005): 0.6 to 1.4 times the given viscosity, depending on the direction of the shear."""
     viscous_solve: Literal["automatic", "explicit", "implicit"] = "automatic"
-    """When the viscous stress acts. "explicit": at the start of a step, which limits the time step. "implicit": at
-    its end, for any time step, by a system of equations. "automatic": implicit where the time step is too long for
-    the other."""
+    """When the viscous stress is computed. "explicit": at the start of a step, which limits the time step. "implicit":
+    at the end of a step, by a system of equations, for any time step. "automatic": implicit if the time step is too
+    long for explicit."""
     pressure: Flag = True
     """Whether the fluid resists compression."""
 
@@ -226,38 +225,38 @@ _OPTIONAL: dict[str, Any] = {
     if p.is_optional
 }
 Forces: Any = create_model("Forces", __base__=FixedForces, __module__=__name__, **_OPTIONAL)
-"""Which forces act: `FixedForces`, and the optional ones of the registry of parameters."""
+"""The forces of a scene: `FixedForces`, and the optional ones of the registry of parameters."""
 
 
 def _with(given: Any, chosen: Mapping[str, Any]) -> Any:
-    """Return a table with what is chosen for it, if it has nothing of that."""
+    """Return a table with the chosen values filled in, if it sets none of these keys."""
     if isinstance(given, Table) and not given.model_fields_set & set(chosen):
         return given.model_copy(update=chosen)
     return {**given, **chosen} if isinstance(given, Mapping) and not set(given) & set(chosen) else given
 
 
 class SceneTables(Table):
-    """Everything that a simulation starts from, each table right in itself."""
+    """Everything that a simulation starts from; each table is valid by itself."""
 
     beside: ClassVar = OTHER_TABLES
     name: Text = "scene"
-    """Shown in titles."""
+    """Name of the scene, shown in titles."""
     dimension: Annotated[int, count(2, 3)]
     """2 for a plane, 3 for space: d, the number of components of vectors."""
     discretisation: DiscretisationTable
-    """How the fluid is cut into particles."""
+    """How the fluid is divided into particles."""
     phase: Several[Phase]
-    """The materials: in this order the components of mass fractions."""
+    """The materials; mass fractions have one component for each phase, in this order."""
     fluid: tuple[AnyFluid, ...] = ()
-    """The bodies of fluid; particles come in this order. With an emitter there may be none."""
+    """The bodies of fluid, in the order of their particles. A scene with an emitter may have no body of fluid."""
     emitter: tuple[EmitterTable, ...] = ()
-    """Emitters, out of which fluid comes; their particles come after those of all fluids."""
+    """Emitters, from which fluid enters; their particles come after those of all fluids."""
     drain: tuple[AnyDrain, ...] = ()
     """Drains, which take particles out of the fluid."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)
-    """What holds the fluid."""
+    """The container of the fluid."""
     solid: tuple[AnySolid, ...] = ()
-    """Solids, which fluid flows around or is held by, besides the container."""
+    """Solids besides the container: obstacles in the fluid, and vessels."""
     hinge: tuple[HingeTable, ...] = ()
     """Hinges, about which free bodies turn."""
     spring: tuple[SpringTable, ...] = ()
@@ -273,46 +272,46 @@ class SceneTables(Table):
     schedule: Schedule = Schedule()
     """What changes while the scene runs."""
     sensor: tuple[AnySensor, ...] = ()
-    """What is read of the fluid in every step; it changes nothing of what is computed."""
+    """Quantities of the fluid that are recorded in every step. They do not influence the simulation."""
     render: Render | None = None
-    """How pictures are taken."""
+    """Settings of differentiable pictures."""
     picture: Picture | None = None
-    """How shaded pictures and films are made."""
+    """Settings of shaded pictures and films."""
 
     @property
     def sticks(self) -> bool:
-        """Return True where fluid has no slip along some walls."""
+        """Return True if some walls have no slip."""
         return self.container.sticks or any(solid.sticks for solid in self.solid)
 
     @property
     def periods(self) -> tuple[Points, Points]:
-        """Return begin and length of the period, each (d,) [m]; the length is 0 for axes without one."""
+        """Return the start and the length of the period, each (d,) [m]; the length is 0 for other axes."""
         return self.container.periods(self.dimension)
 
     @property
     def domain(self) -> Domain:
-        """Return the periods, with what follows from them."""
+        """Return the periods as a domain, with the quantities that follow from them."""
         return self.container.domain(self.dimension)
 
     @property
     def region(self) -> Region:
-        """Return the region of the container, which nothing closes along a period."""
+        """Return the region inside the container, which is open along periodic axes."""
         return self.container.region(self.dimension).opened(self.periods[1])
 
     @property
     def room(self) -> Room:
-        """Return the room of the fluid at the start, in the container and outside of solids."""
+        """Return the room for fluid at the start: inside the container and outside of solids."""
         return Room(self.region, solids_of(thick(self.solid)), self.periods[1])
 
     @property
     def resting_room(self) -> Room:
-        """Return the room that solids at rest alone leave."""
+        """Return the room for fluid if only solids at rest were present."""
         return replace(self.room, solids=solids_of(tuple(solid for solid in thick(self.solid) if not solid.moves)))
 
     @model_validator(mode="before")
     @classmethod
     def _choose_for_solver(cls, data: Any) -> Any:
-        """Fill in the kernel with its support, and the jitters, that suit the solver, where they are not given."""
+        """Fill in the kernel, the support and the jitters that suit the solver, if they are not given."""
         if not isinstance(data, Mapping):
             return data
         data = dict(data)

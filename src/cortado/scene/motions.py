@@ -1,5 +1,5 @@
-"""Changes while a scene runs: parameters over time, as values at some times, and solids that move, are turned and
-change their size. States have the fields of solids by the names that are made here."""
+"""Changes while a scene runs: parameters with given values at some times, and solids that move, rotate and change their
+size. The names of solids' state fields are defined here."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,24 +21,24 @@ from cortado.scene.tables import MISSING, FieldPath, Several, Table, field_error
 
 
 class Course(Table):
-    """One parameter over time, constant before the first of some times and after the last."""
+    """The course of one parameter over time, constant before the first and after the last of the given times."""
 
     columns: ClassVar[Callable[[int], Columns]]
-    """Columns that its file has, by the number of dimensions."""
+    """Columns of the parameter's file, by the number of dimensions."""
     grows_from: ClassVar[float | None] = 0.0
-    """What a ramp begins with; None for the first value."""
+    """Value at the start of a ramp; None for the first value."""
     times: Several[Annotated[float, quantity("s", ge=0.0)]] | None = None
-    """(k,) counted from the first state of the run, each greater than the one before [s]"""
+    """(k,) Times since the first state of the run, increasing [s]"""
     values: Any = None
     """(k, components) in the parameter's unit"""
     file: File | None = None
-    """A CSV file in the place of `times` and `values`, with a column time [s] and one with a unit for each component:
-    x, y and z; tilt, in 3-D tilt_x and tilt_z. A relative name begins at the scene file."""
+    """A CSV file in place of `times` and `values`. It has a column time [s] and a column with a unit for each
+    component: x, y and z; tilt, in 3-D tilt_x and tilt_z. A relative path starts at the scene file's folder."""
     interpolation: Interpolation = "linear"
-    """Between the times: straight lines, or a cubic spline, which is level at both ends."""
+    """Curve between the times: straight lines, or a cubic spline with zero slope at both ends."""
     ramp: Ramp | None = None
-    """Time after which values, or the way from the first place, are whole [s]; until then they are multiplied by a
-    number that grows smoothly (C2) from 0 to 1."""
+    """Duration of the ramp [s]. Until its end values, or displacements from the first place, are multiplied by a factor
+    that grows smoothly (C2) from 0 to 1."""
     _dimension: int = PrivateAttr(0)
 
     @model_validator(mode="after")
@@ -86,7 +86,7 @@ class Course(Table):
 
 
 def course_table(parameter: Parameter) -> type[Course]:
-    """Make the table of one parameter over time, whose values have its unit."""
+    """Build the table of one parameter over time; its values have the parameter's unit."""
     unit = parameter.unit.replace("²", "2").replace("°", "degrees")
     row = Annotated[tuple[Annotated[float, quantity(unit)], ...], Field(min_length=1, max_length=3, fail_fast=True)]
     values: Any = (Several[row] | None, Field(None, description="(k, components) one row for each of the times"))
@@ -97,7 +97,7 @@ def course_table(parameter: Parameter) -> type[Course]:
 
 
 def _columns(parameter: Parameter, unit: str, dimension: int) -> Columns:
-    """Return the columns of a file with a parameter over time: x, y and z of a vector of space, or its own name."""
+    """Return the columns of a file with a parameter over time: x, y and z for a vector in space, or its own name."""
     size = 1 if parameter.components is None else parameter.components(dimension, 1)
     if size == dimension:
         return tuple((axis, unit) for axis in "xyz"[:size])
@@ -125,11 +125,11 @@ class _Schedule(Table):
 
     @property
     def leads_gravity(self) -> bool:
-        """Return True where gravity changes, as such or by a tilt."""
+        """Return True if gravity changes, either directly or by a tilt."""
         return not self._tables.keys().isdisjoint(("gravity", "tilt"))
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """Return this table, with rows of as many components as their parameters have in 2 or 3 dimensions."""
+        """Return this table for 2 or 3 dimensions, with rows checked to have the components of their parameters."""
         placed = {name: course.in_dimension(dimension, (*path, name)) for name, course in self._tables.items()}
         return self.model_copy(update=placed)
 
@@ -140,23 +140,23 @@ Schedule: Any = create_model(
 """A course for each parameter over time that changes, made from the registry of parameters."""
 
 AXES = ("turn_x", "turn_y", "turn_z")
-"""Endings of state fields' names for a free body's rotation: how far the ends of its unit axes have moved [-]."""
+"""Endings of state fields' names for a free body's rotation: displacements of the ends of its unit axes [-]."""
 RESTITUTION = 0.6
-"""That of a free body that does not say its own."""
+"""Default restitution of a free body."""
 RADIAN = 1.0
-"""A large turn for an optimiser [rad]."""
+"""Typical large rotation for an optimiser [rad]."""
 STRETCH = 0.2
-"""A large change of a scale for an optimiser, in parts of it."""
+"""Typical large relative change of a scale for an optimiser."""
 
 
 def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
-    """Return the solids that move, in their order."""
+    """Return the solids that move, in order."""
     return [solid for solid in solids if solid.moves]
 
 
 def wall_numbers(solids: Sequence[SolidTable]) -> dict[str, int]:
-    """Return the numbers by which wall particles name solids, by name: those that move from 0 on, and those at rest
-    from -2 on downwards, as -1 is the container."""
+    """Return the numbers of solids in wall particles, by name: 0, 1, ... for moving solids, and -2, -3, ... for solids
+    at rest, because -1 is the container."""
     resting = [solid for solid in solids if not solid.moves]
     numbers = {solid.name: number for number, solid in enumerate(moving(solids))}
     return numbers | {solid.name: -2 - number for number, solid in enumerate(resting)}
@@ -173,14 +173,14 @@ def free(solids: Sequence[SolidTable]) -> list[SolidTable]:
 
 
 def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the first middles (k, d) [m] and rotation matrices (k, d, d) of a scene's solids that move."""
+    """Return the first middles (k, d) [m] and rotation matrices (k, d, d) of a scene's moving solids."""
     tables, d = moving(scene.solid), scene.dimension
     middles = np.array([table.middle() for table in tables]).reshape(-1, d)
     return middles, np.array([table.turn(d) for table in tables]).reshape(-1, d, d)
 
 
 def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> float:
-    """Return the greatest speed of any point of a solid [m/s], with values of parameters that replace the scene's."""
+    """Return the greatest speed of any point of a solid [m/s]; ``values`` of parameters replace the scene's."""
     found = [0.0]
     for solid in moving(solids):
         shifts, turns = courses(solid)
@@ -193,48 +193,47 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
 
 
 def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
-    """Return the distance from a solid's middle to its furthest point, at most [m], with values of parameters that
-    replace the scene's."""
+    """Return a bound of the distance from a solid's middle to its furthest point [m]; ``values`` of parameters replace
+    the scene's."""
     furthest = np.abs(solid.own_solid().extent()).max(axis=0)
     return float(np.linalg.norm(furthest) * values.get(scale_name(solid.name), 1.0))
 
 
 def _name(end: str) -> Callable[[str], str]:
-    """Make the function that returns the name of a solid's parameter, or of a field of a state, by the solid's name."""
+    """Build the function that returns the name of a solid's parameter or state field, from the solid's name."""
     return lambda solid: f"{solid}.{end}"
 
 
 position_name = _name("position")
-"""The parameter where the middle begins [m]; the field where it is."""
+"""Parameter: position of the middle at the start [m]; field: current position."""
 rotation_name = _name("rotation")
-"""The parameter, and the field: how it is turned at first [rad]."""
+"""Parameter and field: rotation at the start [rad]."""
 scale_name = _name("scale")
-"""The parameter, and the field: how many times as large as in the scene it is."""
+"""Parameter and field: size relative to that in the scene."""
 displacement_name = _name("displacement")
-"""The parameter: how far the middle is from where it began [m]."""
+"""Parameter: displacement of the middle since the start [m]."""
 turn_name = _name("turn")
-"""The parameter, and the field: how far it is turned from how it began [rad]."""
+"""Parameter and field: rotation since the start [rad]."""
 velocity_name = _name("velocity")
-"""The parameter: how fast the middle is, of a free body at the start [m/s]; the field of a free body."""
+"""Parameter: velocity of the middle, for a free body the one at the start [m/s]; field: a free body's velocity."""
 angular_velocity_name = _name("angular_velocity")
-"""The parameter: how fast it turns, a free body at the start [rad/s]; the field of a free body."""
+"""Parameter: angular velocity, for a free body the one at the start [rad/s]; field: that of a free body."""
 density_name = _name("density")
 mass_name = _name("mass")
 friction_name = _name("friction")
-"""The parameter: the coefficient of friction of a free body [-]."""
+"""Parameter: coefficient of friction of a free body [-]."""
 restitution_name = _name("restitution")
-"""The parameter: with which part of the speed of a hit a free body leaves [-]."""
+"""Parameter: coefficient of restitution of a free body [-], its speed after a hit over that before."""
 
 
 def weight_name(solid: SolidTable) -> str:
-    """Return the name of the parameter of a free body that is its density [kg/m3] or its mass [kg], as its table says
-    one or the other."""
+    """Return the name of the parameter for a free body's density [kg/m3] or mass [kg], whichever its table gives."""
     return (density_name if solid.mass is None else mass_name)(solid.name)
 
 
 def mass_of_one(solid: SolidTable) -> Mass:
-    """Return the mass of a free body, with its inertia about its centre of mass, if its density or its mass, whichever
-    its table says, is 1."""
+    """Return the mass of a free body, and its inertia about its centre of mass, for a density or a mass of 1, whichever
+    its table gives."""
     even = Mass.of(solid.shape_about()[0])
     size = even.volume if solid.mass is None else 1.0
     if solid.inertia is not None:
@@ -249,14 +248,14 @@ def mass_of_one(solid: SolidTable) -> Mass:
 
 
 def solids_in(fields: Iterable[str]) -> list[str]:
-    """Return the names of the solids that a state has fields of."""
+    """Return the names of the solids for which a state has fields."""
     end = position_name("")
     return [field.removesuffix(end) for field in fields if field.endswith(end)]
 
 
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
-    """Return the parameters of solids that move. Prescribed ones have a first place and size, and places at the end of
-    each step from there, or, if their motion is steady, a speed. Free bodies have a first motion and a density."""
+    """Return the parameters of moving solids. Prescribed ones have a first position and size, and a displacement at the
+    end of each step or, in steady motion, a speed. Free bodies have a first motion and a density."""
     known = {parameter.name: parameter for solid in moving(solids) for parameter in _parameters(solid)}
     names = (position_name, rotation_name, scale_name, displacement_name, turn_name)
     found = [known[name(solid.name)] for solid in told(solids) for name in names]
@@ -273,7 +272,7 @@ def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
 
 
 def _parameters(solid: SolidTable) -> list[Parameter]:
-    """Return all parameters that a solid that moves may have."""
+    """Return all parameters that a moving solid may have."""
     name, middle, still = solid.name, solid.middle(), np.zeros(len(solid.middle()))
     unturned = np.zeros(_shape_of(2 * len(middle) - 3))
     when, (shifts, turns) = " at the start" if solid.motion == "free" else "", courses(solid)
@@ -321,7 +320,7 @@ def _shape_of(components: int) -> tuple[int, ...]:
 
 
 def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
-    """Return displacement [m] and turn [rad] of a solid whose motion is prescribed, over time, from where it begins."""
+    """Return displacement [m] and rotation [rad] over time, since the start, of a solid with prescribed motion."""
     d = len(solid.middle())
     times, shifts, turns = path_of(solid, d) or (None, None, None)
 
@@ -337,26 +336,26 @@ def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """The place and rotation of a solid that moves, in a state: R = Q R(w), in space also for one in the plane."""
+    """Position and rotation of a moving solid in a state: R = Q R(w), as 3 x 3 matrices also in the plane."""
 
     name: str
     """Name of the solid."""
     is_free: bool
-    """True for a body that fluid moves: states keep Q of these by its columns, and of others by its vector."""
+    """True for a free body: states store the columns of Q for free bodies, and a rotation vector for other solids."""
     position: NDArray[Any]
     """(d,) [m]"""
     scale: float
     """Scale of the solid, relative to the scene's."""
     begun: NDArray[Any]
-    """w, (3,), by which it was turned at first [rad]"""
+    """w, (3,), rotation vector of the solid at the start [rad]"""
     turn: NDArray[Any]
-    """(3,) by which it was turned since [rad]; 0 of a body that is free"""
+    """(3,) rotation vector since the start [rad]; 0 for a free body"""
     turned: NDArray[Any]
-    """Q, (3, 3)"""
+    """Q, (3, 3), rotation since the start"""
 
     @classmethod
     def of(cls, name: str, is_free: bool, at: Any) -> Self:
-        """Read the pose of a solid in a state, ``at``, whose fields have an axis of one entry."""
+        """Read the pose of a solid from a state, ``at``, whose fields have a first axis of length 1."""
         position, begun, turn, scale = at[position_name(name)][0], at[rotation_name(name)][0], np.zeros(3), 1.0
         if is_free:
             turned = np.eye(3) + np.array([_in_space(at[f"{name}.{axis}"][0]) for axis in AXES]).T
@@ -372,17 +371,17 @@ class Pose:
 
     @property
     def angles(self) -> NDArray[np.float64]:
-        """Return the rotation vector (3,) of R, in the plane the angle (1,), of at most half a turn [rad]."""
+        """Return the rotation vector (3,) of R, in the plane its angle (1,), of at most half a turn [rad]."""
         from scipy.spatial.transform import Rotation
 
         return np.asarray(_angles(Rotation.from_matrix(self.rotation).as_rotvec(), len(self.position)).ravel())
 
     def angle_bars(self, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Turn the derivative with respect to `angles` into those of fields, by their names."""
+        """Convert the derivative with respect to `angles` into derivatives with respect to fields, by name."""
         return self.turning_bars(np.linalg.solve(_jacobian(_in_space(self.angles)).T, _in_space(bar)))
 
     def turning_bars(self, t: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Turn ``t`` (3,), the derivative with respect to a further turn of R, into those of fields, by their names."""
+        """Convert ``t`` (3,), the derivative with respect to a further turn of R, into those of fields, by name."""
         name, dimension = self.name, len(self.position)
         bars = {rotation_name(name): _angles(_jacobian(self.begun).T @ self.turned.T @ t, dimension)}
         if not self.is_free:
@@ -399,7 +398,7 @@ def matrix(rotation: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _in_space(vector: NDArray[Any]) -> NDArray[np.float64]:
-    """Return a vector as (3,), or the rotation vector of an angle."""
+    """Return a vector as (3,); an angle becomes a rotation vector."""
     found = np.zeros(3)
     if np.ndim(vector) == 0 or len(vector) == 1:
         found[2] = np.reshape(vector, ())
@@ -409,7 +408,7 @@ def _in_space(vector: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _angles(w: NDArray[Any], dimension: int) -> NDArray[np.float64]:
-    """Return a rotation vector w (3,) as a field of a state, (1, 1) or (1, 3)."""
+    """Return a rotation vector w (3,) in the form of a state field, (1, 1) or (1, 3)."""
     return np.asarray(w[2:] if dimension == 2 else w[None])
 
 

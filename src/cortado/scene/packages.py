@@ -1,7 +1,7 @@
-"""Solvers and forces that installed packages register, by entry points, for scene files to name.
+"""Solvers and forces that installed packages register by entry points, and that scene files can name.
 
-Entry points are read where a scene names a kind that is not Cortado's own, and nowhere else. What goes wrong in a part
-of a package is a sentence that names the package, wherever the part is used.
+Entry points are read only if a scene names a kind that is not Cortado's own. An error in a package's part, wherever it
+occurs, becomes a sentence that names the package.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -37,11 +37,11 @@ GUARDED = "_guarded_by_cortado"
 """The attribute that marks guarded classes."""
 ABSENT = object()
 OTHERS = ("builtins", "cortado", "numpy", "types", "warp")
-"""Modules whose objects are no part of a package."""
+"""Top-level modules whose functions and classes never belong to a package of a user."""
 
 
 def _in_words(problem: BaseException, package: str) -> str:
-    """Describe the error that a package raised, and its place, in words without the full stop."""
+    """Describe an error that a package raised, and the line where it occurred, in words without the full stop."""
     try:
         text = " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".: ")
     except Exception:  # words of its own that cannot be made
@@ -55,8 +55,8 @@ def _in_words(problem: BaseException, package: str) -> str:
 def guarded(
     what: str, package: str, error: type[CortadoError] = InputError, expected: tuple[type[BaseException], ...] = ()
 ) -> Iterator[None]:
-    """Turn an error that a package raises within into an ``error`` that begins with ``what``, but for Cortado's own,
-    for interruptions and for ``expected`` ones. A package that asks for the end of the process does not get it."""
+    """Turn an error that a package raises into an ``error`` whose text begins with ``what``. Cortado's own errors,
+    interruptions and ``expected`` errors pass unchanged; an attempt to end the process becomes an ``error``, too."""
     kept: tuple[type[BaseException], ...] = (CortadoError, KeyboardInterrupt, *expected)
     try:
         yield
@@ -67,10 +67,10 @@ def guarded(
 
 
 class PackageMaker:
-    """A wrapper of a solver or force that an installed package makes: errors raised in it name the package."""
+    """A wrapper around a solver or force from an installed package; errors raised in it name the package."""
 
     def __init__(self, part: Any, kind: str, package: str):
-        """Guard a part: ``kind`` is the name that the package gives it, ``package`` the package's name in messages."""
+        """Guard a part: ``kind`` is the package's name for it, ``package`` the package's name in messages."""
         self._part, self._kind, self._package = part, kind, package
 
     def __getattr__(self, name: str) -> Any:
@@ -84,7 +84,7 @@ class PackageMaker:
 
     @cached_property
     def parameters(self) -> Any:
-        """Return the parameters of the part, whose functions are guarded."""
+        """Return the parameters of the part, with guarded functions."""
         found = self.__getattr__("parameters")
         return [self._judged(one) for one in found] if isinstance(found, (list, tuple)) else found
 
@@ -109,7 +109,7 @@ class PackageMaker:
 
 
 def _at_work(made: Any, kind: str, package: str) -> Any:
-    """Wrap an object made by a package, such as a solver, with guarded methods, which name the package in errors."""
+    """Guard the methods of an object that a package made, such as a solver, so that errors name the package."""
     cls: Any = type(made)
     if cls.__module__.partition(".")[0] not in OTHERS and not isinstance(made, type):
         with suppress(TypeError):  # of a class that is not Python's
@@ -119,7 +119,7 @@ def _at_work(made: Any, kind: str, package: str) -> Any:
 
 @cache
 def _guarded_class(cls: type, kind: str, package: str) -> type:
-    """Make a class of equal name whose methods are guarded, without those that are Cortado's."""
+    """Build a class of the same name whose methods are guarded, except those inherited from Cortado."""
     if GUARDED in cls.__dict__:
         return cls
     own: dict[str, Any] = {"__slots__": (), "__module__": cls.__module__, GUARDED: True}
@@ -155,8 +155,8 @@ TYPES = {float: Annotated[float, quantity()], int: Annotated[int, count(-MOST, M
 
 
 def registered(group: str, kind: str, own: Collection[str], advice: str) -> EntryPoint:
-    """Return the entry point of a group, such as "cortado.forces", with a name that is none of Cortado's ``own``; raise
-    a `SceneError` about ``kind``."""
+    """Return the entry point with this name in a group, such as "cortado.forces"; raise a `SceneError` about ``kind``.
+    Names that are Cortado's ``own`` are refused."""
     if kind in own:
         raise SceneError(None, "kind", kind, f"another name, as {kind} is a force of Cortado's own, in [forces]")
     found = entry_points(group=group)
@@ -195,7 +195,7 @@ def loaded(entry: EntryPoint) -> Callable[..., Any]:
 
 @contextmanager
 def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
-    """Turn an error that a package raises into a `SceneError` about a field, other errors of Cortado's own included."""
+    """Turn any error that a package raises, also an error of Cortado's, into a `SceneError` about a field."""
     try:
         with guarded(what, _package_of(entry)):
             yield
@@ -208,8 +208,8 @@ def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
 
 
 def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved: Collection[str]) -> dict[str, Any]:
-    """Return the keys of a table as the arguments of a factory, each checked by its annotation; raise a `SceneError`
-    about the first that does not fit."""
+    """Check the keys of a table by the annotations of a factory's arguments, and return them as its arguments. Raise a
+    `SceneError` about the first key that does not fit."""
     arguments = _arguments(factory)
     if arguments is None:
         return dict(keys)
@@ -229,8 +229,7 @@ def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved:
 
 
 def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
-    """Return a function's arguments that have names, and ``**others`` if it takes them; None where Python cannot
-    tell."""
+    """Return a function's named arguments, and ``**others`` if it takes them; None if Python cannot find out."""
     for evaluated in (True, False):
         try:
             found = signature(factory, eval_str=evaluated).parameters
@@ -244,8 +243,8 @@ def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
 
 
 def _adapter(argument: Argument) -> tuple[TypeAdapter | None, str]:
-    """Return the check of a value, and in words a right value; values with other annotations than plain types and
-    fields of scenes are judged by whoever is given them."""
+    """Return the check of a value, and a description of valid values. Only plain types and scene field types are
+    checked here; values with other annotations are left to the part itself."""
     annotation: Any = TYPES.get(argument.annotation) if isinstance(argument.annotation, type) else argument.annotation
     if annotation is None or get_origin(annotation) is not Annotated:
         return None, "given"
@@ -267,7 +266,7 @@ def _checked(name: str, value: Any, argument: Argument | None) -> Any:
 
 
 def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any], method: str) -> Any:
-    """Make a part by a factory from the keys of a table, and check that it has a method of that name; raise a
+    """Build a part by a factory from the keys of a table, and check that the part has the named method; raise a
     `SceneError`."""
     called = f'of the kind "{entry.name}"'
     with _told("", entry, f"{called} cannot be made:"):
@@ -288,11 +287,11 @@ class PackageTable(Table):
     method: ClassVar[str]
     """Name of a method that the made part must have."""
     own: ClassVar[Collection[str]] = ()
-    """Names that no package can have."""
+    """Names that no package can use."""
     advice: ClassVar[str] = ""
-    """Other things that may stand in place of ``kind``, in words."""
+    """Words about alternatives to ``kind``, for error messages."""
     kind: Text
-    """The name that the package gives it."""
+    """The package's name for the part."""
 
     @model_validator(mode="before")
     @classmethod
@@ -311,7 +310,7 @@ class PackageTable(Table):
 
     @classmethod
     def _judged(cls, kind: str, keys: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the keys as the part takes them; raise a `SceneError` about one of them."""
+        """Return the keys as arguments of the part; raise a `SceneError` about a key that does not fit."""
         entry = registered(cls.group, kind, cls.own, cls.advice)
         factory = loaded(entry)
         checked = checked_keys(factory, keys, tuple(cls.model_fields))
@@ -319,7 +318,7 @@ class PackageTable(Table):
         return checked
 
     def make(self) -> Any:
-        """Make the part, as the package does from the keys; raise a `SceneError`."""
+        """Build the part by the package's factory from the keys; raise a `SceneError`."""
         entry = registered(self.group, self.kind, self.own, self.advice)
         return made(entry, loaded(entry), self.model_extra or {}, self.method)
 
@@ -328,7 +327,7 @@ class PackageTable(Table):
 
 
 class Inline:
-    """A mark that puts the JSON schema of a table where it is used, and not among tables whose keys are known."""
+    """A mark that inlines the JSON schema of a table, instead of listing it among the tables with known keys."""
 
     def __get_pydantic_json_schema__(self, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         return {"allOf": [handler.resolve_ref_schema(handler(core_schema))]}

@@ -1,7 +1,7 @@
-"""Values of parameters as users write them, checked, with one sentence where one is wrong; and the functions of them
-that a run starts from. Without Warp, in float64.
+"""Checks of the parameter values that users give, each error in one sentence; and functions of these values with which
+a run starts. Without Warp, in float64.
 
-n counts fluid particles in the order in which the scene lists them, d is the scene's dimension.
+n is the number of fluid particles, in the order in which the scene lists them; d is the scene's dimension.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,15 +17,15 @@ from cortado.scene.parameters import BY_NAME, Axis, Parameter, Range, Role, Sour
 
 
 def reference_density(fractions: np.ndarray, rest_density: np.ndarray) -> np.ndarray:
-    """Return mixtures' rest densities m (n,) [kg / m3], for fractions (n, phases) and rest densities (phases,) [kg /
-    m3]."""
+    """Return the mixtures' rest densities m (n,) [kg / m3] from fractions (n, phases) and rest densities (phases,) [kg
+    / m3]."""
     return 1.0 / (fractions / rest_density).sum(axis=1)
 
 
 def reference_density_tangent(
     fractions: np.ndarray, rest_density: np.ndarray, fractions_dot: np.ndarray, rest_density_dot: np.ndarray
 ) -> np.ndarray:
-    """Return the derivative of the mixture's rest density m (n,) along a direction."""
+    """Return the derivative of the mixtures' rest density m (n,) in a direction."""
     change = (fractions_dot - fractions * rest_density_dot / rest_density) / rest_density
     return -(reference_density(fractions, rest_density) ** 2) * change.sum(axis=1)
 
@@ -33,23 +33,23 @@ def reference_density_tangent(
 def reference_density_adjoint(
     fractions: np.ndarray, rest_density: np.ndarray, reference_density_bar: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the adjoints of fractions (n, phases) and of rest densities (phases,) for one of m (n,)."""
+    """Return the adjoints of fractions (n, phases) and of rest densities (phases,), given the adjoint of m (n,)."""
     by_volume = (reference_density_bar * reference_density(fractions, rest_density) ** 2)[:, None] / rest_density
     return -by_volume, (by_volume * fractions / rest_density).sum(axis=0)
 
 
 SMALL = 1e-2
-"""Angles [rad] below which a series takes the place of a division by them; its error is below round-off."""
+"""Angles [rad] below which a series replaces a division by the angle; the error of the series is below round-off."""
 
 
 @dataclass(frozen=True)
 class Tilt:
-    """A map to gravity g(a) = |g| (cos|a| e_0 + sin|a| / |a| sum_k a_k e_k) of angles a (d - 1,) [degrees] from the
-    rest e_0.
+    """A map from angles a (d - 1,) [degrees] to gravity g(a) = |g| (cos|a| e_0 + sin|a| / |a| sum_k a_k e_k), where e_0
+    is gravity's direction at rest.
 
-    The unit vectors e_k are the axes other than the one that gravity at rest is most nearly along, in their order, made
-    perpendicular to it and to each other. Where it is along -y, gravity leans towards x by a_1 and towards z by a_2.
-    The map is smooth, at rest as well (it is the exponential map of the sphere), and there and back for |a| < 180.
+    The unit vectors e_k come from the axes other than the one nearest to gravity at rest, in order, made orthogonal to
+    gravity and to each other. If gravity at rest is along -y, it leans towards x by a_1 and towards z by a_2. The map
+    is the exponential map of the sphere: smooth also at rest, and invertible for |a| < 180.
     """
 
     rest: tuple[float, ...]
@@ -62,7 +62,7 @@ class Tilt:
         return self._size * np.concatenate([np.cos(size), np.sinc(size / np.pi) * a], axis=-1) @ self._axes
 
     def tangent(self, angles: np.ndarray, dot: np.ndarray) -> np.ndarray:
-        """Return the derivative of `gravity` along ``dot`` [m/s2], of the angles' shape."""
+        """Return the derivative of `gravity` in the direction ``dot``, of the shape of the angles [m/s2]."""
         a, a_dot = np.radians(angles), np.radians(dot)
         sine, sine_derivative = self._factors(a)
         along = (a * a_dot).sum(axis=-1, keepdims=True)
@@ -73,7 +73,7 @@ class Tilt:
         )
 
     def adjoint(self, angles: np.ndarray, bar: np.ndarray) -> np.ndarray:
-        """Return the derivative with respect to the angles [1/degree], from that with respect to gravity."""
+        """Return the derivative with respect to the angles [1/degree], given that with respect to gravity."""
         a, bars = np.radians(angles), self._size * bar @ self._axes.T
         sine, sine_derivative = self._factors(a)
         rest_bar, lean_bar = bars[..., :1], bars[..., 1:]
@@ -82,7 +82,7 @@ class Tilt:
 
     @property
     def towards(self) -> str:
-        """Return the names of the axes that gravity leans towards, such as "xz"."""
+        """Return the names of the axes towards which gravity leans, such as "xz"."""
         return "".join(np.delete(list("xyz"[: len(self.rest)]), np.abs(self.rest).argmax()))
 
     @property
@@ -100,7 +100,7 @@ class Tilt:
 
     @staticmethod
     def _factors(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return s = sin|a| / |a| (..., 1), and its derivative along |a|, over |a|."""
+        """Return s = sin|a| / |a| (..., 1), and the derivative of s with respect to |a|, divided by |a|."""
         size = np.linalg.norm(a, axis=-1, keepdims=True)
         sine, safe = np.sinc(size / np.pi), np.maximum(size, SMALL)
         derivative = (np.cos(safe) - np.sinc(safe / np.pi)) / safe**2
@@ -108,13 +108,13 @@ class Tilt:
 
 
 class Known(Mapping[str, Parameter]):
-    """A table of parameters by name, those of the registry first. It is equal to itself alone."""
+    """A table of parameters by name, beginning with those of the registry. A table is equal only to itself."""
 
     __eq__, __hash__ = object.__eq__, object.__hash__
 
     def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
-        """Take parameters ``own`` of forces and of a solver, each with its owner in words; `TIME` may be among them
-        several times. Raises `InputError` where two parameters have one name, or the same arguments of kernels."""
+        """Add the parameters ``own`` of forces and of a solver, each with its owner in words; `TIME` may occur several
+        times. Raises `InputError` if two parameters share a name, or a name of kernel arguments."""
         self._by_name = dict(BY_NAME)
         arguments = {argument(name): name for name in BY_NAME}
         for parameter, whose in dict(own).items():
@@ -127,22 +127,22 @@ class Known(Mapping[str, Parameter]):
             arguments[argument(name)] = name
             self._by_name[name] = parameter
         self.own = tuple(p for p in self._by_name.values() if p.name not in BY_NAME)
-        """Those of forces and of a solver."""
+        """Parameters of forces and of a solver."""
         self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
-        """Names of what steps depend on."""
+        """Names of the parameters on which steps depend."""
         self.state = tuple(name for name, p in self.items() if p.role is Role.STATE)
-        """Names of what the first state has, and other states have of their own."""
+        """Names of the parameters that describe the first state; later states have values of their own."""
         self.over_time = tuple(name for name, p in self.items() if p.axis is Axis.STEP)
-        """Names of those that may have a row for each step."""
+        """Names of the parameters that may have a row for each step."""
         self.vectors = tuple(name for name in self.run if self[name].components is not None)
-        """Names of what steps depend on and has the components of a vector."""
+        """Names of the vector parameters on which steps depend."""
         self.views = {p.name: p.in_place_of for p in self.values() if p.in_place_of is not None}
-        """Names of other ways to write parameters, with those of these parameters."""
+        """Alternative forms of parameters: the name of each, with the name of the parameter that it replaces."""
         self.courses = {p.name: p.course for p in self.own if p.course is not None}
-        """How these change while a scene runs."""
+        """Courses over time of parameters of forces and of a solver."""
 
     def has_rows(self, name: str, value: Any) -> bool:
-        """Test whether a value of a parameter has rows in time: one for each step, or for each of some knots."""
+        """Test whether a value has rows in time: one for each step, or one for each of some knots."""
         parameter = self[name]
         return parameter.axis is Axis.STEP and np.ndim(value) == parameter.rank + 1
 
@@ -157,7 +157,7 @@ class Known(Mapping[str, Parameter]):
 
 
 class _Passing:
-    """Time itself, as a course of a parameter."""
+    """The course of the parameter `TIME`: time itself."""
 
     def at(self, times: NDArray) -> NDArray:
         return times
@@ -176,17 +176,17 @@ TIME = Parameter(
     moment=0.0,
     course=_Passing(),
 )
-"""The parameter for forces that depend on time. Kernels find (members, steps) numbers; derivatives with respect to the
-time step follow, and runs that go on have their own."""
+"""The parameter for forces that depend on time; kernels read it from an array (members, steps). Derivatives with
+respect to the time step include it, and a resumed run continues it."""
 
 
 def argument(name: str) -> str:
-    """Return the name of a parameter among arguments of kernels: ``drag_k`` for ``drag.k``."""
+    """Return a parameter's name as a kernel argument: ``drag_k`` for ``drag.k``."""
     return name.replace(".", "_")
 
 
 REGISTRY = Known()
-"""The parameters of a simulation without forces of its own."""
+"""The parameters of a simulation without user-defined forces."""
 
 
 Values = Mapping[str, Any]
@@ -197,14 +197,14 @@ NAMES = names()
 UNITS = {name: parameter.unit for name, parameter in BY_NAME.items()}
 """Units of all parameters by name."""
 OVER_TIME = names(axis=Axis.STEP)
-"""Parameters that may have a row for each step; a tilt takes the place of gravity."""
+"""Parameters that may have a row for each step; a tilt replaces gravity."""
 SUM_TOLERANCE = 0.01
-"""Deviation from 1 of the sum of a particle's mass fractions that is allowed: differences need some room."""
+"""Allowed deviation from 1 of the sum of a particle's mass fractions; finite differences need some room."""
 
 
 def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
-    """Return the scene's value of every parameter of the ``known`` that it has, in the shape that a user would write;
-    without a tilt, which is another way to write gravity."""
+    """Return the scene's value of every ``known`` parameter that it has, in the shape that a user would write. A tilt,
+    another form of gravity, is left out."""
     phases, positions = len(source.scene.phase), source.positions.shape
     found = {}
     for name, parameter in known.items():
@@ -215,7 +215,7 @@ def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
 
 
 def check_known(name: str, scene: Any, what: str = "parameter", known: Known = REGISTRY) -> None:
-    """Raise `InputError` for a parameter that does not exist, or that a scene does not have."""
+    """Raise `InputError` for a parameter that does not exist, or that the scene does not have."""
     if name not in known or known[name].role is Role.CLOCK:
         owner = str(name).rpartition(".")[0]
         if owner in (solid.name for solid in scene.solid if not solid.moves):
@@ -229,7 +229,7 @@ def check_known(name: str, scene: Any, what: str = "parameter", known: Known = R
 
 
 def require_points(points: object) -> None:
-    """Raise `InputError` unless these are parameters by name, of at least one point."""
+    """Raise `InputError` unless the argument maps names of parameters to values, for at least one parameter."""
     if not isinstance(points, Sequence) or isinstance(points, (str, bytes)) or not points:
         raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")
     for point in points:
@@ -237,7 +237,7 @@ def require_points(points: object) -> None:
 
 
 def is_too_small(array: np.ndarray, allowed: Range) -> bool:
-    """Test whether a number is below a range that begins at 0."""
+    """Test whether a number is too small for a range that begins at 0."""
     if allowed is Range.POSITIVE:
         return bool((array <= 0.0).any())
     return allowed is Range.NOT_NEGATIVE and bool((array < 0.0).any())
@@ -246,8 +246,8 @@ def is_too_small(array: np.ndarray, allowed: Range) -> bool:
 def checked_value(
     name: str, value: Any, shapes: list[tuple[int, ...]], what: str = "parameter", known: Known = REGISTRY
 ) -> np.ndarray:
-    """Return a value as a float64 array of one of the shapes, finite and in range; raise `InputError` in a sentence, an
-    `OutOfRangeError` where only the value is wrong. A ``what`` of "direction" may be negative."""
+    """Return a value as a finite float64 array of one of the shapes, in range. Raise `InputError`, or `OutOfRangeError`
+    if only the numbers are wrong. If ``what`` is "direction", numbers may be negative."""
     array, parameter = as_numbers(f"{what} {name}", value), known[name]
     unit = f" in {parameter.unit}" if parameter.unit else ""
     if array.shape not in shapes:
@@ -271,10 +271,10 @@ def _check_range(name: str, array: np.ndarray, allowed: Range, what: str) -> Non
 
 
 def stacked(tables: Sequence[Arrays]) -> Arrays:
-    """Stack arrays of equal names along a first axis for the tables."""
+    """Stack the arrays of equal name in several tables along a new first axis."""
     return {name: np.stack([one[name] for one in tables]) for name in tables[0]}
 
 
 def entry(arrays: Arrays, number: int) -> Arrays:
-    """Return one entry of the first axis of each array."""
+    """Return one entry along the first axis of each array."""
     return {name: array[number] for name, array in arrays.items()}

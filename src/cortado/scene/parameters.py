@@ -1,9 +1,9 @@
-"""The one list of parameters: what each is called, its unit, shape and range, what it is in a scene, and what a
-meaningful change of it is. Without Warp.
+"""The registry of parameters: name, unit, shape, range, value in a scene, and typical change of each. Without Warp.
 
-Shapes on a device, checks of what users write, scales of the certificate and tables of the documents follow from it.
+Array shapes on a device, checks of user input, scales of the certificate and tables of the documents are derived from
+it.
 
-The quantities of particles are here too, by name, with their units and what they are.
+The quantities of particles are listed here, too, with names, units and meanings.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ from cortado.errors import InputError, shown
 
 
 class Axis(Enum):
-    """The kinds of entries that a parameter has values for: a single one, phases, steps or particles."""
+    """What the entries of a parameter belong to: phases, steps, particles, or nothing (a single entry)."""
 
     SCALAR = "one number"
     PHASE = "each phase"
@@ -39,7 +39,7 @@ class Role(Enum):
 
 
 class Range(Enum):
-    """The range of numbers that a parameter may have."""
+    """The range of valid numbers of a parameter."""
 
     ANY = "any"
     POSITIVE = "greater than 0"
@@ -48,7 +48,7 @@ class Range(Enum):
 
 
 class Source(Protocol):
-    """A simulation as the registry sees it: a scene, cut into particles."""
+    """A simulation as the registry needs it: a scene, discretised into particles."""
 
     scene: Any
     positions: NDArray
@@ -57,7 +57,7 @@ class Source(Protocol):
 
 
 class Changing(Protocol):
-    """The course of a parameter while a scene runs, at times (n,) [s]."""
+    """The course of a parameter during a run, at times (n,) [s]."""
 
     def at(self, times: NDArray) -> NDArray:
         """Return numbers (n,) or (n, components) at times (n,) [s]."""
@@ -67,57 +67,57 @@ class Changing(Protocol):
 
 
 Limit = Callable[[Any, Mapping[str, Any]], float]
-"""A time step [s] of a scene, with values of parameters that replace the scene's; there may be none of these."""
+"""A time step [s] of a scene, given values of parameters that replace the scene's (possibly none)."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """An input of a run, or of its loss, with its unit, shape and range: an entry of the registry."""
+    """An input of a run, or of its loss, with its unit, shape and range: one entry of the registry."""
 
     name: str
     unit: str
-    """In SI; empty for a plain number."""
+    """SI unit; empty for a plain number."""
     meaning: str
-    """In words, for the documents."""
+    """Meaning in words, for the documents."""
     axis: Axis
     value: Callable[[Source], Any]
-    """Returns its value in a scene that has it."""
+    """Returns the value in a scene that has the parameter."""
     components: Callable[[int, int], int] | None = None
-    """Returns the number of components of a vector, for a number of dimensions and of phases; None for a number."""
+    """Returns the number of components of a vector, from the numbers of dimensions and phases; None for a number."""
     role: Role = Role.RUN
     range: Range = Range.ANY
     change: Callable[[Source, NDArray], Any] = lambda source, value: np.abs(value)
-    """Returns a large change for an optimiser, at a value: by default the value itself."""
+    """Returns a typical large change for an optimiser, at a value; the default is the value itself."""
     acts: Callable[[Source, Mapping[str, NDArray]], bool] = lambda source, values: True
-    """Tells whether it can make a difference in a scene, with values of parameters by name."""
+    """Returns whether the parameter can have any effect in a scene, with values of parameters by name."""
     present: Callable[[Any], bool] = lambda scene: True
-    """Tells whether a scene has it."""
+    """Returns whether a scene has the parameter."""
     absent: str = ""
-    """Words about a scene that does not have it: "has only one phase"."""
+    """Words about a scene without the parameter, such as "has only one phase"."""
     force: str | None = None
-    """The module whose ``force`` makes the force that reads it, in scenes that have it: see `cortado.sph.parts`."""
+    """Module whose ``force`` builds the force that uses the parameter, in scenes with it: see `cortado.sph.parts`."""
     is_optional: bool = False
-    """True for a key of [forces] that scenes may leave out, and its force with it."""
+    """True for a key of [forces] that scenes may leave out; its force is then left out, too."""
     longest_step: Limit = lambda scene, values: inf
     """The longest time step at which an optional force is likely to be stable."""
     moment: float = 0.5
-    """Moment within a step for which a schedule's row of a parameter over time is taken; 0 is the start, 1 the end."""
+    """Time within a step, from 0 (start) to 1 (end), at which a schedule is evaluated for the step's row."""
     grows: bool = False
-    """True for one over time that is 0 where a run begins, so that a steady change of it grows."""
+    """True for a parameter over time that is 0 at the start of a run, so that a steady change of it grows."""
     in_place_of: str | None = None
-    """Name of the parameter in whose place this one is another way to write it."""
+    """Name of the parameter that this one replaces when it is given."""
     course: Changing | None = None
-    """Course of a parameter over time of a user's force, where it is not given."""
+    """Default course over time, for a parameter of a user-defined force."""
     shape: tuple[int, ...] = ()
-    """Shape of an array."""
+    """Shape of a parameter that is an array."""
 
     @property
     def rank(self) -> int:
-        """Return the number of axes that the value has for one step, one phase or one particle: 1 of a vector."""
+        """Return the number of axes of the value for one step, phase or particle: 1 for a vector."""
         return 0 if self.components is None else 1
 
     def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
-        """Return the shapes that the parameter's values may have, () for a number, where positions are (n, d)."""
+        """Return the shapes that a value may have, () for a number; positions have shape (n, d)."""
         if self.axis is Axis.ARRAY:
             return [self.shape]
         particles, dimension = positions
@@ -160,9 +160,9 @@ def _of_phases(name: str) -> Callable[[Source], list[Any]]:
 
 
 def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
-    """Return C sqrt(rho s^3 / sigma), the longest time step with surface tension, of the lightest phase, with the
-    spacing s (Brackbill et al. 1992). C is 0.08, as with PCISPH drops in space need many more iterations from 0.1 on;
-    by curvature, 0.2."""
+    """Return C sqrt(rho s^3 / sigma) for the lightest phase and the spacing s, the longest time step with surface
+    tension (Brackbill et al. 1992). C is 0.08, because from 0.1 on PCISPH needs many more iterations for drops in
+    space; for the curvature form C is 0.2."""
     tension = float(values.get("surface_tension", scene.forces.surface_tension))
     density = float(np.min(values.get("rest_density", [phase.rest_density for phase in scene.phase])))
     part = 0.08 if scene.solver.kind == "pcisph" else 0.2
@@ -172,8 +172,8 @@ def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
 def _optional(
     name: str, unit: str, meaning: str, force: str, longest_step: Limit = lambda scene, values: inf
 ) -> Parameter:
-    """Make the parameter of a number of at least 0 in the table [forces] of a scene, which switches a force on.
-    ``force`` is the module that makes it, ``longest_step`` the largest time step at which it is likely to be stable."""
+    """Build the parameter of a number >= 0 in the table [forces] of a scene, which switches a force on. ``force`` is
+    the module that builds the force, ``longest_step`` the longest time step at which it is likely to be stable."""
     return Parameter(
         name,
         unit,
@@ -313,18 +313,18 @@ BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 
 
 def names(role: Role | None = None, axis: Axis | None = None) -> tuple[str, ...]:
-    """Return the names of parameters of a role and with an axis, of any where none is given, in the list's order."""
+    """Return the names of parameters with a role and an axis, or with any if not given, in the list's order."""
     return tuple(p.name for p in PARAMETERS if role in (None, p.role) and axis in (None, p.axis))
 
 
 def offered(scene: Any) -> tuple[str, ...]:
-    """Return the names of parameters that a scene has, without mass fractions where there is one phase."""
+    """Return the names of the parameters of a scene, without mass fractions if it has one phase."""
     one_phase = {"mass_fractions"} if len(scene.phase) == 1 else set()
     return tuple(p.name for p in PARAMETERS if p.present(scene) and p.name not in one_phase)
 
 
 class Kind(Enum):
-    """The numbers that a quantity has for each particle."""
+    """The shape of a quantity at one particle."""
 
     NUMBER = "a number"
     VECTOR = "a vector"
@@ -333,16 +333,16 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity of each particle that follows from a state and the parameters of the step after it."""
+    """A quantity of each particle, computed from a state and the parameters of the step after it."""
 
     name: str
     unit: str
     meaning: str
-    """One sentence."""
+    """Meaning, one sentence."""
     kind: Kind = Kind.NUMBER
 
     def shape(self, particles: int, dimension: int) -> tuple[int, ...]:
-        """Return the shape of its values for a number of particles and dimensions."""
+        """Return the shape of the quantity's values for a number of particles and dimensions."""
         is_vector = self.kind is Kind.VECTOR or (self.kind is Kind.TURNING and dimension == 3)
         return (particles, dimension) if is_vector else (particles,)
 
@@ -362,8 +362,8 @@ NAMES = tuple(QUANTITIES)
 
 
 def sizes(name: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Return sizes (..., n) of the values of a quantity or, of one frame, of a field: numbers, or lengths of vectors
-    (..., n, k)."""
+    """Return sizes (..., n) of the values of a quantity, or of one frame of a state field: absolute values of numbers,
+    or lengths of vectors (..., n, k)."""
     known = QUANTITIES.get(name)
     is_vector = values.ndim == 2 if known is None else len(known.shape(1, dimension)) == 2
     return np.linalg.norm(values, axis=-1) if is_vector else values
@@ -374,24 +374,23 @@ LOAD = ".load"
 
 
 def load_name(solid: str) -> str:
-    """Return the name of force [N] and torque [N m] of the fluid on a solid, in the plane [N/m] and [N], one behind the
-    other."""
+    """Return the name of the load of the fluid on a solid: force [N], then torque [N m]; in the plane [N/m] and [N]."""
     return f"{solid}{LOAD}"
 
 
 def is_load(name: object) -> bool:
-    """Test whether a name is that of a load; its computation says whether there is such a solid."""
+    """Test whether a name has the form of a load's; whether such a solid exists is checked when it is computed."""
     return isinstance(name, str) and name.endswith(LOAD)
 
 
 def check_readable(name: object, what: str, fields: tuple[str, ...]) -> str:
-    """Return a name of a quantity, of one of the ``fields`` of a state, or of a load on a solid; raise `InputError` for
-    any other."""
+    """Return the name if it is that of a quantity, of one of the ``fields`` of a state, or of a load on a solid;
+    otherwise raise `InputError`."""
     return str(name) if is_load(name) else check_quantity(name, what, fields)
 
 
 def check_quantity(name: object, what: str = "quantity", others: tuple[str, ...] = ()) -> str:
-    """Return a name of a quantity, or one of ``others``; raise `InputError` for any other."""
+    """Return the name if it is that of a quantity or one of ``others``; otherwise raise `InputError`."""
     if not isinstance(name, str) or name not in (*others, *NAMES):
         raise InputError(f"{what} is {shown(name)}, but must be one of {', '.join((*others, *NAMES))}.")
     return name

@@ -1,9 +1,9 @@
-"""Points from files: NumPy arrays and what VTK reads.
+"""Points from files: NumPy arrays, and the formats that VTK reads.
 
-VTK and HDF5 trust what a file says of itself: a damaged one may make them print pages, wait, take all memory or end
-the process. So they read in a process of its own, ``python -m cortado.scene.point_files FILE``, which has limits, and
-whose messages nobody sees. It writes the points (n, 3) or (n, 2) in NumPy's own format to its standard output, or, with
-exit code `REFUSED`, why there are none.
+VTK and HDF5 trust the contents of a file: a damaged file may make them print pages, wait, use all memory or end the
+process. So a process of its own, ``python -m cortado.scene.point_files FILE``, reads such files within limits, and its
+messages are discarded. It writes the points (n, 3) or (n, 2) in NumPy's format to standard output. If it refuses the
+file, it writes the reason and exits with the code `REFUSED`.
 """
 
 import io
@@ -25,14 +25,14 @@ from cortado.errors import InputError, Words, shown
 from cortado.files.disk import reason, regular_file
 
 MOST_POINTS = 10_000_000
-"""Most points of a file."""
+"""Largest number of points in a file."""
 REFUSED = 3
 ROOM = 2**30
-"""Memory that any file may take [byte]; a large file may take more."""
+"""Memory allowed for any file [byte]; large files are allowed more."""
 
 
 class Refused(Exception):
-    """The reason why a file with points cannot be used, a clause."""
+    """The reason why a file with points cannot be used, as a clause."""
 
 
 def _poly_data(path: str) -> Any:
@@ -65,7 +65,7 @@ def _read_by_vtk(reader: Any, path: str) -> Any:
 
 
 def _hdf5(path: str) -> Any:
-    """Read the points of the first step, of all its parts; of a trajectory of Cortado's only if its checksums hold."""
+    """Read the points of all parts of the first time step; a file that Cortado wrote must have valid checksums."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -102,7 +102,7 @@ def _trajectory(path: str) -> Any:
 
 
 READERS: dict[str, Callable[[str], Any]] = {".vtk": _legacy, ".vtp": _poly_data, ".vtkhdf": _hdf5}
-"""Readers by the end of a file's name."""
+"""Readers by file name suffix."""
 
 
 def _check_count(count: int) -> None:
@@ -111,7 +111,7 @@ def _check_count(count: int) -> None:
 
 
 def _limit_memory(size: int) -> None:
-    """Limit the process's memory for a file of a size [byte]: VTK's data are several times as large, plus an array."""
+    """Limit the process's memory for a file of a size [byte]: several times the file's size for VTK, plus an array."""
     try:
         import resource
     except ImportError:  # on Windows
@@ -142,13 +142,13 @@ def main(path: str) -> int:
 
 SUFFIXES = (".npy", *READERS)
 MOST_POINT_BYTES = 2**30
-"""Most bytes of a file of points."""
+"""Largest size of a file of points [byte]."""
 SECONDS, BYTES_PER_SECOND = 15.0, 5e6
-"""How long a file may take to be read at most: this long, and its size over this pace."""
+"""Time limit for reading a file [s]: the first number, plus the file's size over the second [byte/s]."""
 
 
 def read_points(path: str, dimension: int) -> Points:
-    """Read points (n, d) [m] from a file, not to be written to. Raises `InputError`, a sentence that names the file."""
+    """Read points (n, d) [m] from a file, read-only. Raises `InputError`, a sentence that names the file."""
     if Path(path).suffix not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}.")
     try:
@@ -160,7 +160,7 @@ def read_points(path: str, dimension: int) -> Points:
 
 @lru_cache(maxsize=4)
 def _read(path: str, dimension: int, changed: int, size: int) -> Points:
-    """Read a file, once for each version of it, which its time of change and its size identify."""
+    """Read each version of a file, identified by its time of change and its size, only once."""
     array = _read_npy(path, size, dimension) if Path(path).suffix == ".npy" else _read_apart(path, size)
     if array.ndim == 2 and array.shape[1] == 3 and dimension == 2 and Path(path).suffix in READERS:
         array = array[:, :2]  # VTK knows no plane
@@ -180,7 +180,7 @@ def _check_form(path: str, shape: tuple[int, ...], dtype: np.dtype[Any], dimensi
 
 
 def _read_npy(path: str, size: int, dimension: int) -> Any:
-    """Read the array of a NumPy file, whose header is first compared with the size of the file."""
+    """Read the array of a NumPy file, after a check that its header agrees with the size of the file."""
     headers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     try:
         with open(path, "rb") as file, warnings.catch_warnings():
@@ -199,7 +199,7 @@ def _read_npy(path: str, size: int, dimension: int) -> Any:
 
 
 def _read_apart(path: str, size: int) -> Any:
-    """Return the points of a file that another process reads: see `cortado.scene.point_files`."""
+    """Return the points of a file, read by another process: see `cortado.scene.point_files`."""
     limit = SECONDS + size / BYTES_PER_SECOND
     command = [sys.executable, "-P", "-m", "cortado.scene.point_files", path]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # each would reserve memory

@@ -1,4 +1,4 @@
-"""States from which a run goes on where another one stopped, bit for bit, and when they are."""
+"""States from which a later run continues an earlier one bit for bit, and the times of these states."""
 
 import json
 from collections.abc import Mapping
@@ -14,18 +14,18 @@ from cortado.errors import InputError, shown
 
 @dataclass(frozen=True)
 class Clock:
-    """The time of a state, counted from the first state of the first run; by default that is the state itself."""
+    """Time of a state, counted from the first state of the first run; by default the state is that first state."""
 
     steps: int = 0
-    """Steps taken."""
+    """Number of steps since the first state."""
     time: float = 0.0
-    """[s]"""
+    """Time since the first state [s]."""
     time_step: float = field(default=0.0, repr=False)
-    """Length of the step that led to the state, if it was chosen: the next one is hardly longer [s]; else 0."""
+    """Length of the step before the state, if steps are adaptive: it bounds the next step [s]; otherwise 0."""
 
     def times(self, steps: NDArray, time_step: float) -> NDArray:
-        """Return times (frames,) [s] after more steps of ``time_step`` [s]; for equal steps they are those of one run,
-        bit for bit."""
+        """Return times (frames,) [s] after more steps of ``time_step`` [s]. With equal steps these are, bit for bit,
+        the times of one uninterrupted run."""
         return (self.time - self.steps * time_step) + (self.steps + steps) * time_step
 
     def after(self, steps: int, time_step: float) -> "Clock":
@@ -35,15 +35,15 @@ class Clock:
 
 @dataclass(frozen=True)
 class RecordedClock(Clock):
-    """The clock of the first state of a run whose time steps were chosen, and recorded."""
+    """The clock of the first state of a run with adaptive, recorded time steps."""
 
     recorded: NDArray = field(default_factory=lambda: np.zeros(1), repr=False, compare=False)
-    """(steps + 1,) time of each state [s]; the states that the run did not come to have no meaning."""
+    """(steps + 1,) time of each state [s]; entries for states that the run did not reach have no meaning."""
     sizes: NDArray = field(default_factory=lambda: np.zeros(0), repr=False, compare=False)
-    """(steps,) [s]"""
+    """(steps,) length of each step [s]"""
 
     def times(self, steps: NDArray, time_step: float) -> NDArray:
-        """Return times (frames,) [s] after ``steps`` more steps, evenly within a step; ``time_step`` is not used."""
+        """Return times (frames,) [s] after ``steps`` more steps, interpolated within one; ``time_step`` is unused."""
         return np.interp(steps, np.arange(len(self.recorded)), self.recorded)
 
     def after(self, steps: int, time_step: float) -> Clock:
@@ -55,8 +55,8 @@ class RecordedClock(Clock):
 
 @dataclass(frozen=True)
 class Origin:
-    """The particles of a state, with all that is equal in every run that goes on from it. Forces, walls and the length
-    of a step may be others there, as they may change within a run."""
+    """The properties of a state's particles that every run continuing from it must share. Forces, walls and the length
+    of a step may differ, because they may change within a run, too."""
 
     spacing: float
     """[m]"""
@@ -65,16 +65,16 @@ class Origin:
     kernel: str
     """Name of the smoothing kernel."""
     periods: tuple[float, ...]
-    """(d,) lengths [m], 0 along an axis that is not periodic."""
+    """(d,) lengths of the periods [m], 0 along an axis that is not periodic."""
     waiting: tuple[int, ...]
-    """Number of particles, the last ones, of each emitter."""
+    """Number of particles of each emitter; these are the last particles."""
     rest_density: tuple[float, ...]
-    """(phases,) that the run had [kg/m3]."""
+    """(phases,) rest densities of the run [kg/m3]."""
     solver: str | None = None
-    """Name in messages of the solver whose own fields the state has; None for a state without such fields."""
+    """Name, in messages, of the solver whose own fields the state has; None if there are no such fields."""
 
     def to_json(self) -> str:
-        """Write the origin as a text, to be read by `from_json`."""
+        """Return the origin as a text that `from_json` can read."""
         return json.dumps(asdict(self))
 
     @classmethod
@@ -87,17 +87,17 @@ class Origin:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RestartState(ShortRepr):
-    """The state at the end of a step, whole: `Trajectory.last_state` gives it and `Simulation.run` takes it."""
+    """The complete state at the end of a step: `Trajectory.last_state` returns it, `Simulation.run` accepts it."""
 
     fields: Mapping[str, NDArray]
-    """By the names that the solver declares: positions [m] and velocities [m/s], (n, d); mass_fractions (n, phases);
-    reference_density (n,), the mass of a particle over its volume on the rest lattice [kg/m3]; of each emitter
-    NAME.outlet (1, d), where its opening is [m], and NAME.emitted (1,), the length of fluid that has left it [m]; and
-    what else a solver carries from step to step, of which PCISPH has nothing."""
+    """Arrays by field name: positions [m] and velocities [m/s], (n, d); mass_fractions (n, phases); reference_density
+    (n,), each particle's mass divided by its volume on the rest lattice [kg/m3]. For each emitter NAME.outlet (1, d) is
+    the position of its opening [m], and NAME.emitted (1,) the length of fluid that has left it [m]. Solvers may add
+    fields that they carry from step to step; PCISPH adds no field."""
     clock: Clock = field(default_factory=Clock)
     """Time of the state."""
     origin: Origin | None = None
-    """Origin of its particles; None for a state that was made by hand, or that an earlier version wrote."""
+    """Origin of the particles; None for a state that a user built, or that an earlier version wrote."""
 
     def __getitem__(self, name: str) -> NDArray:
         """Return a field by name; raise `InputError` for one that the state does not have."""
@@ -106,7 +106,7 @@ class RestartState(ShortRepr):
         return self.fields[name]
 
     def fixed(self) -> "RestartState":
-        """Return this state in arrays of its own, which nobody can change."""
+        """Return this state with its own, read-only copies of the arrays."""
         own = {name: np.array(value) for name, value in self.fields.items()}
         for array in own.values():
             array.setflags(write=False)

@@ -1,7 +1,7 @@
-"""A scene as users write it, in a TOML file or in Python, checked and frozen; overrides such as
-``solver.time_step=0.002``; and the units of keys.
+"""A scene as users write it, in a TOML file or in Python, checked and frozen. Also overrides such as
+``solver.time_step=0.002``, and warnings about numbers that may be in another unit.
 
-Whatever is wrong raises a `SceneError`, one sentence.
+Any wrong value raises a `SceneError`, one sentence.
 """
 
 import json
@@ -30,15 +30,15 @@ from cortado.scene.stability import broken_limits, longest_step
 from cortado.scene.tables import sentences
 
 LIGHTEST = 50.0
-"""Rest density below which a scene warns [kg/m3]: liquid hydrogen has 71, mercury 13.5 g/cm3."""
+"""Rest density below which a scene warns [kg/m3]: liquid hydrogen has 71, and mercury in g/cm3 is 13.5."""
 THICKEST = 1e4
-"""Viscosity above which a scene warns [Pa s]: honey has 10."""
+"""Viscosity above which a scene warns [Pa s]; honey has 10."""
 HEAVIEST = {2: 3e5, 3: 3e6}
-"""By the dimension, the mass of fluid above which a scene warns [kg]: that of water 30 m x 10 m, and 10 m deep."""
+"""Mass of fluid above which a scene warns [kg], by dimension: the mass of water 30 m x 10 m, in space 10 m deep."""
 
 
 EMPTY = ("force", "solid", "hinge", "spring", "emitter", "drain")
-"""Lists of tables that do not count where there are none."""
+"""Lists of tables that are left out of `Scene.computed_json` if empty."""
 
 
 @public
@@ -46,8 +46,8 @@ class Scene(SceneTables):
     """A scene, from which a simulation starts.
 
     Its keys are those of a scene file. A table such as [discretisation] is a dict, and tables such as [[phase]] are a
-    list of dicts. What is missing or wrong is a `SceneError`, one sentence. A scene does not change: `replaced` makes
-    another one, with all checks, which pydantic's ``model_copy(update=...)`` leaves out.
+    list of dicts. A missing or wrong value raises a `SceneError`, one sentence. Scenes are immutable: `replaced`
+    returns another scene, with all checks. Pydantic's ``model_copy(update=...)`` would skip the checks.
 
     Example::
 
@@ -81,17 +81,17 @@ class Scene(SceneTables):
     def replaced(self, *overrides: str) -> "Scene":
         """Return this scene with other values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
 
-        The overrides are those of `load_scene`; a file that one names is looked for in the current folder. Raises
-        `SceneError` as `load_scene` does.
+        Overrides are written as for `load_scene`; a relative file name in an override starts at the current folder.
+        Raises `SceneError` as `load_scene` does.
         """
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
     def lasting(self, time: float | None = None, steps: int | None = None) -> "Scene":
-        """Return this scene with emitters that have a reserve for a time [s], or for ``steps`` steps.
+        """Return this scene with emitters that have enough fluid for a time [s], or for ``steps`` steps.
 
-        It is the scene as it is where emitters have a volume, or drains that feed them, and where columns suffice. So
-        it is where all axes are periodic, which leaves no place for a reserve. Raises `InputError` for more particles
-        than memory holds.
+        An emitter is unchanged if it has a volume, is fed by drains, or has a long enough column. If all axes are
+        periodic the scene is unchanged, because there is no place for a reserve. Raises `InputError` if the particles
+        would not fit into memory.
         """
         spacing = self.discretisation.spacing
         if steps is not None:
@@ -108,7 +108,7 @@ class Scene(SceneTables):
         return self.model_copy(update={"emitter": lasting})
 
     def going_on(self, state: RestartState) -> "Scene":
-        """Return this scene with emitters that have as many particles as the run of a state."""
+        """Return this scene with emitters that have as many particles as in the run that a state comes from."""
         origin, spacing, made = state.origin, self.discretisation.spacing, list(self.emitter)
         if origin is None or len(origin.waiting) != len(made):
             return self
@@ -118,14 +118,14 @@ class Scene(SceneTables):
         return self.model_copy(update={"emitter": tuple(made)})
 
     def to_json(self) -> str:
-        """Return the scene as JSON with all defaults but colours, which materials may have, to be read by
-        `from_json`."""
+        """Return the scene as JSON with all defaults, except colours that follow from materials; `from_json` reads
+        it."""
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """Return as JSON the part of the scene on which results depend. It has no [picture], [[sensor]] and materials.
-        It also leaves out what is empty of [[force]], [[solid]], [[hinge]], [[spring]], [[emitter]] and [[drain]], a
-        jitter of 0, keys of chosen time steps where they are fixed, and options of the projection that are off."""
+        """Return as JSON the part of the scene on which results depend: no [picture], [[sensor]] or materials. Also
+        left out: empty lists of [[force]], [[solid]], [[hinge]], [[spring]], [[emitter]] and [[drain]]; a jitter of 0;
+        keys of adaptive time steps if steps are fixed; and options of the projection that are off."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
         aside |= {name: True for name in EMPTY if not getattr(self, name)}
         aside |= {} if self.discretisation.jitter else {"discretisation": {"jitter"}}
@@ -139,7 +139,7 @@ class Scene(SceneTables):
 
     @classmethod
     def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
-        """Read the scene that `to_json` wrote, with replacements as for `load_scene`."""
+        """Read a scene that `to_json` wrote, with overrides as for `load_scene`."""
         if not isinstance(text, (str, bytes)):
             raise InputError(f"text is {shown(text)}, but must be the text that Scene.to_json gives.")
         try:
@@ -153,7 +153,7 @@ class Scene(SceneTables):
 
 
 def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
-    """Yield sentences about numbers that look as if they had another unit."""
+    """Yield sentences about numbers that look as if they were in another unit."""
     for phase in scene.phase:
         if phase.rest_density < LIGHTEST:
             found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
@@ -169,8 +169,8 @@ def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
 
 
 def _millimetres(scene: SceneTables) -> str | None:
-    """Return the sentence about fluid that weighs so much that its lengths may be in millimetres; None where it does
-    not, or where gravity is not the Earth's in metres."""
+    """Return the warning that the scene's lengths may be in millimetres, as its fluid is very heavy; None if the mass
+    is plausible, or if gravity is not the Earth's in metres."""
     densities, spacing = {phase.name: phase.rest_density for phase in scene.phase}, scene.discretisation.spacing
     cells = sum(fluid.count(spacing) * densities[fluid.phase] for fluid in scene.fluid)
     mass, strength = cells * spacing**scene.dimension, np.linalg.norm(scene.forces.gravity)
@@ -181,7 +181,7 @@ def _millimetres(scene: SceneTables) -> str | None:
 
 
 def _given(value: Any) -> Any:
-    """Return tables without entries that are left out, which JSON has as null."""
+    """Return tables without the entries that are left out (null in JSON)."""
     if isinstance(value, dict):
         return {name: _given(entry) for name, entry in value.items() if entry is not None}
     return [_given(entry) for entry in value] if isinstance(value, list) else value
@@ -192,11 +192,11 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
     """Read a scene from a TOML file.
 
     Args:
-        path: the file. Its tables [problem], [optimise] and [fit] belong to others and are ignored.
+        path: the file. Its tables [problem], [optimise] and [fit] are for other modules and are ignored.
         overrides: replacements such as ``solver.time_step=0.002`` or ``fluid[0].upper=[1,1,1]``.
 
     Raises:
-        SceneError: in one sentence, with the file, the field, what was found and what was wanted.
+        SceneError: in one sentence, with the file, the field, the value found and the values allowed.
 
     Example: ``scene = cortado.load_scene("dam.toml", ["solver.time_step=0.001"])``
     """
@@ -204,7 +204,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
 
 
 def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
-    """Return the scene itself, or the one in the file at a path; raise `InputError` for anything else."""
+    """Return the argument itself if it is a scene, or the scene in the file at a path; raise `InputError` otherwise."""
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, (str, os.PathLike)):
@@ -213,7 +213,7 @@ def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
 
 
 def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
-    """Make a scene from the contents of its file, whose folder is where its other files are looked for."""
+    """Build a scene from the contents of its file; other files are looked for in the scene file's folder."""
     if isinstance(data, Mapping):
         data = {key: value for key, value in data.items() if key not in OTHER_TABLES}
     folder = Path(file).parent if file else Path()
@@ -225,14 +225,14 @@ def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
 
 
 def files_named(tables: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """Return the tables, among those that `Scene.to_json` wrote, that name a file, each with the key that does."""
+    """Return, from what `Scene.to_json` wrote, the tables that name a file, each with the key of the file."""
     found = [*(tables.get("solid") or ()), *(tables.get("fluid") or ()), *(tables.get("schedule") or {}).values()]
     found += [one["path"] for one in tables.get("emitter") or ()]
     return [(table, key) for table in found if table for key in ("file", "path") if table.get(key)]
 
 
 def scene_in_words(scene: Scene, particles: int) -> str:
-    """Describe a scene of a number of particles in one sentence: its contents, its container, and its forces."""
+    """Describe a scene with this number of particles in one sentence: its contents, its container, and its forces."""
     phases = " and ".join(
         f"{phase.name} ({phase.rest_density:g} kg/m³, {phase.viscosity:g} Pa s)" for phase in scene.phase
     )
@@ -263,16 +263,16 @@ def _held(scene: Scene) -> str:
 
 
 MOST_BYTES = 1_000_000
-"""Most bytes of a file: TOML of that size, made to be as bad as it can, takes a few seconds and some hundred MB."""
+"""Largest size of a file [byte]: even the worst TOML of this size takes only a few seconds and some hundred MB."""
 MOST_PARTS = 10
-"""Most parts of a dotted key: the time and the memory that one takes grow with the square of their number."""
+"""Most parts of a dotted key: the time and memory to parse a key grow with the square of their number."""
 
 _ASIDE = re.compile(
     r'''#[^\n]*|"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5}|\Z)|"(?:[^"\\\n]|\\.)*+"?'''
     r"""|'{3}(?:[^']|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?""",
     re.DOTALL,
 )
-"""Finds comments and quoted texts, unfinished ones too."""
+"""Finds comments and quoted texts, including unfinished ones."""
 _TOO_DEEP = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_PARTS}}}[\w-]++")
 _TWICE = re.compile(r"Cannot declare \('(fluid|phase)',\) twice")
 _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
@@ -281,12 +281,12 @@ _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
 def read_toml(
     path: str | os.PathLike[str], overrides: Sequence[str] = (), unread: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Read a TOML file and return its contents with overrides put in, none of them of the tables that stay ``unread``.
+    """Read a TOML file and return its contents with overrides applied. Overrides of ``unread`` tables are refused.
     Raises `SceneError`.
 
     An override is ``key=value``: ``forces.gravity=[0,-5,0]``, ``fluid.0.upper=[1,1,1]`` or ``fluid[0].upper=[1,1,1]``;
-    an entry with a name may be called by it, ``phase.oil.viscosity=0.1``.
-    A value that is not TOML is taken as text.
+    an entry with a name may be addressed by its name, ``phase.oil.viscosity=0.1``. A value that is not TOML is taken as
+    text.
     """
     file = as_path("path", path)
     try:
@@ -310,7 +310,7 @@ def read_toml(
 
 
 def overrides_of(overrides: Sequence[str], tables: Sequence[str]) -> list[str]:
-    """Return the overrides, among some, that replace something in tables."""
+    """Return those overrides that replace something in the given tables."""
     return [one for one in overrides if isinstance(one, str) and _table_of(one) in tables]
 
 
@@ -319,7 +319,7 @@ def _table_of(override: str) -> str:
 
 
 def _beside(file: str) -> str | None:
-    """Return the scene file in the same folder whose name is nearly that of one that is not there."""
+    """Return a scene file in the same folder whose name nearly equals that of a missing file."""
     folder, name = os.path.split(file)
     try:
         names = [one for one in os.listdir(folder or ".") if one.endswith(".toml")]
@@ -330,8 +330,7 @@ def _beside(file: str) -> str | None:
 
 
 def put_in(data: dict[str, Any], overrides: Sequence[str], file: str, unread: Sequence[str] = ()) -> dict[str, Any]:
-    """Put overrides into the contents of a file, none of them of the tables that stay ``unread``; raise
-    `SceneError`."""
+    """Apply overrides to the contents of a file; raise `SceneError`, also for overrides of ``unread`` tables."""
     if isinstance(overrides, str):
         sentence = f"must be in a list, as [{shown(overrides)}], as there may be several overrides."
         raise SceneError(file, shown(overrides), sentence=sentence)
@@ -353,7 +352,7 @@ def _unreadable(file: str, sentence: str) -> SceneError:
 
 
 def _require_shallow(text: str, file: str) -> None:
-    """Raise `SceneError` for a key of very many parts, wherever it stands, before anything is made of it."""
+    """Raise `SceneError` for a dotted key with very many parts, anywhere in the text, before the text is parsed."""
     plain = _ASIDE.sub(lambda found: "" if found[0].startswith("#") else "text", text)
     deep = _TOO_DEEP.search(plain)
     if deep:
@@ -365,7 +364,7 @@ def _too_deep(file: str, key: str) -> SceneError:
 
 
 def _apply(data: dict[str, Any], override: str, file: str) -> None:
-    """Put one override into the contents of a file."""
+    """Apply one override to the contents of a file."""
     if len(override) > MOST_BYTES:
         sentence = f"is the beginning of {len(override)} characters, but an override must have at most {MOST_BYTES}."
         raise SceneError(file, shown(override), sentence=sentence)
@@ -408,7 +407,7 @@ def _entry(tables: list[Any], part: str) -> int | None:
 
 
 def _entries(tables: list[Any]) -> str:
-    """Say in words how entries of a list are addressed."""
+    """Explain in words how entries of a list are addressed."""
     if not tables:
         return "left out, as the list is empty"
     names = _names(tables)
@@ -417,7 +416,7 @@ def _entries(tables: list[Any]) -> str:
 
 
 def _names(tables: list[Any]) -> list[str]:
-    """Return the names of entries that have one, or the kinds of forces that have no other name."""
+    """Return the names of entries; a force without a name is named by its kind."""
     found = (table.get("name", table.get("kind")) for table in tables if isinstance(table, dict))
     return [str(name) for name in found if name is not None]
 

@@ -1,4 +1,4 @@
-"""Warnings about scenes that may not do what is meant: keys that change nothing, and physics that is off."""
+"""Warnings about scenes that may not do what the user means: keys without effect, and inaccurate physics."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -29,7 +29,7 @@ OF_SPACE = ("surface", "field_of_view", "transparency", "floor")
 
 
 def given(table: Table, *names: str) -> Iterator[str]:
-    """Yield the names, among some, of the fields of a table that have other values than their defaults."""
+    """Yield those of the names whose fields in a table differ from their defaults."""
     for name in names:
         field = type(table).model_fields.get(name)
         if field is not None and getattr(table, name) != field.default:
@@ -37,21 +37,21 @@ def given(table: Table, *names: str) -> Iterator[str]:
 
 
 def check_idle(scene: SceneTables) -> None:
-    """Raise a `field_error` for the first key that belongs to a choice that was not made."""
+    """Raise a `field_error` for the first key that has no effect because of the choice made in another key."""
     for path, table, names, reason in _idle(scene):
         for name in given(table, *names):
             raise field_error((*path, name), getattr(table, name), f"left out, as {reason}")
 
 
 def idle_sentences(scene: SceneTables) -> Iterator[str]:
-    """Yield sentences about keys that a number of 0 turns off."""
+    """Yield sentences about keys that have no effect because another number is 0."""
     for path, table, names, reason in _turned_off(scene):
         for name in given(table, *names):
             yield f"{field_name((*path, name))} changes nothing, as {reason}."
 
 
 Idle = tuple[FieldPath, Table, tuple[str, ...], str]
-"""A table by its path, those of its keys that change nothing, and why."""
+"""A table's path, the table, those of its keys that have no effect, and the reason."""
 
 
 def _idle(scene: SceneTables) -> Iterator[Idle]:
@@ -123,11 +123,11 @@ def _turned_off(scene: SceneTables) -> Iterator[Idle]:
 
 
 def creep_sentence(scene: SceneTables) -> str | None:
-    """Return a sentence on creeping fluid with a yield stress; None without one, or without fluid at the start.
+    """Return a sentence about creeping fluid with a yield stress; None without one, or without fluid at the start.
 
-    A film of depth H whose stress at the wall is a part r <= 1 of the yield stress has at its surface the speed (H / m)
-    (1 + (1 - r) ln(1 - r) / r). The shear rate at each height is -ln(1 - stress / yield stress) / m. The speed is at
-    most H / m, with the ``regularisation`` m.
+    Consider a film of depth H whose wall stress is a fraction r <= 1 of the yield stress. The surface speed is (H / m)
+    (1 + (1 - r) ln(1 - r) / r), with the ``regularisation`` m. The shear rate at each height is -ln(1 - stress / yield
+    stress) / m. The speed is at most H / m.
     """
     phase, law = scene.phase[0], scene.phase[0].rheology
     if not isinstance(law, Yielding) or law.yield_stress == 0.0 or not scene.fluid:
@@ -143,26 +143,26 @@ def creep_sentence(scene: SceneTables) -> str | None:
 
 
 FAULT = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear"
-"""The fault of the pairwise viscosity, as measured in waves of shear (`docs/records/validation_viscosity.md`)."""
+"""The error of the pairwise viscosity, as measured in shear waves (`docs/records/validation_viscosity.md`)."""
 
 
 def viscosity_sentence(scene: SceneTables, where: str) -> str | None:
-    """Return the sentence about a scene with the inaccurate form of viscosity, ``where`` it matters; None of others."""
+    """Return a sentence about the inaccurate viscosity form, ``where`` it matters; None for other forms."""
     if scene.forces.viscosity != "pairwise":
         return None
     return f'{where} and forces.viscosity is "pairwise", {FAULT}: viscosity = "stress" has it within 1 %.'
 
 
 THROUGH = 1.5
-"""In spacings: how far a solid reaches through a wall at least for fluid to rest in the corner between them. Water 15
-deep moves with 0.13 m/s beside one that ends on the floor, with 0.10 if it goes on for 0.5 spacings, and with 0.05 for
-1 to 5."""
+"""In spacings: how far a solid must extend through a wall for fluid in the corner between them to rest. Water 15 deep
+moves at 0.13 m/s beside a solid that ends on the floor; at 0.10 if it extends by 0.5 spacings, and at 0.05 if by 1 to
+5."""
 FACING = 0.9
-"""The part along an axis of the normal of a face that counts as one across it."""
+"""Least component of a face's normal along an axis at which the face counts as perpendicular to the axis."""
 
 
 def standing_sentences(scene: SceneTables) -> Iterator[str]:
-    """Yield a sentence on each flat wall of the container that a solid moves along and ends on."""
+    """Yield a sentence for each flat wall of the container on which a solid ends and along which it moves."""
     box = scene.container
     if not isinstance(box, BoxContainer):
         return
@@ -185,7 +185,7 @@ def standing_sentences(scene: SceneTables) -> Iterator[str]:
 
 
 def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
-    """Test whether a path does not turn a solid, and keeps its middle as far from a wall across an axis."""
+    """Test whether a path does not rotate a solid and keeps its distance from a wall across an axis."""
     shifts, turns = courses(table)
     if turns.greatest() > 0.0:
         return False
@@ -195,19 +195,19 @@ def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
 
 
 ONE_LAYER, TWO_LAYERS = 1.1, 1.5
-"""In spacings: how thick walls are at least that hold fluid, where they have one layer of particles, and two as fluid
-sees further than two spacings. Water 25 to 120 spacings deep, at rest, on a shelf or in a cup, went through those of
-0.75, in space 1.0, and of 1.0 to 1.25. It did so within 10 to 90 steps, with either solver and steps however short."""
+"""In spacings: least thickness of walls that hold fluid, with one layer of wall particles, and with two (supports
+beyond two spacings). Water at rest 25 to 120 spacings deep, on shelves or in cups, leaked through 0.75 (in space 1.0),
+and with two layers through 1.0 to 1.25. It took 10 to 90 steps, with either solver, however short."""
 DEPTHS = np.arange(1, 9) / 8.0
-"""Parts of that thickness: beneath the surface there is to be no room for fluid so deep."""
+"""Fractions of that thickness: the solid must reach at least so deep below its surface."""
 MARGIN = 1e-3
-"""Part of that thickness by which a wall may be thinner."""
+"""Fraction of that thickness by which a wall may be too thin."""
 SHARE = 0.01
-"""Part of the surface that may be too thin without a word."""
+"""Fraction of the surface that may be too thin without a warning."""
 
 
 def thin_sentences(scene: SceneTables) -> Iterator[str]:
-    """Yield a sentence on each solid that has fluid on both sides where it is too thin to hold any."""
+    """Yield a sentence for each solid with fluid on both sides that is too thin to hold it back."""
     cut = scene.discretisation
     spacing, least = cut.spacing, (ONE_LAYER if cut.support <= 2.0 else TWO_LAYERS) * cut.spacing
     for table in thick(scene.solid) if scene.forces.pressure else ():

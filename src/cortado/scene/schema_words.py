@@ -1,5 +1,5 @@
-"""Words from the JSON schema of the tables of files: what a value must be, the units of keys, and the help of a table,
-which lists its keys."""
+"""Words from the JSON schema of files' tables: descriptions of valid values, units of keys, and help of tables, which
+lists their keys."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,12 +19,12 @@ else:
     ModelMetaclass = type(BaseModel)
 
 GREATEST = 1e50
-"""No number of a scene is larger, as its cube must fit into a float64, and no positive one smaller than its inverse."""
+"""Largest number in a scene, so that its cube fits into a float64. No positive number is smaller than the inverse."""
 Schema = Mapping[str, Any]
 
 
 def wanted(schema: Schema, name: str = "") -> str:
-    """Describe a right value in words, from its part of a JSON schema; ``name`` is that of its field."""
+    """Describe a valid value in words, from its part of a JSON schema; ``name`` is that of its field."""
     match schema:
         case {"enum": names}:
             return any_of(names)
@@ -72,8 +72,8 @@ def _limits(schema: Schema) -> str:
 
 
 def unit_of(key: str) -> str:
-    """Return the unit of the value of a scene with a dotted key, such as "Pa s" of ``phase.0.viscosity``; nothing where
-    it has none, or where shapes of a body have different ones."""
+    """Return the unit of a scene's value with a dotted key, such as "Pa s" for ``phase.0.viscosity``. Return an empty
+    text for a value without unit, or if shapes of a body give the key different units."""
     found = list(_choices(_schema()))
     for part in key.split("."):
         found = [choice for one in found for choice in _choices(_part(one, part))]
@@ -83,19 +83,19 @@ def unit_of(key: str) -> str:
 
 @cache
 def _schema() -> Schema:
-    """Read the shipped JSON schema, which `Scene` is compared with in the tests."""
+    """Read the JSON schema that Cortado ships; tests compare it with `Scene`."""
     read: Schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
     return read
 
 
 def _part(schema: Schema, part: str) -> Schema:
-    """Return the schema of an entry of a list, by its number, or of a table's field."""
+    """Return the schema of a list's entry, given its index, or of a table's field, given its name."""
     found: Schema = schema.get("items", {}) if part.isdigit() else schema.get("properties", {}).get(part, {})
     return found
 
 
 def _choices(schema: Schema) -> Iterator[Schema]:
-    """Yield a schema, and those of which it has one or all."""
+    """Yield a schema, and the schemas that it combines or chooses among."""
     yield schema
     if "$ref" in schema:
         yield from _choices(_schema()["$defs"][schema["$ref"].rpartition("/")[2]])
@@ -105,12 +105,12 @@ def _choices(schema: Schema) -> Iterator[Schema]:
 
 
 _HOMES: dict[str, str] = {}
-"""The module of each table, by its name."""
+"""The module of each table, by the table's name."""
 
 
 class Documented(ModelMetaclass):
-    """The class of tables, whose help has their keys, without the types that pydantic needs, and a line for each from
-    the shipped schema."""
+    """The metaclass of tables. It gives their help a line for each key from the shipped schema, without the types that
+    only pydantic needs."""
 
     def __init__(cls, name: str, *arguments: Any, **named: Any):
         super().__init__(name, *arguments, **named)
@@ -118,7 +118,7 @@ class Documented(ModelMetaclass):
 
     @property
     def __doc__(cls) -> str | None:  # type: ignore[override]
-        """Return the docstring of a table, with its keys."""
+        """Return the docstring of a table, followed by its keys."""
         own: str | None = cls.__dict__.get("__doc__")
         schema = _schema() if cls.__name__ == "Scene" else _schema()["$defs"].get(cls.__name__, {})
         known, needed = cls.__dict__.get("__pydantic_fields__", {}), schema.get("required", ())
@@ -127,7 +127,7 @@ class Documented(ModelMetaclass):
 
     @property
     def __signature__(cls) -> Signature:
-        """Return the keys with their defaults; a table that is left out is an empty one."""
+        """Return the keys with their defaults; a table that may be left out has an empty one as default."""
         found = []
         for name, field in vars(cls)["__pydantic_fields__"].items():
             default = Parameter.empty if field.is_required() else field.get_default(call_default_factory=True)
@@ -137,11 +137,11 @@ class Documented(ModelMetaclass):
 
     @__signature__.setter
     def __signature__(cls, value: Any) -> None:
-        """Leave out pydantic's, with annotations."""
+        """Leave out pydantic's own signature, which has annotations."""
 
 
 def _line(key: str, schema: Schema, is_needed: bool) -> str:
-    """Say in a line what a key is, what it is if left out, and what it means."""
+    """Describe a key in one line: its name, its default and its meaning."""
     given, *others = schema.get("anyOf", (schema,))
     words = [{"word": one["const"]} for one in others if "const" in one]
     what = _tables(given, "a table") or _tables(given.get("items", {}), "a list of tables")
@@ -153,7 +153,7 @@ def _line(key: str, schema: Schema, is_needed: bool) -> str:
 
 
 def _tables(schema: Schema, what: str) -> str:
-    """Name the tables that a key takes, with the module that they are in; nothing where it takes none."""
+    """Name the tables that a key accepts, with their module; return an empty text if it accepts no table."""
     names = [one["$ref"].rpartition("/")[2] for one in (schema, *schema.get("oneOf", ())) if "$ref" in one]
     there = [name for name in names if hasattr(modules.get(_HOMES.get(name, "")), name)]
     return f"{what}, {_HOMES[there[0]]}.{' or '.join(there)}" if there else what if names else ""

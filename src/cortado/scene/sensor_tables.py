@@ -1,4 +1,4 @@
-"""The tables of sensors, which read numbers of a run in every step."""
+"""The tables of sensors, which record numbers of a run in every step."""
 
 import unicodedata
 from typing import Annotated, Literal, Self
@@ -14,15 +14,15 @@ Axes = Literal["world", "body"]
 
 
 class SensorTable(Table):
-    """A sensor that reads numbers of the fluid in every step."""
+    """A sensor that records numbers of the fluid in every step."""
 
     name: Text
-    """Beginning of the names of its columns in sensors.csv."""
+    """Name with which the names of its columns in sensors.csv begin."""
 
     @field_validator("name")
     @classmethod
     def _check_name(cls, name: str) -> str:
-        """Refuse a name that begins with a sign, wide ones too, by which a spreadsheet would run a formula."""
+        """Refuse a name that begins with a sign, also a full-width one: a spreadsheet would take it for a formula."""
         plain = unicodedata.normalize("NFKC", name).strip()
         if plain[:1] in tuple("=+-@") or not name.isprintable():
             wanted = "one line of text that begins with none of = + - @, as it heads a column of a table"
@@ -38,46 +38,46 @@ class PressureProbeTable(SensorTable):
     """A sensor of the mean pressure of the particles around a point."""
 
     kind: Literal["pressure_probe"]
-    """Which sensor it is."""
+    """Kind of the sensor."""
     position: Vector[Length]
-    """(d,) the point [m]."""
+    """(d,) Position of the point [m]."""
     radius: Reach = None
-    """How far away particles count [m]; the support radius if left out."""
+    """Radius within which particles contribute [m]; the support radius if left out."""
     on: Text | None = None
-    """The name of a solid that moves, which carries the point from where it is as the scene begins."""
+    """Name of a moving solid that carries the point along, from its position at the start of the scene."""
 
 
 class WaveGaugeTable(SensorTable):
-    """A sensor of the height of the fluid's surface at a place: the level to which its volume in a column fills the
-    room that solids leave there."""
+    """A sensor of the height of the fluid's surface at a place. It is the level at which the fluid in a vertical column
+    would fill the space that solids leave free there."""
 
     kind: Literal["wave_gauge"]
-    """Which sensor it is."""
+    """Kind of the sensor."""
     position: Vector[Length]
-    """(d,) a point of the middle of the column [m]; its height does not matter."""
+    """(d,) A point on the axis of the column [m]; its height has no effect."""
     floor: Length = 0.0
-    """From where on the column is filled [m], against gravity: the bottom of the container as a rule."""
+    """Height at which the column begins [m], measured against gravity; usually the bottom of the container."""
     radius: Reach = None
     """Radius of the column [m]; two support radii, but at least five spacings, if left out."""
     on: Text | None = None
-    """The name of a solid that moves, which carries the column from where it is as the scene begins."""
+    """Name of a moving solid that carries the column along, from its position at the start of the scene."""
     axes: Axes = "world"
-    """Along which axes a column on a solid stands. "body": it turns with the solid, and its height is that in the
-    solid, as that begins. "world": it stands upright, and its height is that in the scene."""
+    """Axes of a column carried by a solid. "body": the column turns with the solid, and heights are those in the solid
+    at the start. "world": the column stays upright, and heights are those in the scene."""
 
 
 class FlowRateTable(SensorTable):
-    """A sensor of the volume of fluid that goes through a plane in a second."""
+    """A sensor of the volume of fluid that flows through a plane per second."""
 
     kind: Literal["flow_rate"]
-    """Which sensor it is."""
+    """Kind of the sensor."""
     position: Vector[Length]
-    """(d,) a point of the plane [m]."""
+    """(d,) A point of the plane [m]."""
     normal: Vector[Annotated[float, quantity()]]
-    """(d,) the direction in which the flow is positive."""
+    """(d,) Direction in which the flow counts as positive."""
     reach: Reach = None
-    """Half of the thickness of the layer that counts [m]; two support radii, but at least five spacings, if left
-    out."""
+    """Half the thickness of the layer of fluid that is measured [m]; if left out, two support radii, but at least five
+    spacings."""
 
     @field_validator("normal")
     @classmethod
@@ -88,21 +88,21 @@ class FlowRateTable(SensorTable):
 
 
 class WallForceTable(SensorTable):
-    """A sensor of the force, and its torque, with which the fluid in a region pushes the walls."""
+    """A sensor of the force, and its torque, that the fluid in a region exerts on the walls."""
 
     kind: Literal["wall_force"]
-    """Which sensor it is."""
+    """Kind of the sensor."""
     lower: Corner = None
-    """(d,) lower corner of the region [m]; without an end there if left out."""
+    """(d,) Lower corner of the region [m]; if left out, the region has no lower end."""
     upper: Corner = None
-    """(d,) upper corner of the region [m]; without an end there if left out."""
+    """(d,) Upper corner of the region [m]; if left out, the region has no upper end."""
     about: Corner = None
-    """(d,) the point of the torque [m]; the origin if left out."""
+    """(d,) Reference point of the torque [m]; the origin if left out."""
     on: Text | None = None
-    """The name of a solid that moves, which carries and turns the region and the point from where they are as the scene
-    begins."""
+    """Name of a moving solid that carries and turns the region and the reference point, from their positions at the
+    start of the scene."""
     axes: Axes = "world"
-    """The axes of force and torque of a region on a solid: "world", or "body", those that turn with the solid."""
+    """Axes of force and torque for a region on a solid: "world", or "body" for axes that turn with the solid."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -112,32 +112,32 @@ class WallForceTable(SensorTable):
 
 
 class SolidLoadTable(SensorTable):
-    """A sensor of the force of the fluid on a solid, and its torque about the solid's position."""
+    """A sensor of the fluid's force on a solid, and of its torque about the solid's position."""
 
     kind: Literal["solid_load"]
-    """Which sensor it is."""
+    """Kind of the sensor."""
     solid: Text
-    """The name of the solid."""
+    """Name of the solid."""
     axes: Axes = "world"
-    """The axes of force and torque: "world", or "body", those that turn with the solid."""
+    """Axes of force and torque: "world", or "body" for axes that turn with the solid."""
 
 
 class SpringForceTable(SensorTable):
-    """A sensor of the force with which a spring pulls, and of its length."""
+    """A sensor of the force with which a spring pulls, and of the spring's length."""
 
     kind: Literal["spring_force"]
-    """Which sensor it is."""
+    """Kind of the sensor."""
     spring: Text
-    """The name of the spring."""
+    """Name of the spring."""
 
 
 class BodyMotionTable(SensorTable):
-    """A sensor of where a free body is, how it is turned, and how fast it goes and turns."""
+    """A sensor of a free body's position, rotation, velocity and angular velocity."""
 
     kind: Literal["body_motion"]
-    """Which sensor it is."""
+    """Kind of the sensor."""
     solid: Text
-    """The name of the body."""
+    """Name of the body."""
 
 
 AnySensor = Annotated[

@@ -1,6 +1,5 @@
-"""The tables of shapes: those that solids and bodies of fluid may both have, and those of containers, each with its
-walls.
-"""
+"""The tables of shapes that both solids and bodies of fluid may have, and the tables of containers, with their
+walls."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -26,17 +25,17 @@ from cortado.scene.tables import Colour, FieldPath, Flag, Length, OneOf, Table, 
 
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 THIN = 2.5
-"""In spacings: sheets of meshes that are thicker are thick."""
+"""In spacings: parts of meshes thicker than this do not count as sheets."""
 
 
 def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:
-    """Check that every component of upper is greater than that of lower."""
+    """Check that each component of upper is greater than that of lower."""
     if len(lower) == len(upper) and any(b <= a for a, b in zip(lower, upper, strict=True)):
         raise field_error(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
 
 
 def _beside_scene(file: str, info: ValidationInfo) -> str:
-    """Return the absolute name of a file that a scene names, which is beside the scene's own."""
+    """Return the absolute path of a file named in a scene; relative paths start at the scene file's folder."""
     folder = Path((info.context or {}).get("folder", "."))
     try:
         return str((folder / file).absolute())
@@ -45,7 +44,7 @@ def _beside_scene(file: str, info: ValidationInfo) -> str:
 
 
 File = Annotated[Text, AfterValidator(_beside_scene)]
-"""The name of a file beside the scene's own."""
+"""The path of a file, relative to the scene file's folder."""
 
 
 class BoxShape(Table):
@@ -63,7 +62,7 @@ class BoxShape(Table):
         return self
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the box about its middle, not turned, and the middle (d,) [m]."""
+        """Return the box centred at the origin, unrotated, and its middle (d,) [m]."""
         return Box(0.5 * np.subtract(self.upper, self.lower)), 0.5 * np.add(self.lower, self.upper)
 
 
@@ -77,7 +76,7 @@ class SphereShape(Table):
     """From the middle to the surface [m]."""
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the sphere about its middle, and the middle (d,) [m]."""
+        """Return the sphere centred at the origin, and its middle (d,) [m]."""
         return Round(np.zeros(len(self.centre)), self.radius), np.array(self.centre)
 
 
@@ -85,16 +84,16 @@ class CylinderShape(Table):
     """A cylinder, in 3-D."""
 
     instead: ClassVar[str]
-    """Shapes that there are in 2-D, in words."""
+    """Words that name the corresponding shapes in 2-D."""
     shape: Literal["cylinder"] = "cylinder"
     base: Vector[Length]
-    """(3,) Middle of the bottom [m]."""
+    """(3,) Centre of the bottom [m]."""
     radius: Annotated[float, quantity("m", gt=0.0)]
-    """From the axis to the side [m]."""
+    """Distance from the axis to the side [m]."""
     height: Annotated[float, quantity("m", gt=0.0)]
-    """From the base, along the axis [m]."""
+    """Length along the axis, from the base [m]."""
     axis: Literal["x", "y", "z"] = "y"
-    """The axis of space along which it stands, before any rotation."""
+    """Axis of space along which the cylinder stands, before any rotation."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if dimension == 2:
@@ -102,7 +101,7 @@ class CylinderShape(Table):
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the cylinder about its middle, not turned, and the middle (3,) [m]."""
+        """Return the cylinder centred at the origin, unrotated, and its middle (3,) [m]."""
         along = INDEX_OF_AXIS[self.axis]
         middle = np.array(self.base) + 0.5 * self.height * np.eye(3)[along]
         return Revolved(Box(np.array([self.radius, 0.5 * self.height])), along), middle
@@ -115,7 +114,7 @@ class PolygonShape(Table):
     corners: Annotated[
         tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)], ...], Field(min_length=3)
     ]
-    """(m, 2) The corners, one after the other along the edge, either way round [m]."""
+    """(m, 2) The corners in order along the boundary, clockwise or counterclockwise [m]."""
 
     @model_validator(mode="after")
     def _check_sides(self) -> Self:
@@ -132,7 +131,7 @@ class PolygonShape(Table):
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the polygon about its centroid, and the centroid (2,) [m]."""
+        """Return the polygon with its centroid at the origin, and the centroid (2,) [m]."""
         corners = np.array(self.corners)
         middle = Polygon(corners).moments().centre
         return Polygon(corners - middle), middle
@@ -143,9 +142,9 @@ class MeshShape(Table):
 
     shape: Literal["mesh"] = "mesh"
     file: File
-    """Name of an STL, OBJ, PLY, glTF or GLB file. A relative one begins at the scene file."""
+    """Name of an STL, OBJ, PLY, glTF or GLB file. A relative path starts at the scene file's folder."""
     scale: Annotated[float, quantity(gt=0.0)] = 1.0
-    """Factor of its lengths, such as 0.001 where they are millimetres."""
+    """Factor by which lengths are multiplied, such as 0.001 for millimetres."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if dimension == 2:
@@ -153,30 +152,30 @@ class MeshShape(Table):
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the mesh about its centroid, and the centroid (3,) [m]."""
+        """Return the mesh with its centroid at the origin, and the centroid (3,) [m]."""
         return _about_middle(mesh_in_file(self.file), self.scale)
 
     def thinnest_sheet(self, spacing: float) -> float:
-        """Return the thickness of its thinnest sheet [m]; infinite where all are thicker than `THIN` spacings [m]."""
+        """Return the thickness of the thinnest sheet [m]; infinite if all are thicker than `THIN` spacings [m]."""
         return _thinnest_sheet(mesh_in_file(self.file), self.scale, THIN * spacing)
 
 
 @lru_cache(maxsize=8)
 def _about_middle(found: FoundMesh, scale: float) -> tuple[Mesh, Points]:
-    """Return a mesh times a scale, about its middle, and the middle (3,) [m]; kept, as looking it up takes a tree."""
+    """Return a mesh, scaled and centred at the origin, and its middle (3,) [m]; cached, because it needs a tree."""
     middle = found.mesh.moments().centre
     return found.mesh.moved(scale, -scale * middle), scale * (found.origin + middle)
 
 
 @lru_cache(maxsize=8)
 def _thinnest_sheet(found: FoundMesh, scale: float, reach: float) -> float:
-    """Return the thickness of the thinnest sheet of a mesh times a scale [m]; infinite where all are thicker than a
-    reach [m]. It is kept, as it takes thousands of points."""
+    """Return the thickness of the thinnest sheet of a scaled mesh [m]; infinite if all are thicker than a reach [m].
+    The result is cached, because it needs thousands of points."""
     return thickness_of(_about_middle(found, scale)[0], reach).thinnest
 
 
 def _crossing(corners: Points) -> tuple[int, int] | None:
-    """Return the numbers of two sides of a polygon that meet beside its corners, or of one without a length."""
+    """Return the indices of two sides of a polygon that cross away from its corners, or of a side without length."""
     count, sides = len(corners), np.roll(corners, -1, axis=0) - corners
 
     def turned(a: Points, b: Points) -> float:
@@ -202,41 +201,41 @@ class Container(Table):
     """A container of the fluid, of any shape."""
 
     sticks: ClassVar[Any] = False
-    """True where its walls have no slip."""
+    """True if the walls have no slip."""
     finish: ClassVar[Any] = None
-    """`Finish` of its walls; None if the scene says nothing of it."""
+    """`Finish` of the walls; None if the scene sets no finish."""
 
     @abstractmethod
     def extent(self) -> tuple[Points, Points] | None:
-        """Return the box around it: lower and upper, each (d,) [m]; None if there is none."""
+        """Return the box around the container: lower and upper corner, each (d,) [m]; None without a container."""
 
     @abstractmethod
     def region(self, dimension: int) -> Region:
         """Return the region where fluid may be, within one period."""
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """Return a mask (n,) of the points (n, d) [m] that are within, or outside by no more than the tolerance [m]."""
+        """Return a mask (n,) of the points (n, d) [m] that are inside, or outside by at most the tolerance [m]."""
         return self.region(points.shape[1]).contains(points, tolerance)
 
     @abstractmethod
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
-        """Return one layer (b, d) of wall particles [m], ``depth`` [m] outside of it."""
+        """Return one layer (b, d) of wall particles [m], ``depth`` [m] outside of the container."""
 
     @abstractmethod
     def places(self, dimension: int, spacing: float, reach: float) -> Places:
-        """Return places where fluid may rest less than ``reach`` [m] from a wall."""
+        """Return positions, less than ``reach`` [m] from a wall, where fluid may rest."""
 
     def shortened(self, spacing: float, support: float) -> "tuple[Container, Callable[[Points], Points]]":
-        """Return a shorter container whose walls have the weights of this one for a spacing and a support [m], and a
-        function that maps places (b, d) [m] on this one's walls to places of equal weight on that one's."""
+        """Return a shorter container whose walls have this one's weights, for a spacing and a support [m], and a
+        function. It maps points (b, d) [m] on this one's walls to points of equal weight on the shorter one's."""
         return self, lambda points: points
 
     @abstractmethod
     def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
-        """Return the solids that close the container, up to ``reach`` [m] beyond the ends of a period."""
+        """Return the solids that form the container's walls, extended by ``reach`` [m] beyond the ends of a period."""
 
     def wall_count(self, spacing: float) -> float:
-        """Estimate how many wall particles one layer has, without making any."""
+        """Estimate the number of wall particles in one layer, without creating any."""
         ends = self.extent()
         if ends is None:
             return 0.0
@@ -244,16 +243,16 @@ class Container(Table):
         return float(2.0 * np.sum(np.prod(cells) / cells))
 
     def periods(self, dimension: int) -> tuple[Points, Points]:
-        """Return begin and length of the period, each (d,) [m]; the length is 0 for axes without one."""
+        """Return the start and the length of the period, each (d,) [m]; the length is 0 for other axes."""
         return np.zeros(dimension), np.zeros(dimension)
 
     def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
-        """Return coordinates of flat walls that mirror the fluid, for a support [m]: at the lower and at the upper end
-        of each axis, each (d,) [m], and -inf or inf where none does."""
+        """Return the coordinates of flat walls that mirror the fluid, for a support [m]: at the lower and the upper end
+        of each axis, each (d,) [m]; -inf or inf without such a wall."""
         return np.full(dimension, -np.inf), np.full(dimension, np.inf)
 
     def domain(self, dimension: int) -> Domain:
-        """Return the container's room and its periods as one object."""
+        """Return the container's region and its periods as one object."""
         return Domain.of(*self.periods(dimension))
 
 
@@ -284,10 +283,10 @@ class Walled(Table):
     slip: Literal["free", "no"] = "free"
     """"no": the viscous force acts between fluid and wall; "free": it does not."""
     material: Annotated[str, OneOf(tuple(FINISHES))] | None = None
-    """What it looks like in pictures; clear glass if left out."""
+    """Look of the walls in pictures; clear glass if left out."""
     colour: Colour | None = None
-    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light. Without a material the walls are
-    painted in it, and not clear."""
+    """(3,) Colour of the walls in pictures: red, green and blue, each from 0 to 1, in linear light. With a colour but
+    without a material the walls are opaque."""
 
     @property
     def sticks(self) -> bool:
@@ -302,10 +301,10 @@ class Walled(Table):
 
 
 class BoxContainer(Walled, BoxShape, Container):
-    """A container in the shape of a box, closed on all sides along which it is not periodic."""
+    """A container in the shape of a box, closed on all sides except along its periodic axes."""
 
     periodic: Vector[Flag] = (False, False, False)
-    """(d,) Whether what leaves on one side of an axis comes back on the other."""
+    """(d,) Whether each axis is periodic: fluid that leaves on one side comes in on the other."""
 
     def extent(self) -> tuple[Points, Points]:
         return np.array(self.lower), np.array(self.upper)
@@ -331,8 +330,8 @@ class BoxContainer(Walled, BoxShape, Container):
         return box_places(*self.extent(), self.periodic, spacing, reach)
 
     def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
-        """Return the walls that mirror the fluid. Walls without slip do not: a mirror would bend the shear beside them.
-        Nor do walls of a box so narrow that images had images."""
+        """Return the walls that mirror the fluid. Walls without slip do not, because mirrored fluid would distort the
+        shear. Walls of a very narrow box do not, because images would have images."""
         (lower, upper), periodic = self.extent(), np.array(self.periodic)
         if self.sticks or (upper - lower < support)[~periodic].any():
             return super().mirrors(dimension, support)
@@ -348,7 +347,7 @@ class CylinderContainer(Walled, CylinderShape, Container):
 
     instead: ClassVar = '"box" or "none"'
     lid: Flag = True
-    """Whether it is closed on top; without a lid, fluid may be above the rim."""
+    """Whether the cup is closed at the top; without a lid, fluid may rise above the rim."""
 
     def extent(self) -> tuple[Points, Points]:
         axis = INDEX_OF_AXIS[self.axis]
@@ -385,7 +384,7 @@ AnyContainer = Annotated[BoxContainer | CylinderContainer | NoContainer, Field(d
 def check_length(container: Container, spacing: float, support_radius: float) -> None:
     """Check that a container is at least one spacing wide, and a period longer than two support radii.
 
-    The neighbour search takes the nearest periodic image only; in a shorter period a pair would have two.
+    The neighbour search considers only the nearest periodic image; in a shorter period a pair would interact twice.
     """
     ends = container.extent()
     if ends is None:

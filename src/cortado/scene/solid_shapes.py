@@ -27,18 +27,18 @@ from cortado.scene.solids import SolidTable
 from cortado.scene.tables import MISSING, FieldPath, Length, Vector, field_error, quantity
 
 ALONG = 1e-9
-"""Component of a normal along a period, of one that is none."""
+"""Largest component along a period of a normal that counts as perpendicular to the period."""
 
 
 class PlaneSolid(SolidTable):
-    """All that is behind a plane, such as a slope or a wall, at rest; fluid is on the side that `normal` points to. It
-    has no end, and so needs a container, which it cuts."""
+    """The half space behind a plane, such as a slope or a wall, at rest; `normal` points from it into the fluid. It is
+    unbounded, and so needs a container, which it cuts."""
 
     shape: Literal["plane"] = "plane"
     position: Vector[Length]
     """(d,) A point of the plane [m]."""
     normal: Vector[Annotated[float, quantity()]]
-    """(d,) Normal from the plane into the fluid, of any length."""
+    """(d,) Normal that points from the plane into the fluid; its length has no effect."""
     _ends: tuple[tuple[float, ...], ...] | None = PrivateAttr(None)
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
@@ -105,16 +105,16 @@ class SphereSolid(SphereShape, SolidTable):
 
 
 class CapsuleSolid(SolidTable):
-    """A solid capsule: all that is no further than a radius from a segment."""
+    """A solid capsule: all points within a radius of a line segment."""
 
     measures: ClassVar = ("start", "end", "radius")
     shape: Literal["capsule"] = "capsule"
     start: Vector[Length]
     """(d,) One end of the segment [m]."""
     end: Vector[Length]
-    """(d,) The other end [m]."""
+    """(d,) Other end of the segment [m]."""
     radius: Size
-    """From the segment to the surface [m]."""
+    """Distance from the segment to the surface [m]."""
 
     def shape_about(self) -> tuple[Solid, Points]:
         start, end = np.array(self.start), np.array(self.end)
@@ -135,20 +135,20 @@ class CylinderSolid(CylinderShape, SolidTable):
 
 
 class CupSolid(SolidTable):
-    """A cup that is open at the top; in 2-D its cut through the axis."""
+    """A cup that is open at the top; in 2-D its cross-section through the axis."""
 
     measures: ClassVar = ("base", "radius", "height", "thickness")
     shape: Literal["cup"] = "cup"
     base: Vector[Length]
-    """(d,) Middle of the bottom, outside [m]."""
+    """(d,) Centre of the bottom's outer side [m]."""
     radius: Size
-    """From the axis to the side, inside [m]."""
+    """Inner radius: distance from the axis to the inner side [m]."""
     height: Size
-    """From the bottom, outside, to the rim [m]."""
+    """Outer height: distance from the outer side of the bottom to the rim [m]."""
     thickness: Size
     """Thickness of the side and the bottom [m]."""
     axis: Literal["x", "y", "z"] = "y"
-    """The axis of space along which it stands, before it is turned; in 2-D it stands along y."""
+    """Axis of space along which the cup stands, before any rotation; in 2-D it stands along y."""
 
     @model_validator(mode="after")
     def _check_height(self) -> Self:
@@ -174,7 +174,7 @@ class CupSolid(SolidTable):
         return self.thickness
 
     def _middle(self) -> float:
-        """Return the height of its centroid above the base [m]."""
+        """Return the height of the cup's centroid above the base [m]."""
         power = len(self.base) - 1
         solid, hollow = (self.radius + self.thickness) ** power, self.radius**power
         whole, cavity = solid * self.height, hollow * (self.height - self.thickness)
@@ -203,12 +203,12 @@ class MeshSolid(MeshShape, SolidTable):
 
 
 FLAT = 1e-6
-"""Part of the size of a sheet with corners in space by which these may be off its plane."""
+"""Largest distance from a common plane of a sheet's corners in space, relative to the sheet's size."""
 
 
 class SheetSolid(SolidTable):
-    """A wall of no thickness with fluid on both sides, which do not see each other. It is a line of straight parts in
-    2-D, and a flat convex polygon or the open mesh of a file in 3-D."""
+    """A wall of no thickness. Fluid on one side does not interact with fluid on the other. In 2-D it is a line of
+    straight parts, in 3-D a flat convex polygon or the open mesh of a file."""
 
     measures: ClassVar = ("scale",)
     least_thickness: ClassVar = 0.0
@@ -217,13 +217,12 @@ class SheetSolid(SolidTable):
     corners: Annotated[
         tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=3)], ...] | None, Field(min_length=2)
     ] = None
-    """(m, d) Its corners, one after the other: along it in 2-D, where the last may be the first, and around it in 3-D
-    [m]."""
+    """(m, d) Corners, in order [m]: in 2-D along the sheet, where the last may equal the first; in 3-D around it."""
     file: File | None = None
-    """In 3-D the file of a mesh in place of corners, which may be open: STL, OBJ, PLY, glTF or GLB; beside the scene
-    file, and absolute once read."""
+    """In 3-D, the file of a mesh, in place of corners: STL, OBJ, PLY, glTF or GLB. The mesh may be open. A relative
+    path starts at the scene file's folder."""
     scale: Annotated[float, quantity(gt=0.0)] = 1.0
-    """Factor of its lengths, such as 0.001 where they are millimetres."""
+    """Factor by which lengths are multiplied, such as 0.001 for millimetres."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         turned = super().in_dimension(dimension, path)
@@ -294,7 +293,7 @@ SHOWN = 0.1
 
 @lru_cache(maxsize=8)
 def _sheet_in(path: str) -> Sheet:
-    """Read the surface in a file of triangles, in its own unit of length; raise `InputError`."""
+    """Read the surface in a file of triangles, in the file's unit of length; raise `InputError`."""
     vertices, corners = triangles_in_file(path)
     places, numbers = np.unique(vertices, axis=0, return_inverse=True)
     found = Sheet(places, numbers.reshape(-1)[corners])

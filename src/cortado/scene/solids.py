@@ -1,4 +1,4 @@
-"""Solids, which fluid flows around or is held by: what all have."""
+"""Solids, obstacles in the fluid or vessels around it: the keys that all of them have."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -31,90 +31,89 @@ from cortado.scene.tables import (
 
 
 class SolidTable(Coloured):
-    """A solid, which fluid cannot enter, of any shape."""
+    """A solid of any shape, which fluid cannot enter."""
 
     measures: ClassVar[tuple[str, ...]] = ()
-    """Fields with which its shape grows."""
+    """Fields that scale with the size of the shape."""
     least_thickness: ClassVar = 1.0
-    """Least thickness, in spacings."""
+    """Smallest allowed thickness, in spacings."""
     is_sheet: ClassVar = False
     """True for a wall of no thickness."""
     materials: ClassVar = FINISHES
     plain: ClassVar = (0.55, 0.55, 0.58)
 
     name: Text
-    """Name by which other tables refer to it."""
+    """Name by which other tables refer to the solid."""
     position: tuple[Length, ...] | None = None
-    """(d,) Where the centroid of its volume is [m]; left out, it is where its measures put it."""
+    """(d,) Position of the centroid of its volume [m]; if left out, the other keys of the shape determine it."""
     rotation: Rotation | None = None
-    """How it is turned about its middle [rad], not at all if left out: in 3-D a rotation vector, in 2-D one number,
+    """Rotation about its middle [rad]; not rotated if left out. In 3-D a rotation vector, in 2-D one number,
     counterclockwise."""
     motion: Literal["fixed", "path", "free"] = "fixed"
-    """How it moves. "fixed": not at all. "path": by `times` with `positions` or `rotations`, by the file `path`, or
-    with a steady `velocity` or `angular_velocity`. "free": as a rigid body, which fluid and gravity move."""
+    """How the solid moves. "fixed": not at all. "path": as `times` with `positions` or `rotations`, the file `path`, or
+    a steady `velocity` or `angular_velocity` prescribe. "free": as a rigid body moved by fluid and gravity."""
     density: Annotated[float, quantity("kg/m3", gt=0.0)] | None = None
-    """Density of a free body: its mass over its volume [kg/m³]."""
+    """Density of a free body: its mass divided by its volume [kg/m³]."""
     mass: Annotated[float, quantity("kg", gt=0.0)] | None = None
-    """Mass of a free body, in place of its density; in 2-D that of a metre of it [kg]."""
+    """Mass of a free body, in place of its density [kg]; in 2-D the mass per metre of depth."""
     centre_of_mass: tuple[Length, ...] | None = None
-    """(d,) Where the centre of mass of a free body is, from the centroid of its volume and along its own axes [m]; 0 if
+    """(d,) Vector from the centroid of a free body's volume to its centre of mass, along the body's own axes [m]; 0 if
     left out."""
     gyration_radius: Radii | None = None
-    """(3,) Radii of gyration of a free body about its own axes through its centre of mass, in 2-D one number: roots of
-    its moments of inertia over its mass [m]. If left out they are those of its shape."""
+    """(3,) Radii of gyration of a free body about its own axes through its centre of mass, in 2-D one number [m]:
+    square roots of moment of inertia over mass. If left out, those of its shape."""
     inertia: Inertia | None = None
-    """Moments of inertia of a free body about its centre of mass [kg m²], in place of its radii of gyration. In 2-D
-    one number, that of a metre of it. In 3-D three, about its own axes, or the nine of a matrix, row by row."""
+    """Moments of inertia of a free body about its centre of mass [kg m²], in place of its radii of gyration. In 2-D one
+    number, per metre of depth. In 3-D three numbers, about its own axes, or the nine of a matrix, row by row."""
     freedom: tuple[Annotated[str, OneOf(sorted({*WAYS[2], *WAYS[3]}))], ...] | None = None
-    """Ways in which a free body can move, all if left out: of "x", "y" and "rotation", in 3-D of "x", "y", "z",
-    "rotation_x", "rotation_y" and "rotation_z", along the axes of space."""
+    """Directions in which a free body can move; all if left out. They are some of "x", "y" and "rotation", in 3-D of
+    "x", "y", "z", "rotation_x", "rotation_y" and "rotation_z", along the axes of space."""
     friction: Annotated[float, quantity(ge=0.0)] | None = None
-    """Coefficient of Coulomb's friction of a free body with what it touches; 0 if left out. Two free bodies that touch
-    have the mean of both."""
+    """Coefficient of Coulomb friction of a free body where it touches something; 0 if left out. Between two free bodies
+    the mean of both acts."""
     restitution: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
-    """Part of the speed of a hit with which a free body leaves what it touches; 0.6 if left out. Two free bodies that
-    touch have the mean of both."""
+    """Coefficient of restitution of a free body: its speed after a hit over that before; 0.6 if left out. Between two
+    free bodies the mean of both acts."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
-    """(k,) Times of the path, from 0 on, each greater than the one before [s]; after the last it rests."""
+    """(k,) Times of the path, increasing from 0 on [s]; after the last time the solid rests."""
     positions: tuple[tuple[Length, ...], ...] | None = None
-    """(k, d) Where the middle is at these times [m]; the first is where it begins."""
+    """(k, d) Positions of the middle at these times [m]; the first is the position at the start."""
     rotations: tuple[Rotation, ...] | None = None
-    """(k, 3) Rotation vectors by which it is turned from how it begins at these times, in 2-D (k,) angles; the first is
-    0 [rad]."""
+    """(k, 3) Rotation vectors since the start at these times, in 2-D (k,) angles [rad]; the first is 0."""
     path: File | None = None
-    """A CSV file in the place of `times`, with columns such as time [s], x [mm], y [mm] and rotation [deg], in 3-D
-    rotation_x [deg] and so on. Only differences from the first line count, and a column that is not there stays 0. A
-    relative name begins at the scene file."""
+    """A CSV file in place of `times`, with columns such as time [s], x [mm], y [mm] and rotation [deg], in 3-D
+    rotation_x [deg] and so on. Only differences from its first line matter; a missing column means 0. A relative path
+    starts at the scene file's folder."""
     interpolation: Interpolation = "linear"
-    """How it gets from one of the times to the next: in straight lines, or along a cubic spline, whose velocity and
-    acceleration are continuous, and which is at rest at both ends."""
+    """Curve between the times: straight lines, or a cubic spline. The spline has continuous velocity and acceleration,
+    and zero velocity at both ends."""
     ramp: Ramp | None = None
-    """Time after which the path is whole [s]; until then it is multiplied by a number that grows smoothly (C2) from 0
-    to 1."""
+    """Duration of the ramp [s]. Until its end the path is multiplied by a factor that grows smoothly (C2) from 0 to
+    1."""
     velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
-    """(d,) Velocity of the middle, if it is steady; of a free body at the start [m/s]."""
+    """(d,) Velocity of the middle [m/s]: steady, or for a free body the one at the start."""
     angular_velocity: Turning | None = None
-    """Angular velocity about the middle, if it is steady; of a free body at the start: in 3-D a vector, in 2-D one
-    number, counterclockwise [rad/s]."""
+    """Angular velocity about the middle [rad/s]: steady, or for a free body the one at the start. In 3-D a vector, in
+    2-D one number, counterclockwise."""
     surface_velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
-    """(d,) How fast its surface slides while its shape stays, as that of a belt does, in the frame of the solid
-    [m/s]."""
+    """(d,) Velocity with which the surface slides although the shape stays in place, as of a conveyor belt, in the
+    solid's own frame [m/s]."""
     side: Literal["outside", "inside"] = "outside"
-    """Where fluid may be: outside of the shape, or inside of it, as in a tank."""
+    """Side on which fluid may be: outside of the shape, or inside, as in a tank."""
     slip: Literal["free", "no"] = "free"
     """"no": the viscous force acts between fluid and solid; "free": it does not."""
     material: Annotated[str, OneOf(tuple(FINISHES))] | None = None
-    """What it looks like in pictures: its colour, how clear it is, and how much it is a mirror."""
+    """Look of the solid in pictures: its colour, its transparency and its reflections."""
     colour: Colour | None = None
-    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light. That of the material if left
-    out, or [0.55, 0.55, 0.58] without one."""
+    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light. If left out, the colour of the
+    material, or [0.55, 0.55, 0.58] without a material."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
-    """The part of the light that goes through it in pictures, from 0 to 1; if left out that of the material, and
-    without one 0, or 1 if fluid is inside."""
+    """Fraction of the light that passes through the solid in pictures, from 0 to 1. If left out, that of the material;
+    without a material it is 0, or 1 if fluid is inside."""
 
     @property
     def finish(self) -> Finish:
-        """Return the finish of its surface in pictures."""
+        """Return the finish of the solid's surface in pictures."""
         plain = Finish(self.plain, transparency=float(self.side == "inside"))
         own = plain if self.material is None else FINISHES[self.material]
         clear = own.transparency if self.transparency is None else self.transparency
@@ -122,17 +121,17 @@ class SolidTable(Coloured):
 
     @property
     def sticks(self) -> bool:
-        """Return True where fluid has no slip along it."""
+        """Return True if fluid has no slip along the solid."""
         return self.slip == "no"
 
     @property
     def is_steady(self) -> bool:
-        """Return True where no table says where it is over time."""
+        """Return True if no table prescribes the solid's position over time."""
         return self.times is None and self.path is None
 
     @property
     def moves(self) -> bool:
-        """Return True where it or its surface moves."""
+        """Return True if the solid or its surface moves."""
         return self.motion != "fixed" or self.surface_velocity is not None
 
     def centroid(self) -> Points:
@@ -140,29 +139,29 @@ class SolidTable(Coloured):
         return self.shape_about()[1] if self.position is None else np.array(self.position)
 
     def middle(self) -> Points:
-        """Return the middle (d,) of the solid at the start [m]: its centroid, or the centre of mass that it has."""
+        """Return the middle (d,) of the solid at the start [m]: its centroid, or its centre of mass if it has one."""
         return self.centroid() + self._arm()
 
     def moved(self, middle: Points, rotation: tuple[float, ...]) -> Self:
-        """Return the solid with its middle (d,) at a place [m], turned by a rotation."""
+        """Return the solid with its middle (d,) at a position [m], rotated by a rotation matrix."""
         turned = self.model_copy(update={"rotation": rotation})
         return turned.model_copy(update={"position": tuple((middle - turned._arm()).tolist())})
 
     def _arm(self) -> Points:
-        """Return the way (d,) from the centroid to the middle at the start [m], (1,) zero without a centre of mass."""
+        """Return the vector (d,) from the centroid to the middle at the start [m]; zero (1,) if they are the same."""
         arm = self.centre_of_mass
         return np.zeros(1) if arm is None else np.asarray(self.turn(len(arm)) @ np.array(arm))
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the shape about its centroid, not turned, and the centroid by its measures, (d,) [m]."""
+        """Return the shape, unrotated with its centroid at the origin, and the centroid in its own keys, (d,) [m]."""
 
     def shown_shape(self, spacing: float) -> Solid:
-        """Return the shape about its centroid, not turned, as pictures show it beside particles of a spacing [m]."""
+        """Return the shape, unrotated with its centroid at the origin, as pictures show it for a spacing [m]."""
         return self.shape_about()[0]
 
     def stretched(self, scale: float) -> Self:
-        """Return the solid ``scale`` times as large about its middle."""
+        """Return the solid enlarged ``scale`` times about its middle."""
         if scale == 1.0:
             return self
         grown = {name: _times(scale, getattr(self, name)) for name in self.measures}
@@ -170,32 +169,32 @@ class SolidTable(Coloured):
 
     @abstractmethod
     def thinnest(self, spacing: float) -> float:
-        """Return the thickness of the solid's thinnest part [m]; infinite where that is not known, as of a mesh whose
-        sheets are all thicker than a few spacings [m]."""
+        """Return the thickness of the solid's thinnest part [m]. It is infinite if unknown, as for a mesh whose sheets
+        are all thicker than a few spacings [m]."""
 
     def in_container(self, container: Container, path: FieldPath) -> Self:
-        """Return this table, at a path, as it is in a container, which shapes without an end need to know."""
+        """Return this table, at a path, adapted to a container, which unbounded shapes need."""
         return self
 
     def wall_count(self, spacing: float) -> float:
-        """Estimate how many wall particles one layer has, without making any."""
+        """Estimate the number of wall particles in one layer, without creating any."""
         lower, upper = self.shape_about()[0].extent()
         cells = np.maximum((upper - lower) / spacing, 1.0)
         return float(2.0 * np.sum(np.prod(cells) / cells))
 
     def solid(self) -> Solid:
-        """Return the solid where fluid may not be: the shape, or all outside of it for a tank."""
+        """Return the solid that fluid cannot enter: the shape, or for a tank everything outside of it."""
         return Hollow(self.body()) if self.side == "inside" else self.body()
 
     def own_solid(self) -> Solid:
-        """Return the solid where fluid may not be, about its middle and not turned."""
+        """Return the solid that fluid cannot enter, unrotated with its middle at the origin."""
         shape = self.shape_about()[0]
         if self.centre_of_mass is not None:
             return Placed(shape, -np.array(self.centre_of_mass), np.eye(len(self.centre_of_mass)))
         return Hollow(shape) if self.side == "inside" else shape
 
     def body(self) -> Solid:
-        """Return the shape in its place."""
+        """Return the shape at its position, with its rotation."""
         centroid = self.centroid()
         return Placed(self.shape_about()[0], centroid, self.turn(len(centroid)))
 
@@ -212,16 +211,16 @@ class SolidTable(Coloured):
 
 
 def thick(tables: Sequence[SolidTable]) -> tuple[SolidTable, ...]:
-    """Return the solids that are no sheets."""
+    """Return the solids that are not sheets."""
     return tuple(table for table in tables if not table.is_sheet)
 
 
 @lru_cache(maxsize=8)
 def solids_of(tables: tuple[SolidTable, ...]) -> tuple[Solid, ...]:
-    """Return the solids that tables describe, in their order."""
+    """Return the solids that tables describe, in order."""
     return tuple(table.solid() for table in tables)
 
 
 def _times(scale: float, value: Any) -> Any:
-    """Multiply a number by a scale, or one by one those of a tuple."""
+    """Multiply a number, or each number of a tuple, by a scale."""
     return tuple(_times(scale, part) for part in value) if isinstance(value, tuple) else scale * value

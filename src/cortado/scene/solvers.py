@@ -11,33 +11,33 @@ from cortado.scene.packages import Inline, PackageTable
 from cortado.scene.tables import Flag, OrWord, Table, Text, count, field_error, quantity
 
 OWN = ("projection", "pcisph")
-"""The kinds that are Cortado's own; a scene that names none has the first."""
+"""The kinds of solvers that Cortado itself has; the first is the default."""
 COURANT = 0.2
-"""The Courant number of a scene that gives none. With it PCISPH took 600 steps of seven scenes, in the plane and in
-space: dams, a drop, a jet and layers of 64 to 600 particles. With 0.3 it lost one of the scenes, with 0.4 four."""
+"""Default Courant number. With it PCISPH completed 600 steps of seven scenes, in the plane and in space: dams, a drop,
+a jet and layers of 64 to 600 particles. With 0.3 one of the scenes diverged, with 0.4 four."""
 
 
 Suits = tuple[tuple[str, Mapping[str, Any]], ...]
-"""Names of tables, with keys that go together and their values."""
+"""Names of tables, each with keys and values that belong together."""
 
 
 class SolverTable(Table):
-    """The algorithm that takes a step, and the length of a step."""
+    """The algorithm of a step, and the length of a step."""
 
     kind: str
     """Name of the algorithm."""
     time_step: Annotated[float | Literal["auto"], OrWord(quantity("s", gt=0.0), "auto")]
-    """Length of a step [s]; with "auto" each step has a length of its own, chosen before it."""
+    """Length of a step [s]; with "auto", the length of each step is chosen before it."""
     courant: Annotated[float, quantity(gt=0.0, le=1.0)] | None = None
-    """Courant number of a time step that is chosen: how far the fastest particle moves in it at most, in smoothing
-    lengths, half of the support radius each; 0.2 if left out."""
+    """Courant number of adaptive time steps: the largest distance that the fastest particle moves in a step, in
+    smoothing lengths (half a support radius each); 0.2 if left out."""
     greatest_time_step: Annotated[float, quantity("s", gt=0.0)] | None = None
-    """Upper bound of a time step that is chosen [s]; needed where nothing else bounds it, without gravity."""
+    """Upper bound of adaptive time steps [s]; needed if nothing else bounds them, as without gravity."""
 
     @model_validator(mode="before")
     @classmethod
     def _refuse_keys_of_others(cls, data: Any) -> Any:
-        """Raise a `field_error` for a key that another solver of Cortado's own has."""
+        """Raise a `field_error` for a key that belongs to another of Cortado's own solvers."""
         own = (ProjectionSolver, PcisphSolver)
         for other in own if cls in own and isinstance(data, Mapping) else ():
             for name in [name for name in data if name in other.model_fields and name not in cls.model_fields]:
@@ -54,40 +54,40 @@ class SolverTable(Table):
 
     @property
     def chooses(self) -> bool:
-        """Return True where the time step is chosen before each step."""
+        """Return True if the time step is chosen before each step."""
         return self.time_step == "auto"
 
     def fixed_time_step(self, what: str) -> float:
-        """Return the length of a step [s]; raise `InputError` where it is chosen, as ``what`` needs a fixed one."""
+        """Return the length of a step [s]; raise `InputError` if steps are adaptive, as ``what`` needs a fixed one."""
         if self.time_step == "auto":
             raise InputError(f'solver.time_step is "auto", but must be a number of seconds for {what}.')
         return self.time_step
 
 
 class ProjectionSolver(SolverTable):
-    """A solver by a projection of velocities, which pulls where fluid is on all sides."""
+    """A solver that projects velocities to zero divergence; its pressure may be negative inside the fluid."""
 
     kind: Literal["projection"] = "projection"
     """Name of the algorithm."""
     iterations: Annotated[int, count(2, 1_000)] = 2
-    """Iterations of the pressure in every step, each from that of the step before; at least, with a tolerance."""
+    """Number of pressure iterations in every step, each starting from the last pressure; with a tolerance, at least."""
     tolerance: Annotated[float, quantity(gt=0.0)] | None = None
-    """Iterations end once the divergence that one finds is below it: times the step, its root mean square inside of the
-    fluid; left out, there are always as many."""
+    """Iterations end once the divergence is below this value. The measure is the root mean square, inside of the fluid,
+    of the divergence times the time step. If left out, every step has the same number of iterations."""
     maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
-    """Iterations of the pressure in a step at most, with a tolerance."""
+    """Largest number of pressure iterations in a step, with a tolerance."""
     repairs: Annotated[int, count(1, 1_000)] = 2
-    """Iterations in every step that bring positions back to the rest density."""
+    """Number of iterations in every step that move particles back to the rest density."""
     velocities_follow: Flag = False
-    """Whether velocities follow where the shift and the repairs take a particle, v + (delta . grad) v: flows in full
-    containers lose less of their speed, and those with a surface can gain energy."""
+    """Whether velocities are corrected when the shift and the repairs move a particle by delta: v + (delta . grad) v.
+    Flows in full containers then lose less speed, but flows with a surface can gain energy."""
     suits: ClassVar[Suits] = (
         ("discretisation", {"kernel": "wendland_c2", "support": 2.6}),
         ("emitter", {"jitter": 0.05}),
     )
-    """What other tables have if they name none of it; `docs/projection.md` has the figures."""
+    """Values for other tables that set none of these keys; `docs/projection.md` has the measurements."""
     suits_without_surface: ClassVar[Suits] = (("discretisation", {"jitter": 0.05}),)
-    """The same where all axes are periodic, so that the order of a lattice never ends at a surface."""
+    """The same if all axes are periodic, where no surface ever disturbs the order of a lattice."""
 
     @model_validator(mode="after")
     def _check_iterations(self) -> Self:
@@ -105,13 +105,13 @@ class PcisphSolver(SolverTable):
     kind: Literal["pcisph"]
     """Name of the algorithm."""
     minimum_iterations: Annotated[int, count(1, 1_000_000)] = 3
-    """Pressure iterations of a step, at least."""
+    """Least number of pressure iterations in a step."""
     maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
-    """Pressure iterations of a step, at most."""
+    """Largest number of pressure iterations in a step."""
     density_tolerance: Annotated[float, quantity(ge=0.0)] = 0.01
-    """Iterations end once the average of (rho - rho_0) / rho_0 is below it."""
+    """Iterations end once the average of (rho - rho_0) / rho_0 is below this value."""
     maximum_density_tolerance: Annotated[float, quantity(ge=0.0)] | None = None
-    """The same for the maximum of (rho - rho_0) / rho_0; not asked for if left out."""
+    """Iterations end only once the maximum of (rho - rho_0) / rho_0 is below this, too; no condition if left out."""
 
     @model_validator(mode="after")
     def _check_iterations(self) -> Self:
@@ -128,13 +128,13 @@ class PackageSolver(SolverTable, PackageTable):
     method = "build"
     own = OWN
     kind: Annotated[Text, Field(json_schema_extra={"not": {"enum": list(OWN)}})]
-    """The name that the package gives it."""
+    """The package's name for the solver."""
     advice = f"{' or '.join(f'{chr(34)}{name}{chr(34)}' for name in OWN)}, or "
 
 
 def what_suits(solver: Any, container: Any) -> Suits:
-    """Return the entries of other tables that suit a solver, or a table that will be one, where none of their keys is
-    given."""
+    """Return the keys of other tables that suit a solver, given its table or the table's contents, if those tables set
+    none of them."""
     if _table_of(solver) != "ProjectionSolver":
         return ()
     periodic = container.get("periodic") if isinstance(container, Mapping) else getattr(container, "periodic", None)

@@ -2,10 +2,10 @@
 from the JSON schemas of the tables.
 
 A field is ``Annotated[float, quantity("kg/m3", gt=0.0)]``. Pydantic checks its value, and describes it in the JSON
-schema of its table. The sentences of errors are made from this schema, so that the checks, the sentences and the help
-of an editor always agree. A wrong value ends in a `SceneError`, whether the scene comes from a file or is built in
-Python. Schemas have the docstrings below fields as descriptions, which are read from the source when somebody asks for
-a schema. Pydantic can read them as it makes a model, but then every process waits a third of a second for it.
+schema of its table. Error sentences are built from this schema, so that checks, sentences and the help of an editor
+always agree. A wrong value raises a `SceneError`, whether the scene comes from a file or is built in Python. In
+schemas, the docstrings below fields become descriptions. They are read from the source only when a schema is requested,
+because reading them while models are built would delay every process by a third of a second.
 """
 
 import ast
@@ -43,10 +43,10 @@ FieldPath = Sequence[str | int]
 
 @dataclass(frozen=True, repr=False)
 class FieldError:
-    """An error in a field: its path, what was found, and what was wanted.
+    """An error in a field: its path, what was found, and what was expected.
 
-    Its ``repr`` does not show the value that was found, as pydantic puts it into messages, and the value may be of any
-    length.
+    Its ``repr`` hides the value that was found: pydantic would put the value, which may be of any length, into
+    messages.
     """
 
     path: tuple[str | int, ...]
@@ -56,12 +56,12 @@ class FieldError:
 
 
 def field_error(path: FieldPath, found: Any, wanted: str, sentence: str | None = None) -> PydanticCustomError:
-    """Make the exception that a check raises; the path (names and indices) starts at the model that is checked."""
+    """Build the exception that a check raises; the path (names and indices) starts at the model under check."""
     return PydanticCustomError("scene", "wrong value", {"error": FieldError(tuple(path), found, wanted, sentence)})
 
 
 def quantity(unit: str = "-", *, gt: float | None = None, ge: float = -GREATEST, le: float = GREATEST) -> Any:
-    """Describe a field with a finite number in a unit; "-" is a plain number."""
+    """Describe a field with a finite number in a unit; "-" means a plain number."""
     least = ge if gt is None else max(ge, 1.0 / GREATEST)
     return Field(strict=True, allow_inf_nan=False, gt=gt, ge=least, le=le, json_schema_extra={"unit": unit})
 
@@ -72,14 +72,14 @@ def count(least: int, most: int) -> Any:
 
 
 def components(*names: str) -> Any:
-    """Describe a field with a list of named components, as many in 2-D as in 3-D: a colour."""
+    """Describe a field with a list of named components, the same number in 2-D and 3-D, such as a colour."""
     extra: Any = {"components": list(names)}
     return Field(min_length=len(names), max_length=len(names), fail_fast=True, json_schema_extra=extra)
 
 
 @dataclass(frozen=True)
 class OneOf:
-    """A mark of a field that is one of the names of a registry."""
+    """A mark of a field whose value must be one of the names of a registry."""
 
     names: Collection[str]
 
@@ -89,7 +89,7 @@ class OneOf:
 
 @dataclass(frozen=True)
 class OrWord:
-    """A mark of a field that is a number, or a word that says how it is found."""
+    """A mark of a field whose value is a number, or a word for a way to choose the number."""
 
     number: Any
     """The number's `quantity`."""
@@ -109,13 +109,13 @@ class OrWord:
 
 Item = TypeVar("Item")
 PER_AXIS = "per axis"
-"""Marks the fields with one component for each axis of the scene."""
+"""Mark of the fields with one component for each axis of the scene."""
 Vector = Annotated[tuple[Item, ...], PER_AXIS, Field(min_length=2, max_length=3, fail_fast=True)]
-"""One component for each axis: a vector, or flags. In 2-D the default is the first two components of that in 3-D."""
+"""One component for each axis: a vector, or flags. The default in 2-D is the first two components of that in 3-D."""
 Several = Annotated[tuple[Item, ...], Field(min_length=1, fail_fast=True)]
 """A list of at least one entry."""
 Text = Annotated[str, Field(strict=True, pattern=r"\S")]
-"""A text that is not empty."""
+"""A text with at least one visible character."""
 Flag = Annotated[bool, Field(strict=True)]
 """Yes or no."""
 Length = Annotated[float, quantity("m")]
@@ -123,7 +123,7 @@ Colour = Annotated[tuple[Annotated[float, quantity(ge=0.0, le=1.0)], ...], compo
 
 
 def without_numpy(value: Any) -> Any:
-    """Return a value with NumPy's arrays and numbers, also those in a list, as lists and numbers of Python."""
+    """Return a value with NumPy's arrays and numbers, also inside a list, converted to Python's lists and numbers."""
     if isinstance(value, (list, tuple)):
         return [entry.tolist() if isinstance(entry, (np.ndarray, np.generic)) else entry for entry in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
@@ -163,7 +163,7 @@ def check_turn(path: FieldPath, value: tuple[float, ...] | None, dimension: int)
 
 
 def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return the matrix (d, d) of a rotation vector [rad], or in 2-D of an angle."""
+    """Return the matrix (d, d) of a rotation vector [rad], in 2-D of an angle."""
     from scipy.spatial.transform import Rotation as Turn
 
     if len(rotation) == 1:
@@ -172,7 +172,7 @@ def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
 
 
 def field_docstrings(cls: type) -> dict[str, str]:
-    """Return the docstrings of fields by name, those of parents included; none of a class without a source."""
+    """Return the docstrings of fields by name, including those of parent classes; empty for a class without source."""
     found: dict[str, str] = {}
     for one in reversed(cls.__mro__):
         found |= _of_module(one.__module__).get(one.__qualname__, {})
@@ -181,7 +181,7 @@ def field_docstrings(cls: type) -> dict[str, str]:
 
 @cache
 def _of_module(name: str) -> dict[str, dict[str, str]]:
-    """Return the docstrings of fields of all classes of a module that are in no other class or function."""
+    """Return the docstrings of the fields of a module's top-level classes."""
     try:
         source = inspect.getsource(modules[name])
     except (KeyError, OSError, TypeError):
@@ -199,14 +199,14 @@ def _in_body(node: ast.ClassDef) -> dict[str, str]:
 
 
 MOST_HOMES = 2
-"""Most tables that have a key and are named in a sentence where the key stands in another table."""
+"""Most tables that an error names as having a key which was given in the wrong table."""
 UNKNOWN = Words("unknown")
-"""What was found of a key that its table does not have."""
+"""The value reported for a key that its table does not have."""
 
 
 @contextmanager
 def sentences(model: type[BaseModel]) -> Iterator[None]:
-    """Turn the first error that pydantic reports of a model into a `SceneError`."""
+    """Convert the first error that pydantic reports about a model into a `SceneError`."""
     try:
         yield
     except ValidationError as error:
@@ -251,8 +251,8 @@ def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
 
 
 def _homes(whole: Schema, path: FieldPath) -> list[str]:
-    """Return where else the key at the end of a path stands in a JSON schema, as ``forces.gravity``; nothing if it is
-    in no other table or in many."""
+    """Return the other places in a JSON schema that have the key at the end of a path, such as ``forces.gravity``;
+    empty if no other table, or too many, have it."""
     key, own = path[-1], tuple(part for part in path if not isinstance(part, int))
     found = [home for home in dict.fromkeys(_fields(whole, whole, ())) if home[-1] == key and home != own]
     words = [field_name(home) if len(home) > 1 else f"{key} at the top of the file" for home in found]
@@ -260,7 +260,7 @@ def _homes(whole: Schema, path: FieldPath) -> list[str]:
 
 
 def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]:
-    """Yield the paths of all keys in a part of a JSON schema, itself at a path: through lists and unions, too."""
+    """Yield the paths of all keys in a part of a JSON schema that is itself at a path, also inside lists and unions."""
     if "$ref" in part:
         part = whole["$defs"][part["$ref"].rpartition("/")[2]]
     for name, field in part.get("properties", {}).items():
@@ -278,8 +278,8 @@ def _is_out_of_size(number: float, schema: Schema) -> bool:
 
 
 def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | int]]:
-    """Return the part of a JSON schema that a location of pydantic's leads to, and the path to it. A location names the
-    member of a union too; a path does not."""
+    """Return the part of a JSON schema at a pydantic location, and the path to it. A location also names the member of
+    a union; a path does not."""
     part, path = whole, list[str | int]()
     for step in location:
         if "discriminator" in part:
@@ -300,7 +300,7 @@ def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | i
 
 
 def _whole(part: Schema) -> Schema:
-    """Return the schema of a table that stands where it is used, and not among those that have a name."""
+    """Return the schema of a table that is written inline, and not among the named ones."""
     return part["allOf"][0] if "allOf" in part else part
 
 
@@ -322,15 +322,15 @@ ALSO_CALLED = {
     **{"type": ("kind", "shape"), "n": ("flow_index",), "cfl": ("courant",), "omega": ("angular_velocity",)},
     **{"angle": ("rotation",), "csv": ("path", "file"), "file": ("path",), "path": ("file",), "fps": ("frame_rate",)},
 }
-"""Keys by the names that users of other programs have for them."""
+"""Keys of Cortado, by the names that other programs use for them."""
 
 
 class Table(BaseModel, metaclass=Documented):
-    """A table of the scene: frozen, without unknown keys, and with a `SceneError` for whatever is wrong."""
+    """A table of the scene: immutable, without unknown keys; any wrong value raises a `SceneError`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     beside: ClassVar[tuple[str, ...]] = ()
-    """Tables of others that a file may hold beside its keys; only for advice."""
+    """Tables of other modules that a file may contain besides these keys; used only for advice."""
 
     def __init__(self, /, **data: Any):
         with sentences(type(self)):
@@ -370,7 +370,7 @@ class Table(BaseModel, metaclass=Documented):
         return schema
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """Return this table, at a path, with vectors checked, and left-out ones filled in, for 2 or 3 dimensions."""
+        """Return this table, at a path, for 2 or 3 dimensions: vectors are checked, and missing ones filled in."""
         filled = {}
         for name, field in type(self).model_fields.items():
             if PER_AXIS in field.metadata:
@@ -381,7 +381,7 @@ class Table(BaseModel, metaclass=Documented):
         return self.model_copy(update=filled)
 
     def check_components(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
-        """Raise a `field_error` for a field of these names that has not one component for each dimension."""
+        """Raise a `field_error` for each of these fields that does not have one component for each dimension."""
         for name in names:
             value = getattr(self, name, None)
             if value is not None and len(value) != dimension:
@@ -389,7 +389,7 @@ class Table(BaseModel, metaclass=Documented):
 
 
 def components_error(path: FieldPath, value: Any, dimension: int) -> PydanticCustomError:
-    """Make the error of a vector that has another number of components than there are dimensions."""
+    """Build the error for a vector whose number of components differs from the number of dimensions."""
     wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
     return field_error(path, value, wanted)
 
