@@ -1,5 +1,4 @@
-"""The process of the command ``cortado``, also ``python -m cortado``: ready for signals before anything large is
-imported."""
+"""Start the command ``cortado`` or ``python -m cortado``: signal handlers are set before large imports."""
 
 from cortado.files import terminal as interruption
 

@@ -1,4 +1,4 @@
-"""Numbers that a user gives in whatever form, as arrays in float64; and what is no number, in a sentence."""
+"""Convert numbers that users give to float64 arrays; anything else raises an error in a sentence."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -18,13 +18,13 @@ REFUSED = {
     "M": "dates",
     "m": "spans of time",
 }
-"""Words for the entries of an array that are not real numbers, by the kind of its type."""
+"""Words for array entries that are not real numbers, by the ``kind`` of the array's dtype."""
 GREATEST_NUMBER = 10**18
-"""Greatest number of steps, within a 64-bit number."""
+"""Greatest allowed number of steps, which fits a 64-bit integer."""
 
 
 def as_number(value: Any) -> float | None:
-    """Return a finite number as a float; None for anything else, a bool included."""
+    """Return a finite number as a float, or None for anything else, including a bool."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         return None
     try:
@@ -37,9 +37,9 @@ def as_number(value: Any) -> float | None:
 def as_numbers(what: str, value: Any) -> np.ndarray:
     """Return a real number or an array as float64; raises `InputError`, in a sentence that begins with ``what``.
 
-    Takes whatever NumPy makes an array of: numbers, lists, arrays of other libraries. An array of float64 is not
-    copied. Complex numbers, text, truth values and masked entries are refused, as NumPy would convert them without a
-    word, and drop what they say.
+    Accepts anything that NumPy converts to an array: numbers, lists, arrays of other libraries. A float64 array is not
+    copied. Complex numbers, text, bools and masked entries raise, because NumPy would convert them silently and lose
+    information.
     """
     try:
         array = np.asarray(value)
@@ -58,8 +58,8 @@ def as_numbers(what: str, value: Any) -> np.ndarray:
 
 
 def as_precise_numbers(what: str, value: Any) -> np.ndarray:
-    """Return real numbers of float32, float64 or integers as float64; raises `InputError` for others, also for half
-    precision, which rounds to three digits."""
+    """Return real numbers of float32, float64 or integers as float64; raises `InputError` for other types, and for
+    float16, which has only three digits."""
     kind = str(getattr(value, "dtype", ""))
     if kind.endswith("float16"):  # bfloat16 too
         raise InputError(f"{what} is {kind}, but must be float32 or float64, as half precision rounds to three digits.")
@@ -67,14 +67,14 @@ def as_precise_numbers(what: str, value: Any) -> np.ndarray:
 
 
 def read_only(what: str, value: Any) -> np.ndarray:
-    """Return a real number or an array as a read-only float64 array of its own."""
+    """Return a real number or an array as a new read-only float64 array."""
     array = as_numbers(what, value).copy()
     array.setflags(write=False)
     return array
 
 
 def as_one_number(what: str, value: Any) -> float:
-    """Return a real number as a float, also from an array of shape (); raises `InputError`."""
+    """Return a real number, or an array of shape (), as a float; raises `InputError` for anything else."""
     array = as_numbers(what, value)
     if array.shape:
         raise InputError(f"{what} has shape {array.shape}, but must be one number.")
@@ -100,7 +100,7 @@ def require_at_most(what: str, value: Any, most: int) -> None:
 
 
 def whole_number(what: str, value: Any, least: int) -> int:
-    """Return a whole number of at least ``least``, also from a float; raises `InputError`."""
+    """Return an int of at least ``least`` from an int or a whole float; raises `InputError` for anything else."""
     whole = is_whole(value) or (isinstance(value, (float, np.floating)) and value.is_integer())
     if not whole or value < least:
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
@@ -110,15 +110,15 @@ def whole_number(what: str, value: Any, least: int) -> int:
 
 
 def require_function(what: str, value: Any, *arguments: str) -> None:
-    """Raise `InputError`, in a sentence that begins with ``what``, unless a value is None or a function of these
-    arguments, described in words."""
+    """Raise `InputError`, in a sentence that begins with ``what``, unless a value is None or callable with these
+    ``arguments``, which are words for the sentence."""
     if value is not None:
         require_arguments(what, value, arguments, "; or leave it out")
 
 
 def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
-    """Raise `InputError` unless ``function`` is callable with the ``wanted`` arguments, as far as Python can tell;
-    ``other``: what else it could be, in words."""
+    """Raise `InputError` unless ``function`` is callable with the ``wanted`` arguments, as far as Python can tell.
+    ``other`` names other accepted values in the sentence."""
     if not callable(function) or isinstance(function, type):
         raise InputError(
             f"{what} is {shown(function)}, but must be a function of {', '.join(wanted) or 'nothing'}{other}."
@@ -142,8 +142,8 @@ def require_truth(what: str, value: object) -> None:
 
 
 def require_methods(what: str, value: object, names: tuple[str, ...], wanted: str) -> None:
-    """Raise `InputError`, in a sentence that begins with ``what`` and says what is ``wanted``, unless a value is an
-    object with these methods."""
+    """Raise `InputError`, in a sentence that begins with ``what`` and ends with ``wanted``, unless a value is an object
+    with these methods."""
     if isinstance(value, type) or not all(callable(getattr(value, name, None)) for name in names):
         raise InputError(f"{what} is {shown(value)}, but must be {wanted}.")
 
@@ -170,7 +170,7 @@ def check_step_numbers(steps: Iterable[int], most: int) -> list[int]:
 
 
 def _is_masked(value: Any) -> bool:
-    """Test if a value is a masked array with masked entries, or a list that holds one."""
+    """Test if a value is a masked array with masked entries, or a list that contains such an array."""
     if isinstance(value, np.ma.MaskedArray):
         return bool(np.ma.is_masked(value))
     return isinstance(value, (list, tuple)) and any(map(_is_masked, value))
@@ -181,14 +181,15 @@ def _is_real(value: Any) -> bool:
 
 
 def require_names(what: str, names: Any) -> list[Any]:
-    """Return several names as a list; raises `InputError` for a single text, whose letters would be taken for names."""
+    """Return several names as a list; raises `InputError` for a single string, because its letters would be taken for
+    names."""
     if isinstance(names, (str, bytes)) or not isinstance(names, Iterable):
         raise InputError(f"{what} is {shown(names)}, but must be a list of names.")
     return list(names)
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
-    """Return a finite vector (d,) other than 0 scaled to length 1, also where its square under- or overflows."""
+    """Return a finite non-zero vector (d,) scaled to length 1, without underflow or overflow of its square."""
     size = np.linalg.norm(vector)
     if not 0.0 < size < np.inf:
         vector = vector / np.abs(vector).max()

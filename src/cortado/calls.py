@@ -1,7 +1,7 @@
-"""Functions that users call say in a sentence which arguments a call lacks, has that are none, or has of another kind.
+"""Make public functions raise one clear sentence when a call lacks an argument or has an unknown or unsuitable one.
 
-Objects that do not change once they are made (`fixed`), and objects that stay in their process (`Staying`), refuse in a
-sentence too. Sentences and a ``repr`` show objects in a few words: how many, how large, never the numbers of an array.
+Changing an unchangeable object (`fixed`) and pickling an object with device arrays (`Staying`) raise a sentence too.
+Sentences and a ``repr`` show arrays by their number and shape, never by their entries.
 """
 
 import os
@@ -29,7 +29,8 @@ _WORDS: dict[Any, str] = {
     Mapping: "a table",
     Iterable: "a list",
 }
-"""Words for types of arguments in sentences; a class that is not here has those of its first base class here."""
+"""Words for types of arguments in sentences. A class that is not listed has the words of its first listed base
+class."""
 
 
 def face(module: dict[str, Any]) -> Callable[[], list[str]]:
@@ -40,8 +41,8 @@ def face(module: dict[str, Any]) -> Callable[[], list[str]]:
 
 
 def public(value: T) -> T:
-    """Make a function, or a class and its methods, `told` wherever it is named; return anything else unchanged. A
-    decorator where public modules import the name late."""
+    """Apply `told` to a function, or to a class and its methods; return anything else unchanged. Use it as a decorator
+    if public modules import the name late."""
     if not str(getattr(value, "__module__", "")).startswith("cortado"):
         return value
     made: Any = value
@@ -64,8 +65,8 @@ def public(value: T) -> T:
 
 @cache
 def told(function: F) -> F:
-    """Wrap a function, or a class's ``__init__``, to raise `InputError` instead of `TypeError` for a call that does not
-    fit, or that fails by an argument's type."""
+    """Wrap a function, or a class's ``__init__``, so that wrong arguments raise `InputError` in a sentence instead of
+    `TypeError`."""
     if hasattr(function, "is_told"):
         return function
     takes = signature(function)
@@ -98,7 +99,7 @@ def told(function: F) -> F:
 
 
 def _misfit(function: Any, bound: BoundArguments) -> str | None:
-    """Return a sentence about the first argument whose type does not match the function's hints, else None."""
+    """Return a sentence about the first argument whose type contradicts the function's type hints, or None."""
     try:
         hints = get_type_hints(function)
     except NameError:  # of types that are imported for the check of types alone
@@ -110,7 +111,7 @@ def _misfit(function: Any, bound: BoundArguments) -> str | None:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Test if a value is of a type, as far as possible without consuming iterators."""
+    """Test if a value matches a type hint, as far as possible without consuming iterators."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return any(_fits(value, one) for one in inner)
@@ -146,7 +147,7 @@ def _takes(function: Any, number: int) -> bool:
 
 
 def _words(hint: Any) -> str:
-    """Return the words for a value of a type in a sentence."""
+    """Return the words that describe a type hint in a sentence."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return " or ".join(dict.fromkeys(map(_words, inner)))
@@ -167,10 +168,10 @@ _OWN = "_made_with"
 
 
 def fixed(made: type[T]) -> type[T]:
-    """Make the public attributes of a class's objects stay as the constructor sets them; no others may be added. A
-    derived class may add attributes, and an object may be given methods.
+    """Decorate a class so that public attributes of its objects cannot be changed or added after construction. A
+    derived class may add attributes, and methods may be assigned to an object.
 
-    Raises `InputError` where one is set or deleted, and where the class is called with other arguments than it takes.
+    Setting or deleting an attribute, or calling the class with wrong arguments, raises `InputError`.
     """
     begin: Callable[..., None] = told(made.__init__)
 
@@ -210,7 +211,7 @@ def _refuse(made: type, name: str, done: str) -> NoReturn:
 
 
 class FixedDict(dict[Any, Any]):
-    """A copy of a table that cannot be changed; its ``repr`` is that of the table."""
+    """An unchangeable copy of a dict, with the ``repr`` of that dict."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle or copy the table as a plain dict."""
@@ -233,7 +234,7 @@ def keep_own(made: object, name: str) -> None:
 
 
 class Staying:
-    """An object with arrays on a device, which raises `InputError` where it is pickled or copied."""
+    """A base class for objects with arrays on a device: pickling or copying them raises `InputError`."""
 
     instead: ClassVar[str] = "but NumPy arrays of what it holds can"
     """End of the error sentence: what can be pickled in its place."""
@@ -266,7 +267,7 @@ def sized(arrays: Mapping[str, Any]) -> str:
 
 
 class ShortRepr:
-    """A base of dataclasses (made with ``repr=False``) whose arrays are shown by their shapes."""
+    """A base class of dataclasses (made with ``repr=False``) whose ``repr`` shows arrays by their shapes."""
 
     def __repr__(self) -> str:
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]

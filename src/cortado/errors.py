@@ -1,4 +1,4 @@
-"""The errors and warnings of Cortado, each with one sentence for the user."""
+"""Cortado's errors and warnings; each message is one sentence for the user."""
 
 import sys
 import warnings
@@ -19,15 +19,15 @@ class CortadoWarning(UserWarning):
 
 
 class MassWarning(CortadoWarning):
-    """A warning that the fluid has another mass than asked for, printed where a scene or run is described."""
+    """A warning that the fluid's mass differs from the mass asked for; printed when a scene or run is described."""
 
 
 _INSIDE = ("cortado", "pydantic", "contextlib", "functools")
-"""Modules whose lines are not the user's."""
+"""Packages whose code is skipped when a warning looks for the user's line."""
 
 
 def warn(sentence: str, category: type[Warning] = CortadoWarning) -> None:
-    """Give a warning at the line of the user's code that led here."""
+    """Issue a warning that points to the line of the user's code which led here."""
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
         level, frame = level + 1, frame.f_back
@@ -43,16 +43,17 @@ def unwarned() -> Iterator[None]:
 
 
 class InputError(CortadoError):
-    """An error in the user's input; takes the sentence that says so. Exit code 2."""
+    """An error in the user's input, with a sentence that explains it. Exit code 2."""
 
 
 class OutOfRangeError(InputError):
-    """An error for a parameter value that allows no run: out of its range, beyond a precision, or a place where no
-    fluid can be. Where it is one of many points, the others are computed all the same."""
+    """An error for a parameter value with which no run is possible: out of range, beyond the precision, or a place
+    without room for fluid. Among many points, only the bad point fails."""
 
 
 class Words(str):
-    """Words in a sentence that describe what was found; a plain ``str`` is a text of the user, and is quoted."""
+    """Our own words in an error's sentence, printed without quotes; a plain ``str`` is the user's text and is
+    quoted."""
 
 
 class MissingDerivativeError(InputError):
@@ -60,19 +61,19 @@ class MissingDerivativeError(InputError):
 
 
 class SceneError(CortadoError):
-    """An error in a scene: where, what was found and what was wanted. Exit code 2."""
+    """An error in a scene, with the key, the value found and the value wanted. Exit code 2."""
 
     def __init__(self, file: str | None, field: str, found: Any = None, wanted: str = "", sentence: str | None = None):
-        """Set the parts of the sentence; ``sentence`` replaces "is <found>, but must be <wanted>.", its default."""
+        """Store the parts of the message; ``sentence`` replaces the default "is <found>, but must be <wanted>."."""
         super().__init__(file, field, found, wanted, sentence)
         self.file = file
-        """As the user gave it; None for a scene that was built in Python."""
+        """Path of the scene file as the user gave it; None for a scene built in Python."""
         self.field = field
-        """Such as ``fluid[0].upper``; empty for the scene as a whole."""
+        """Key of the scene, such as ``fluid[0].upper``; empty for the scene as a whole."""
         self.found = found
-        """The value, or a `Words`."""
+        """The wrong value, or `Words` that describe it."""
         self.wanted = wanted
-        """What would have been right, in words."""
+        """Words that describe a correct value."""
         self.sentence = sentence or f"is {shown(found)}, but must be {wanted}."
 
     def in_file(self, file: str) -> "SceneError":
@@ -86,7 +87,7 @@ class SceneError(CortadoError):
 
 
 class ComputationError(CortadoError):
-    """An error of a computation that failed although the input was good. Exit code 1."""
+    """An error for a computation that failed although the input was valid. Exit code 1."""
 
 
 class DivergedError(ComputationError):
@@ -97,24 +98,24 @@ class DivergedError(ComputationError):
     ):
         super().__init__(step, particle, advice, where, others, preface)
         self.step = step
-        """The first bad step, counted from 1."""
+        """The step in which the particle was lost, counted from 1."""
         self.particle = particle
-        """The first bad particle, in the scene's order."""
+        """Number of the first lost particle, in the scene's order."""
         self.advice = advice
-        """What to try, in words."""
+        """Advice for the user, in words."""
         self.where = where
-        """What became of the particle, and where it was at the end of that step, in words."""
+        """Words that say how the particle was lost, and where it was at the end of the step."""
         self.others = others
-        """How many particles more were lost in the same step."""
+        """Number of further particles lost in the same step."""
         self.preface = preface
-        """Of one run among several: what became of them together, in a sentence."""
+        """A sentence about all runs, if this run is one of several."""
 
     def with_advice(self, advice: str) -> "DivergedError":
-        """Return this error with another advice."""
+        """Return a copy of this error with different advice."""
         return DivergedError(self.step, self.particle, advice, self.where, self.others, self.preface)
 
     def among_others(self, preface: str) -> "DivergedError":
-        """Return this error as the first of several, after a sentence about all of them."""
+        """Return a copy of this error whose message begins with ``preface``, a sentence about all runs."""
         return DivergedError(self.step, self.particle, self.advice, self.where, self.others, preface)
 
     def __str__(self) -> str:
@@ -164,10 +165,11 @@ class LibraryMissingError(CortadoError, ImportError):
     """An error for a missing library that Cortado can do without."""
 
     def __init__(self, name: str, package: str, module: str | None = None):
-        """Name the library; ``module`` of Cortado needs it, by default the one with the name of the package."""
+        """Store the library's ``name`` and ``package``; ``module`` is the part of Cortado that needs it, by default
+        ``package``."""
         super().__init__(name, package, module)
         self.package = package
-        """What it is installed as."""
+        """Name of the package to install."""
 
     def __str__(self) -> str:
         name, package, module = self.args

@@ -1,4 +1,4 @@
-"""Forces of one's own, each one function: given to ``Simulation(scene, forces=[...])``; see `docs/own_parts.md`."""
+"""Your own forces, each made from one function, for ``Simulation(scene, forces=[...])``; see `docs/own_parts.md`."""
 
 from cortado.calls import face
 from cortado.sph.own_force import Body, OverTime, Pair, Rheology

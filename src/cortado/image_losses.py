@@ -1,4 +1,4 @@
-"""How far an image is from its target: numbers of two images (rows, columns, 3), each with its own adjoint."""
+"""Differences between an image (rows, columns, 3) and its target as one number, with derivatives."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ SMALLEST = 2
 
 
 class ImageLoss(Protocol):
-    """Protocol of a differentiable number of an image and its target."""
+    """Protocol of a differentiable loss that compares an image with its target."""
 
     @property
     def fingerprint(self) -> str:
-        """Text that tells losses apart, for checkpoints."""
+        """Text that identifies the loss and its settings; checkpoints store it."""
 
     def value(self, image: ArrayLike, target: ArrayLike) -> float:
         """Return the loss of an image (rows, columns, 3)."""
@@ -39,7 +39,7 @@ class ImageLoss(Protocol):
 class SquaredDifference:
     """An image loss: the mean over pixels and channels of the squared difference.
 
-    Shapes that do not overlap do not feel each other; `Pyramid` is for these.
+    Where a shape does not overlap its target, the gradient does not move it towards the target; `Pyramid` helps then.
 
     Example: ``loss = cortado.losses.Image(renderer, target, cortado.image_losses.SquaredDifference())``
     """
@@ -61,18 +61,18 @@ class Pyramid:
     """An image loss: the weighted mean squared difference, summed over the levels of a Gaussian pyramid (Burt and
     Adelson 1983).
 
-    The first level is the image itself, every other one the level before, blurred by a binomial and reduced by 2
-    (`reduction`). Coarse levels see where a shape is before it overlaps with its target, fine levels its outline.
+    The first level is the image itself. Each further level is the previous one, blurred by a binomial and halved
+    (`reduction`). Coarse levels locate a shape before it overlaps its target; fine levels compare outlines.
 
-    ``weights``: a number for each level, all 1 if left out.
+    ``weights``: a number for each level, by default 1, 2, 4 ... from fine to coarse.
 
     Example: ``loss = cortado.losses.Image(renderer, target, cortado.image_losses.Pyramid())``
     """
 
     levels: int | None = None
-    """Number of levels; None: that of the weights or, without weights, until no side is longer than 2 pixels."""
+    """Number of levels. If None, as many as weights; without weights, until no side is longer than 2 pixels."""
     weights: tuple[float, ...] | None = None
-    """Weights (levels,) from fine to coarse; None: 1, 2, 4 ..., as a shape is fainter the more it is blurred."""
+    """Weights (levels,) from fine to coarse; None: 1, 2, 4 ..., because blurring makes shapes fainter."""
 
     def __post_init__(self) -> None:
         if self.levels is not None:
@@ -147,10 +147,9 @@ def reduce_transposed(bar: Image, shape: tuple[int, ...]) -> Image:
 def reduction(size: int) -> Any:
     """Return a sparse matrix (ceil(size / 2), size) that blurs a line of pixels and keeps every other one.
 
-    Where the size is odd, Burt and Adelson's 1 4 6 4 1 about every other pixel, the first and the last among them.
-    Where it is even, that would treat the two ends differently and make a level prefer shapes at one of them; there,
-    1 3 3 1 makes one pixel of two. At an edge the weights of the pixels that are there are divided by their sum, so
-    that a constant stays constant.
+    For an odd size, Burt and Adelson's weights 1 4 6 4 1 are centred on every other pixel, from the first to the last.
+    For an even size these weights would treat the two ends differently, so weights 1 3 3 1 merge two pixels into one.
+    At an edge the weights inside the image are divided by their sum, so that a constant stays constant.
     """
     from scipy.sparse import csr_array
 

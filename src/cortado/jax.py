@@ -1,9 +1,9 @@
 """Cortado as a layer of JAX: see `docs/layers.md`.
 
 States are dictionaries of arrays by the names of their fields, in the simulation's precision, with their ``time`` [s];
-parameters are dictionaries by the names that `Problem` has. All functions are differentiable in both modes, mapped by
-`jax.vmap` as batches, and may stand within `jax.jit` and `jax.lax.scan`; second derivatives are refused. Within a
-compiled program, where values are known only as it runs, JAX raises an error of its own with Cortado's sentence.
+parameters are dictionaries with the names of `Problem`. All functions are differentiable in both modes, run as batches
+under `jax.vmap`, and work inside `jax.jit` and `jax.lax.scan`. Second derivatives raise an error. Inside compiled
+programs JAX raises its own error, which contains Cortado's sentence.
 """
 
 from cortado.calls import face

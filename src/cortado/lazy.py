@@ -1,7 +1,7 @@
-"""Names that are imported when they are first used, so that packages are quick to import, and of packages on top.
+"""Import names when they are first used, so that ``import cortado`` is quick.
 
-The core imports none of the packages that lie on top of it, which do pictures, films, exports, and pages for notebooks.
-A method such as `Trajectory.film` asks for a function by its name, and only then the package is imported that has it.
+The core does not import the packages built on it: pictures, films, exports, notebook pages. A method such as
+`Trajectory.film` asks for a function by name, and the package with this function is imported only then.
 """
 
 import importlib
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
 
 def getter(package: str, homes: "Mapping[str, str] | None" = None) -> "Callable[[str], Any]":
-    """Return the ``__getattr__`` of a package, which finds its modules, and the names in ``homes``, each with the
-    module that has it: one within the package, or anywhere in Cortado if it begins with ``cortado.``."""
+    """Return a ``__getattr__`` for a package that imports its modules and the names in ``homes`` when asked. ``homes``
+    maps a name to its module: one of the package, or of all Cortado if it begins with ``cortado.``."""
 
     def found(name: str) -> "Any":
         if homes and name in homes:
@@ -45,9 +45,9 @@ FUNCTIONS = {
     "trajectory_page": "pictures.pages",
     "trajectory_picture": "pictures.run_pictures",
 }
-"""Modules within `cortado` by the function that each has."""
+"""Modules of `cortado`, by the name of the function that each provides."""
 
 
 def on_top(name: str) -> "Any":
-    """Return the function of a name, one of `FUNCTIONS`."""
+    """Import and return a function named in `FUNCTIONS`."""
     return getattr(importlib.import_module(f"cortado.{FUNCTIONS[name]}"), name)

@@ -1,4 +1,4 @@
-"""What was measured of an experiment, for `cortado.fit`."""
+"""Measurements of an experiment, for `cortado.fit`."""
 
 from cortado.calls import face
 from cortado.optimisation.fitting.experiment import Experiment

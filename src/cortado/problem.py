@@ -1,7 +1,7 @@
-"""Parameters in, loss out; loss and gradient; and the derivative along a direction.
+"""Compute a simulation's loss from parameters, its gradient, and its derivative along a direction.
 
-`ProblemForwardPass` is a run that can be gone back through. The fingerprint tells which problem a search is of, so that
-it is not resumed with another one.
+`ProblemForwardPass` is a run with backward passes. A search stores the problem's fingerprint, so that nobody resumes
+the search with another problem.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -42,11 +42,11 @@ from cortado.sph.function_text import code_words
 __all__ = ["NAMES", "UNITS", "Problem"]
 
 SPARSE = 8
-"""From one state in so many on, quantities are read in every step. With a probe in every 8th state a loss costs 3 to
-6 % less so, and its gradient 1 to 9 %, with 408 and 7,824 particles in float32. With one in every 16th state the costs
-are the same to 2 % (`python -m benchmarks probed`)."""
+"""Quantities are read during the run if the loss needs at least one state in so many. With a probe in every 8th state
+this saves 3 to 6 % of a loss and 1 to 9 % of its gradient (408 and 7,824 particles, float32). In every 16th state both
+ways cost the same to 2 % (`python -m benchmarks probed`)."""
 KEPT = 2
-"""Number of batches of a problem, of different sizes, that are kept for the next evaluation."""
+"""Number of batches of different sizes that a problem keeps for its next evaluations."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class ProblemForwardPass(Staying):
     """A forward run of a problem with its loss, and with backward passes through it."""
 
     loss: Any
-    """Loss of the run, of a batch (batch,)."""
+    """Loss of the run: a number, or an array (batch,) for a batch."""
     instead = "but the problem can, and the parameters, with which it is run again"
     _residual: Residual
     _values: Arrays
@@ -77,17 +77,16 @@ class ProblemForwardPass(Staying):
         """Return the gradient by an estimator; ``observe`` is given the number and the adjoint of every state, from the
         last to the first.
 
-        Other evaluations of the problem may be in between: the bits are the same. Raises `InputError` for an estimator
-        whose settings may change, as its backward step would keep the first ones, and for one that may mix up the
-        scenes of a batch.
+        The result has the same bits if the problem was evaluated in between. Raises `InputError` for an estimator whose
+        settings may change, because the backward step would keep the old ones, or that may mix scenes of a batch.
         """
         derivative = self._derivatives.of(estimator)
         return self._gradient(derivative, self._first_adjoint(derivative, observe))
 
     @in_turn
     def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
-        """Return the gradient by an estimator, and the derivatives with respect to the fields of the first state, by
-        name, and its ``time``."""
+        """Return the gradient by an estimator, and derivatives by name with respect to the first state's fields and its
+        ``time``."""
         derivative = self._derivatives.of(estimator)
         first = self._first_adjoint(derivative)
         initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
@@ -95,7 +94,7 @@ class ProblemForwardPass(Staying):
 
     @property
     def _lost(self) -> OfLost:
-        """NaN for each lost scene of a batch, whose loss has no number and so no derivatives."""
+        """NaN for each lost scene of a batch: its loss is NaN, so it has no derivatives."""
         return dict.fromkeys(self.rollout.lost, np.nan)
 
     def _first_adjoint(self, derivative: BackwardStep, observe: Observer | None = None) -> State:
@@ -119,7 +118,7 @@ class ProblemForwardPass(Staying):
 
 
 def _fingerprint(simulation: Simulation, steps: int, loss: Any, states: Sequence[RestartState]) -> str:
-    """Return a text of the parts of a problem that its values follow from; see `Problem.fingerprint`."""
+    """Return a text that identifies everything that a problem's values depend on; see `Problem.fingerprint`."""
     energy = simulation.free_energy
     parts = {
         "scene": simulation.scene.computed_json().encode(),
@@ -141,26 +140,26 @@ def _fingerprint(simulation: Simulation, steps: int, loss: Any, states: Sequence
 @public
 @fixed
 class Problem:
-    """A simulation of a number of steps, judged by a loss.
+    """A loss of a simulation over a number of steps, as a function of parameters.
 
     Parameters, any of them together:
 
     - ``gravity`` (d,) or (steps, d) [m / s2]; ``time_step`` [s];
-    - in the place of gravity ``tilt`` (d - 1,) or (steps, d - 1) [degrees], the angle by which the scene's gravity
-      leans, with its size kept. Gravity along -y leans towards x and, in 3-D, z; see
+    - instead of gravity ``tilt`` (d - 1,) or (steps, d - 1) [degrees], the angle by which the scene's gravity is
+      turned; its size stays. Gravity along -y turns towards x and, in 3-D, z; see
       `cortado.scene.parameter_values.Tilt`;
     - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d);
     - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3], a number, with several phases (phases,);
     - with several phases the first ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];
-    - with emitters ``NAME.path`` (d,) or (steps, d), where an opening is after each step [m], and of these and of
-      sinks ``NAME.flow_rate``, a number or (steps,) [m3 / s];
+    - with emitters ``NAME.path`` (d,) or (steps, d), the opening's place after each step [m]; with emitters and sinks
+      ``NAME.flow_rate``, a number or (steps,) [m3 / s];
     - in a scene with surface tension ``surface_tension`` [N / m];
     - with a loss of images ``colours`` (phases, 3);
-    - with forces of one's own, ``simulation.forces``, their parameters, such as ``drag.k``.
+    - with forces of your own in ``simulation.forces``, the parameters of these forces, such as ``drag.k``.
 
-    What is not given is the scene's, as its schedule changes it. n counts fluid particles in the order in which the
-    scene lists them. Methods take a table of them, ``parameters``, and as ``gradient`` or ``estimator`` an object of
-    `cortado.gradients`, which is `cortado.gradients.Exact` if left out.
+    Parameters left out have the scene's values, with its schedule. n counts fluid particles, in the scene's order.
+    Methods take ``parameters``, a table of values by these names. Their ``gradient`` or ``estimator`` is an object of
+    `cortado.gradients`, by default `cortado.gradients.Exact`.
 
     Example::
 
@@ -177,12 +176,12 @@ class Problem:
         memory_budget: int = MEMORY_BUDGET,
         state: RestartState | Sequence[RestartState] | None = None,
     ):
-        """Make a problem of ``steps`` steps, which may be 0: the loss is then one of the first state.
+        """Make a problem of ``steps`` steps. With 0 steps the loss is computed from the first state.
 
         ``loss``: an object with ``value`` and ``adjoint``, `losses.Frames` of such, or a function of Warp arrays (see
-        `losses.Recorded`). ``memory_budget``: bytes of states kept on the way forward; with less, states are
-        recomputed on the way back. ``state``: where the steps begin, of a batch one for each scene; parameters are
-        then those of the steps to come, and first values cannot be given. See `Simulation.state`.
+        `losses.Recorded`). ``memory_budget``: bytes of states that the forward run may store; the backward pass
+        recomputes the others. ``state``: the state to begin from, or one for each scene of a batch. Parameters are then
+        of the steps that follow it, and initial values cannot be given. See `Simulation.state`.
         """
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is a {type(simulation).__name__}, but must be a cortado.Simulation.")
@@ -211,27 +210,29 @@ class Problem:
 
     @in_turn
     def value(self, parameters: Values) -> Any:
-        """Return the loss, forward only: a float, of a batch (batch,), NaN for a scene that was ``lost``."""
+        """Return the loss by a forward run: a float, or (batch,) for a batch, with NaN for a scene that is in
+        ``lost``."""
         return self._losses.total(self._ends(self._checked(parameters), self._losses, keep=False), self._going)
 
     def end(self, parameters: Values) -> Any:
-        """Return the last state of the rollout under these parameters: a `Snapshot`, of a batch a `SnapshotBatch`."""
+        """Return the last state of the rollout with these parameters: a `Snapshot`, or a `SnapshotBatch` for a
+        batch."""
         return self.states(parameters, [self.steps])[self.steps]
 
     @in_turn
     def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Any]:
-        """Return states of the rollout under these parameters, by the number of steps before them, from 0 on."""
+        """Return states of the rollout with these parameters, by their number of steps; 0 is the first state."""
         return self._ends(self._checked(parameters), check_step_numbers(steps, self.steps), keep=False)
 
     @in_turn
     def run(self, parameters: Values, record_every: int = 1) -> Any:
-        """Return the whole trajectory under these parameters, a frame every ``record_every`` steps."""
+        """Return the whole trajectory with these parameters, with a frame every ``record_every`` steps."""
         self._space.begin(self._rollout, self._checked(parameters), states=self._states)
         return self.simulation.collect(self._rollout, record_every)
 
     def value_and_gradient(self, parameters: Values, gradient: GradientEstimator | None = None) -> tuple[Any, Arrays]:
-        """Return the loss and its derivatives: for each parameter given, an array of its shape (float64), of a batch
-        with a first axis for the scenes."""
+        """Return the loss and its derivatives: for each given parameter a float64 array of its shape, for a batch with
+        a first axis for the scenes."""
         found = self.estimate(parameters, gradient)
         return found.loss, found.gradient
 
@@ -239,9 +240,9 @@ class Problem:
     def value_and_gradients(
         self, parameters: Values, gradient: AdjointEstimator | None = None
     ) -> tuple[Any, Arrays, Arrays]:
-        """Return the loss, its derivatives as `value_and_gradient`, and those with respect to the first state: float64,
-        by the names of its fields in their shapes, with ``time`` for its clock. Those of a batch have a first axis for
-        the scenes."""
+        """Return the loss, its derivatives as `value_and_gradient` does, and its derivatives with respect to the first
+        state. The third table has float64 arrays by field name, in the fields' shapes, and ``time``; for a batch with a
+        first axis for the scenes."""
         forward_pass = self.forward_pass(parameters)
         return forward_pass.loss, *forward_pass.back_to_state(Exact() if gradient is None else gradient)
 
@@ -249,11 +250,11 @@ class Problem:
     def estimate(
         self, parameters: Values, gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """Return the loss and its derivatives, with what the estimator ``gradient`` (`gradients.Exact` by default)
-        reports.
+        """Return the loss, its derivatives, and the report of the estimator ``gradient`` (`gradients.Exact` by
+        default).
 
-        ``observe`` is given the number and the adjoint of every state, from the last to the first, by estimators that
-        go back through a run; `gradients.AdjointNorms` is such an observer.
+        Estimators with a backward pass call ``observe`` with the number and the adjoint of every state, from the last
+        to the first. `gradients.AdjointNorms` is such an observer.
         """
         require_function("observe", observe, *OBSERVED)
         found = estimate(self, parameters, gradient, observe)
@@ -268,8 +269,8 @@ class Problem:
 
     @in_turn
     def forward_pass(self, parameters: Values) -> ProblemForwardPass:
-        """Run forward, and return a run for backward passes, also after other evaluations. Its states are kept for as
-        long as it is held."""
+        """Run forward and return the run, for backward passes at any later time. The returned object keeps the stored
+        states in memory."""
         values = self._checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
@@ -279,8 +280,8 @@ class Problem:
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> Any:
-        """Return the derivative of the loss along ``directions`` (any of the parameters), by forward mode: a float, of
-        a batch (batch,)."""
+        """Return the derivative of the loss along ``directions`` (of any parameters) by forward mode: a float, or
+        (batch,) for a batch."""
         dots: dict[int, Arrays] = {}
 
         def observe(step: int, dot: State) -> None:
@@ -299,17 +300,16 @@ class Problem:
     def tangents(
         self, parameters: Values, directions: Values, observe: Observer, steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """Run in forward mode, and give ``observe`` the number of every state and its tangent along ``directions`` (any
-        of the parameters), which the next step overwrites. Returns the states after ``steps`` steps, by these, as
-        `states` does."""
+        """Run in forward mode and return states by step, as `states` does. ``observe`` is called with the number of
+        every state and its tangent along ``directions`` (of any parameters); the next step overwrites this tangent."""
         return self.several_tangents(parameters, [(directions, observe)], steps)
 
     @in_turn
     def several_tangents(
         self, parameters: Values, each: Iterable[tuple[Values, Observer]], steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """Run once in forward mode along several directions, each with an observer of its own, and return the states
-        after some ``steps``; see `tangents`."""
+        """Run once in forward mode along several directions, with an observer for each, and return states by step; see
+        `tangents`."""
         values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
         for directions, observe in each:
             require_arguments("observe", observe, OBSERVED)
@@ -322,8 +322,8 @@ class Problem:
 
     @in_turn
     def along(self, end: Any, quantities: Iterable[str], dot: Arrays, parameters: Values, directions: Values) -> Arrays:
-        """Return tangents of quantities of ``end``, a state of the last run, by name, along ``dot``, the state's own
-        tangent by fields, and ``directions`` of the parameters."""
+        """Return tangents of quantities of ``end``, a state of the last run, by name. ``dot`` is the state's tangent by
+        field; ``directions`` are those of the parameters."""
         names = list(quantities)
         if not names:
             return {}
@@ -333,11 +333,11 @@ class Problem:
 
     @property
     def lost(self) -> Mapping[int, DivergedError]:
-        """Errors of the scenes of a batch that lost a particle in the last evaluation, by their number."""
+        """Errors, by scene number, of the scenes of a batch that lost a particle in the last evaluation."""
         return self._rollout.lost
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """Return how many points `together` takes at once; see `Batchable.room`."""
+        """Return how many points one call of `together` can take; see `Batchable.room`."""
         if self.simulation.batch is not None or (estimator is not None and not checked_reverse(estimator).batches):
             return 1
         return self.simulation.room(self.steps, self.memory_budget if estimator else 0.0)
@@ -361,7 +361,7 @@ class Problem:
         return [lost[b] if b in lost else found.member(b, shapes) for b in range(len(points))]
 
     def beginning_at(self, state: RestartState | Sequence[RestartState]) -> "Problem":
-        """Return this problem, with shared arrays, beginning at another state."""
+        """Return a problem that begins at another state and shares this problem's arrays."""
         found, judged = object.__new__(Problem), self.simulation.judged_states
         states = [one if one in judged else one.fixed() for one in one_for_each(state, self.simulation.batch)]
         found.__dict__ |= {**self.__dict__, "state": state, "_states": states, "_batches": {}}
@@ -379,29 +379,30 @@ class Problem:
 
     @property
     def fingerprint(self) -> str:
-        """Text that identifies the problem by words and checksums: steps, precision, scene, first positions (which may
-        be in a file), and free energy (by its name, curvature and code). It also covers forces and solver of one's own,
-        and the ``fingerprint`` of the loss, or the code of a function. For any other loss only its type is known."""
+        """Text that identifies the problem: steps, precision, scene, first positions, and free energy (name, curvature,
+        code). It also covers your own forces and solver, and the ``fingerprint`` of the loss or the code of a loss
+        function. Any other loss enters by its type alone."""
         return _fingerprint(self.simulation, self.steps, self.loss, self._states)
 
     def iterations(self) -> np.ndarray:
-        """Return the pressure iterations (steps,) of the last evaluation, of a solver with one loop."""
+        """Return the pressure iterations (steps,) of the last evaluation, for a solver with one iteration loop."""
         return noted(self.diagnostics, "iterations")
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
-        """Diagnostics (steps,) by name of the last evaluation: ``converged``, and others that the solver notes."""
+        """Diagnostics (steps,) of the last evaluation, by name: ``converged``, and further ones that the solver
+        records."""
         return self._rollout.diagnostics
 
     def _checked(self, parameters: Values) -> Arrays:
-        """Return the parameters as arrays, checked to go with the first state, if one is given."""
+        """Return the parameters as arrays, after checking that they fit the given first state, if there is one."""
         values = self._space.checked(parameters)
         self._space.check_restarts(self._states, values)
         self.simulation.judged_states.update(one for one in self._states if one.origin is not None)
         return values
 
     def _ends(self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()) -> dict[int, Any]:
-        """Return states by the number of steps before them; ``keep`` stores checkpoints for a backward pass."""
+        """Run forward and return states by their number of steps; ``keep`` stores checkpoints for a backward pass."""
         wanted, single, ends = set(steps), self.simulation.batch is None, dict[int, Any]()
         each = np.array([self._space.colours(own) for own in self._space.members(values)])
         made, colours = (Snapshot, each[0]) if single else (SnapshotBatch, each)
@@ -422,8 +423,8 @@ class Problem:
         return ends
 
     def _reader(self, wanted: set[int]) -> QuantityReader | None:
-        """Return what reads the quantities that losses need of states in the run's own steps; None where so few are
-        ``wanted`` that taking their steps again costs less."""
+        """Return a reader that computes the quantities for the loss during the run. Return None if the loss needs so
+        few states that repeating their steps costs less."""
         each = {k: name for k, name in self._losses.quantities(self.simulation.evaluator).items() if k in wanted}
         each.pop(self.steps, None)  # no step is behind it
         if len(each) * SPARSE < self.steps or not each:
@@ -432,6 +433,6 @@ class Problem:
 
     @property
     def _going(self) -> list[int] | None:
-        """Numbers of the scenes of a batch that have not lost a particle; None of a single scene."""
+        """Numbers of the scenes of a batch that have not lost a particle; None for a single scene."""
         batch = self.simulation.batch
         return None if batch is None else [b for b in range(batch) if b not in self.lost]

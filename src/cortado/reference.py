@@ -1,4 +1,4 @@
-"""The reference engine in C++, to judge gradients by: a distribution of its own, ``cortado-reference``."""
+"""The C++ reference engine, which checks gradients; it is installed as a separate package, ``cortado-reference``."""
 
 from cortado.calls import face
 from cortado.errors import EngineMissingError

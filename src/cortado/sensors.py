@@ -1,5 +1,5 @@
-"""What a gauge would read in the fluid: pressure at a point, the height of its surface, a flow, the load on a solid,
-how a body moves."""
+"""Sensors: pressure at a point, height of the fluid's surface, flow rate, load on a solid, spring force, motion of a
+body."""
 
 from cortado.calls import face
 from cortado.runs.body_sensors import BodyMotion, SpringForce

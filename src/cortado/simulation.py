@@ -1,4 +1,4 @@
-"""A scene on a device in a precision: the thing that runs."""
+"""The class `Simulation`: a scene prepared to run on a device in a floating-point precision."""
 
 from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
@@ -58,7 +58,8 @@ from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy, stable_substeps
 from cortado.watching import Watch
 
 WORTH = {"cpu": 16_000, "cuda": 1_000_000}
-"""Number of particles of all scenes in one launch above which more are no faster, by kind of device."""
+"""Number of particles in one launch, all scenes together, above which larger batches are no faster, by kind of
+device."""
 
 
 @public
@@ -66,7 +67,7 @@ WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 class Simulation(Stepping):
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
 
-    Threads that use it take turns, and other processes can have it, pickled or by a fork: see `docs/processes.md`.
+    Only one thread at a time uses a simulation. It can be pickled and used after a fork; see `docs/processes.md`.
 
     Example::
 
@@ -87,12 +88,12 @@ class Simulation(Stepping):
         solver: SolverMaker | None = None,
         lanes: int | None = None,
     ):
-        """Prepare ``scene``: one, or the path of its file; ``device`` as Warp names it ("cpu", "cuda:0"), ``precision``
-        "float32" or "float64"; ``free_energy`` replaces the one that the scene names. ``batch``: run so many of it in
-        one launch, each with parameters of its own; see `docs/batches.md`. ``forces``: forces of one's own, such as
-        `cortado.forces.Body`, which act besides the scene's; ``solver``: what makes a solver of one's own, instead of
-        the one that the scene names; see `docs/own_parts.md`. ``lanes``: threads of a GPU that share a particle, by
-        default as many as are fastest for a scene of this size that runs alone; see `docs/batches.md`."""
+        """Prepare ``scene``, a `Scene` or the path of its file. ``device``: "cpu" or "cuda:0", as in Warp.
+        ``precision``: "float32" or "float64". ``free_energy`` replaces the scene's. ``batch``: number of copies in one
+        launch, each with its own parameters. ``forces``: your own forces, such as `cortado.forces.Body`, added to the
+        scene's. ``solver``: a function that makes your own solver, used instead of the scene's; see
+        `docs/own_parts.md`. ``lanes``: GPU threads per particle, by default the fastest number for one scene of this
+        size; see `docs/batches.md`."""
         scene, self.batch = as_scene(scene), None if batch is None else whole_number("batch", batch, 1)
         start_warp()
         if free_energy is not None and not isinstance(free_energy, FreeEnergy):
@@ -103,13 +104,13 @@ class Simulation(Stepping):
         self.scene = scene
         self._given = checked_makers(forces), None if solver is None else checked_solver(solver)
         self.forces = (*forces_named(scene), *self._given[0])
-        """What makes the forces that are not Cortado's own: those of packages that the scene names, and those given."""
+        """Makers of the forces that are not part of Cortado: those of packages named in the scene, and those given."""
         self._maker = self._given[1] or solver_named(scene.solver)
         self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
-        """What makes the solver, if it is not Cortado's own."""
+        """The maker of the solver if it is not one of Cortado's; None otherwise."""
         self._called, self._lanes = called(scene.solver, self._given[1]), checked_lanes(lanes)
         self.known = known_of(self.forces, self._maker, scene)
-        """Its parameters."""
+        """Parameters of the forces and of the solver."""
         self.device = device_named(device)
         self.precision = precision_named(precision)
         discrete = discretise(scene)
@@ -120,25 +121,26 @@ class Simulation(Stepping):
         require(parts, f"take {smaller}a larger spacing or a smaller container", self.device)
         check_distance(scene, discrete, self.precision)
         self.positions, self.velocities = discrete.fluid.positions, discrete.fluid.velocities
-        """(n, d) first positions [m], and first velocities [m / s]."""
+        """First positions (n, d) [m] and first velocities (n, d) [m / s]."""
         self.mass_fractions = np.eye(len(scene.phase))[discrete.fluid.phase]
-        """(n, phases) first mass fractions [-]."""
+        """First mass fractions (n, phases) [-]."""
         self.particles = len(self.positions)
         check_own(self.known, self)
         self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
         self.smoothing = discrete.kernel
         self.walls, self.wall_solids = discrete.walls.positions, discrete.walls.solid
-        """(b, d) wall particles [m], and (b,) the solid of each, as `wall_numbers` has them; -1 for the container."""
+        """Positions of wall particles (b, d) [m], and the number of each one's solid (b,) as in `wall_numbers`; -1 for
+        the container."""
         self.lattice, self.masses = discrete.lattice, discrete.masses
         """Constants of the lattice of particles at rest; masses of the fluid at the start, given and asked for [kg]."""
         self.free_particles = discrete.fluid.emitted.start
-        """How many particles, the first ones, do not wait in a nozzle."""
+        """Number of particles outside nozzles at the start; these come first in the arrays."""
         own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
         self.solver: Solver = built(self._maker, SolverSetting(*own, self._called, self._lanes))
         self.initial = self.solver.new_state()
         """The first state on the device."""
         self.judged_states: WeakSet[RestartState] = WeakSet()
-        """Those that need not be judged again, as nobody can change them."""
+        """States that were checked once and cannot change, so that they are not checked again."""
         first = SceneParameters(self, 0).first(self.parameters())
         self.initial.set(first if self.batch is None else {name: [a] * self.batch for name, a in first.items()})
         for array in (self.positions, self.velocities, self.mass_fractions, self.walls):
@@ -147,7 +149,7 @@ class Simulation(Stepping):
 
     @property
     def carried_by(self) -> str | None:
-        """Name of the solver in sentences, if it adds fields of its own to states, from which no other solver goes on;
+        """Name of the solver for messages, if it adds fields to states so that no other solver can continue from them;
         else None."""
         return self._called if getattr(self.solver, "carried_fields", ()) else None
 
@@ -156,7 +158,7 @@ class Simulation(Stepping):
         return _made_again, (self._made_of(self.precision.name, self.batch), self._points)
 
     def _made_of(self, precision: str, batch: int | None) -> tuple[Any, ...]:
-        """Return the arguments to make a simulation of this scene, in a precision and for a batch."""
+        """Return the constructor's arguments for a simulation of this scene in a precision and of a batch."""
         energy = self.free_energy if len(self.scene.phase) > 1 else None
         return self.scene, self.device.alias, precision, energy, batch, *self._given, self._lanes
 
@@ -192,19 +194,18 @@ class Simulation(Stepping):
         time: float | None = None,
         observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
-        """Run from the scene's first state and return the frames, the first and the last state included; of a batch a
-        `TrajectoryBatch`. A frame is kept every ``record_every`` steps. ``time`` [s], in the place of ``steps``: as
-        many steps as it takes, the last of which ends then or later.
+        """Run from the scene's first state and return the frames: the first, every ``record_every`` steps one, and the
+        last. A batch returns a `TrajectoryBatch`. ``time`` [s], instead of ``steps``, runs until the first step that
+        ends at this time or later.
 
-        ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity, its schedule included; so
-        does any other parameter of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same
-        scene, the run goes on from there, with the same bits as if it had not stopped. A parameter over time then has a
-        value for each of the steps to come, and a rest density that the earlier run was given is given again. A batch
-        goes on from one state for each scene. ``record=["density"]`` keeps quantities of the particles with every
-        frame: see `quantity`. ``sensors`` by name are read in every step, besides those of the scene: see
-        `cortado.sensors`. ``observe`` is called with the number of each step, to show how far a run is. Warns when the
-        pressure did not converge; raises `DivergedError` when a particle is lost, where a batch warns, and goes on
-        without the scene.
+        ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity and its schedule; any other
+        parameter of `Problem` can be given as well. ``state``, the ``last_state`` of an earlier trajectory (one for
+        each scene of a batch), continues that run bit for bit. Parameters over time then have a value for each
+        remaining step, and a rest density given to the earlier run must be given again. ``record=["density"]`` stores
+        particle quantities with every frame: see `quantity`. ``sensors``, by name, are read in every step besides the
+        scene's: see `cortado.sensors`. ``observe`` is called with the number of each step, to show progress. Warns when
+        the pressure did not converge. When a particle is lost, a single run raises `DivergedError`; a batch warns and
+        continues without that scene.
         """
         own, number = self.__dict__, steps_of_run(self, steps, time, {} if controls is None else controls)
         rollout = own.pop("_idle", None)  # not to be had by a run within this one
@@ -226,8 +227,8 @@ class Simulation(Stepping):
         sensors: Mapping[str, Sensor] | None = None,
         observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
-        """Run a rollout forward and return its frames. ``record_every``, ``record``, ``sensors`` and ``observe`` are
-        those of `run`, which warns and raises in the same way."""
+        """Run a rollout forward and return its frames. The other arguments, the warnings and the errors are those of
+        `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         expected = expected_frames(rollout, record_every)
@@ -252,7 +253,7 @@ class Simulation(Stepping):
         return found
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
-        """Return the fields of a state that a trajectory records, as steps change them."""
+        """Return those fields of a state that a trajectory records, which are the fields that steps change."""
         return state.numpy(self.dimension, self._changing)
 
     @property
@@ -261,7 +262,8 @@ class Simulation(Stepping):
         return [field.name for field in self.initial.fields if not field.is_constant]
 
     def numbers_in_frame(self, components: int) -> int:
-        """Return the greatest number of numbers that `frame` records, for vectors with so many components."""
+        """Return the greatest number of floating-point numbers that `frame` records, for vectors with so many
+        components."""
         sizes = self.particles, components, len(self.scene.phase)
         return sum(prod(field.shape(*sizes)) for field in self.initial.fields if not field.is_constant)
 
@@ -278,8 +280,8 @@ class Simulation(Stepping):
         state: RestartState | Sequence[RestartState] | None = None,
         time: float | None = None,
     ) -> Rollout:
-        """Return a rollout that is ready to go forward from the scene's first state, or from ``state``, by so many
-        ``steps`` or for a ``time`` [s], with ``controls`` as of `run`."""
+        """Return a rollout ready to run forward from the scene's first state, or from ``state``, over ``steps`` steps
+        or a ``time`` [s]; ``controls`` are as in `run`."""
         rollout = Rollout(self.solver, steps_of_run(self, steps, time, {} if controls is None else controls))
         self._begin(rollout, controls, state, time)
         return rollout
@@ -291,7 +293,7 @@ class Simulation(Stepping):
         state: RestartState | Sequence[RestartState] | None,
         time: float | None,
     ) -> None:
-        """Give a rollout its first state and parameters, and its end where that is a time."""
+        """Set a rollout's first state and parameters, and its end time if one is given."""
         space, given = ParameterSpace(self, rollout.steps), {} if controls is None else controls
         values = space.checked(given)
         states = one_for_each(state, self.batch)
@@ -306,22 +308,20 @@ class Simulation(Stepping):
         controls: Mapping[str, Any] | None = None,
     ) -> np.ndarray:
         """Return a quantity of the particles: "density" [kg / m3], "pressure" [Pa], "speed" [m / s], "vorticity" [1 /
-        s], "wall_force" [N]; see `docs/sensors.md`. Or a field of the state, such as one that a part of one's own
-        keeps, or the load on a solid, such as "rotor.load".
+        s], "wall_force" [N]; see `docs/sensors.md`. Fields of the state work too, such as one of your own solver, and
+        the load on a solid, such as "rotor.load".
 
         Args:
-            name: of the quantity.
-            of: a state of this simulation, of a batch one for each scene; or a trajectory, of which it is found for
-                every frame; the scene's first state if left out.
-            controls: as of `run`; the pressure is that of the step that begins at the state, which they act in. Of a
-                trajectory they are those of its run.
+            name: name of the quantity. of: a state of this simulation (of a batch, one for each scene), or a trajectory
+            to evaluate frame by frame; by default the scene's first state. controls: as in `run`, for the step that
+            begins at the state: the pressure is computed in this step. For a trajectory, give the controls of its run.
 
         Returns:
-            (n,) or (n, k), of a trajectory (frames, n, ...), float64, in the scene's order, of a field its shape, of a
+            float64 (n,) or (n, k) in the scene's order, for a trajectory (frames, n, ...); a field has its own shape, a
             load (k,).
 
         Raises:
-            InputError: another name, or a state that is none of this simulation's.
+            InputError: the name is unknown, or the state is not one of this simulation.
         """
         check_readable(name, "quantity", self.initial.names)
         if not isinstance(of, Trajectory):
@@ -340,7 +340,7 @@ class Simulation(Stepping):
 
     @in_turn
     def evaluator(self) -> QuantityEvaluator:
-        """Return the evaluator of quantities of states on the device, made once."""
+        """Return the object that computes quantities of states on the device. It is made once."""
         made: QuantityEvaluator | None = self.__dict__.get("_evaluator")
         if made is None:
             spacing, support = self.scene.discretisation.spacing, self.lattice.support
@@ -349,8 +349,8 @@ class Simulation(Stepping):
         return made
 
     def renderer(self, **settings: Any) -> Renderer:
-        """Return the renderer that takes pictures of the simulation, ``renderer.render(trajectory[k])``, and
-        differentiates them: as the table ``[render]`` of its scene says, or from above, in 2-D as the plane is.
+        """Return a differentiable renderer of this simulation: ``renderer.render(trajectory[k])`` returns a picture.
+        The scene's table ``[render]`` sets the view; by default the camera looks from above, and in 2-D at the plane.
 
         ``settings`` replace keys of that table: ``resolution=(320, 240)``, or ``view="volume", position=(1, 1, 2),
         look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for settings that do not fit.
@@ -358,13 +358,12 @@ class Simulation(Stepping):
         return scene_renderer(self, **settings)
 
     def picture(self, frame: Frame, **settings: Any) -> ShadedPicture:
-        """Return a shaded picture of a frame, (rows, columns, 3), linear from 0 to 1, as the table ``[picture]`` of the
-        scene says; ``settings`` replace keys of it: ``width=640, height=360``, as those of `film` do.
+        """Return a shaded picture of a frame, (rows, columns, 3), linear from 0 to 1, with the settings of the scene's
+        table ``[picture]``. ``settings`` replace keys of this table, as in `film`: ``width=640, height=360``.
 
         Raises:
-            SceneError: settings that do not fit.
-            InputError: what ``colour`` names was not recorded in the frame, or is the age, which one frame does not
-                tell.
+            SceneError: the settings do not fit. InputError: the quantity that ``colour`` names is not recorded in the
+            frame, or is the age, which needs more than one frame.
 
         Example: ``cortado.pictures.write_picture("last.png", simulation.picture(trajectory[-1]))``
         """
@@ -372,8 +371,8 @@ class Simulation(Stepping):
         return image
 
     def film(self, trajectory: Trajectory, path: str | Path, **settings: Any) -> Film:
-        """Write a film of a ``trajectory`` to a ``path`` on the simulation's device; for ``settings`` see
-        `Trajectory.film`. It also computes the quantity of ``colour`` that was not recorded, such as the pressure."""
+        """Render a film of a ``trajectory`` on the simulation's device and write it to ``path``; for ``settings`` see
+        `Trajectory.film`. If the quantity of ``colour``, such as the pressure, was not recorded, it is computed."""
         film: Film = on_top("simulation_film")(self, trajectory, path, settings)
         return film
 
@@ -398,8 +397,8 @@ class Simulation(Stepping):
         return Simulation(self.scene.replaced(*overrides), *others)
 
     def room(self, steps: int, checkpoints: float) -> int:
-        """Return the number of runs of ``steps`` steps that are worth one launch, and fit half of the free memory, with
-        at most ``checkpoints`` bytes of kept states in all."""
+        """Return how many runs of ``steps`` steps one launch should compute. They fit half of the free memory, with at
+        most ``checkpoints`` bytes of stored states in total."""
         neighbours, real = first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
         own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
         states = real * self.numbers_in_frame(3) * 2 * max(isqrt(steps), 1)
@@ -408,15 +407,16 @@ class Simulation(Stepping):
         return int(max(min(WORTH["cpu" if self.device.is_cpu else "cuda"] // self.particles, fitting, kept), 1))
 
     def parameters(self) -> dict[str, np.ndarray]:
-        """Return every parameter of `Problem` as the scene and forces have it, without the changes of its schedule."""
+        """Return the value of every parameter of `Problem` in the scene and its forces, without the scene's
+        schedule."""
         return scene_values(self, self.known)
 
     def substeps(
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
     ) -> int:
         """Return the number of explicit diffusion substeps per ``time_step`` [s] that is stable with a ``mobility``
-        [m2/s], an ``interface_width`` [m] and a ``rest_density`` (phases,) [kg/m3]; raises `InputError` where there
-        would be more than `cortado.sph.free_energy.MOST_SUBSTEPS`."""
+        [m2/s], an ``interface_width`` [m] and a ``rest_density`` (phases,) [kg/m3]; raises `InputError` if that is more
+        than `cortado.sph.free_energy.MOST_SUBSTEPS`."""
         if len(self.scene.phase) == 1:
             return 0
         numbers = (float(time_step), float(mobility), float(interface_width), rest_density)
@@ -424,7 +424,7 @@ class Simulation(Stepping):
 
 
 def _controls_at(given: dict[str, Any], trajectory: Trajectory, frame: int) -> dict[str, Any]:
-    """Return the controls of the step after a frame of the run that they were given to."""
+    """Return the controls of the step that follows a frame, from the controls given to the whole run."""
     step = int(trajectory.steps[frame] - trajectory.steps[0])
     rows = {name: value for name, value in given.items() if name in OVER_TIME and np.ndim(value) == 2}
     return given | {name: value[min(step, len(value) - 1)] for name, value in rows.items()}
@@ -432,7 +432,7 @@ def _controls_at(given: dict[str, Any], trajectory: Trajectory, frame: int) -> d
 
 @unwarned()
 def _made_again(made_of: tuple[Any, ...], points: str) -> Simulation:
-    """Make a simulation from pickled arguments; raises `InputError` unless first positions have an equal checksum."""
+    """Make a simulation from pickled arguments; raises `InputError` if the checksum of its first positions differs."""
     simulation = Simulation(*made_of)
     if simulation._points != points:
         raise InputError(

@@ -1,3 +1,3 @@
-"""The version of Cortado, of which `cortado.__version__` is the public name."""
+"""The version of Cortado; its public name is `cortado.__version__`."""
 
 __version__ = "0.2.0"

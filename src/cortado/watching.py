@@ -1,4 +1,4 @@
-"""Looking at a run's states while it runs: quantities of recorded frames, and sensors in every step."""
+"""Observe a run while it runs: compute quantities of recorded frames and read sensors in every step."""
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache, partial
@@ -21,14 +21,14 @@ from cortado.scene.parameter_values import Arrays
 
 
 class Watched(Steppable, Protocol):
-    """Protocol of a simulation as `Watch` needs it."""
+    """Protocol of the simulations that `Watch` can observe."""
 
     @property
     def walls(self) -> NDArray:
         """Positions (b, d) of wall particles [m]."""
 
     def evaluator(self) -> QuantityEvaluator:
-        """Return the evaluator of quantities that uses the arrays of the simulation."""
+        """Return the object that computes quantities with the arrays of the simulation."""
 
     def rollout(self, steps: int, controls: Mapping[str, Any] | None, state: Any) -> Rollout:
         """Return a rollout that is ready to go forward."""
@@ -42,8 +42,7 @@ class Watched(Steppable, Protocol):
 
 class Watch:
     """An observer of one rollout that computes quantities and reads sensors. Sensors that are sums over particles are
-    read on the device, where the run goes on meanwhile. Others are read with the arrays of another solver of the
-    scene."""
+    read on the device while the run continues. Other sensors use the arrays of a second solver of the scene."""
 
     def __init__(
         self,
@@ -53,7 +52,7 @@ class Watch:
         sensors: Mapping[str, Sensor] | None = None,
     ):
         """Prepare to record quantities, and to read ``sensors`` besides those of the scene. Raises `InputError` for
-        unknown quantities, and for a batch with sensors of one's own."""
+        unknown quantities, and for a batch with user-defined sensors."""
         if sensors is not None:
             require_table("sensors", sensors, "{'probe': cortado.sensors.PressureProbe([0.1, 0.1])}")
 
@@ -66,7 +65,7 @@ class Watch:
         warn_of_places(simulation, known)
         self._recorder = Recorder(rollout, record, evaluator, simulation.dimension)
         self._logs = [SensorLog(known, simulation.dimension) for _ in range(simulation.batch or 1)]
-        """One for each scene."""
+        """Sensor readings, one log for each scene."""
         self._rollout, self._simulation, self._evaluator = rollout, simulation, evaluator
         self._on_host = {name: one for name, one in known.items() if type(one) not in SENSORS.values()}
         if self._on_host and simulation.batch is not None:
@@ -75,12 +74,12 @@ class Watch:
             raise InputError(f"sensors has {type(own).__name__} as {name!r}, but {wanted}.")
         summed: Any = {name: one for name, one in known.items() if name not in self._on_host}
         self._reader = StepReader(simulation.evaluator(), rollout, summed) if summed else None
-        """What reads sensors on the device; None where it has none to read."""
+        """The reader of sensors on the device; None if there are no such sensors."""
         self._quantities = set[str](() if self._reader is None else self._reader.quantities)
-        """Those that sensors read of a state."""
+        """Names of the quantities that sensors read from a state."""
         self._colours = np.array([phase.colour for phase in simulation.scene.phase])
         self.names = self._recorder.names
-        """Of the quantities that are recorded."""
+        """Names of the recorded quantities."""
         self._waiting: Any = None
 
     def run(
@@ -89,10 +88,11 @@ class Watch:
         record: Observer,
         observe: Callable[[int], object] | None = None,
     ) -> State:
-        """Run the rollout forward and return its last state. Sensors read every state; ``record`` is given frames.
+        """Run the rollout forward and return its last state. Sensors read every state; ``record`` is called with the
+        frames.
 
-        Both look at copies while a GPU takes the next steps; ``observe`` is called with the number of each before.
-        Raises `DivergedError`. What was computed before that, or before an interrupt, was looked at.
+        Both read copies of states while a GPU computes the next steps; ``observe`` is called first, with each state's
+        number. Raises `DivergedError`. States computed before this error, or before an interrupt, are still read.
         """
 
         def look(step: int, state: State) -> None:
@@ -114,29 +114,29 @@ class Watch:
         return last
 
     def look(self) -> None:
-        """Look at all that waits: states that were copied, and what sensors have read on the device."""
+        """Process everything that waits: copied states, and sensor values read on the device."""
         if self._waiting is not None:
             self._waiting.look()
         for row in () if self._reader is None else self._reader.rows():
             self._logs[row.member].read(row.sensor, row.number, row.reading)
 
     def first(self) -> None:
-        """Let sensors of one's own read the first state, before the run."""
+        """Make user-defined sensors read the first state, before the run."""
         self._step(0, self._rollout.initial)
 
     def frame(self, step: int, state: State) -> Arrays:
-        """Return the recorded quantities of a state after so many steps, by name."""
+        """Return the recorded quantities, by name, of the state after ``step`` steps."""
         return self._recorder(step, state)
 
     def _step(self, step: int, state: State) -> None:
-        """Make the sensors of one's own read a state after so many steps."""
+        """Make user-defined sensors read the state after ``step`` steps."""
         if self._on_host:
             at: Any = self._snapshot(step, state, self._evaluator)
             for name, sensor in self._on_host.items():
                 self._logs[0].read(name, step, partial(value_of, sensor, at))
 
     def end(self, state: State) -> None:
-        """Make the sensors read the last state, after a run to its end, with the arrays of the simulation."""
+        """Make the sensors read the last state of a finished run, with the arrays of the simulation."""
         if self._reader is None:
             return
         step = self._rollout.taken
@@ -156,11 +156,11 @@ class Watch:
         return SnapshotBatch(state, d, np.array([self._colours] * batch), moment)
 
     def known(self, readings: Mapping[str, Readings]) -> float:
-        """Return the last step of which an earlier process has left all readings; infinite without sensors."""
+        """Return the last step for which an earlier process stored all readings; infinite without sensors."""
         return self._logs[0].known(readings)
 
     def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
-        """Take over sensor readings by an earlier process of the first states, up to that after ``steps`` steps."""
+        """Load the sensor readings that an earlier process stored, up to the state after ``steps`` steps."""
         self._logs[0].go_on(steps, readings)
 
     def readings(self, member: int = 0) -> dict[str, Readings]:

@@ -1,10 +1,10 @@
-"""Gradient estimators: objects to be given to `Problem.value_and_gradient`, each with its formula, bias and cost.
+"""Gradient estimators for `Problem.value_and_gradient`; each class states its formula, bias and cost.
 
-`Exact` is the derivative of the discrete map by its own adjoint, `Tape` the same by Warp's automatic differentiation.
-Beyond the predictability horizon, where neighbouring trajectories diverge, that derivative is of little use, and others
-take its place: `AdjointViscosity`, the mean of its gradients over an ensemble, `EnsembleMean`, or that mean with its
-sizes mended by differences, `Guided`. `RandomizedSmoothing`, which needs forward
-runs alone, is the reference that they are compared with.
+`Exact` computes the derivative of the discrete step by hand-written adjoints, `Tape` by Warp's automatic
+differentiation. Beyond the predictability horizon neighbouring trajectories diverge, and this derivative is of little
+use. `AdjointViscosity` damps the adjoint. `EnsembleMean` averages such gradients over an ensemble; `Guided` also
+corrects their size by differences of the loss. `RandomizedSmoothing` needs forward runs only; the others are compared
+with it.
 """
 
 from cortado.arrays import require_function, require_methods
@@ -50,9 +50,9 @@ def estimate(
 ) -> Estimate:
     """Return the loss of a problem and its gradient by an estimator, `Exact` by default.
 
-    Raises `InputError` where what is given is no estimator, or does not return the gradient of every parameter.
+    Raises `InputError` if ``gradient`` is no estimator, or does not return the gradient of every parameter.
 
-    ``parameters`` by name; ``observe`` is given the number and the state of each step.
+    ``parameters`` are values by name; ``observe`` is called with the number and the adjoint of each state.
 
     Example::
 

@@ -1,4 +1,5 @@
-"""Estimators over an ensemble of parameters and first states: means of differences, of gradients, and of both."""
+"""Estimators that average over an ensemble of parameters and first states: differences of the loss, gradients, or
+both."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,30 +28,30 @@ from cortado.rollout.rollout import Observer
 from cortado.scene.parameter_values import Arrays, Values
 
 MOST_SAMPLES = 100_000
-"""Greatest number of samples of an ensemble; more are taken for a mistake."""
+"""Greatest number of samples of an ensemble."""
 _RUN = 1000.0
-"""Bytes kept of a run besides its numbers."""
+"""Bytes stored per run in addition to its numbers."""
 
 
 @dataclass(frozen=True)
 class Ensemble:
-    """An ensemble around the parameters that an estimator is asked about: its width, and how many samples are drawn.
+    """The settings of a random ensemble around given parameters: its width and its number of samples.
 
-    The parameters, N numbers in all, are drawn from a ball of radius sqrt(N), in units of their spreads; to every
-    coordinate of the first positions a normal random number is added. Samples come in antithetic pairs, and are the
-    same at every call.
+    The parameters, N numbers in all, are drawn from a ball of radius sqrt(N) in units of their spreads. A normal random
+    number is added to every coordinate of the first positions. Samples come in antithetic pairs and are equal at every
+    call.
     """
 
     spread: float | Mapping[str, float] = 0.5
-    """Width of the ensemble in each parameter, in its units, one for all or by name. It is sqrt((N + 2) / N) times the
-    standard deviation of a component."""
+    """Width of the ensemble in each parameter, in the parameter's units: one number for all, or a table by name. It is
+    sqrt((N + 2) / N) times a component's standard deviation."""
     samples: int = 8
-    """Number of samples, at most 100,000; all their results are kept until they are averaged, which needs memory."""
+    """Number of samples, at most 100,000. The results of all samples are kept in memory until they are averaged."""
     position_noise: float = 0.01
     """Standard deviation of the perturbations of first positions [spacings]; 0 for none."""
     seed: int = 0
     executor: Executor = field(default=InProcess(), compare=False, repr=False, kw_only=True)
-    """Executor that computes the members of the ensemble, which changes no bit of the result."""
+    """Executor that computes the members of the ensemble; the result has the same bits with every executor."""
 
     def __post_init__(self) -> None:
         if not is_whole(self.samples) or self.samples < 2:
@@ -69,8 +70,8 @@ class Ensemble:
         keep_own(self, "spread")
 
     def around(self, problem: Differentiable, parameters: Values, draw: int = 0) -> "Sampler":
-        """Return the ensemble around these parameters of a problem; another ``draw`` has independent samples. Raises
-        `InputError` for a batch, for no parameters, and for spreads that round-off swallows."""
+        """Return the ensemble around these parameters of a problem; a different ``draw`` has independent samples.
+        Raises `InputError` for a batch, without parameters, and for spreads smaller than round-off."""
         if problem.simulation.batch is not None:
             raise InputError(
                 f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene, whose "
@@ -88,13 +89,14 @@ class Ensemble:
         return Sampler(values, spreads, start, position_noise, np.random.default_rng([self.seed, draw]))
 
     def evaluated(self, problem: Differentiable, points: Iterable[Point], observe: Observer | None) -> list[Estimate]:
-        """Return estimates at points, in their order. With ``observe``, they are computed in this process, which has
-        the states for it."""
+        """Return estimates at points, in order. With ``observe`` they are computed in this process, because it needs
+        the states."""
         executor = self.executor if observe is None else InProcess()
         return evaluated(problem, points, executor, observe)
 
     def require_memory(self, runs: int, numbers: int) -> None:
-        """Raise `InputError` unless there is memory for the results of ``runs`` runs of ``numbers`` numbers each."""
+        """Raise `InputError` unless memory is sufficient for the results of ``runs`` runs with ``numbers`` numbers
+        each."""
         require({f"{runs:,} runs of {self.samples:,} samples": runs * (_RUN + 8.0 * numbers)}, "take fewer samples")
 
     def _spread(self, name: str) -> float:
@@ -117,12 +119,13 @@ class Sampler:
     random: np.random.Generator
 
     def rotation(self) -> np.ndarray:
-        """Return a random orthonormal basis, its vectors as rows (numbers, numbers), uniform over all rotations."""
+        """Return a random orthonormal basis (numbers, numbers), uniform over all rotations, with the vectors as
+        rows."""
         q, r = np.linalg.qr(self.random.standard_normal((len(self.spreads), len(self.spreads))))
         return (q * np.sign(np.diag(r))).T
 
     def offset(self) -> np.ndarray:
-        """Return a random point (numbers,) uniform in the ball, in spreads."""
+        """Return a random point (numbers,), uniform in the ball, in units of the spreads."""
         direction, numbers = self.random.standard_normal(len(self.spreads)), len(self.spreads)
         radius = np.sqrt(numbers) * self.random.random() ** (1.0 / numbers)
         return radius / np.linalg.norm(direction) * direction
@@ -132,7 +135,8 @@ class Sampler:
         return self.position_noise * self.random.standard_normal(self.start.shape)
 
     def sample(self, u: np.ndarray, displacement: np.ndarray, estimator: GradientEstimator | None = None) -> Sample:
-        """Return a sample with parameters moved by ``u`` (numbers,), in spreads, and displaced first positions."""
+        """Return a sample with parameters moved by ``u`` (numbers,), in units of the spreads, and displaced first
+        positions."""
         values = _moved(self.values, self.spreads * u)
         if self.position_noise:
             values["initial_positions"] = values.get("initial_positions", self.start) + displacement
@@ -144,7 +148,7 @@ class Sampler:
 
 
 def _check_resolved(name: str, value: np.ndarray, spread: float, precision: Precision) -> None:
-    """Raise `InputError` where round-off swallows a spread, which would make all samples equal."""
+    """Raise `InputError` if a spread is smaller than round-off, because all samples would be equal."""
     lost = np.asarray(value, precision.numpy) == np.asarray(value + spread, precision.numpy)
     if lost.any():
         wanted = f"large enough to change {value[lost].flat[0]:g} in {precision.name}"
@@ -152,27 +156,27 @@ def _check_resolved(name: str, value: np.ndarray, spread: float, precision: Prec
 
 
 def _moved(values: Arrays, change: np.ndarray) -> Arrays:
-    """Return values plus a change (numbers,), one vector for all of them."""
+    """Return values by name plus a change, which is one vector (numbers,) for all values."""
     ends = np.cumsum([value.size for value in values.values()])
     parts = np.split(change, ends[:-1])
     return {name: value + part.reshape(value.shape) for (name, value), part in zip(values.items(), parts, strict=True)}
 
 
 MOST_LEFT_OUT = 0.25
-"""Greatest share of the members that an average may leave out; with more it would be that of another ensemble."""
+"""Greatest share of members that an average may leave out."""
 ADVICE = "take a smaller spread, or a logarithm (cortado.optimisation.transforms)"
 
 
 class LeftOutWarning(CortadoWarning):
-    """A warning that an average is over fewer runs than asked for."""
+    """A warning that an average uses fewer runs than asked for."""
 
 
 def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
-    """Return masks (members,) of ensemble members to average, given their runs one member after the other. A member
-    with a diverged run is left out: the others are as symmetric about the parameters as before.
+    """Return a mask (members,) of the ensemble members to average, given the runs of one member after the other.
+    Members with a diverged run are left out; the rest stays symmetric about the parameters.
 
-    ``what``: the members in words, in the plural. Warns of those that are left out; where they are more than a quarter
-    of all, it raises the error of the first run that diverged.
+    ``what``: word for the members, in the plural. Warns of members left out. If they are more than a quarter of all,
+    raises the error of the first run that diverged.
     """
     errors = [getattr(one, "diverged", None) for one in runs]  # an estimator of one's own may return anything
     lost = np.array([error is not None for error in errors], dtype=bool).reshape(members, -1)
@@ -193,29 +197,27 @@ def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
 
 SMOOTHING, SURROGATE = AdjointViscosity(order=2), AdjointViscosity()
 MOST_NUMBERS = 64
-"""Greatest number of components to take differences along: each costs two runs a sample."""
+"""Greatest number of components along which differences are taken; each component costs two runs per sample."""
 
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(Ensemble):
-    """A gradient estimator: central differences, averaged over an ensemble of parameters and first states: the
+    """A gradient estimator: central differences averaged over an ensemble of parameters and first states. It is the
     reference for long runs.
 
     Formula: for parameters u of N numbers, each in units of its spread h,
 
         g = mean over samples of sum_k (L(u + r q_k) - L(u - r q_k)) / (2 r) q_k,   r = sqrt(N),
 
-    with q_1 ... q_N an orthonormal basis, rotated at random in every sample, and first positions perturbed, in the same
-    way on both sides of a difference. It is the gradient of the loss averaged over the ball of an `Ensemble`, of radius
-    h sqrt(N) (randomised smoothing, in antithetic and orthogonal directions).
+    where q_1 ... q_N is an orthonormal basis, rotated at random in every sample. Both sides of a difference have the
+    same perturbed first positions. g is the gradient of the loss averaged over the ball of an `Ensemble`, of radius h
+    sqrt(N) (randomised smoothing with antithetic, orthogonal directions).
 
-    Bias: features of the loss that are narrower than the spread are averaged out, as intended. Noise: the
-    ``standard_error`` of the `Estimate`. Cost: 2 N forward runs a sample, so that it is for a few dozen numbers at
-    most.
+    Bias: features of the loss narrower than the spread are averaged out, as intended. Noise: the ``standard_error`` of
+    the `Estimate`. Cost: 2 N forward runs per sample, so N should be a few dozen at most.
 
-    Runs that diverge: their differences are left out, up to a quarter of all, and the sum over the others of the sample
-    is scaled by N over their number. So the mean keeps its size, and has no bias from this as long as no direction
-    diverges more often than others.
+    Runs that diverge: their differences are left out, up to a quarter of all. The sum over a sample's remaining
+    differences is scaled by N divided by their number. This adds no bias if all directions diverge equally often.
 
     ``position_noise``: how far first positions are moved, in spacings; ``seed`` of the random numbers; ``executor``:
     where the members run.
@@ -224,7 +226,7 @@ class RandomizedSmoothing(Ensemble):
     """
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the loss and its smoothed gradient; ``observe`` is not called, as there are no adjoints."""
+        """Return the loss and its smoothed gradient; ``observe`` is not called, because there are no adjoints."""
         ensemble = self.around(problem, parameters)
         numbers = len(ensemble.spreads)
         if numbers > MOST_NUMBERS:
@@ -261,16 +263,15 @@ class RandomizedSmoothing(Ensemble):
 class EnsembleMean(Ensemble):
     """A gradient estimator: the mean of another estimator's gradients over an ensemble of parameters and first states.
 
-    Formula: g = mean over points of the ensemble of the estimator's gradient there. It is the gradient of the loss that
-    `RandomizedSmoothing` differentiates, as far as the estimator is right, and its cost does not depend on the number
-    of parameters. The mean of `Exact` gradients of long runs is useless, as the largest few of them dominate it.
+    Formula: g = mean of the estimator's gradient over points of the ensemble. If the estimator is accurate, g is the
+    gradient of `RandomizedSmoothing`, at a cost that does not depend on the number of parameters. For long runs, do not
+    average `Exact` gradients: the largest few dominate the mean.
 
-    Bias: that of the estimator; and where the loss is as small as the effect of the perturbed first positions, that
-    effect. Noise: the ``standard_error`` of the `Estimate`. Cost: ``samples`` times that of the estimator, and a
-    forward run.
+    Bias: the estimator's bias, and the effect of the perturbed first positions if the loss is as small as this effect.
+    Noise: the ``standard_error`` of the `Estimate`. Cost: ``samples`` gradients of the estimator and one forward run.
 
-    Samples that diverge: they are left out with the other one of their antithetic pair, up to a quarter of all pairs,
-    so that what remains is as symmetric about the parameters as before. Half a pair would shift the mean to its side.
+    Samples that diverge: the whole antithetic pair is left out, up to a quarter of all pairs. The remaining samples
+    stay symmetric about the parameters; half a pair would shift the mean.
 
     ``spread``: by name or for all, how far parameters are moved, in their units; ``position_noise``: how far first
     positions are, in spacings; ``seed`` of the random numbers; ``executor``: where the members run.
@@ -279,7 +280,7 @@ class EnsembleMean(Ensemble):
     """
 
     samples: int = 4
-    """Number of samples, an even one, as they are drawn in antithetic pairs."""
+    """Number of samples, which is even because samples are drawn in antithetic pairs."""
     estimator: GradientEstimator = SMOOTHING
     """The estimator whose gradients are averaged."""
 
@@ -310,20 +311,20 @@ class EnsembleMean(Ensemble):
         return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1, mean, len(samples) - len(checked))
 
     def combined(self, gradients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the average (numbers,) of gradients (samples, numbers), and its standard error, from the means of
-        antithetic pairs, which are neighbours."""
+        """Return the average (numbers,) of gradients (samples, numbers), and its standard error from the means of
+        antithetic pairs. The two samples of a pair are adjacent rows."""
         return mean_and_error((gradients[::2] + gradients[1::2]) / 2.0)
 
 
 def require_pairs(samples: int) -> None:
-    """Raise `InputError` unless there are two antithetic pairs of samples or more, which shows their scatter."""
+    """Raise `InputError` unless there are at least two antithetic pairs, which a standard error needs."""
     if samples % 2 or samples < 4:
         raise InputError(f"samples is {shown(samples)}, but must be an even number of at least 4.")
 
 
 def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of the rows and its standard error, also where squares overflow; NaN where a number is
-    infinite."""
+    """Return the mean of the rows and its standard error, without overflow of squares; NaN for columns with an infinite
+    number."""
     size = np.abs(samples).max(initial=0.0)
     unit = size if 0.0 < size < np.inf else 1.0
     with np.errstate(invalid="ignore"):
@@ -340,23 +341,23 @@ class Guided(Ensemble):
     """A gradient estimator: the mean of a surrogate's gradients over an ensemble, each of its parts scaled by
     differences of the loss.
 
-    Formula: in units of the spreads, the mean of the surrogate's gradients is cut along the first axis of each
-    parameter, the steps or knots, into equal parts. Their directions p_1 ... p_K have length 1, and
+    Formula: the mean of the surrogate's gradients, in units of the spreads, is cut into equal parts along the first
+    axis of each parameter (steps or knots). Scaled to length 1, the parts are directions p_1 ... p_K, and
 
         g = sum_k D_k p_k,   D_k = mean over samples of (L(u + r_k p_k) - L(u - r_k p_k)) / (2 r_k),   r_k = sqrt(N_k),
 
-    where N_k is how many numbers of part k are not 0. First positions are perturbed in the same way on both sides. So g
-    is the projection of the smoothed gradient on the span of the parts (guided evolution strategies, Maheswaranathan
-    et al. 2019, without their search outside of the span).
+    where N_k is the number of non-zero numbers of part k. Both sides of a difference have the same perturbed first
+    positions. So g projects the smoothed gradient onto the span of the parts (guided evolution strategies,
+    Maheswaranathan et al. 2019, without their search outside the span).
 
-    Bias: what the surrogate does not point at is missed; but sizes, over time too, are those of the smoothed loss.
-    Noise: the ``standard_error`` of the `Estimate` is that of the D_k and of the directions p_k together, with degrees
-    of freedom by Welch and Satterthwaite. Cost: ``samples`` gradients of the surrogate and 1 + 2 K ``differences``
-    forward runs, however many numbers a parameter has.
+    Bias: directions that the surrogate's gradient lacks are missed, but the size of each part is that of the smoothed
+    loss. Noise: the ``standard_error`` combines the errors of D_k and p_k, with degrees of freedom by Welch and
+    Satterthwaite. Cost: ``samples`` gradients of the surrogate and 1 + 2 K ``differences`` forward runs, for any number
+    of parameters.
 
-    Runs that diverge: those of the surrogate count as in `EnsembleMean`. A sample of the differences is left out as a
-    whole, up to a quarter of them, so that all D_k are means over the same samples. With fewer than 4 none can be left
-    out.
+    Runs that diverge: the surrogate's are treated as in `EnsembleMean`. A sample of the differences is left out as a
+    whole, so that all D_k average the same samples. At most a quarter may be left out, so no sample if there are fewer
+    than 4.
 
     ``spread``: by name or for all, how far parameters are moved, in their units; ``position_noise``: how far first
     positions are, in spacings; ``seed`` of the random numbers; ``executor``: where the members run.
@@ -367,7 +368,7 @@ class Guided(Ensemble):
     samples: int = 4
     """Number of gradients of the surrogate, an even one."""
     parts: int = 4
-    """Number of parts of each parameter; fewer where it has fewer rows, and one for a vector or a number."""
+    """Number of parts of each parameter: at most its number of rows, and 1 for a vector or a number."""
     differences: int = 2
     """Number of samples of each difference."""
     surrogate: GradientEstimator = SURROGATE
@@ -413,8 +414,8 @@ class Guided(Ensemble):
         return Estimate(surrogate.loss, gradient, error, freedom, surrogate.mean_loss, left_out)
 
     def _parts(self, ensemble: Sampler, gradient: Arrays, error: Arrays) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return directions (numbers,) of length 1, in spreads: the gradient on one part of one parameter, 0 elsewhere;
-        and their standard errors. Parts without a gradient are left out."""
+        """Return directions (numbers,) of length 1, in units of the spreads, and their standard errors. A direction is
+        the gradient on one part of one parameter, and 0 elsewhere. Parts with zero gradient are left out."""
         places = np.concatenate([_places(value, self.parts) for value in ensemble.values.values()])
         firsts = np.cumsum([0, *(value.size for value in ensemble.values.values())])
         places += self.parts * np.repeat(np.arange(len(firsts) - 1), np.diff(firsts))
@@ -435,12 +436,13 @@ class Guided(Ensemble):
 
 
 def _places(value: np.ndarray, parts: int) -> np.ndarray:
-    """Return for each number of a parameter, (size,), the part that its row belongs to; 0 for a vector and a number."""
+    """Return, for each number of a parameter (size,), the number of the part to which its row belongs; 0 for a vector
+    or a number."""
     rows = len(value) if value.ndim > 1 else 1
     return np.repeat(np.arange(rows) * parts // rows, value.size // rows)
 
 
 def _freedom(errors: np.ndarray, freedoms: tuple[float, float]) -> float:
-    """Return the degrees of freedom of the sum of two errors (2, numbers), given theirs (Welch 1947)."""
+    """Return the degrees of freedom of the sum of two errors (2, numbers), given those of each (Welch 1947)."""
     shares = (errors**2).sum(axis=1) / max((errors**2).sum(), np.finfo(float).tiny)
     return float(1.0 / max((shares**2 / freedoms).sum(), 1.0 / sum(freedoms)))

@@ -1,4 +1,4 @@
-"""Gradient estimators: their protocols, what they return, and a problem evaluated at many points."""
+"""Protocols and results of gradient estimators, and the evaluation of a problem at many points."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -20,29 +20,31 @@ from cortado.solvers.solver import Counts
 
 @dataclass(frozen=True)
 class Estimate:
-    """A loss and its gradient, with what the estimator knows about its accuracy."""
+    """A loss and its gradient, with standard errors and other accuracy figures if the estimator has them."""
 
     loss: Any
-    """Loss: a float, of a batch (batch,)."""
+    """Loss: a float, or an array (batch,) for a batch."""
     gradient: Arrays
-    """Gradient by parameter in its shape (float64), of a batch with a first axis for the scenes."""
+    """Gradient by parameter name, float64 in the parameter's shape; for a batch with a first axis for the scenes."""
     standard_error: Arrays | None = None
-    """Standard error of every component of the gradient, where it is an average over samples."""
+    """Standard error of every component of the gradient; None if the gradient is no average over samples."""
     degrees_of_freedom: float | None = None
-    """Degrees of freedom of the standard error: independent samples less one; of `Guided` those of its two parts."""
+    """Degrees of freedom of the standard error: the number of independent samples minus one; `Guided` combines two
+    errors."""
     mean_loss: float | None = None
-    """Mean of the loss over the ensemble that the gradient is averaged over."""
+    """Mean of the loss over the ensemble over which the gradient is averaged."""
     left_out: int = 0
-    """Number of an ensemble's runs left out of the average, as they or their partners diverged or are out of range."""
+    """Number of an ensemble's runs left out of the average, because they or their partners diverged or are out of
+    range."""
     diverged: Exception | None = None
-    """Error for which a point of `cortado.evaluate` had no run, `DivergedError` or `OutOfRangeError`; loss and gradient
+    """The `DivergedError` or `OutOfRangeError` of a point of `cortado.evaluate` that has no result; loss and gradient
     are then NaN."""
 
     def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
         """Return the lower and the upper end, by parameter, of an interval for each component of the gradient.
 
-        With this probability it contains the mean that the estimator would have over endlessly many samples: by
-        Student's distribution, as the scatter is known from few samples. A bias of the estimator comes on top.
+        With this probability the interval contains the estimator's mean over infinitely many samples. It uses Student's
+        t-distribution, because there are few samples. It does not include the estimator's bias.
 
         Raises:
             InputError: the estimate is no average, or the confidence is not between 0 and 1.
@@ -73,7 +75,7 @@ class Estimate:
 
 
 class ForwardPass(Protocol):
-    """Protocol of a forward run with its loss, from which reverse passes may start until the problem is run again."""
+    """Protocol of a forward run with its loss, from which backward passes can start until the problem is run again."""
 
     @property
     def loss(self) -> float:
@@ -85,15 +87,15 @@ class ForwardPass(Protocol):
 
 
 class Differentiable(Protocol):
-    """Protocol of a problem as estimators need it."""
+    """Protocol of the problems that estimators can differentiate."""
 
     simulation: Any
 
     def value(self, parameters: Values) -> float:
-        """Return the loss of these parameters, by a run forward only."""
+        """Return the loss for these parameters by a forward run."""
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
-        """Run forward, and return a run from which reverse passes may start."""
+        """Run forward and return the run, from which backward passes can start."""
 
 
 @runtime_checkable
@@ -101,20 +103,21 @@ class Batchable(Protocol):
     """Protocol of a problem that can be evaluated at many points in one launch."""
 
     def room(self, estimator: "AdjointEstimator | None" = None) -> int:
-        """Return how many points `together` takes at once, for gradients by an estimator or for losses alone."""
+        """Return how many points one call of `together` can take, for gradients by an estimator or for losses alone."""
 
     def together(
         self, points: Sequence[Values], estimator: "AdjointEstimator | None" = None
     ) -> list[Estimate | DivergedError]:
-        """Return estimates at points with equal names and shapes of parameters, in one launch, each with the bits that
-        it has alone; without an estimator of the loss alone. A lost particle's error takes the place of an estimate."""
+        """Return estimates at points with equal parameter names and shapes, computed in one launch, bit for bit as one
+        by one. Without an estimator they have the loss alone. A point with a lost particle returns its error
+        instead."""
 
 
 class GradientEstimator(Protocol):
     """Protocol of an object that computes a gradient, exact or approximate."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the loss and its gradient, calling ``observe`` with each adjoint of a state, if any."""
+        """Return the loss and its gradient; ``observe``, if given, is called with the adjoint of each state."""
 
 
 def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
@@ -125,7 +128,7 @@ def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
 
 
 def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
-    """Return the estimator; raises `InputError` for anything but one that goes back through a run."""
+    """Return the estimator; raises `InputError` unless it makes a backward pass through a run."""
     if not isinstance(estimator, AdjointEstimator):
         wanted = "an AdjointEstimator such as cortado.gradients.Exact()"
         raise InputError(f"estimator is {shown(estimator)}, but must be {wanted}.")
@@ -133,8 +136,8 @@ def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
 
 
 def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -> Estimate:
-    """Return an estimator's result in float64; raises `InputError` unless it has a gradient in the shape of every given
-    parameter, of a batch with a first axis for the scenes."""
+    """Return an estimator's result in float64; raises `InputError` unless there is a gradient of every given parameter
+    in its shape, for a batch with a first axis for the scenes."""
     if not isinstance(found, Estimate):
         raise InputError(f"the estimator returned a {type(found).__name__}, but must return a gradients.Estimate.")
     loss = as_one_number("the estimate's loss", found.loss) if batch is None else as_numbers("losses", found.loss)
@@ -151,11 +154,12 @@ def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -
 
 
 class AdjointEstimator(ABC):
-    """An estimator that makes one reverse pass through one rollout, step by step."""
+    """A base class of estimators that make one backward pass through one rollout, step by step."""
 
     @property
     def batches(self) -> bool:
-        """True if the estimator treats each scene of a batch by itself; a user's class overrides it to say so."""
+        """True if the estimator never mixes scenes of a batch. Your own class overrides this property to allow
+        batches."""
         return False
 
     @abstractmethod
@@ -173,11 +177,11 @@ class AdjointEstimator(ABC):
 
 
 class Filtered:
-    """A backward step that applies another estimator's, then filters the adjoint."""
+    """A backward step that calls another estimator's backward step and then filters the adjoint."""
 
     only_launches: ClassVar[bool] = False
-    """True if `filter` does nothing but launch kernels, always in equal form. Only then may a backward step be captured
-    as a graph, which does not repeat the work of Python or NumPy between them."""
+    """True if `filter` only launches kernels, and always the same ones. Only then may a backward step be captured as a
+    CUDA graph, because a graph does not repeat work in Python or NumPy."""
 
     def __init__(self, base: BackwardStep):
         self._base, self.rollout, self.solver = base, base.rollout, base.solver
@@ -194,12 +198,12 @@ class Filtered:
         return self._base.parameters()
 
     def filter(self, bar: State) -> None:
-        """Change the adjoint of the state whose step the solver has replayed last."""
+        """Change the adjoint of the state that begins the step which the solver replayed last."""
         raise NotImplementedError
 
 
 NO_RUN: tuple[type[Exception], ...] = (DivergedError, OutOfRangeError)
-"""Errors that say that a point has no run, which is no mistake where it is one of many."""
+"""Errors that mean that a point has no result; with many points they do not stop the others."""
 
 
 @dataclass(frozen=True)
@@ -211,10 +215,10 @@ class Point:
     """Estimator of the gradient; None for the loss alone."""
     loss_if_diverged: float = np.nan
     errors: tuple[type[Exception], ...] = ()
-    """Errors in place of a run that give the point its substitute loss."""
+    """Error types after which the point gets a substitute loss."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """Return the loss of a problem at the point, and its gradient, which is empty without an estimator."""
+        """Return the loss of a problem at the point, and its gradient; without an estimator the gradient is empty."""
         try:
             found = self.found(problem, observe)
             return found if self.estimator is None else checked_estimate(found, self.values, problem.simulation.batch)
@@ -228,18 +232,18 @@ class Point:
         return self.estimator.estimate(problem, self.values, observe)
 
     def without_a_run(self, why: Exception, loss: float = np.nan) -> Estimate:
-        """Return the estimate for a point without a run: its gradient is NaN."""
+        """Return the estimate for a point whose run failed: its gradient is NaN."""
         names = self.values if self.estimator is not None else ()
         return Estimate(loss, {name: np.full(np.shape(self.values[name]), np.nan) for name in names}, diverged=why)
 
 
 @dataclass(frozen=True)
 class Sample(Point):
-    """A point that an ensemble has drawn, at which there may be no run."""
+    """A random point of an ensemble; the run there may fail."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """Return the estimate at the sample, unchecked, as perturbed first positions need no gradient; an `InputError`
-        then says that the user did not choose this point."""
+        """Return the estimate at the sample without checks, because perturbed first positions need no gradient. Its
+        `InputError` says that the user did not choose this point."""
         try:
             return self.found(problem, observe)
         except NO_RUN as error:
@@ -254,8 +258,8 @@ Group = tuple[Point, ...]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A problem as a function of groups of points, which a worker process keeps. An error in a point, or in
-    the run there, has the sentence that it would have for the point alone."""
+    """A problem as a function of groups of points; worker processes keep it. Errors have the same sentences as when
+    points are evaluated one by one."""
 
     problem: Differentiable
     observe: Observer | None = None
@@ -275,8 +279,7 @@ class Evaluation:
         ]
 
     def groups(self, points: Iterable[Point], threads: Callable[[], int]) -> Iterator[Group]:
-        """Yield the points in their order, in groups that fit one launch of the problem, shared out among the threads
-        of present workers."""
+        """Yield the points in order, in groups that fit one launch and give every worker thread something to do."""
         for (estimator, _), alike in groupby(points, _kind):
             room = 1
             if isinstance(self.problem, Batchable) and isinstance(estimator, AdjointEstimator | None):
@@ -292,7 +295,7 @@ def evaluated(
     observe: Observer | None = None,
     on_result: OnResult | None = None,
 ) -> list[Estimate]:
-    """Return estimates at points, in their order, computed by an executor, as many at once as one launch takes."""
+    """Compute estimates at points by an executor, many in one launch, and return them in order."""
     evaluation, firsts = Evaluation(problem, observe), [0]
 
     def groups() -> Iterator[Group]:
@@ -309,7 +312,7 @@ def evaluated(
 
 
 def without_runs(errors: Sequence[Exception], of: str) -> str:
-    """Return in words how many of something had no run, and why: "2 of 4 points diverged"."""
+    """Return a phrase with the number and the cause of failed runs: "2 of 4 points diverged"."""
     diverged = sum(isinstance(error, DivergedError) for error in errors)
     why = ["diverged"] * bool(diverged) + ["cannot be run"] * (diverged < len(errors))
     return f"{len(errors)} of {of} {' or '.join(why)}"

@@ -1,5 +1,5 @@
-"""Estimators that go back through a run step by step: exact, by a tape, or with filters of the adjoint of a
-state between two steps, an eddy viscosity and a limit; norms of adjoints.
+"""Estimators with one backward pass: exact, by Warp's tape, or with an eddy viscosity and a limit on the adjoint
+between steps. Also an observer of adjoint norms.
 """
 
 from dataclasses import dataclass, replace
@@ -22,15 +22,15 @@ from cortado.scene.parameter_values import Arrays
 from cortado.solvers.solver import Counts, Solver
 
 STRONGEST = 0.6
-"""Greatest strength s of the viscosity, at which waves of two spacings are damped and keep their sign."""
+"""Greatest strength s of the viscosity; with it, waves two spacings long are damped without a change of sign."""
 
 
 @cache
 def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
-    """Return the kernels of `AdjointViscosity`, which has their formulas, by name. Adjoints are in the scene's order,
-    and ``sort`` sorts them for ``viscosity``, which needs ``crowd`` and ``strength`` before it. Owing to the division
-    by S it acts at a surface, and in a drop of a few particles, as it does within the fluid; W(h / 2) limits it where
-    particles hardly touch."""
+    """Return the kernels of `AdjointViscosity`, by name; its docstring has the formulas. Launch ``crowd`` and
+    ``strength``, then ``sort``, which brings adjoints from the scene's order to the sorted one, then ``viscosity``.
+    Dividing by S makes it as strong at surfaces and in drops as inside the fluid; W(h / 2) weakens it between distant
+    particles."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, per_size = pair.weight, pair.per_size
@@ -58,7 +58,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def crowd(s, x, most):
-        """Write max(S_i, W(h / 2)) with the sum S_i of weights over neighbours."""
+        """Store max(S_i, W(h / 2)), where S_i is the sum of weights over neighbours."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x, s) - real(s.filling[i]) * s.self_weight
         if lane() > 0:
@@ -68,7 +68,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def strength(s, coefficient: real, time_step, x, v, most, strengths):
-        """Write the strength s_i of the viscosity for sorted particles, from sorted arguments."""
+        """Store the viscosity's strength s_i for sorted particles, from sorted arguments."""
         i = s.first + wp.tid() // LANES
         total = strain(i, x, v, most, s)
         if lane() > 0:
@@ -85,7 +85,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def viscosity(s, order: wp.array(dtype=wp.int32), x, most, strengths, a_sorted, b_sorted, a, b):
-        """Blend two fields of an adjoint at once, written in the scene's order."""
+        """Apply the viscosity to two adjoint fields and store the results in the scene's order."""
         i = s.first + wp.tid() // LANES
         a_total, b_total = exchange(i, x, most, strengths, a_sorted, b_sorted, s)
         if lane() > 0:
@@ -96,7 +96,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def squares(a, b, found):
-        """Write |a_i|^2 and |b_i|^2 in float64, as adjoints may have squares beyond float32."""
+        """Store |a_i|^2 and |b_i|^2 in float64, because squares of adjoints may overflow float32."""
         i = wp.tid()
         a_i = wp.vec3d(a[i])
         b_i = wp.vec3d(b[i])
@@ -105,8 +105,8 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def limit(times: wp.float64, particles: int, squares, sums, strengths, a, b):
-        """Limit a and b, given their ``squares`` by particle, their ``sums`` over each scene, and the sum of the
-        viscosity's strengths: a flow without strain is not limited."""
+        """Limit a and b, given their ``squares`` by particle and the ``sums`` of these over each scene. A scene whose
+        ``strengths`` sum to 0 (no strain) is not limited."""
         i = wp.tid()
         if strengths[i // particles] == real(0.0):
             return
@@ -121,8 +121,8 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
 
 
 class EddyViscosity:
-    """A filter that blends adjoints of positions and velocities with averages over neighbours, the more the faster the
-    forward flow strains there."""
+    """A filter that blends adjoints of positions and velocities with averages over neighbours, more strongly where the
+    forward flow's strain rate is larger."""
 
     def __init__(self, solver: Solver, coefficient: float):
         self._solver, self._coefficient = solver, coefficient
@@ -133,7 +133,7 @@ class EddyViscosity:
         self._sorted = {"a_sorted": a, "b_sorted": b}
 
     def __call__(self, bar: State, parameters: Parameters) -> None:
-        """Blend the adjoint of the state whose step the solver has replayed last, and set ``strengths`` for its sorted
+        """Filter the adjoint of the state that begins the step replayed last, and set ``strengths`` for its sorted
         particles."""
         context, kernels = self._solver.context(parameters), self._kernels
         fields = {"a": bar.positions, "b": bar.velocities, **self._sorted}
@@ -145,7 +145,8 @@ class EddyViscosity:
 
 
 class AdjointNorms:
-    """An observer of the reverse pass that keeps the norms of adjoints, on the device until `numpy` is called."""
+    """An observer of a backward pass that computes the norms of adjoints; they stay on the device until `numpy` is
+    called."""
 
     def __init__(self, solver: Solver, steps: int):
         self._launch, self._layout = solver.launch, solver.layout
@@ -160,19 +161,20 @@ class AdjointNorms:
         wp.copy(self._history, self._sum(self._squares), dest_offset=step * members, count=members)
 
     def numpy(self) -> np.ndarray:
-        """Return the norms (steps + 1, 2), in a batch (steps + 1, batch, 2), of the adjoints of positions and of
-        velocities over all particles of a scene, state by state."""
+        """Return, for every state, the norms of the adjoints of positions and of velocities over all particles: (steps
+        + 1, 2), or (steps + 1, batch, 2) for a batch."""
         norms = np.sqrt(self._history.numpy())
         return norms if self._layout.batch is None else norms.reshape(-1, self._layout.batch, 2)
 
 
 @dataclass(frozen=True)
 class Exact(AdjointEstimator):
-    """A gradient estimator: the exact adjoint of the discrete step, by gathers: no atomics, the same bits every time.
+    """A gradient estimator: the exact adjoint of the discrete step. It uses gathers without atomics, so results repeat
+    bit for bit.
 
-    Formula: the transposed derivative of the step. Bias: none; but where neighbouring trajectories diverge it grows as
-    fast as they do, by a constant factor a step. Cost: every step is computed once more forward, and the backward step
-    has about twice the neighbour sums of a forward one.
+    Formula: the transposed derivative of the step. Bias: none; but if neighbouring trajectories diverge, the gradient
+    grows exponentially with the number of steps, as their distance does. Cost: every step is computed once more
+    forward, and a backward step has about twice a forward step's neighbour sums.
 
     Example: ``value, gradient = problem.value_and_gradient(parameters, cortado.gradients.Exact())``
     """
@@ -187,8 +189,8 @@ class Exact(AdjointEstimator):
 class Tape(AdjointEstimator):
     """A gradient estimator: the exact adjoint by Warp's own automatic differentiation of the forward kernels.
 
-    It is slower than `Exact`, with atomics on a GPU, and is kept to check it. Only for scenes with the solver
-    ``"pcisph"``; others say so.
+    It is slower than `Exact`, uses atomics on a GPU, and serves to check `Exact`. It works only with the solver
+    ``"pcisph"``; other solvers raise an error.
 
     Example: ``value, gradient = problem.value_and_gradient(parameters, cortado.gradients.Tape())``
     """
@@ -235,7 +237,7 @@ class _TapeStep:
             wp.copy(total, own.grad)
 
     def _forget(self, tape: Any) -> None:
-        """Zero every adjoint but those of the parameters, which add up over the steps."""
+        """Set every adjoint to 0 except those of the parameters, which are summed over the steps."""
         kept = {own.ptr for own in self._own.arrays()}
         for array, gradient in tape.gradients.items():
             if isinstance(array, wp.array) and array.ptr not in kept:
@@ -259,25 +261,25 @@ class AdjointViscosity(AdjointEstimator):
         gamma_i^2 = sum_j w_ij (v_i - v_j)^2 / ((x_i - x_j)^2 + 0.01 h^2),
         w_ij = W_ij / max(S_i, S_j, W(h / 2)),                S_i = sum_j W_ij.
 
-    Here x and v are positions and velocities in the state of the adjoint. The weights are symmetric and add up to
-    0.6 at most: sum_i a_i is kept, the square norm does not grow.
+    Here x and v are positions and velocities of the state to which the adjoint belongs. The weights are symmetric and
+    sum to at most 0.6, so sum_i a_i is conserved and the norm of a does not grow.
 
-    Why: what grows exponentially in an adjoint lives at the scale of particles, the response to a parameter at that of
-    the fluid. A step damps a wave of length l by about s (2 pi / l)^2 s_W^2 / 2, s_W^2 being the second moment of W.
-    The adjoint grows where the forward flow strains, and as fast; so one coefficient serves all flows, and where the
-    flow is calm nothing is damped.
+    Why: exponential growth of an adjoint happens at the scale of particles; the response to a parameter has the fluid's
+    scale. A step damps a wave of length l by about s (2 pi / l)^2 s_W^2 / 2, with s_W^2 the second moment of W. The
+    adjoint's growth rate follows the strain rate of the forward flow. So one coefficient fits all flows, and calm flow
+    is not damped.
 
-    Then each vector of a is limited to ``limit`` root mean squares over all particles. Now and then the adjoint of a
-    few particles grows faster than the average can spread it, and would dominate the rest. Where nothing strains
-    there is no limit either.
+    Then the length of each vector a_i is limited to ``limit`` times the root mean square over all particles. Otherwise
+    a few particles' adjoints may grow faster than the viscosity spreads them, and dominate all others. Without strain
+    there is no limit.
 
-    Long waves are damped too, a little, and most of all the gradient with respect to early steps. With an ``order`` of
-    2 the gradients g of two coefficients are extrapolated to none (Richardson): g = 2 g(C) - g(2 C).
+    Long waves are slightly damped too, which affects gradients with respect to early steps most. ``order=2``
+    extrapolates the gradients g of two coefficients to zero viscosity (Richardson): g = 2 g(C) - g(2 C).
 
-    Bias: the short waves of the adjoint are lost, and of the long ones a part: gradients of long runs are too small.
-    The gradient of a loss of single particles, which has no long waves, is poor. Noise: with the second order more,
-    so that it is for means over several runs (`EnsembleMean`). Cost: ``order`` reverse passes, with three more sums
-    over neighbours for each step.
+    Bias: short waves of the adjoint are lost and long waves are weakened, so gradients of long runs are too small.
+    Gradients of a loss of single particles are poor, as they have no long waves. Noise: order 2 has more, so use it
+    with means over several runs (`EnsembleMean`). Cost: ``order`` backward passes, with three more neighbour sums per
+    step.
 
     Sources: Smagorinsky (1963) for a viscosity by the strain rate. Wang and Zaki (2026, arXiv 2606.25399) for an eddy
     viscosity of the adjoint of turbulence. Ke, You and Wang (2026, arXiv 2602.14016) precondition the adjoint by its
@@ -287,12 +289,13 @@ class AdjointViscosity(AdjointEstimator):
     """
 
     coefficient: float = 2.0
-    """Coefficient C of the viscosity, at least 0, with which it equals `Exact`."""
+    """Coefficient C of the viscosity, at least 0; 0 gives `Exact`."""
     limit: float = 4.0
-    """Greatest vector of a particle, in root mean squares over all; infinite for none."""
+    """Greatest length of a particle's adjoint vector, in root mean squares over all particles; infinite for no
+    limit."""
     order: int = 1
-    """Order 1, or 2 for an extrapolation by two passes over a whole run: not with respect to the first state, nor step
-    by step."""
+    """Order 1, or 2 for an extrapolation from two backward passes. Order 2 cannot give derivatives with respect to the
+    first state, or a single backward step."""
 
     def __post_init__(self) -> None:
         if not is_whole(self.order) or self.order not in (1, 2):
@@ -306,14 +309,15 @@ class AdjointViscosity(AdjointEstimator):
     batches = True
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
-        """Return the backward step of the first order; raise `InputError` for another, which takes two passes."""
+        """Return the backward step for order 1; raises `InputError` for order 2, which takes two passes."""
         if self.order != 1:
             raise InputError(f"order is {self.order}, but must be 1 where a gradient goes on to the state before.")
         step = EXACT.derivative(rollout)
         return _ViscousStep(step, rollout, self) if self.coefficient > 0.0 else step
 
     def back(self, forward_pass: ForwardPass, observe: Observer | None = None) -> Arrays:
-        """Return the gradient of a forward run's loss; ``observe`` is given the adjoints of the smaller coefficient."""
+        """Return the gradient of a forward run's loss; ``observe`` is called with the adjoints of the smaller
+        coefficient."""
         once = replace(self, order=1)
         gradient = forward_pass.back(once, observe)
         if self.order == 1:
@@ -334,8 +338,8 @@ class _ViscousStep(Filtered):
         self._sum, self._sum_of_strengths = layout.sum_of(wp.vec2d), layout.sum_of(layout.precision.real)
 
     def filter(self, bar: State) -> None:
-        """Blend the adjoint, then limit each particle's vector to a multiple of the root mean square over all; where
-        nothing strains, nothing changes."""
+        """Filter the adjoint, then limit each particle's vector to a multiple of the root mean square over all
+        particles. Without strain nothing changes."""
         self._viscosity(bar, self._parameters)
         launch, kernels = self.solver.launch, adjoint_filter_kernels(self.solver.discretisation)
         squares, fields = self._squares, {"a": bar.positions, "b": bar.velocities}

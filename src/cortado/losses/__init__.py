@@ -1,4 +1,4 @@
-"""What a rollout is judged by: objects with a value and an adjoint at the end of the trajectory, or on the way."""
+"""Losses of a rollout: objects that compute a value and an adjoint of its last state or of states in between."""
 
 from cortado.calls import face
 from cortado.losses.distances import (

@@ -1,5 +1,5 @@
-"""Losses that are distances from targets: of particles, of the centre of mass, of a solid, of a picture, and of what a
-sensor reads from a measured series.
+"""Losses that measure the distance to a target: of particles, the centre of mass, a solid, a picture, or a sensor's
+readings.
 """
 
 from functools import cache
@@ -27,8 +27,8 @@ from cortado.scene.motions import AXES, Pose, matrix, position_name, solids_in
 
 @cache
 def matching_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of vectors from targets,
-    which all scenes of a batch share."""
+    """Return the kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of vectors and targets.
+    All scenes of a batch have the same targets."""
     real, vector = precision.real, precision.vector
     module = kernel_module(f"matching_{precision.name}")
 
@@ -118,7 +118,7 @@ class CentreOfMass:
     """
 
     def __init__(self, target: Any, masses: np.ndarray | None = None):
-        """Set the ``target`` (d,) [m], and the particles' ``masses`` (n,) in any unit, None where all are equal."""
+        """Set the ``target`` (d,) [m], and the particles' ``masses`` (n,) in any unit; None if all are equal."""
         self.target, self._weights = _finite("target", target), _weights(masses)
         self.fingerprint = _checksum(self.target, self._weights)
         """Tells one target from another, for checkpoints."""
@@ -138,13 +138,13 @@ class CentreOfMass:
 
 @fixed
 class CentreOfMassAlong:
-    """A loss: the centre of mass along a direction [m], whose gradient is that of the centre of mass itself.
+    """A loss: the coordinate of the centre of mass along a direction [m].
 
     Example: ``problem = cortado.Problem(simulation, 100, cortado.losses.CentreOfMassAlong([1.0, 0.0]))``
     """
 
     def __init__(self, direction: Any, masses: np.ndarray | None = None):
-        """Set the ``direction`` (d,) [-], and ``masses`` as for `CentreOfMass`."""
+        """Set the ``direction`` (d,) [-], and ``masses`` as in `CentreOfMass`."""
         self.direction, self._weights = _finite("direction", direction), _weights(masses)
         self.fingerprint = _checksum(self.direction, self._weights)
         """Tells one direction from another, for checkpoints."""
@@ -189,21 +189,21 @@ def _shares(weights: np.ndarray | None, end: Snapshot) -> np.ndarray:
 
 
 def _checksum(*parts: Any) -> str:
-    """Return a checksum of arrays and bytes, with None for parts that are left out."""
+    """Return a checksum of arrays and bytes; None stands for a part left out."""
     return sha256(b" ".join(b"" if one is None else bytes(memoryview(one)) for one in parts)).hexdigest()
 
 
 @fixed
 class SolidPose:
-    """A loss of a moving solid, ``|x - x*|^2 + l^2 (3 - tr R*^T R)`` [m2]. To its middle's squared distance from a
-    target it adds, for small angles off a target rotation, the squared angle times l^2.
+    """A loss of a moving solid, ``|x - x*|^2 + l^2 (3 - tr R*^T R)`` [m2]. The first term is the squared distance of
+    its middle from a target; the second is, for small angles, l^2 times the squared angle to a target rotation.
 
     Example: ``loss = cortado.losses.SolidPose("raft", position=[0.8, 0.3], rotation=0.0)``
     """
 
     def __init__(self, name: str, position: Any = None, rotation: Any = None, length: float = 1.0):
-        """Set the ``name`` of the solid; targets ``position`` (d,) of its middle [m] and ``rotation`` [rad], a vector
-        (3,) in 3-D and a number in 2-D, or one of them. ``length`` l [m], greater than 0."""
+        """Set the ``name`` of the solid and one or both targets: ``position`` (d,) of its middle [m], and ``rotation``
+        [rad], a number in 2-D and a vector (3,) in 3-D. ``length`` is l [m], greater than 0."""
         if not isinstance(name, str):
             raise InputError(f"name is {shown(name)}, but must be the name of a solid.")
         if position is None and rotation is None:
@@ -239,7 +239,7 @@ class SolidPose:
         return value, bars
 
     def _turned(self, end: Snapshot) -> tuple[float, dict[str, np.ndarray]]:
-        """Return the rotation's part of the loss, and its adjoint by field."""
+        """Return the part of the loss due to rotation, and the adjoint of this part by field."""
         assert self.rotation is not None
         pose = Pose.of(self.name, f"{self.name}.{AXES[0]}" in end.state.names, end)
         R, wanted, weight = pose.rotation, matrix(self.rotation), self.length**2
@@ -268,9 +268,9 @@ class Image:
     """
 
     def __init__(self, renderer: Pictures, target: np.ndarray, distance: ImageLoss | None = None):
-        """Set the ``target`` picture (rows, columns, 3), linear RGB from 0 to 1; ``distance``:
-        `cortado.image_losses.SquaredDifference`, the default, or `Pyramid`, whose gradient leads shapes to each other
-        that do not overlap. Raises `InputError` for a target of another shape, or with values of a file up to 255."""
+        """Set the ``target`` picture (rows, columns, 3), linear RGB from 0 to 1. ``distance``:
+        `cortado.image_losses.SquaredDifference`, the default, or `Pyramid` for shapes that may not overlap their
+        target. Raises `InputError` for a target of another shape, or with values up to 255."""
         require_methods("renderer", renderer, ("render", "adjoint"), "an object such as Simulation.renderer() gives")
         self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
         wanted = "an object such as cortado.image_losses.Pyramid()"
@@ -278,7 +278,7 @@ class Image:
         self.target = _target_image(target, getattr(renderer, "shape", None))
         parts = (self.distance.fingerprint, _checksum(self.target))
         self.fingerprint = " ".join((*parts, getattr(renderer, "fingerprint", "")))
-        """Tells one target, or one view of it, from another, for checkpoints."""
+        """Text that identifies the target and the view; checkpoints store it."""
 
     def image(self, end: Snapshot) -> np.ndarray:
         """Return the picture (rows, columns, 3) of a state."""
@@ -299,7 +299,8 @@ class Image:
 
 
 def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
-    """Return a float64 copy (rows, columns, 3) of a target, of that ``shape`` if given; raises `InputError`."""
+    """Return a float64 copy (rows, columns, 3) of a target; raises `InputError` if it is no picture or not of a given
+    ``shape``."""
     image = read_only("target", target)
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"target has shape {image.shape}, but must be a picture (rows, columns, 3).")
@@ -314,12 +315,13 @@ def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray
 
 
 SAME = 1e-6
-"""Relative difference below which time steps count as equal, as one may have been rounded to float32."""
+"""Relative difference below which time steps count as equal, because one may be rounded to float32."""
 
 
 @fixed
 class SensorMatch:
-    """A loss: the weighted sum of squared differences between a sensor's reading and a target, over squared scales.
+    """A loss: the weighted sum of squared differences between a sensor's reading and a target, divided by squared
+    scales.
 
     Example::
 
@@ -328,7 +330,7 @@ class SensorMatch:
     """
 
     def __init__(self, sensor: Sensor, target: Any, weight: float = 1.0, scale: Any = 1.0):
-        """Set the ``target`` (k,), a number for each column of the sensor, NaN for one that does not count; the
+        """Set the ``target`` (k,), a number for each column of the sensor, with NaN for columns to ignore; the
         ``weight`` of the sum; and the ``scale``, a number or (k,)."""
         self.sensor, self.weight = checked_sensor(sensor), as_one_number("weight", weight)
         self.target = np.atleast_1d(read_only("target", target))
@@ -356,19 +358,19 @@ class SensorMatch:
 
 @fixed
 class Series(Frames):
-    """A loss of a sensor against a measured series: the mean over steps of the squared difference of the two, all
-    columns added up.
+    """A loss: the mean over steps of the squared difference between a sensor's readings and a measured series, summed
+    over columns.
 
-    The series is interpolated linearly to the times of the steps; steps before its first and after its last time do not
-    count.
+    The series is interpolated linearly to the times of the steps. Steps before its first and after its last time are
+    ignored.
 
     Example: ``loss = cortado.losses.Series(gauge, times, heights, time_step=0.002)``
     """
 
     def __init__(self, sensor: Sensor, times: Any, values: Any, time_step: float, every: int = 1, scale: Any = 1.0):
-        """Set the series: ``times`` (m,) [s], rising; ``values`` (m,) or (m, k), a number for each column of the
-        sensor, NaN for one that does not count. ``time_step`` of the problem [s]; ``every``: take only every so many
-        steps into account; ``scale``: what a difference is divided by, a number or (k,)."""
+        """Set the series: increasing ``times`` (m,) [s] and ``values`` (m,) or (m, k), a number for each column of the
+        sensor, NaN to ignore it. ``time_step``: of the problem [s]. ``every``: interval between compared steps.
+        ``scale``: divisor of differences, a number or (k,)."""
         moments, series = read_only("times", times), as_numbers("values", values)
         series = series[:, None] if series.ndim == 1 else series
         if moments.ndim != 1 or len(moments) < 2 or not (np.diff(moments) > 0.0).all():
@@ -397,7 +399,7 @@ class Series(Frames):
         super().__init__({k: SensorMatch(sensor, row, weight, scale) for k, row in zip(steps, rows, strict=True)})
 
     def check(self, time_steps: np.ndarray) -> None:
-        """Raise `InputError` unless the run's time step is that of the series."""
+        """Raise `InputError` unless the run has the time step given to this loss."""
         other = time_steps[np.abs(time_steps - self.time_step) > SAME * time_steps]
         if len(other):
             found = f"time_step of the series is {self.time_step:g} s"

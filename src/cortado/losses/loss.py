@@ -1,4 +1,5 @@
-"""Losses: what they are given and return, of one scene and of a batch, and the sum of several at several steps."""
+"""Protocols of losses, for one scene and for a batch; the states they receive, the adjoints they return, and sums of
+losses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,16 +29,16 @@ def precision_of(state: State) -> Precision:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A state of a rollout, usually the last, as NumPy arrays or as Warp arrays, in the scene's order."""
+    """A state of a rollout, usually the last, as NumPy and Warp arrays in the scene's order."""
 
     state: State
-    """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-], and further fields that the solver
-    carries from step to step."""
+    """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-], and further fields that the solver's
+    steps update."""
     dimension: int
     colours: np.ndarray
     """Colours of the phases, (phases, 3): red, green and blue, linear, from 0 to 1."""
     moment: Moment | None = None
-    """State with the parameters of the step after it, which determine its quantities; None where unknown."""
+    """The state with the parameters of the step that follows, from which quantities are computed; None if unknown."""
 
     def __repr__(self) -> str:
         return f"Snapshot({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
@@ -63,9 +64,9 @@ class Snapshot:
         return self._field("mass_fractions")
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return a field of the state by its name, such as "velocities", or a quantity of its particles, such as
-        "density" or "pressure", or the load on a solid, such as "rotor.load" (see `docs/sensors.md`). Float64,
-        read-only. Raises `InputError` for any other name."""
+        """Return by name a field of the state ("velocities"), a quantity of its particles ("density", "pressure"), or
+        the load on a solid ("rotor.load"), float64, read-only; see `docs/sensors.md`. Raises `InputError` for any other
+        name."""
         if name in ADJOINT_FIELDS:
             return getattr(self, name)
         if isinstance(name, str) and name in self.state.names:
@@ -75,12 +76,13 @@ class Snapshot:
 
     @property
     def lattice(self) -> Lattice:
-        """Constants of the particles at rest, such as their volume."""
+        """Constants of the lattice of particles at rest, such as the volume of a particle."""
         return moment_of(self).evaluator().lattice
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
-        """Tables of the scene's solids as they begin; fields of the state say where a moving one is now."""
+        """Tables of the scene's solids with their initial places; fields of the state have the current place of a
+        moving solid."""
         return moment_of(self).evaluator().solids
 
     @property
@@ -96,14 +98,14 @@ class Snapshot:
 
 
 def _read_only(values: np.ndarray) -> np.ndarray:
-    """Return a read-only copy in float64, which a loss cannot change by mistake."""
+    """Return a read-only float64 copy, so that a loss cannot change the state by mistake."""
     found = values.astype(np.float64)
     found.flags.writeable = False
     return found
 
 
 def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
-    """Return the state and parameters that determine quantities; raises `InputError` where they are unknown."""
+    """Return the state and parameters from which quantities are computed; raises `InputError` if they are unknown."""
     if end.moment is None:
         raise InputError("a quantity is asked for of a state whose simulation is not known, but must be of a run's.")
     return end.moment
@@ -114,15 +116,17 @@ class StepBar:
     """Derivatives of a loss with respect to the parameters of one step."""
 
     row: int
-    """Number of the step in the run, or the number of steps: one after the last (`row_of` of
+    """Number of the step in the run, counted from 0; the number of steps for the last state (see `row_of` of
     `cortado.runs.quantity_values`)."""
     parameters: Mapping[str, np.ndarray]
-    """Derivatives by parameter name, with a first axis for the scenes of a batch, and one row of those over time."""
+    """Derivatives by parameter name, for a batch with a first axis for the scenes. A parameter over time has this
+    step's row alone."""
 
 
 @dataclass(frozen=True, repr=False)
 class SnapshotAdjoint:
-    """Derivatives of a loss that also looks at the colours."""
+    """Derivatives of a loss with respect to a state, the phases' colours, quantities, and the parameters of one
+    step."""
 
     state: State
     """Derivatives with respect to positions, velocities and mass fractions, as Warp arrays."""
@@ -131,10 +135,11 @@ class SnapshotAdjoint:
     quantities: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Derivatives with respect to quantities of the particles, by name."""
     step: StepBar | None = None
-    """Derivatives with respect to the parameters of the step after the state, once those of quantities are included."""
+    """Derivatives with respect to the parameters of the step after the state; None before `through_quantities` computes
+    them."""
 
     def through_quantities(self, end: "Snapshot | SnapshotBatch") -> "SnapshotAdjoint":
-        """Return the derivatives with respect to the state and the parameters alone, from which quantities follow."""
+        """Apply the chain rule to quantities: return derivatives with respect to the state and the parameters alone."""
         if not self.quantities:
             return self
         moment = moment_of(end)
@@ -147,15 +152,15 @@ class SnapshotAdjoint:
 
 
 ADJOINT_FIELDS = ("positions", "velocities", "mass_fractions")
-"""Names of the fields that the arrays of an adjoint tuple differentiate by, in their order."""
+"""Names of the fields to which the arrays of an adjoint tuple belong, in order."""
 Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...] | Mapping[str, np.ndarray]
-"""Derivatives of a loss with respect to positions and velocities, (n, d) each, and, if there is a third array, mass
-fractions (n, phases). They may also come by the names of fields of a state and of quantities, where names left out mean
-0; or as Warp arrays."""
+"""Derivatives of a loss in one of three forms: a tuple of arrays for positions and velocities (n, d) and, optionally,
+mass fractions (n, phases); a `State` of Warp arrays; or a table by state field and quantity. In a table, names left out
+mean 0."""
 
 
 def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
-    """Return an adjoint as arrays by the names of state fields and quantities, with vectors (n, d)."""
+    """Return an adjoint as a table of arrays by names of state fields and quantities; vectors are (n, d)."""
     if isinstance(bar, Mapping):
         return dict(bar)
     if isinstance(bar, SnapshotAdjoint):
@@ -164,7 +169,7 @@ def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
 
 
 def bar_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
-    """Return any form of a state's adjoint as Warp arrays, and that of quantities by name."""
+    """Convert a state's adjoint of any form to Warp arrays for fields, and a table by name for quantities."""
     if isinstance(bar, SnapshotAdjoint):
         return bar
     no_colours = np.zeros_like(end.colours)
@@ -177,8 +182,9 @@ def bar_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
 
 
 def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...] = ()) -> np.ndarray:
-    """Return the derivative of a loss along tangents of fields, quantities and ``colours`` (phases, 3), by name, 0
-    where left out: a number, or of a batch in the shape ``leading``, (batch,). Vectors are (n, d), or all (n, 3)."""
+    """Return the derivative of a loss along tangents, by name, of fields, quantities and ``colours`` (phases, 3);
+    tangents left out are 0. It is a number, or has the shape ``leading``, (batch,), for a batch. Vectors are (n, d), or
+    all (n, 3)."""
     arrays = by_field(bar, np.shape(dots["positions"])[-1])
     arrays |= {"colours": bar.colours} if isinstance(bar, SnapshotAdjoint) else {}
     products = [
@@ -190,24 +196,24 @@ def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...]
 
 
 class Loss(Protocol):
-    """Protocol of a loss: a differentiable number of the end of a trajectory.
+    """Protocol of a loss: a differentiable number computed from the last state of a trajectory.
 
-    A loss of your own may have a method ``adjoint(end)``, of the derivatives alone, in the place of
+    Your own loss may have a method ``adjoint(end)``, which returns the derivatives alone, instead of
     `value_and_adjoint`.
     """
 
     def value(self, end: Snapshot) -> float:
-        """Return the value of the loss for the end of a run."""
+        """Return the value of the loss for the last state of a run."""
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """Return the loss and its derivatives, which often share work. They are a tuple of NumPy arrays, a table of
-        them by the names of fields and quantities, ``{"density": array}``, or a `State` of Warp arrays. The method
-        ``end.state.like()`` makes such a state, all 0, and its ``set({"positions": array})`` fills it."""
+        """Return the loss and its derivatives. The derivatives are a tuple of NumPy arrays, a table of arrays by field
+        or quantity, ``{"density": array}``, or a `State` of Warp arrays. ``end.state.like()`` makes such a state of
+        zeros; its ``set({"positions": array})`` fills it."""
 
 
 @fixed
 class Frames:
-    """A sum of losses of several states of a run, by the number of steps before each.
+    """A sum of losses at several states of a run, each given by its number of steps.
 
     Example: ``loss = cortado.losses.Frames({50: cortado.losses.CentreOfMass([0.4, 0.2]), 100: last})``
     """
@@ -222,16 +228,16 @@ class Frames:
         self.losses = FixedDict(losses)
 
     def check(self, time_steps: np.ndarray) -> None:
-        """Raise `InputError` where the losses do not fit a run with these time steps (scenes,) [s]."""
+        """Raise `InputError` if a loss does not fit a run with these time steps (scenes,) [s]."""
 
     @property
     def fingerprint(self) -> str:
-        """Text that tells sets of targets apart, for checkpoints."""
+        """Text that identifies the losses and their targets; checkpoints store it."""
         return " ".join(f"{step}:{fingerprint(loss)}" for step, loss in sorted(self.losses.items()))
 
 
 def fingerprint(loss: Any) -> str:
-    """Return a text that tells losses apart: the loss's ``fingerprint``, the code of a function, or the type.
+    """Return a text that identifies a loss: its ``fingerprint``, the code of a function, or the type's name.
 
     Example: ``print(cortado.losses.fingerprint(cortado.losses.CentreOfMass([1.0, 0.2])))``
     """
@@ -293,13 +299,13 @@ class SnapshotBatch(Sequence[Snapshot]):
 
     @cached_property
     def on_host(self) -> dict[str, np.ndarray]:
-        """All fields of all scenes by name, read from the device at once; float64, read-only."""
+        """All fields of all scenes by name, copied from the device together; float64, read-only."""
         return {name: _read_only(array) for name, array in self.state.numpy(self.dimension).items()}
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class _Member(Snapshot):
-    """A snapshot of one scene of a batch, whose arrays come to the host with those of the others."""
+    """A snapshot of one scene of a batch; the arrays of all scenes are copied to the host together."""
 
     batch: SnapshotBatch
     number: int
@@ -313,19 +319,20 @@ class _Member(Snapshot):
 
 @runtime_checkable
 class BatchedLoss(Protocol):
-    """Protocol of a loss of all scenes of a batch at once, which saves a launch and a host read for each. Scene b gets
-    the bits that it would get alone."""
+    """Protocol of a loss that treats all scenes of a batch together, which saves a launch and a host read per scene.
+    The results have the same bits as for single scenes."""
 
     def values(self, end: SnapshotBatch) -> np.ndarray:
-        """Return the losses (batch,); those of lost scenes are meaningless."""
+        """Return the losses (batch,); values for lost scenes are meaningless."""
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
         """Return the losses (batch,) and the derivatives with respect to the states, as Warp arrays:
-        ``end.state.like()`` makes them, all 0, and its ``set({"positions": array})`` writes an array (batch, n, d)."""
+        ``end.state.like()`` makes a state of zeros, and its ``set({"positions": array})`` fills it from an array
+        (batch, n, d)."""
 
 
 def batch_values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:
-    """Return the losses (batch,) of some scenes; NaN for others."""
+    """Return the losses (batch,), with NaN for scenes that are not in ``members``."""
     found = np.full(len(end), np.nan)
     if isinstance(loss, BatchedLoss):
         found[members] = loss.values(end)[members]
@@ -337,7 +344,7 @@ def batch_values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.n
 def batch_values_and_adjoints(
     loss: Loss, end: SnapshotBatch, members: Sequence[int]
 ) -> tuple[np.ndarray, SnapshotAdjoint]:
-    """Return the losses (batch,) of some scenes, NaN for others, and the adjoints of their states, 0 for others."""
+    """Return the losses (batch,) and the states' adjoints. Scenes not in ``members`` have NaN and adjoints of 0."""
     found = np.full(len(end), np.nan)
     if isinstance(loss, BatchedLoss):
         all_found, state = loss.values_and_adjoint(end)

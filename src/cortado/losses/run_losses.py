@@ -1,4 +1,4 @@
-"""The losses of a run, in whatever form users give them: checked, and each of the state after its number of steps."""
+"""Check the losses that users give, in any accepted form, and assign each to the state after its number of steps."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -38,9 +38,9 @@ LAUNCHED = "positions", "velocities", "an array for the loss"
 class Recorded:
     """A loss made of any function of Warp arrays, differentiated by Warp's tape.
 
-    ``function(positions, velocities, loss)`` launches kernels that add to ``loss``, an array (1,) of the precision of
-    the (n,) vectors it is given. Mind Warp's rules for kernels that loop: a sum that is used non-linearly belongs
-    into a function of its own.
+    ``function(positions, velocities, loss)`` launches kernels that add to ``loss``, an array (1,) in the precision of
+    the vectors (n,). Warp's rules for loops in kernels apply: put a sum that is used non-linearly into a separate
+    function.
 
     Example::
 
@@ -56,7 +56,7 @@ class Recorded:
 
     @property
     def fingerprint(self) -> str:
-        """Text that tells losses of other functions or numbers apart, for searches that go on."""
+        """Text that identifies the function and its numbers; a resumed search compares it."""
         return f"{type(self).__qualname__} {code_words(self.function)}"
 
     @WARP
@@ -80,21 +80,21 @@ class Recorded:
 
 
 FORMS = tuple(name.replace("_", " ") for name in ADJOINT_FIELDS)
-"""Names in words of the fields that the arrays of an adjoint differentiate by."""
+"""Words for the fields to which the arrays of an adjoint tuple belong."""
 
 
 class CheckedLoss:
-    """A wrapper of a loss that checks that its value is a number, and that its adjoint fits the state."""
+    """A wrapper of a loss that checks that the value is a number and that the adjoint fits the state."""
 
     def __init__(self, loss: Any):
-        """Wrap a `Loss`; its own ``adjoint``, if any, takes the place of ``value_and_adjoint``."""
+        """Wrap a `Loss`; if the loss has a method ``adjoint``, it is used instead of ``value_and_adjoint``."""
         self._loss = loss
 
     def value(self, end: Snapshot) -> float:
         return as_one_number("the loss's value", self._loss.value(end))
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """Return the loss and its derivatives, checked, with NumPy arrays in float64."""
+        """Return the loss and its derivatives after checking them; NumPy arrays become float64."""
         if hasattr(self._loss, "adjoint"):
             return self.value(end), self._checked(self._loss.adjoint(end), end)
         value, bar = self._loss.value_and_adjoint(end)
@@ -131,7 +131,8 @@ class CheckedBatchedLoss(CheckedLoss):
 
 
 def as_loss(loss: Any) -> Loss:
-    """Return a loss with its results checked; a function of Warp arrays is made into one. Raises `InputError`."""
+    """Wrap a loss, or a function of Warp arrays, so that its results are checked; raises `InputError` for anything
+    else."""
     if isinstance(loss, type):
         raise InputError(f"loss is the class {loss.__name__}, but must be an object that is made of it.")
     derivative = next((name for name in ("adjoint", "value_and_adjoint") if hasattr(loss, name)), None)
@@ -160,7 +161,7 @@ def _checked_state(bar: Any, end: Snapshot | SnapshotBatch) -> State:
 
 
 def _checked_table(bar: Mapping[str, Any], end: Snapshot) -> dict[str, np.ndarray]:
-    """Return adjoints by the names of state fields and quantities, checked."""
+    """Check and return adjoints given by names of state fields and quantities."""
     for name in bar:
         check_readable(name, "a name in the loss's adjoint", end.state.names)
     return {name: _checked_share(f"adjoint of {name}", array, end[name].shape) for name, array in bar.items()}
@@ -182,17 +183,16 @@ def _checked_share(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray
 
 
 def _layout(array: wp.array) -> str:
-    """Return a Warp array's type, shape and device in words, which decide if one array can be copied to another."""
+    """Return a Warp array's type, shape and device in words; arrays must agree in them to be copied."""
     return f"a Warp array of {wp.types.type_repr(array.dtype)} of shape {array.shape} on {array.device}"
 
 
 class LossesByStep(dict[int, Loss]):
-    """The losses of a run, each by the number of steps before the state that it judges."""
+    """The losses of a run, by the number of steps of the state that each is computed from."""
 
     def __init__(self, loss: Any, steps: int, chosen: bool = False):
-        """Take a ``loss`` of the state after all ``steps``, or `Frames` of several. Raises `InputError` for what is no
-        loss, for frames that a run of so many steps does not have, and where the steps are ``chosen`` for frames at
-        times of their own."""
+        """Take a ``loss`` of the state after all ``steps``, or `Frames`. Raises `InputError` for anything else, for
+        frames beyond ``steps``, and for frames at fixed times if the time steps are ``chosen`` during the run."""
         if chosen and getattr(loss, "time_step", None) is not None:
             raise InputError(
                 f"loss is a {type(loss).__name__} of steps of {loss.time_step:g} s, but must be one of numbers of "
@@ -205,23 +205,23 @@ class LossesByStep(dict[int, Loss]):
         super().__init__({step: as_loss(one) for step, one in by_step.items()})
         self._sensors = {step: one.sensor for step, one in by_step.items() if hasattr(one, "sensor")}
         self.sensors = {repr(sensor): sensor for sensor in self._sensors.values()}
-        """Those that losses read, by what they are."""
+        """Sensors that the losses read, by ``repr``."""
         self._frames = loss if isinstance(loss, Frames) else None
 
     def _check(self, ends: Mapping[int, Any]) -> None:
-        """Raise `InputError` for states of a run that the losses do not fit."""
+        """Raise `InputError` if the losses do not fit these states of a run."""
         if self._frames is not None:
             end = next(iter(ends.values()))
             self._frames.check(np.ravel(moment_of(end).parameters["time_step"]))
 
     def quantities(self, scene: Callable[[], SensedScene]) -> dict[int, str]:
-        """Return the quantities that sensors of Cortado's read of particles, by the numbers of states."""
+        """Return the particle quantities that Cortado's sensors read, by state number."""
         sums = {step: one.summed(scene()) for step, one in self._sensors.items() if hasattr(one, "summed")}
         return {step: one.quantity for step, one in sums.items() if one.quantity is not None}
 
     def total(self, ends: Mapping[int, Any], going: Sequence[int] | None) -> Any:
-        """Return the sum of the losses, given states by the number of steps before them; of a batch (batch,), NaN
-        except for the scenes ``going``, which is None for a single scene."""
+        """Return the sum of the losses, given states by number of steps. For a batch it is (batch,), with NaN for
+        scenes not in ``going``; for a single scene ``going`` is None."""
         self._check(ends)
         if going is None:
             return sum(loss.value(ends[step]) for step, loss in self.items())
@@ -230,7 +230,7 @@ class LossesByStep(dict[int, Loss]):
     def total_and_adjoints(
         self, ends: Mapping[int, Any], going: Sequence[int] | None
     ) -> tuple[Any, dict[int, SnapshotAdjoint]]:
-        """Return the sum of the losses, as `total`, and the states' adjoints by number of steps."""
+        """Return the sum of the losses, as `total` does, and the states' adjoints by number of steps."""
         self._check(ends)
         if going is None:
             one = {step: loss.value_and_adjoint(ends[step]) for step, loss in self.items()}
