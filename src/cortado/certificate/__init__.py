@@ -1,4 +1,4 @@
-"""Are the gradients of a problem right, and up to how many steps are they useful? `certify` finds out."""
+"""`certify` tests if the gradients of a problem are right, and up to how many steps they are useful."""
 
 from cortado.certificate.certificate import Certificate, certify
 from cortado.certificate.consistency import Consistency

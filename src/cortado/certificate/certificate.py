@@ -1,4 +1,5 @@
-"""The certificate of a problem's gradients: are they right, up to which step are they useful, what to use beyond."""
+"""The certificate of a problem's gradients: if they are right, up to which step they are useful, and which estimator to
+use for longer runs."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -46,9 +47,10 @@ from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
 BESIDE = 0.1 * PERTURBATION
-"""Part of the spacing, and of the speed of a fall, by which particles are moved off a corner of the loss."""
+"""Distance, relative to the spacing, and velocity, relative to the speed of a fall, by which particles are moved off a
+corner of the loss."""
 ROUGHLY = 0.1
-"""Greatest relative distance of the adjoint of a loss in float32 from finite differences of its values."""
+"""Greatest accepted relative difference between the adjoint of a float32 loss and finite differences of its values."""
 
 
 @dataclass(frozen=True)
@@ -61,24 +63,26 @@ class Certificate:
     """Time step of the run [s]."""
     loss: float
     loss_changes: dict[str, float]
-    """Change of the loss by a meaningful perturbation of each parameter, extrapolated: the adjoint times a perturbation
-    that was not tried."""
+    """Change of the loss by a meaningful perturbation of each parameter, estimated as adjoint times perturbation,
+    without a run."""
     consistency: Consistency
     """Check of the derivatives with respect to all parameters together."""
     wrong: tuple[str, ...]
-    """Parameters with a wrong derivative; empty where the adjoint is right."""
+    """Parameters with a wrong derivative; empty if the adjoint is right."""
     norms: np.ndarray
     """Norms (steps + 1,) of the exact adjoint of the state after each number of steps."""
     growth: float
     """Growth of the exact adjoint's norm in each step backwards, in e-folds."""
     horizons: tuple[Horizon, ...]
-    """Horizon of every parameter asked for; none where the adjoint is wrong."""
+    """Horizon of every requested parameter; empty if the adjoint is wrong."""
     alignment: Alignment | None
-    """Alignment of each estimator's gradient with the smoothed one, for all of these parameters together."""
+    """Alignment of each estimator's gradient with the smoothed gradient, for all requested parameters together; None
+    without a smoothed gradient."""
     beside: Consistency | None = None
-    """Check beside a corner of the loss, where differences do not tell, with particles moved a little; else None."""
+    """Check with slightly moved particles, if the loss has a corner at the first state so that differences are not
+    conclusive; else None."""
     beyond: tuple[str, ...] = ()
-    """Sentences on questions left open, as a copy of the run loses a particle."""
+    """Sentences on open questions, because a copy of the run lost a particle."""
 
     def __repr__(self) -> str:
         verdict = f"right, horizon {self.horizon}" if self.right else f"WRONG for {', '.join(self.wrong)}"
@@ -113,7 +117,8 @@ class Certificate:
         return "\n".join(lines)
 
     def _changes(self) -> Iterator[tuple[str, str, str]]:
-        """Yield each parameter with its change of the loss, extrapolated unless its horizon lasts, and the verdict."""
+        """Yield for each parameter its name, its change of the loss and the verdict. The change is marked as
+        extrapolated unless the horizon reaches the last step."""
         tried = {one.parameter for one in self.horizons if one.lasts}
         for name, share in self.loss_changes.items():
             verdict = "WRONG" if name in self.wrong else "right" if share else "no effect on this loss"
@@ -129,7 +134,7 @@ class Certificate:
 
     @property
     def horizon(self) -> int:
-        """Last step up to which the exact gradient is useful for every parameter asked for."""
+        """Last step up to which the exact gradient is useful for every requested parameter."""
         return min((one.measured for one in self.horizons), default=0)
 
     @property
@@ -146,7 +151,7 @@ class Certificate:
 
     @property
     def _spread(self) -> str:
-        """Phrase with the spread to give to the advised estimator; empty if it takes none."""
+        """Phrase with the spread for the advised estimator; empty if this estimator has no spread."""
         if self.alignment is None or "(spread)" not in self.estimator:
             return ""
         return f" with spread = { {name: float(f'{value:.3g}') for name, value in self.alignment.spread.items()} }"
@@ -169,11 +174,11 @@ def certify(
     seed: int = 0,
     steps: int | None = None,
 ) -> Certificate:
-    """Check the gradients of a problem, always in float64; ``certify("scene.toml", steps=50)`` those of a scene.
+    """Check the gradients of a problem in float64; ``certify("scene.toml", steps=50)`` checks those of a scene.
 
-    A problem in float32 is made once more in float64, on the same device, to be checked: the code is the same, and
-    round-off does not hide what is wrong. A loss of your own is still computed in float32 then; its adjoint is compared
-    with finite differences of its values, and may be off by a tenth, which is what float32 allows.
+    A float32 problem is rebuilt in float64 on the same device: the code is the same, and round-off does not hide
+    errors. Your own loss is still computed in float32. Its adjoint may differ from finite differences of its values by
+    a tenth, because of float32 round-off.
 
     The adjoint is checked with respect to every parameter of the scene. Two things are found for ``parameters`` alone:
     the horizon, which is the number of steps up to which the exact gradient is useful, and the estimator to use beyond
@@ -182,13 +187,13 @@ def certify(
     Args:
         problem: a problem; or, with a number of ``steps``, a simulation, a scene or the path of a scene's file. The
             loss is then the particles' mean squared distance from where they start.
-        perturbation: how large a meaningful perturbation of a parameter is, relative to the parameter's value; for
-            positions it is relative to the spacing, for velocities to the speed of a fall over the fluid's height.
-        seed: of the random directions.
-        steps: to be left out where a problem is given, as a problem has its own number of steps.
+        perturbation: size of a meaningful perturbation, relative to the parameter's value; for positions relative to
+            the spacing, for velocities to the speed of a fall over the fluid's height.
+        seed: seed of the random directions. steps: number of steps; leave it out for a problem, which has its own
+        number of steps.
 
-    Where a copy of the run loses a particle, moved or in float64, the answers are those of the steps before, and
-    `Certificate.beyond` says so. Raises `InputError` for arguments that do not fit, `DivergedError` where the problem
+    If a perturbed or float64 copy of the run loses a particle, the results cover the steps before, and
+    `Certificate.beyond` says so. Raises `InputError` for unsuitable arguments, and `DivergedError` if the problem
     itself diverges.
 
     Example::
@@ -219,7 +224,7 @@ def certify(
 
 
 def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int) -> Certificate:
-    """Return the certificate of a problem in float64; raises `DivergedError` where its run diverges."""
+    """Return the certificate of a problem in float64; raises `DivergedError` if its run diverges."""
     random = np.random.default_rng(seed)
     history, values = LossHistory(problem), everything(problem, chosen)
     norms = AdjointNorms(problem.simulation.solver, problem.steps)
@@ -261,7 +266,8 @@ def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int)
 
 
 def _problem(subject: Any, steps: int | None) -> Problem:
-    """Return a problem itself; for a scene or a simulation, one with the particles' squared displacements as loss."""
+    """Return a given problem; for a scene or a simulation, make a problem with the mean squared displacement of
+    particles as loss."""
     if isinstance(subject, Problem):
         if steps is not None:
             own = f"as the problem has {subject.steps} steps"
@@ -277,7 +283,8 @@ def _problem(subject: Any, steps: int | None) -> Problem:
 def _consistency(
     history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays
 ) -> tuple[Consistency, tuple[str, ...]]:
-    """Return the check of all parameters together and, where it fails, the names of those that also fail alone."""
+    """Check all parameters together; if this fails, check each alone. Return the check and the names of the parameters
+    that fail alone."""
     together = check_consistency(history, values, gradient, balanced(gradient, along))
     if together.right:
         return together, tuple(along) if history.rough_miss(values, along) > ROUGHLY else ()
@@ -288,12 +295,12 @@ def _consistency(
 def _beside(
     problem: Problem, values: Arrays, along: Arrays, random: np.random.Generator
 ) -> tuple[Consistency | None, int]:
-    """Check all parameters with first positions and velocities moved a little at random, and return the check and its
-    number of steps: those before the moved run loses a particle (None where none are).
+    """Check all parameters at slightly, randomly moved first positions and velocities. Return the check and its number
+    of steps, all before the moved run loses a particle; the check is None if there are no such steps.
 
-    Fluid at rest is on the corner of each |v| and min(v, 0) at once. Derivatives are those of one side of each; as the
-    errors of many corners may cancel in the slopes of the loss to both sides, these are no bound. Fluid that is moved
-    has the same terms, and is on no corner.
+    Fluid at rest is at a corner of every |v| and min(v, 0), where the adjoint is a derivative to one side. Errors of
+    many corners may cancel in the one-sided slopes of the loss, so these slopes bound nothing. Moved fluid has the same
+    terms but no corners.
     """
     known = problem.simulation.known
     states = {n: v for n, v in values.items() if known[n].role is Role.STATE and known[n].range is Range.ANY}
@@ -315,7 +322,8 @@ WIDTH = 110
 
 
 def beyond_words(horizon: Horizon) -> str | None:
-    """Return a sentence on the step after which a horizon has no answer; None where it is the last one."""
+    """Return a sentence about the step after which a horizon has no result; None if it has results up to the last
+    step."""
     if horizon.reached == horizon.sample_steps[-1]:
         return None
     moved = f"a run that the perturbation of {horizon.parameter} moves"
@@ -325,7 +333,8 @@ def beyond_words(horizon: Horizon) -> str | None:
 
 
 def consistency_words(c: Consistency, beside: Consistency | None = None) -> str:
-    """Return in words to how many digits reverse, forward and central differences agree, and if on a corner."""
+    """Return words on how many digits reverse mode, forward mode and central differences have in common, and if the
+    loss has a corner."""
     digits = f"reverse and forward mode agree to {_digits(c.disagreement)} digits"
     if c.miss is None:
         return f"{digits}, no difference is reliable here"

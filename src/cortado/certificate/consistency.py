@@ -1,5 +1,5 @@
-"""Is the adjoint right? The derivative of the loss along a direction, by reverse mode, forward mode and differences, as
-a function of the number of steps of the run, in float64.
+"""Check the adjoint: compare the loss's derivative along a direction by reverse mode, forward mode and differences, in
+float64, for growing numbers of steps.
 """
 
 from collections.abc import Iterator
@@ -34,8 +34,8 @@ from cortado.simulation import Simulation
 
 
 def up_to(problem: Problem, steps: int) -> Problem | None:
-    """Return a problem cut to ``steps`` steps, with its loss at their end, or with the loss's frames up to there; None
-    where nothing is left."""
+    """Return a problem shortened to ``steps`` steps, with its loss at the new end, or the loss's frames up to there;
+    None if no step or frame is left."""
     loss: Any = problem.loss
     if isinstance(loss, Frames):
         kept = {step: one for step, one in loss.losses.items() if step <= steps}
@@ -44,21 +44,22 @@ def up_to(problem: Problem, steps: int) -> Problem | None:
 
 
 def first_rows(problem: Problem, values: Arrays, steps: int) -> Arrays:
-    """Return parameters of a problem, with the rows of its first ``steps`` steps."""
+    """Return parameters of a problem; those over time are cut to the rows of the first ``steps`` steps."""
     known = problem.simulation.known
     over_time = {name for name, value in values.items() if name in known.over_time and value.ndim > known[name].rank}
     return {name: value[:steps] if name in over_time else value for name, value in values.items()}
 
 
 ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong, SensorMatch)
-"""Losses that take states of either precision."""
+"""Loss classes that accept states in float32 and in float64."""
 
 
 def in_float64(problem: Problem) -> Problem:
-    """Return the problem itself where it is one in float64, else the same scene, device, steps and loss in float64.
+    """Return a float64 problem unchanged; otherwise return a problem with the same scene, device, steps and loss in
+    float64.
 
-    Losses of this package are computed from states in float64 then. Whether any other loss can be is not known, so it
-    is still computed in float32: see `Rounded`.
+    Cortado's losses are then computed from float64 states. Any other loss may work in float32 alone, so it gets states
+    rounded to float32: see `Rounded`.
     """
     single = problem.simulation
     if single.precision == FLOAT64:
@@ -81,7 +82,7 @@ def _loss_in_float64(loss: Any, single: Simulation) -> Any:
 
 
 class Rounded:
-    """A wrapper of a loss that may work in float32 alone: it rounds states in float64 to float32."""
+    """A wrapper of a loss that may work in float32 alone: it rounds float64 states to float32."""
 
     def __init__(self, loss: Any, single: Simulation):
         """Wrap a loss made for the float32 simulation ``single``."""
@@ -108,13 +109,13 @@ class Rounded:
 
 
 SAMPLE_STEPS = 25
-"""Greatest number of sample steps, where the loss is one of the last state."""
+"""Greatest number of sample steps for a loss of the last state."""
 ROUGH = (1e-1, 1e-2, 1e-3)
 """Steps h of central differences of a loss in float32, in units of the direction."""
 FLOAT32_ROUND_OFF = 1e-6
 """Relative round-off of a loss in float32."""
 ABOVE_ROUND_OFF = 30.0
-"""Least ratio of a difference of float32 losses to their round-off at which it counts."""
+"""Least ratio of a difference of float32 losses to their round-off; smaller differences are ignored."""
 
 
 @dataclass(frozen=True)
@@ -126,14 +127,15 @@ class Tangent:
     slopes: np.ndarray
     """Derivatives (sample_steps,) of the loss."""
     strain: np.ndarray
-    """Distances (sample_steps,) between the tangents of a particle's position and of its nearest neighbour's [m], root
+    """Differences (sample_steps,) between the position tangents of a particle and of its nearest neighbour [m], root
     mean square over particles."""
 
 
 class LossHistory:
     """A problem whose loss is also computed at earlier steps, the sample steps, as if the run ended there.
 
-    A loss of several frames (`Frames`) is sampled at its frames; there it is the sum of those up to the sample step.
+    A loss of several frames (`Frames`) is sampled at its frames; its value there is the sum over frames up to the
+    sample step.
     """
 
     def __init__(self, problem: Problem):
@@ -149,13 +151,14 @@ class LossHistory:
         self._total = np.cumsum if frames else np.asarray
 
     def difference(self, parameters: Arrays, along: Arrays, h: float) -> np.ndarray:
-        """Return central differences (sample_steps,) of step h along a direction of all or some of the parameters; NaN
-        from the step on in which a run diverges."""
+        """Return central differences (sample_steps,) of step h along a direction of all or some parameters; NaN after a
+        run diverges."""
         return self.sides(parameters, along, h, np.zeros(len(self.sample_steps)))[0]
 
     def sides(self, parameters: Arrays, along: Arrays, h: float, losses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return central differences (sample_steps,) and the distances between the differences to both sides, given the
-        ``losses`` (sample_steps,) between them; 0 of losses in float32, whose round-off would be all of it."""
+        """Return central differences (sample_steps,), and how far the two one-sided differences are apart; ``losses``
+        (sample_steps,) are the unperturbed losses. For float32 losses the second result is 0, because it would be
+        round-off."""
         differences, sums = [], []
         for loss, before, after in self._beside(parameters, along, h):
             rounded = isinstance(loss, Rounded)
@@ -167,10 +170,11 @@ class LossHistory:
         return self._total(differences + unknown) / (2.0 * h), np.nan_to_num(bends)
 
     def rough_miss(self, parameters: Arrays, along: Arrays) -> float:
-        """Return the relative distance of the adjoints of `Rounded` losses from finite differences of their values.
+        """Return the relative difference between the adjoints of `Rounded` losses and finite differences of their
+        values.
 
-        It is the least over the steps h, and of these the median over sample steps; 0 where no loss is `Rounded`, or
-        where round-off is as large as the differences.
+        It is the smallest over steps h of the median over sample steps; 0 if no loss is `Rounded`, or if round-off is
+        as large as the differences.
         """
         if not any(isinstance(loss, Rounded) for loss in self._losses.values()):
             return 0.0
@@ -185,8 +189,8 @@ class LossHistory:
         return float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else 0.0
 
     def _beside(self, parameters: Arrays, along: Arrays, h: float) -> Iterator[tuple[Loss, Snapshot, Snapshot]]:
-        """Yield at every sample step its loss, and the states with parameters moved by -h and by h along the direction,
-        as far as both runs come."""
+        """Yield the loss at every sample step, and the states with parameters moved by -h and h along the direction,
+        until one of the two runs diverges."""
         behind, ahead = (
             self._reached({**parameters, **{name: parameters[name] + step * d for name, d in along.items()}})
             for step in (-h, h)
@@ -196,8 +200,7 @@ class LossHistory:
                 yield loss, behind[step], ahead[step]
 
     def _reached(self, parameters: Arrays) -> dict[int, Snapshot]:
-        """Return the states at sample steps that a run comes to before it loses a particle; none where it cannot
-        begin."""
+        """Return the states at the sample steps before a run loses a particle; empty if the run cannot begin."""
         try:
             return self.problem.states(parameters, self._losses)
         except NO_RUN as error:
@@ -210,7 +213,7 @@ class LossHistory:
         return shorter.states(first_rows(problem, parameters, last), steps)
 
     def tangent(self, parameters: Arrays, along: Arrays) -> Tangent:
-        """Return derivatives along a direction, which names all or some of the parameters."""
+        """Return derivatives along a direction of all or some of the parameters."""
         dots: dict[int, Arrays] = {}
         dimension = self.problem.simulation.dimension
 
@@ -231,9 +234,9 @@ class LossHistory:
 
 
 def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
-    """Return the change of a loss between two states from its adjoints: their mean times the difference of the states.
+    """Return the change of a loss between two states: the mean of its two adjoints times the difference of the states.
 
-    It is exact to second order, and free of the round-off of the loss's values.
+    The result is exact to second order and avoids the round-off of the loss's values.
     """
     ends = (before, after)
     old, new = (end.state.numpy(end.dimension) for end in ends)
@@ -255,24 +258,24 @@ STEPS = tuple(10.0**-k for k in range(3, 9))
 """Steps h of the central differences, in units of the direction. Smaller ones are tried until the differences stop
 converging and agree with forward mode."""
 MODE_TOLERANCE = 1e-8
-"""Greatest relative distance of reverse mode from forward mode in float64; both are exact to round-off."""
+"""Greatest accepted relative difference between reverse and forward mode in float64; both are exact to round-off."""
 PLATEAU = 1e-3
-"""Greatest relative distance of the central differences of two successive steps h that count as converged."""
+"""Central differences with two successive steps h count as converged up to this relative difference."""
 CORNER = 1e-4
-"""Least relative distance of the slopes to both sides at which the loss has a corner."""
+"""The loss has a corner if its slopes to the two sides differ by at least this relative amount."""
 SLACK = 10.0
-"""Greatest distance of forward mode from a central difference, over the least distance of two successive ones."""
+"""Greatest accepted distance of forward mode from a central difference, divided by the least distance of two successive
+differences."""
 RESOLUTION = 1e-6
-"""Relative distance between forward mode and differences that is always allowed."""
+"""Relative difference between forward mode and finite differences that is always accepted."""
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
-"""Golden ratio less 1, whose multiples all differ in their parts beyond whole numbers."""
+"""Golden ratio minus 1; the fractional parts of its multiples are all different."""
 FAINT = 1e-4
-"""Parameters that change the loss by less than this part of what the strongest does are left out when the others are
-scaled down to the weakest (`balanced`)."""
+"""`balanced` ignores parameters whose effect on the loss is less than this part of the strongest parameter's effect."""
 ROUND_OFF = 1e-13
-"""Derivatives along the direction that are smaller than this part of the loss are taken as 0."""
+"""Derivatives along the direction smaller than this part of the loss are treated as 0."""
 DIFFERENCE_ROUND_OFF = 1e-15
-"""The round-off of a central difference of step h is estimated as this part of the loss, divided by h."""
+"""Estimated round-off of a central difference of step h, relative to the loss divided by h."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -286,19 +289,19 @@ class Consistency(ShortRepr):
     adjoint: float
     """Derivative of the last loss by reverse mode: gradient times direction, summed over all numbers."""
     size: float
-    """Root sum of squares of the products gradient times direction: the scale of their sum's round-off."""
+    """Root of the sum of squared products gradient times direction, which is the scale of round-off in their sum."""
     tangents: np.ndarray
     """Derivatives (sample_steps,) by forward mode."""
     differences: np.ndarray
-    """Central differences (tried, sample_steps); no rows where reverse and forward mode already differ."""
+    """Central differences (tried, sample_steps); no rows if reverse and forward mode already differ."""
     sides: np.ndarray
-    """Distances (tried, sample_steps) between the differences to one side and to the other."""
+    """Distances (tried, sample_steps) between the two one-sided differences."""
     steps: np.ndarray
     """Steps h (tried,) of the differences, in units of the direction."""
 
     @property
     def disagreement(self) -> float:
-        """Relative distance of reverse mode from forward mode; 0 where both are below round-off."""
+        """Relative difference between reverse and forward mode; 0 if both are below round-off."""
         last, least = float(self.tangents[-1]), ROUND_OFF * abs(float(self.losses[-1]))
         size = max(abs(self.adjoint), abs(last), self.size)
         distance = abs(self.adjoint - last) / size if size > least else 0.0
@@ -306,54 +309,58 @@ class Consistency(ShortRepr):
 
     @property
     def gaps(self) -> np.ndarray:
-        """Relative distances (tried - 1, sample_steps) of central differences of one h and the next, with round-off.
+        """Relative differences (tried - 1, sample_steps) between central differences with successive h, with round-off
+        added.
 
-        At every sample step it is the greatest up to there.
+        The value at a sample step is the greatest up to that step.
         """
         round_off = DIFFERENCE_ROUND_OFF * np.abs(self.losses).max() / self.steps[1:, None]
         return self._worst(np.abs(np.diff(self.differences, axis=0)) + round_off)
 
     @property
     def misses(self) -> np.ndarray:
-        """Relative distances (tried, sample_steps) of differences from forward mode, the greatest so far."""
+        """Relative distances (tried, sample_steps) of central differences from forward mode, each the greatest up to
+        its sample step."""
         return self._worst(np.abs(self.differences - self.tangents))
 
     @property
     def corner(self) -> np.ndarray:
-        """Least relative distances (sample_steps,) of differences to one side and to the other, the greatest up to each
-        sample step. They vanish for small h except on a corner of the loss, where both have limits of their own."""
+        """Least relative distances over h (sample_steps,) between the two one-sided differences, each the greatest up
+        to its sample step. For small h they vanish, except at a corner of the loss, where the two sides have different
+        limits."""
         return np.asarray(self._worst(self.sides).min(axis=0, initial=np.inf))
 
     @property
     def is_on_a_corner(self) -> bool:
-        """True if reverse mode agrees with forward mode, and differences to one side and to the other have limits of
-        their own, up to where they converge."""
+        """True if reverse and forward mode agree, and one-sided differences have two different limits up to the last
+        converged step."""
         slopes = self.corner[self.converged]
         return self.disagreement < MODE_TOLERANCE and bool(len(slopes)) and float(slopes[-1]) > CORNER
 
     @property
     def converged(self) -> np.ndarray:
-        """Masks (sample_steps,), true where differences of two successive h agree up to there. Where none do, chaos or
-        round-off hides the limit of differences."""
+        """Mask (sample_steps,) of the steps up to which differences with two successive h agree. Beyond them, chaos or
+        round-off hides the limit."""
         return np.asarray(self.gaps.min(axis=0, initial=np.inf) < PLATEAU)
 
     @property
     def last_converged(self) -> int | None:
-        """Last sample step at which differences converge; None where they do nowhere."""
+        """Last sample step at which differences converge; None if they never converge."""
         return int(self.sample_steps[self.converged][-1]) if self.converged.any() else None
 
     @property
     def miss(self) -> float | None:
-        """Relative distance of forward mode from the nearest difference at the last converged step, or None."""
+        """Relative distance of forward mode from the nearest difference at the last converged step; None without such a
+        step."""
         return float(self.misses[:, self.converged].min(axis=0)[-1]) if self.converged.any() else None
 
     @property
     def differences_agree(self) -> bool:
         """True if forward mode is near a central difference at every sample step at which differences converge.
 
-        Near means within `SLACK` times the least distance of two successive differences, or, on a corner of the loss,
-        within the distance of both sides. One near difference is enough: beside a kink of the loss, differences agree
-        with each other and are off until h is smaller than the distance to the kink.
+        Near means within `SLACK` times the least distance of two successive differences or, at a corner of the loss,
+        within the distance between its sides. One near difference is enough: close to a corner, differences agree but
+        are wrong until h is smaller than the distance to the corner.
         """
         allowed = np.maximum(SLACK * self.gaps.min(axis=0, initial=np.inf), RESOLUTION)
         near = self.misses.min(axis=0, initial=np.inf) <= np.maximum(allowed, self.corner)
@@ -361,11 +368,11 @@ class Consistency(ShortRepr):
 
     @property
     def right(self) -> bool:
-        """True if reverse mode agrees with forward mode, and forward mode with differences."""
+        """True if reverse mode agrees with forward mode, and forward mode agrees with differences."""
         return self.disagreement < MODE_TOLERANCE and self.differences_agree
 
     def _worst(self, distances: np.ndarray) -> np.ndarray:
-        """Return distances relative to the derivatives, both the greatest up to each sample step."""
+        """Return the greatest distance up to each sample step, divided by the greatest derivative up to that step."""
         size = np.maximum.accumulate(np.abs(self.differences[len(self.differences) - len(distances) :]), axis=1)
         worst = np.maximum.accumulate(distances, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -373,11 +380,11 @@ class Consistency(ShortRepr):
 
 
 def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
-    """Return directions scaled such that each parameter's changes the loss by as much as the weakest, or up to twice
-    that.
+    """Scale directions so that each parameter's direction changes the loss about as much as the weakest one, at most
+    twice as much.
 
-    Along their sum an error in one parameter's adjoint is not hidden by a parameter that changes the loss far more. And
-    as no two change it by the same, wrong signs of two of them do not cancel.
+    Then a parameter with a much larger effect cannot hide an error in another one's adjoint. No two effects are equal,
+    so two wrong signs cannot cancel.
     """
     changes = {name: abs(float((gradient[name] * along).sum())) for name, along in directions.items()}
     finite = [change for change in changes.values() if np.isfinite(change)]

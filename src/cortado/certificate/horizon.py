@@ -1,4 +1,5 @@
-"""Up to how many steps the exact gradient is useful, for meaningful perturbations, and which gradients are beyond."""
+"""Find up to how many steps the exact gradient predicts meaningful perturbations, and which estimators help in longer
+runs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -17,11 +18,12 @@ from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.parameters import Axis, Parameter, Range, Role
 
 PERTURBATION = 0.05
-"""Size of a meaningful perturbation, relative to that of the parameter or, for states, of the flow (`scales`)."""
+"""Size of a meaningful perturbation, relative to the parameter's value or, for states, to scales of the flow
+(`scales`)."""
 
 
 def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
-    """Return the values of parameters, given as values or as names of the scene's."""
+    """Return the values of parameters, from a table of values or from names, whose values are then the scene's."""
     simulation = problem.simulation
     if problem.state is not None:
         raise InputError(
@@ -52,11 +54,11 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
 
 
 def everything(problem: Problem, chosen: Arrays) -> Arrays:
-    """Return every parameter of the problem that acts and that can be both increased and decreased, with its values.
+    """Return the values of all parameters that have an effect and can be both increased and decreased.
 
-    Values are the chosen ones, else the scene's, as its schedule has them; parameters over time have a row for each
-    step. A viscosity of 0 cannot be decreased and is left out; so is a mobility in a scene of one phase, where it does
-    nothing.
+    Values are the chosen ones, or otherwise those of the scene and its schedule; parameters over time have a row for
+    each step. A viscosity of 0 is left out, because it cannot be decreased, and so is the mobility of a single phase,
+    which has no effect.
     """
     values = {**ParameterSpace(problem.simulation, problem.steps).defaults(), **chosen}
     found = {}
@@ -74,14 +76,15 @@ def everything(problem: Problem, chosen: Arrays) -> Arrays:
 
 
 def _moves_both_ways(parameter: Parameter, value: np.ndarray) -> bool:
-    """Test if no number of a parameter is at the end of its range."""
+    """Test if all numbers of a parameter lie inside its range, not at a bound."""
     return parameter.range is not Range.NOT_NEGATIVE or bool((value > 0.0).all())
 
 
 def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION) -> Arrays:
     """Return the size of a meaningful perturbation of every number of these parameters, in their shapes and units.
 
-    It is a part of the parameter's value; of the spacing for positions, of the speed of a fall for velocities.
+    It is the fraction ``perturbation`` of the parameter's value, for positions of the spacing, and for velocities of
+    the speed of a fall.
     """
     known = problem.simulation.known
     return {
@@ -91,7 +94,8 @@ def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION)
 
 
 def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return for every parameter a random direction of the given size; a single number is increased."""
+    """Return a random direction of the given size for every parameter; for a single number the direction is
+    positive."""
     return {
         name: sizes[name] * (random.standard_normal(value.shape) if value.ndim else 1.0)
         for name, value in values.items()
@@ -99,10 +103,10 @@ def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Ar
 
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return random directions that are smooth in space and constant in time, which move the fluid as a whole; for a
-    path that begins at 0 they grow in time.
+    """Return random directions that are smooth in space and constant in time, so that they move the fluid as a whole.
+    For a path that begins at 0 they grow in time.
 
-    An independent random number for each particle would only move particles against their neighbours.
+    Independent random numbers for each particle would only move neighbouring particles against each other.
     """
     x = problem.simulation.positions - problem.simulation.positions.mean(axis=0)
     x = x / (np.abs(x).max() or 1.0)
@@ -122,11 +126,11 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
 
 
 def growth(norms: np.ndarray, time_step: float) -> float:
-    """Return the growth of an adjoint from the last state to the first, in e-folds, by a line fitted to the logarithm
-    of its norm.
+    """Return the growth rate of an adjoint from the last state to the first, in e-folds, by a line fitted to the
+    logarithm of its norm.
 
-    The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the time T of the whole run. In free flight, where v^ grows linearly,
-    it hardly grows.
+    The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the duration T of the run. In free flight v^ grows linearly, and this
+    norm grows little.
     """
     steps = len(norms) - 1
     total = np.hypot(norms[:, 0], norms[:, 1] / max(steps * time_step, 1e-300))[::-1]
@@ -139,14 +143,16 @@ def growth(norms: np.ndarray, time_step: float) -> float:
 
 
 WITHIN = 0.25
-"""Greatest relative distance from the finite difference at which the exact derivative counts as useful."""
+"""Greatest relative difference between the exact derivative and the finite difference at which the derivative counts as
+useful."""
 LINEAR = 0.3
-"""Relative displacement of neighbours up to which their forces are nearly linear in it [spacings]."""
+"""Relative displacement of neighbours up to which their forces depend on it almost linearly [spacings]."""
 
 
 @dataclass(frozen=True, repr=False)
 class Horizon(ShortRepr):
-    """The derivative of the loss along a meaningful perturbation of one parameter, exact and as a finite difference."""
+    """The loss's derivative along a meaningful perturbation of one parameter, exact and by a finite difference, at
+    several numbers of steps."""
 
     parameter: str
     sample_steps: np.ndarray
@@ -154,26 +160,27 @@ class Horizon(ShortRepr):
     exact: np.ndarray
     """Derivatives (sample_steps,) by forward mode."""
     difference: np.ndarray
-    """Central differences (sample_steps,) over the whole perturbation, in both directions; NaN beyond the last step
-    that both of its runs come to."""
+    """Central differences (sample_steps,) over the whole perturbation; NaN after the first of their two runs
+    diverges."""
     strain: np.ndarray
-    """Separations (sample_steps,) of nearest neighbours by the perturbation, to first order [spacings]."""
+    """Change of the distance of nearest neighbours by the perturbation, to first order (sample_steps,) [spacings]."""
 
     @property
     def meaningful(self) -> np.ndarray:
-        """Masks (sample_steps,), true where the exact derivative is near the difference."""
+        """Mask (sample_steps,) of the steps at which the exact derivative is near the finite difference."""
         return np.abs(self.exact - self.difference) <= WITHIN * np.maximum.accumulate(np.abs(self.difference))
 
     @property
     def measured(self) -> int:
-        """Last sample step at which, and at the one before, the exact derivative is useful; 0 for none."""
+        """Last sample step such that the exact derivative is useful there and at the sample step before; 0 if there is
+        none."""
         good = self.meaningful
         there = np.flatnonzero(good & np.append(good[:1], good[:-1]))
         return int(self.sample_steps[there[-1]]) if there.size else 0
 
     @property
     def reached(self) -> int:
-        """Last sample step that has a difference; 0 for none."""
+        """Last sample step with a finite difference; 0 if there is none."""
         there = np.flatnonzero(~np.isnan(self.difference))
         return int(self.sample_steps[there[-1]]) if there.size else 0
 
@@ -184,13 +191,14 @@ class Horizon(ShortRepr):
 
     @property
     def predicted(self) -> int | None:
-        """First sample step at which the perturbation separates neighbours by more than `LINEAR`, None for none."""
+        """First sample step at which the perturbation separates neighbours by more than `LINEAR`; None if there is
+        none."""
         beyond = np.flatnonzero(self.strain > LINEAR)
         return int(self.sample_steps[beyond[0]]) if beyond.size else None
 
 
 def horizon(history: LossHistory, values: Arrays, name: str, perturbation: np.ndarray) -> Horizon:
-    """Return the horizon of one parameter, for a perturbation of it."""
+    """Return the horizon of one parameter for a given perturbation of the parameter."""
     along, spacing = {name: perturbation}, history.problem.simulation.scene.discretisation.spacing
     tangent = history.tangent(values, along)
     difference = history.difference(values, along, 1.0)
@@ -198,35 +206,37 @@ def horizon(history: LossHistory, values: Arrays, name: str, perturbation: np.nd
 
 
 MOST_NUMBERS = 12
-"""Greatest number of components of a smoothed gradient: each costs two runs a sample."""
+"""Greatest number of components for which a smoothed gradient is computed; each component costs two runs per sample."""
 SAMPLES = 2
 LEAST_COSINE = 0.5
-"""Least cosine of an estimator's gradient with the smoothed one at which it is advised."""
+"""An estimator is recommended only if its gradient's cosine with the smoothed gradient is at least this."""
 GOOD_COSINE = 0.95
-"""Cosine below which, for all estimators of one run, averages over an ensemble are tried, which cost some ten times as
-much."""
+"""If all estimators with one run have a smaller cosine than this, ensemble averages are tried too. They cost about ten
+times as much."""
 ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity())
 """Estimators that need one run, tried first."""
 AVERAGES: dict[str, Callable[[dict[str, float]], GradientEstimator]] = {
     "EnsembleMean(spread)": lambda spread: EnsembleMean(spread, seed=1, estimator=AdjointViscosity()),
     "Guided(spread)": lambda spread: Guided(spread, seed=1),
 }
-"""Best estimators of averages in `docs/gradients.md`, with other random numbers than the smoothed gradient."""
+"""Ensemble estimators that `docs/gradients.md` found best; their random numbers differ from those of the smoothed
+gradient."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """An estimator's gradient beside the smoothed one, each component in units of its meaningful perturbation."""
+    """An estimator's gradient compared with the smoothed gradient, each component scaled by its meaningful
+    perturbation."""
 
     estimator: str
     """Estimator as written in Python, after ``gradients.``."""
     cosine: float
     size: float
-    """Norm of the gradient over that of the smoothed one."""
+    """Norm of the gradient divided by the norm of the smoothed gradient."""
 
     @property
     def merit(self) -> float:
-        """Cosine over the factor by which the gradient is too large or too small; 1 is perfect."""
+        """Cosine divided by the factor by which the gradient is too large or too small; 1 is perfect."""
         return self.cosine * min(self.size, 1.0 / self.size) if self.size > 0.0 else 0.0
 
 
@@ -237,22 +247,22 @@ class Alignment:
     noise: float
     """Relative standard error of the smoothed gradient."""
     estimators: tuple[Judged, ...]
-    """Judged estimators; `Exact` comes first."""
+    """Results of the estimators; `Exact` comes first."""
     spread: Mapping[str, float] = field(default_factory=dict)
     """Spreads by parameter of the smoothed gradient and of averages."""
 
     @property
     def best(self) -> Judged | None:
-        """Estimator other than `Exact` with the greatest merit; None where no cosine is large enough."""
+        """Estimator other than `Exact` with the greatest merit; None if no cosine is large enough."""
         good = [judged for judged in self.estimators[1:] if judged.cosine > LEAST_COSINE]
         return max(good, key=lambda judged: judged.merit, default=None)
 
 
 def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Alignment | None:
-    """Return the alignment for all these parameters together.
+    """Compare estimators' gradients with the smoothed gradient, for all these parameters together.
 
-    None where they have too many components for a smoothed gradient, where it has no run, and where the loss
-    does not depend on them.
+    Return None if there are too many components for a smoothed gradient, if its runs fail, or if the loss does not
+    depend on the parameters.
     """
     if sum(value.size for value in values.values()) > MOST_NUMBERS:
         return None

@@ -1,6 +1,6 @@
-"""Environments of Gymnasium with fluids in them: see `docs/environments.md`.
+"""Gymnasium environments that simulate fluids: see `docs/environments.md`.
 
-The import registers them, for ``gymnasium.make("cortado/Carry-v0")`` and ``gymnasium.make_vec``.
+Importing this package registers the environments for ``gymnasium.make("cortado/Carry-v0")`` and ``gymnasium.make_vec``.
 """
 
 from typing import TYPE_CHECKING, Any

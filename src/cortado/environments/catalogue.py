@@ -1,5 +1,5 @@
-"""All tasks, by name: a cup that is carried, a latte, a jug that pours, a raft, a splash, and a cup that is stirred.
-The cup and the jug come in the plane and in space."""
+"""The control tasks: carry a cup, pour a latte, pour from a jug, move a raft, shape a splash, stir a cup. Carrying and
+pouring exist in 2-D and in 3-D."""
 
 import warnings
 from collections.abc import Sequence
@@ -20,16 +20,17 @@ WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.05, "colour": [
 COFFEE = {"name": "coffee", "rest_density": 1000.0, "viscosity": 0.05, "colour": [0.20, 0.09, 0.04]}
 MILK = {"name": "milk", "rest_density": 950.0, "viscosity": 0.05, "colour": [0.95, 0.92, 0.85]}
 LED = {"motion": "path", "velocity": [0.0, 0.0], "colour": [0.6, 0.6, 0.65]}
-"""Table of a solid that actions move along a path."""
+"""Scene keys of a solid whose path is set by actions."""
 
 
 def box(lower: Sequence[float], upper: Sequence[float], **others: Any) -> dict[str, Any]:
-    """Return the scene table of a box with corners ``lower`` and ``upper`` [m] and other keys."""
+    """Return the scene table of a box with corners ``lower`` and ``upper`` [m], and further keys."""
     return {"shape": "box", "lower": lower, "upper": upper, **others}
 
 
 def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Actuator, Actuator]:
-    """Return the actuators of a solid that goes along x, at most so fast [m/s], and turns about z [rad/s]."""
+    """Return the actuators of a solid that moves along x, at up to ``fastest`` [m/s], and turns about z, at up to
+    ``turning`` [rad/s]."""
     still, plane = (0.0,) * dimension, dimension == 2
     turn: Any = {"rest": (0.0,), "axes": (0,)} if plane else {"rest": still, "axes": (2,)}
     return (
@@ -39,40 +40,41 @@ def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Act
 
 
 class Vessels(Task):
-    """A task of cups and jugs: in space they are round, about axes at z = 0, and in the plane they are cuts through
-    these."""
+    """A base class of tasks with cups and jugs. In 3-D the vessels are round, with axes in the plane z = 0; in 2-D they
+    are cross-sections."""
 
     view: ClassVar[dict[str, Any]] = {}
-    """Table of the pictures: in space where the camera is, and where it looks at [m]."""
+    """Settings of pictures; in 3-D the position of the camera and the point it looks at [m]."""
 
     def place(self, x: float, y: float) -> list[float]:
         """Return a point of the plane z = 0 [m]."""
         return [x, y, 0.0][: self.dimension]
 
     def corners(self, lower: Sequence[float], upper: Sequence[float]) -> tuple[list[float], list[float]]:
-        """Return the corners of a box in the plane [m], in space with a square base about z = 0."""
+        """Return the corners of a box [m], given in the plane; in 3-D the box has a square base centred at z = 0."""
         half = 0.5 * (upper[0] - lower[0])
         return [*lower, -half][: self.dimension], [*upper, half][: self.dimension]
 
     def filled(self, lower: Sequence[float], upper: Sequence[float], phase: str) -> dict[str, Any]:
-        """Return the table of fluid in a box of the plane [m], in space in a round vessel of this cut."""
+        """Return the scene table of fluid in a box of the plane [m]; in 3-D in a round vessel with this
+        cross-section."""
         if self.dimension == 2:
             return box(lower, upper, phase=phase)
         size = {"radius": 0.5 * (upper[0] - lower[0]), "height": upper[1] - lower[1]}
         return {"shape": "cylinder", "base": self.place(0.5 * (lower[0] + upper[0]), lower[1]), **size, "phase": phase}
 
     def room(self, lower: Sequence[float], upper: Sequence[float]) -> dict[str, Any]:
-        """Return the table of a container; in space there is none, and what is spilt falls on and on."""
+        """Return the scene table of a container; in 3-D there is no container, and spilt fluid falls without end."""
         return box(lower, upper) if self.dimension == 2 else {"shape": "none"}
 
 
 class Carry(Vessels):
     """The task of carrying a cup of water to a place, without spilling.
 
-    Actions: velocity of the cup along x, and rate at which it leans. Goal: where its middle shall be. After
-    TransportWater of SoftGym (Lin et al. 2020), with its reward: minus the distance of the cup to its goal [m], minus
-    10 times the share of the water that is not in the cup. SoftGym counts particles; here they count smoothly
-    (`cortado.environments.terms.Share`). The cup can lean as well.
+    Actions: the cup's velocity along x and its angular velocity. Goal: the place of the cup's middle. The task and its
+    reward follow TransportWater of SoftGym (Lin et al. 2020). The reward is minus the cup's distance to its goal [m],
+    minus 10 times the share of water outside the cup. SoftGym counts particles; here they count smoothly
+    (`cortado.environments.terms.Share`), and the cup can lean.
     """
 
     name = "Carry"
@@ -81,11 +83,11 @@ class Carry(Vessels):
     lowest = -12.0
     goal_names: ClassVar[tuple[str, ...]] = ("x of the cup [m]",)
     width, depth, height, wall = 0.15, 0.1, 0.175, 0.05
-    """Of the inside of the cup, of its water, of the cup above the floor of its inside, and of its walls [m]."""
+    """Inner width of the cup, depth of its water, inner height of the cup, and thickness of its walls [m]."""
     floor = -0.15
-    """Height of the floor on which spilt water falls, deeper than any corner of the cup [m]."""
+    """Height of the floor that catches spilt water, below every corner of the cup [m]."""
     fastest, turning = 0.6, 1.0
-    """[m/s], [rad/s]"""
+    """Greatest velocity [m/s] and angular velocity [rad/s]."""
     actuators = led("cup", fastest, turning, 2)
     goals = np.array([0.5 * width + 0.3]), np.array([0.5 * width + 0.5])
 
@@ -113,7 +115,8 @@ class Carry(Vessels):
 class CarryInSpace(Carry):
     """The task of carrying a round cup of water along a line to a place, without spilling.
 
-    Actions, goal and reward are those of `Carry`; the cup leans about the axis across its way, and is less high.
+    Actions, goal and reward are those of `Carry`. The cup leans about the horizontal axis across its path, and is
+    lower.
     """
 
     name = "CarryInSpace"
@@ -124,11 +127,12 @@ class CarryInSpace(Carry):
 
 
 class Latte(Task):
-    """The task of pouring milk from a nozzle into coffee as a hidden path of the nozzle would have done.
+    """The task of pouring milk from a moving nozzle into coffee, so that it lands as if the nozzle followed a hidden
+    path.
 
     Actions: the positions along x to which the nozzle is sent. The task follows LatteArt of FluidLab (Xian et al.
-    2023), with its reward but for scale and a constant. The reward is minus the mean squared distance between the
-    poured milk and its places under the hidden path at the same time. It is divided by the squared radius of the cup.
+    2023); its reward differs by a factor and a constant. The reward is minus the mean squared distance between the
+    poured milk and its places with the hidden path at the same time, divided by the squared radius of the cup.
     """
 
     name = "Latte"
@@ -136,11 +140,12 @@ class Latte(Task):
     coarse_spacing, coarse_step = 0.0025, 0.0014
     lowest = -4.0
     radius, depth, opening, column = 0.03, 0.015, 0.0025, 0.0625
-    """Of the cup, of its coffee, of the nozzle, and of the milk in it [m]."""
+    """Radius of the cup, depth of its coffee, half-width of the nozzle, and height of the milk in the nozzle [m]."""
     height = depth + 0.005
     """Height of the nozzle above the floor [m]."""
     reach, lag, pouring = 0.6 * radius, 0.03, 25
-    """How far the nozzle can be sent [m], how it follows [s], and for how many steps of the environment it pours."""
+    """Greatest position of the nozzle [m], time constant of its motion [s], and number of environment steps during
+    which it pours."""
     actuators = (Position("nozzle.path", (0.0, height), (0,), (reach,), lag=lag),)
 
     @property
@@ -164,15 +169,15 @@ class Latte(Task):
 
 
 def hidden_actions(task: Latte) -> NDArray:
-    """Return the actions (horizon, 1) of the hidden path: once around the outline of a heart, then its middle."""
+    """Return the actions (horizon, 1) of the hidden path: once around the outline of a heart, then to its middle."""
     angle = 2.0 * np.pi * np.arange(task.horizon) / task.pouring
     return np.where(angle < 2.0 * np.pi, np.sin(angle) ** 3, 0.0)[:, None]
 
 
 @cache
 def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]:
-    """Return positions (horizon, n, d) [m] on the hidden path after each step, and the weights (horizon, n) [1/m2] of
-    the milk particles poured until then."""
+    """Return the positions (horizon, n, d) [m] of particles after each step with the hidden path, and weights (horizon,
+    n) [1/m2], which are 0 except for milk poured so far."""
     simulation = Simulation(task.scene, device, precision)
     (nozzle,), steps = task.actuators, task.horizon * task.substeps
     path = nozzle.over(task.horizon, task.substeps, task.time_step).parameter(hidden_actions(task))
@@ -190,9 +195,9 @@ def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]
 class Pour(Vessels):
     """The task of turning and moving a jug until its syrup is in a glass.
 
-    Actions: velocity of the jug along x, and rate at which it turns, counterclockwise. After PourWater of SoftGym (Lin
-    et al. 2020), with its reward: the share of the fluid that is in the glass. SoftGym counts particles; here they
-    count smoothly (`cortado.environments.terms.Share`), and the jug stays at its height.
+    Actions: the jug's velocity along x and its angular velocity, counterclockwise. The task and its reward, the share
+    of fluid in the glass, follow PourWater of SoftGym (Lin et al. 2020). SoftGym counts particles; here they count
+    smoothly (`cortado.environments.terms.Share`), and the jug stays at its height.
     """
 
     name = "Pour"
@@ -202,7 +207,7 @@ class Pour(Vessels):
     lower, upper, wall = (0.25, -0.28), (0.45, -0.12), 0.05
     """Corners of the inside of the glass, and the thickness of walls [m]."""
     fastest, turning = 0.1, 4.0
-    """[m/s], [rad/s]"""
+    """Greatest velocity [m/s] and angular velocity [rad/s]."""
     actuators = led("jug", fastest, turning, 2)
 
     @property
@@ -231,10 +236,10 @@ class Pour(Vessels):
 
 
 class PourInSpace(Pour):
-    """The task of pouring a given share of a round jug into a round glass, and no more.
+    """The task of pouring exactly a given share of a round jug's syrup into a round glass.
 
-    Actions are those of `Pour`. Goal: the share of the syrup that shall be in the glass. The reward is minus the
-    distance of the share that is in it from the goal.
+    Actions are those of `Pour`. Goal: the share of the syrup to pour. The reward is minus the difference between the
+    share in the glass and the goal.
     """
 
     name = "PourInSpace"
@@ -250,10 +255,10 @@ class PourInSpace(Pour):
 
 
 class Raft(Task):
-    """The task of bringing a raft to a place, and keeping it level, by the waves of a paddle.
+    """The task of moving a raft to a place, and keeping it level, with waves from a paddle.
 
-    Actions: where the paddle is sent to, along x. Goal: where the middle of the raft shall be. The reward is
-    -(x - x*)^2 / l^2 - 2 (1 - cos angle), with the goal x* and the length l of the raft.
+    Actions: the positions along x to which the paddle is sent. Goal: the place of the raft's middle. The reward is -(x
+    - x*)^2 / l^2 - 2 (1 - cos angle), with the goal x* and the length l of the raft.
     """
 
     name = "Raft"
@@ -265,7 +270,7 @@ class Raft(Task):
     length = 0.25
     """Length of the raft [m]."""
     reach, lag = 0.05, 0.1
-    """How far the paddle can be sent [m], and how it follows [s]."""
+    """Greatest displacement of the paddle [m], and time constant of its motion [s]."""
     actuators = (Position("paddle.displacement", (0.0, 0.0), (0,), (reach,), lag=lag),)
     goals = np.array([0.45]), np.array([0.6])
 
@@ -287,12 +292,11 @@ class Raft(Task):
 
 
 class Splash(Task):
-    """The task of shaking a box, in which a dam breaks, until its water has the shape of the letter L.
+    """The task of shaking a box in which a dam breaks, so that its water gets the shape of the letter L.
 
-    Actions: the acceleration of the box along x and y, which its water feels as gravity that leans, and grows. Goal:
-    where the left side of the stem is. The reward is the share of the water that is in the letter: in its foot along
-    the floor, or in its stem, which stands at a goal's place, each particle counted smoothly
-    (`cortado.environments.terms.Share`).
+    Actions: the acceleration of the box along x and y, which acts on its water as a change of gravity. Goal: the left
+    side of the letter's stem. The reward is the share of the water inside the letter, that is in its foot along the
+    floor or in its stem. Particles count smoothly (`cortado.environments.terms.Share`).
     """
 
     half = 0.3
@@ -303,7 +307,7 @@ class Splash(Task):
     lowest = 0.0
     goal_names: ClassVar[tuple[str, ...]] = ("x of the stem [m]",)
     gravity, strength, lag = 9.81, 12.0, 0.05
-    """What the box is shaken with at most, besides gravity [m/s2], and how it follows [s]."""
+    """Gravity and greatest acceleration of the box [m/s2], and time constant of this acceleration [s]."""
     actuators = (Position("gravity", (0.0, -gravity), (0, 1), (-strength, -strength), lag=lag),)
     goals = np.array([0.0]), np.array([1.5 * half])
 
@@ -322,10 +326,10 @@ class Splash(Task):
 
 @dataclass(frozen=True)
 class Letter:
-    """A function from goals to the boxes of the letter's foot and stem, which together have the area of the water."""
+    """A function from goals to the boxes of the letter's foot and stem, whose total area is that of the water."""
 
     half: float
-    """Side of the square that the water fills at first [m]."""
+    """Side of the square that the water fills at the start [m]."""
 
     def __call__(self, goal: NDArray) -> tuple[NDArray, NDArray]:
         lower, upper = np.zeros((len(goal), 2, 2)), np.zeros((len(goal), 2, 2))
@@ -336,11 +340,11 @@ class Letter:
 
 
 class Stir(Task):
-    """The task of stirring milk in a corner of a cup of coffee until it is everywhere.
+    """The task of stirring a cup of coffee until milk from one corner is spread everywhere.
 
     Actions: the positions to which the spoon, a disc in the plane, is sent. The task follows Mixing of FluidLab (Xian
-    et al. 2023), with its reward but for scale. The reward is the mean distance of all pairs of milk particles,
-    component by component, over the mean distance of all particles at the start, less 1.
+    et al. 2023); its reward differs by a factor. The reward is the mean distance |dx| + |dy| of pairs of milk
+    particles, divided by that of pairs of all particles at the start, minus 1.
     """
 
     name = "Stir"
@@ -348,9 +352,9 @@ class Stir(Task):
     coarse_spacing, coarse_step = 0.005, 0.001
     lowest = -1.0
     width, depth, milky = 0.08, 0.045, 0.02
-    """Of the cup, of what is in it, and of the part whose left half is milk [m]."""
+    """Width of the cup, depth of the fluid, and size of the part whose left half is milk [m]."""
     spoon, radius, reach, lag = (0.04, 0.0225), 0.01, (0.018, 0.005), 0.1
-    """Where the spoon begins, its radius, how far it can be sent [m], and how it follows [s]."""
+    """Position of the spoon at the start, its radius, greatest displacement [m], and time constant of motion [s]."""
     actuators = (Position("spoon.displacement", (0.0, 0.0), (0, 1), reach, lag=lag),)
 
     @property
@@ -382,7 +386,7 @@ TASKS: dict[str, type[Task]] = {
 
 def task_of(task: str | Task, size: str | None) -> Task:
     """Return the task of a name in a size ("small" if left out), or a user's `Task` itself; raises `InputError` for
-    unknown names and sizes, and for a size beside a `Task`."""
+    unknown names and sizes, and for a size given together with a `Task`."""
     if isinstance(task, Task):
         if size is not None:
             raise InputError(f"size is {shown(size)}, but must be left out, as the task is one of your own.")

@@ -1,5 +1,5 @@
-"""Environments of Gymnasium: one, or many of one task in one launch, and the parts of Gymnasium that both need. Where
-it is not installed, one sentence says so. `Twin` is an episode as a differentiable function of its actions.
+"""Gymnasium environments: a single one, and a batch of one task in one launch. If Gymnasium is not installed, an error
+says so in a sentence. `Twin` is an episode as a differentiable function of its actions.
 """
 
 from collections.abc import Mapping
@@ -25,12 +25,12 @@ from cortado.scene.parameter_values import Arrays
 
 
 class Twin:
-    """A loss of actions (actions, a) for one episode, with its scene, start and goal: minus the sum of rewards. Actions
-    beyond -1 to 1 are clipped, as in the environment, with derivative 0."""
+    """Minus the sum of rewards of one episode, as a loss of its actions (actions, a). Actions outside -1 to 1 are
+    clipped, as in the environment; their derivative is 0."""
 
     def __init__(self, scenes: Scenes, number: int = 0, actions: int | None = None, state: EnvState | None = None):
-        """Copy the present episode of scene ``number`` from its start, or that of a saved ``state`` from there;
-        ``actions``: how many, by default those that are left of a whole episode."""
+        """Copy the current episode of scene ``number``, from the episode's start or from a saved ``state``.
+        ``actions``: number of actions, by default all that remain of a whole episode."""
         task, m = scenes.task, scenes.task.substeps
         require_at_most("number", whole_number("number", number, 0), len(scenes) - 1)
         done, begun, restart = 0, [one.at_rest(1) for one in task.actuators], None
@@ -47,36 +47,37 @@ class Twin:
             one.parameter: one.over(count, m, task.time_step, now)
             for one, now in zip(task.actuators, begun, strict=True)
         }
-        """From the actions of each actuator to the parameter that it drives."""
+        """Maps from the actions of each actuator to the parameter it drives."""
         goal = start.goal[None]
         loss = Frames({k * m: MinusReward(scenes.reward, goal, done + k) for k in range(1, count + 1)})
         self.problem = Problem(scenes.single, count * m, loss, state=restart)
-        """The loss as one of the parameters of the scene."""
+        """The loss as a function of the scene's parameters."""
         fixed: Any = FixedParameters(self.problem, self._start) if self._start else self.problem
         self.search = Transformed(fixed, self.coordinates)
-        """The loss as one of the actions, named by `named`: what `cortado.optimise` takes."""
+        """The loss as a function of actions, by the names of `named`; pass this to `cortado.optimise`."""
         self.shape = count, sum(len(one.axes) for one in task.actuators)
-        """(actions, a)"""
+        """Shape (actions, a) of the actions."""
 
     def named(self, actions: Any) -> Arrays:
-        """Return actions by the names of the parameters that they drive."""
+        """Split actions into arrays by the name of the driven parameter."""
         parts = split(self._actuators, checked_actions("actions", actions, self.shape))
         return {one.parameter: u for one, u in zip(self._actuators, parts, strict=True)}
 
     def value(self, actions: Any) -> float:
-        """Return the loss of some actions: minus the sum of rewards."""
+        """Return the loss for these actions: minus the sum of rewards."""
         return self.search.value(self.named(actions))
 
     def value_and_gradient(
         self, actions: Any, gradient: GradientEstimator | None = None
     ) -> tuple[float, NDArray[np.float64]]:
-        """Return the loss and its derivative (actions, a), by any estimator, `gradients.Exact` by default."""
+        """Return the loss and its derivative (actions, a) by an estimator, by default `gradients.Exact`."""
         value, found = self.search.value_and_gradient(self.named(actions), gradient)
         bar = np.concatenate([found[one.parameter] for one in self._actuators], axis=1)
         return value, np.where(np.abs(actions) <= 1.0, bar, 0.0)
 
     def in_jax(self, gradient: GradientEstimator | None = None) -> Any:
-        """Return the loss as a function of a JAX array (actions, a), differentiable there: see `cortado.jax.value`."""
+        """Return the loss as a function of a JAX array (actions, a) that JAX can differentiate: see
+        `cortado.jax.value`."""
         from cortado.jax import value
         from cortado.optimisation.layers.with_jax import jnp
 
@@ -106,7 +107,8 @@ class Twin:
         return actions
 
     def _parameters(self, u: Any, contracted: Any) -> dict[str, Any]:
-        """Return the scene's parameters under actions of another library, whose product is ``contracted``."""
+        """Return the scene's parameters for actions of JAX or PyTorch; ``contracted`` is the library's product of
+        matrix and actions."""
         found, first = dict[str, Any](self._start), 0
         for one in self._actuators:
             last = first + len(one.axes)
@@ -125,15 +127,15 @@ except ModuleNotFoundError as error:
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
 WIDTH, HEIGHT = 320, 200
-"""Of pictures."""
+"""Width and height of pictures [pixels]."""
 BEFORE = "before the first one"
-"""When a step is refused: no episode has begun."""
+"""Words for the error of a step before any episode has begun."""
 Observation = NDArray[np.float32]
 Info = dict[str, Any]
 
 
 class FluidEnv(gymnasium.Env[Observation, NDArray]):
-    """A Gymnasium environment of one scene, as `gymnasium.make("cortado/Carry-v0")` makes; see
+    """A Gymnasium environment of one scene; `gymnasium.make("cortado/Carry-v0")` makes one. See
     `docs/environments.md`."""
 
     metadata = METADATA
@@ -148,17 +150,17 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         sensors: Mapping[str, Sensor] | None = None,
         render_mode: str | None = None,
     ):
-        """Make the environment of a ``task``: its name, such as "Carry", in the ``size`` "small", if left out, or
-        "large"; or a `Task` of your own. ``particles``: how many are observed; ``sensors`` by name, such as those of
-        `cortado.sensors`, are observed as well; ``device`` and ``precision`` as those of `Simulation`; ``render_mode``
-        None or "rgb_array"."""
+        """Make the environment of a ``task``: a name, such as "Carry", or your own `Task`. ``size``: "small" (the
+        default) or "large". ``particles``: number of observed particles. ``sensors``, by name, are observed too; see
+        `cortado.sensors`. ``device`` and ``precision`` are as in `Simulation`; ``render_mode`` is None or
+        "rgb_array"."""
         self.render_mode = checked_render_mode(render_mode)
         self.scenes = Scenes(task_of(task, size), 1, device, precision, particles, sensors)
         self.observation_space, actions = spaces(self.scenes)
         self.action_space, self._shape = actions, actions.shape
         self._over, self._counts = BEFORE, False
-        """Why no step is possible, if so; and whether the environment itself counts how long an episode may be, as
-        Gymnasium's wrapper cannot know how far a restored one was."""
+        """Reason why no step is possible, if any; and whether the environment counts steps itself, because Gymnasium's
+        wrapper does not know the step number of a restored episode."""
         self._closed = False
 
     @property
@@ -168,7 +170,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
         """Begin an episode; equal seeds give equal bits. ``options={"state": state}`` goes back to a saved state, as
-        `restore` does, through wrappers that count steps. Raises `InputError` for other options."""
+        `restore` does, and resets wrappers that count steps. Raises `InputError` for other options."""
         self._require_open("reset")
         if (state := saved_option(options, seed)) is not None:
             return self.restore(state), {}
@@ -180,11 +182,12 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return self._observation.copy(), {}
 
     def step(self, action: NDArray) -> tuple[Observation, float, bool, bool, Info]:
-        """Advance the episode by one action, clipped to -1 to 1. An episode is truncated after as many steps as its
-        task has, or as `gymnasium.make` was given as ``max_episode_steps``. Where the simulation diverges, the episode
-        is terminated, ``info["diverged"]`` says how in a sentence, and the observation is the last one before.
+        """Advance the episode by one action, clipped to -1 to 1. An episode is truncated after the task's number of
+        steps, or after ``max_episode_steps`` of `gymnasium.make`. If the simulation diverges, the episode is
+        terminated, ``info["diverged"]`` is a sentence about it, and the observation is the previous one.
 
-        Raises `InputError` for an action of another shape or that is not finite, and where no episode is going on."""
+        Raises `InputError` for an action of a wrong shape or with numbers that are not finite, and if no episode is in
+        progress."""
         if self._over:
             raise InputError(f"step is called {self._over}, but must come after reset().")
         actions = checked_actions("action", action, self._shape)
@@ -197,7 +200,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return self._observation.copy(), float(rewards[0]), bool(lost), truncated, info
 
     def close(self) -> None:
-        """End the episode for good: no other may begin."""
+        """Close the environment: no further episode can begin."""
         self._closed, self._over = True, "after close()"
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -205,8 +208,8 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return pictures(self.scenes)[0] if self.render_mode else None
 
     def save(self) -> EnvState:
-        """Return where the episode is, with the random generator, for `restore`: any number of times, and in other
-        environments of the same task. Raises `InputError` before the first `reset`."""
+        """Return the state of the episode and of the random generator. `restore` accepts it any number of times, also
+        in other environments of the same task. Raises `InputError` before the first `reset`."""
         self._require_open("save")
         if self._over == BEFORE:
             raise InputError("save is called before the first reset(), but must come after it.")
@@ -214,7 +217,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return self.scenes.save(np.array([bool(self._over)]), self._observation[None], [random])
 
     def restore(self, state: EnvState) -> Observation:
-        """Go back to a saved state, and return its observation. Raises `InputError` for a state of another task, batch
+        """Go back to a saved state and return its observation. Raises `InputError` for a state of another task, batch
         or scene."""
         self._require_open("restore")
         self.scenes.restore(state)
@@ -224,8 +227,8 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return self._observation.copy()
 
     def twin(self, actions: int | None = None, state: EnvState | None = None) -> Twin:
-        """Return a differentiable copy of the present episode from its start, or of that of a saved ``state`` from
-        there, of so many ``actions``, by default all that are left."""
+        """Return a differentiable copy of the current episode, from its start or from a saved ``state``, over
+        ``actions`` actions, by default all that remain."""
         return Twin(self.scenes, 0, actions, state)
 
     def _require_open(self, what: str) -> None:
@@ -234,7 +237,8 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
 
 
 class FluidVectorEnv(VectorEnv):
-    """A Gymnasium vector environment: a batch of scenes, each with the bits of the single one with its seed."""
+    """A Gymnasium vector environment: a batch of scenes. Each gives the same bits as a single environment with the same
+    seed."""
 
     def __init__(
         self,
@@ -249,8 +253,8 @@ class FluidVectorEnv(VectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
     ):
-        """Make a batch of ``num_envs`` scenes; ``autoreset_mode`` as that of `gymnasium.vector.SyncVectorEnv`;
-        ``max_episode_steps``: after how many steps an episode is truncated, by default the horizon of the task. Other
+        """Make a batch of ``num_envs`` scenes. ``autoreset_mode`` is as in `gymnasium.vector.SyncVectorEnv`.
+        ``max_episode_steps``: number of steps after which an episode is truncated, by default the task's horizon. Other
         arguments are those of `FluidEnv`."""
         self.num_envs, self.render_mode = whole_number("num_envs", num_envs, 1), checked_render_mode(render_mode)
         try:
@@ -268,7 +272,7 @@ class FluidVectorEnv(VectorEnv):
         self._horizon = whole_number("max_episode_steps", most, 1)
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
         self._over = np.ones(num_envs, dtype=bool)
-        """(num_envs,) whose episodes are over."""
+        """Mask (num_envs,) of the environments whose episodes have ended."""
         self._observations = self.scenes.observed()
 
     @property
@@ -304,9 +308,9 @@ class FluidVectorEnv(VectorEnv):
         return self._observations.copy(), {}
 
     def step(self, actions: NDArray) -> tuple[Observation, NDArray, NDArray, NDArray, Info]:
-        """Advance all episodes by actions (num_envs, a); see `FluidEnv.step`. An episode that is over begins anew as
-        the autoreset mode says. It does so in the next step, in the place of its action; in the same step, with what it
-        ended with in ``infos["final_obs"]`` and ``infos["final_info"]``; or only by `reset`."""
+        """Advance all episodes by actions (num_envs, a); see `FluidEnv.step`. The autoreset mode decides when an ended
+        episode begins again: in the next step, which ignores the action; in the same step, with the last observation
+        and info in ``infos["final_obs"]`` and ``infos["final_info"]``; or only by `reset`."""
         self._require_open("step")
         actions = checked_actions("actions", actions, self._shape)
         if self._over.any() and self._mode is not AutoresetMode.NEXT_STEP:
@@ -339,14 +343,15 @@ class FluidVectorEnv(VectorEnv):
         return tuple(pictures(self.scenes)) if self.render_mode else None
 
     def save(self) -> EnvState:
-        """Return where all episodes are, with the random generators; see `FluidEnv.save`. Some of them, in any order,
-        are ``state[[0, 0, 2]]``."""
+        """Return the state of all episodes and random generators; see `FluidEnv.save`. ``state[[0, 0, 2]]`` selects
+        episodes from it, in any order."""
         self._require_open("save")
         random = [one.bit_generator.state for one in self._generators]
         return self.scenes.save(self._over, self._observations, random)
 
     def restore(self, state: EnvState) -> Observation:
-        """Go back to a saved state of as many environments, and return its observations; see `FluidEnv.restore`."""
+        """Go back to a saved state of the same number of environments and return its observations; see
+        `FluidEnv.restore`."""
         self._require_open("restore")
         self.scenes.restore(state)
         for generator, own in zip(self._generators, state.generators, strict=True):
@@ -390,8 +395,8 @@ def checked_render_mode(mode: str | None) -> str | None:
 
 
 def saved_option(options: Any, seed: Any, *others: str) -> EnvState | None:
-    """Return the state among the options of a reset, if any. Raises `InputError` for options that are no table, that
-    have unknown names, and for a state beside anything else."""
+    """Return the state among the options of a reset, if any. Raises `InputError` if the options are no table or have
+    unknown names, and if other options or a seed come with a state."""
     require_table("options", options or {}, "{'state': state}")
     found, known = options or {}, ("state", *others)
     for name in found:

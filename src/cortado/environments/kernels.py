@@ -1,4 +1,4 @@
-"""Kernels of observations and of rewards, each with its derivative: particle by particle, for all scenes of a batch."""
+"""Kernels for observations and rewards with their derivatives, one thread per particle, for all scenes of a batch."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -14,9 +14,9 @@ FAR = wp.constant(1.0e30)
 
 @cache
 def environment_kernels(precision: Precision) -> Any:
-    """Return the kernels of observations and rewards in one precision, by name; they write float64 values to be summed.
-    ``per``: particles of a scene; ``factor`` (scenes,) scales derivatives; a ``period`` from ``origin`` [m], and its
-    ``frequency`` [1/m], are 0 along axes without one."""
+    """Return the kernels in one precision, by name. They store float64 values, which are summed later. ``per``:
+    particles of a scene; ``factor`` (scenes,) multiplies derivatives. ``period`` [m] and ``frequency`` [1/m] are 0
+    along axes that are not periodic."""
     real, vector = precision.real, precision.vector
     module, boxes = kernel_module(f"environments_{precision.name}"), wp.array2d(dtype=vector)
     samples, names = wp.array(dtype=wp.float32, ndim=4), "r period frequency x v place"
@@ -34,7 +34,7 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def sample(per: int, origin: vector, period: vector, frequency: vector, chosen, x, v, seen: samples):
-        """Write positions, wrapped into the period, and velocities of some particles."""
+        """Store positions, wrapped into the period, and velocities of the ``chosen`` particles."""
         b, p, axis = wp.tid()
         i = b * per + chosen[p]
         lap = wp.floor((x[i][axis] - origin[axis]) * frequency[axis])
@@ -49,8 +49,8 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.func
     @typed
     def outside(r, angle, period, frequency, b: int, lower: boxes, upper: boxes):
-        """Return the place of a particle's image in the frame of the boxes, and the vector to it from the nearest point
-        of the nearest box."""
+        """Return the position of a particle's image in the frame of the boxes, and the vector from the nearest point of
+        any box to this image."""
         place, found, least = vector(), vector(), real(FAR)
         for k in range(lower.shape[1]):
             middle = turned(real(0.5) * (lower[b, k] + upper[b, k]), angle)
@@ -68,8 +68,8 @@ def environment_kernels(precision: Precision) -> Any:
     def share(
         per: int, width: real, period: vector, frequency: vector, x, place, turn, lower: boxes, upper: boxes, value
     ):
-        """Write 1 / (1 + e^2 / w^2) for each particle, with its distance e to the nearest of some boxes, which may be
-        fixed to a solid in the plane."""
+        """Store 1 / (1 + e^2 / w^2) for each particle, where e is its distance to the nearest box. Boxes may move with
+        a solid that turns in the plane."""
         i = wp.tid()
         b = i // per
         _y, way = outside(x[i] - place[b], turn[b], period, frequency, b, lower, upper)
@@ -105,8 +105,8 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def apart(per: int, period: vector, frequency: vector, chosen, x, value: wp.array2d(dtype=wp.float64)):
-        """Write for each of some particles the sum of its distances |dx| + |dy| + |dz| to all of them, by the nearest
-        images."""
+        """Store, for each chosen particle, the sum of distances |dx| + |dy| + |dz| to all chosen particles, between
+        nearest images."""
         b, p = wp.tid()
         own, total = x[b * per + chosen[p]], wp.float64(0.0)
         for q in range(chosen.shape[0]):
@@ -132,7 +132,7 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def missed(per: int, step, target: wp.array2d(dtype=vector), weight: wp.array2d(dtype=real), x, value):
-        """Write each particle's weighted squared distance to its own target; targets change from step to step."""
+        """Store each particle's weighted squared distance to its own target; targets change from step to step."""
         i = wp.tid()
         k, p = step[i // per], i % per
         r = x[i] - target[k, p]

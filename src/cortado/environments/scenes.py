@@ -1,10 +1,9 @@
-"""Many scenes of one task in one launch, each in an episode of its own, and their saved states.
+"""Step many scenes of one task in one launch, each in its own episode, and save and restore their states.
 
-`Scenes` steps them together, rewards them, begins their episodes, and observes them. An `EnvState` is where they are.
+`Scenes` steps all scenes together, computes rewards and observations, and begins episodes. `EnvState` saves a state.
 
-On a CPU a launch with few particles is a captured graph, and runs on one core. With more it is cut for the cores,
-without a graph, which costs more than it saves until there are many. A batch between the two is cut into smaller
-batches here.
+On a CPU, a launch with few particles runs on one core as a captured graph. A larger launch is split over the cores
+without a graph, which pays only with many particles. Batches of medium size are split here into smaller batches.
 """
 
 import warnings
@@ -40,11 +39,11 @@ from cortado.simulation import Simulation
 JITTER = 0.02
 """Standard deviation of the noise of first positions, in spacings."""
 LANES = 1
-"""Lanes per particle, fastest for large batches; small ones use as many, which keeps a scene's bits equal in all."""
+"""Lanes per particle: the fastest number for large batches. It is the same for small ones, for equal bits in all."""
 SEEN = 32
 """Number of observed particles by default."""
 MOST_PARTS = 16
-"""Parts of a batch at most: one that would need more has launches large enough to be cut."""
+"""Greatest number of parts of a batch. If more were needed, launches are large enough to be split over cores."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +58,14 @@ class Start:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EnvState:
-    """Where the episodes of an environment, or of a batch, are: what its `save` returns, and its `restore` takes.
+    """The saved state of an environment or batch; `save` returns it and `restore` accepts it.
 
-    It shares the arrays of the environment on its device, which no step overwrites: saving copies none of them. It can
-    be pickled and copied, with NumPy arrays in their place.
+    It shares the environment's device arrays, which no step overwrites, so saving copies no array. Pickles and copies
+    have NumPy arrays instead.
     """
 
     kind: str
-    """Number of scenes, task, size, precision and observed numbers, in words."""
+    """Number of scenes, task, size, precision and observed numbers in words; a restored state must have the same."""
     scene: Scene
     """The scene that all environments of the batch simulate."""
     fields: Mapping[str, Any]
@@ -74,17 +73,17 @@ class EnvState:
     clocks: tuple[RestartState, ...]
     """Clock and origin of each scene, as restart states without fields."""
     step_number: NDArray
-    """(scenes,) steps of the environment since each episode began."""
+    """Number of environment steps (scenes,) since each episode began."""
     starts: tuple[Start, ...]
-    """How the episode of each scene began."""
+    """Start of each scene's episode."""
     driven: tuple[NDArray, ...]
-    """What each actuator drives, and its commands: (scenes, 2, a)."""
+    """For each actuator the driven components and the commands: (scenes, 2, a)."""
     lost: frozenset[int]
     """Scenes that have diverged."""
     over: NDArray
-    """(scenes,) bool: which episodes are over."""
+    """Mask (scenes,) of the episodes that have ended."""
     observations: NDArray
-    """The last observation (scenes, k) of each."""
+    """The last observation of each scene (scenes, k)."""
     generators: tuple[Any, ...]
     """States of the random generators from which the next episodes are drawn."""
 
@@ -93,8 +92,8 @@ class EnvState:
         return len(self.step_number)
 
     def __getitem__(self, numbers: int | Iterable[int]) -> "EnvState":
-        """Return the state of a batch of some of the scenes, by their numbers, which may come again: ``state[[0] * 8]``
-        is a batch of eight that all begin where scene 0 is. Their random generators are then the same, too."""
+        """Return the state of a batch of the scenes with these numbers. Numbers may repeat: ``state[[0] * 8]`` is a
+        batch of eight scenes in the state of scene 0, with equal random generators."""
         chosen = list(numbers) if isinstance(numbers, Iterable) else [numbers]
         if not chosen or any(not isinstance(b, (int, np.integer)) or not 0 <= b < len(self) for b in chosen):
             raise InputError(f"numbers are {shown(numbers)}, but must be from 0 to {len(self) - 1}, at least one.")
@@ -127,7 +126,7 @@ def _scenes_in_words(scenes: int) -> str:
 
 @WARP
 def _picked(array: Any, chosen: list[int], scenes: int) -> Any:
-    """Return the parts of some scenes of an array (scenes n,), one behind the other."""
+    """Return the parts of an array (scenes n,) that belong to the chosen scenes, one after the other."""
     n = len(array) // scenes
     parts = [array[b * n : (b + 1) * n] for b in chosen]
     if isinstance(array, np.ndarray):
@@ -139,8 +138,8 @@ def _picked(array: Any, chosen: list[int], scenes: int) -> Any:
 
 
 def parts_of(simulation: Simulation) -> int:
-    """Return into how many parts a batch is best cut, so that each has a graph: 1 where it has one as a whole, on a
-    GPU, and where there would be too many."""
+    """Return the number of parts into which a batch is best split, so that each part has a graph. It is 1 if the whole
+    batch has a graph, on a GPU, and if too many parts would be needed."""
     scenes, cores = simulation.batch or 1, min(usable_cores(), MOST_CORES)
     together = (2 * LEAST_PART - 1) // simulation.particles
     if not simulation.device.is_cpu or cores == 1 or not together or scenes <= together:
@@ -152,24 +151,24 @@ def parts_of(simulation: Simulation) -> int:
 
 
 class SideBySide:
-    """So many steps of a batch of scenes, taken in parts, each a batch by itself; scenes have the bits of a whole."""
+    """A stepper that splits a batch into parts and takes ``steps`` steps of each; no bit of the results changes."""
 
     def __init__(self, simulation: Simulation, make: Callable[[int], Simulation], parts: int, steps: int):
-        """Cut the batch of a simulation; ``make`` makes the same one for another number of scenes."""
+        """Split the batch of a simulation; ``make`` returns the same simulation for another number of scenes."""
         scenes = simulation.batch or 1
         self._ranges = list(pairwise(scenes * k // parts for k in range(parts + 1)))
         self._simulations = [simulation] if parts == 1 else [make(last - first) for first, last in self._ranges]
         self.steppers = [Stepper(one, steps) for one in self._simulations]
-        """Of each part."""
+        """One stepper for each part."""
 
     @property
     def lost(self) -> dict[int, DivergedError]:
-        """The scenes that lost a particle in the last steps, by number."""
+        """Errors of the scenes that lost a particle in the last call, by scene number."""
         each = zip(self._ranges, self.steppers, strict=True)
         return {first + b: error for (first, _), one in each for b, error in one.rollout.lost.items()}
 
     def begin(self, rows: Arrays) -> None:
-        """Take steps from the first state, so that others can `follow`; ``rows`` are all that is given over time."""
+        """Take steps from the first state, so that `follow` can continue; ``rows`` are all parameters over time."""
         for (first, last), one, simulation in zip(self._ranges, self.steppers, self._simulations, strict=True):
             one.advance(simulation.on_device(), {name: row[first:last] for name, row in rows.items()})
 
@@ -200,7 +199,7 @@ def _cut(arrays: State, first: int, last: int) -> State:
 
 @WARP
 def _together(like: State, parts: list[DeviceState]) -> DeviceState:
-    """Return the states of all parts in arrays of their own."""
+    """Copy the states of all parts into one new state."""
     whole = {name: wp.empty_like(like[name]) for name in like.names}
     for name, array in whole.items():
         begin = 0
@@ -211,7 +210,7 @@ def _together(like: State, parts: list[DeviceState]) -> DeviceState:
 
 
 class Scenes:
-    """A batch of scenes of one task that are stepped together, each in an episode of its own."""
+    """A batch of scenes of one task that are stepped together, each in its own episode."""
 
     def __init__(
         self,
@@ -222,7 +221,7 @@ class Scenes:
         seen: int,
         sensors: Mapping[str, Sensor] | None = None,
     ):
-        """Make ``scenes`` scenes; ``seen``: how many particles are observed, at most all."""
+        """Make ``scenes`` scenes; ``seen``: number of observed particles, at most all."""
         self._sensors = checked_sensors(sensors, {"particles", "goal", "progress", *task.free_solids, *task.driven})
         self.task = task
         with warnings.catch_warnings():  # rewards are shares of the fluid that there is
@@ -244,14 +243,14 @@ class Scenes:
         self._jitters = (np.arange(n) < free)[:, None] * JITTER * task.spacing
         self.state: DeviceState = self._first
         self.step_number = np.zeros(scenes, dtype=int)
-        """(scenes,) steps of the environment since each episode began."""
+        """Number of environment steps (scenes,) since each episode began."""
         self.goal = np.zeros((scenes, len(task.goals[0])))
-        """(scenes, g)"""
+        """Goals of the episodes (scenes, g)."""
         self._now = [one.at_rest(scenes) for one in task.actuators]
         self.starts: list[Start] = [Start(self.simulation.positions, self.goal[b]) for b in range(scenes)]
-        """Of each scene's episode."""
+        """Start of each scene's episode."""
         self._lost: set[int] = set()
-        """Scenes that have diverged, and have no numbers."""
+        """Numbers of the scenes that have diverged; their states are meaningless."""
         self._given = task, scenes, device, precision, seen, sensors
         still = {name: np.repeat(row, task.substeps, axis=1) for name, row in self._driven.items()}
         with warnings.catch_warnings():  # see `advance`
@@ -263,12 +262,12 @@ class Scenes:
         return len(self.step_number)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle or copy the scenes as their constructor's arguments and where they are."""
+        """Pickle or copy the scenes as the constructor's arguments and a saved state."""
         return _made_again, (self._given, self.save())
 
     @cached_property
     def kind(self) -> str:
-        """What a saved state has to be of: scenes, task, size, precision and observed numbers, in words."""
+        """Number of scenes, task, size, precision and observed numbers in words, which a saved state must share."""
         seen = counted(max(one.stop for one in self.layout.values()), "observed number")
         of = f"the task {self.task.name}, {self.task.size}, in {self.simulation.precision.name} with {seen}"
         return f"{_scenes_in_words(len(self))} of {of}"
@@ -281,7 +280,7 @@ class Scenes:
             return Simulation(self.task.scene, self.simulation.device.alias, self.simulation.precision.name)
 
     def save(self, over: NDArray | None = None, observations: NDArray | None = None, generators: Any = ()) -> EnvState:
-        """Return where all scenes are, with what an environment adds: which episodes are ``over``, the last
+        """Return the state of all scenes, with three additions of an environment: which episodes are ``over``, the last
         ``observations``, and states of random ``generators``."""
         arrays, none = self.state.arrays, np.zeros(len(self))
         return EnvState(
@@ -309,7 +308,7 @@ class Scenes:
 
     @WARP
     def taken(self, saved: EnvState) -> DeviceState:
-        """Return the fluid of a saved state in arrays of its own; raises `InputError` for a state of other scenes."""
+        """Return a copy of a saved state's fluid on the device; raises `InputError` for a state of other scenes."""
         self.require(saved)
         arrays = self._first.arrays.copy()
         for name in arrays.names:
@@ -318,7 +317,7 @@ class Scenes:
         return DeviceState(arrays, saved.clocks)
 
     def restore(self, saved: EnvState) -> None:
-        """Go back to a saved state, also one of other scenes like these; raises `InputError` for another one."""
+        """Go back to a saved state of these scenes or of equal ones; raises `InputError` for other states."""
         self.state = self.taken(saved)
         self.step_number, self.starts, self._lost = saved.step_number.copy(), list(saved.starts), set(saved.lost)
         self.goal = np.stack([start.goal for start in saved.starts])
@@ -331,7 +330,7 @@ class Scenes:
 
     @WARP
     def begin(self, starts: Mapping[int, Start]) -> None:
-        """Begin episodes of some scenes, by their number."""
+        """Begin episodes in the scenes with these numbers."""
         if not starts:
             return
         arrays, first = self.state.arrays.copy(), self._first.arrays
@@ -351,8 +350,8 @@ class Scenes:
         self.state = DeviceState(arrays, tuple(scenes))
 
     def step(self, actions: NDArray) -> tuple[NDArray, dict[int, str]]:
-        """Step all scenes with actions (scenes, a) from -1 to 1, and return the rewards (scenes,) and, by number, a
-        sentence on each scene that diverged; it has to begin anew before the next step."""
+        """Step all scenes with actions (scenes, a) from -1 to 1. Return the rewards (scenes,) and, by scene number, a
+        sentence on each diverged scene, which must begin a new episode before the next step."""
         self.advance(actions)
         rewards = self.reward.values(self.reward.at(self.state.arrays, self.goal, self.step_number))
         lost = {}
@@ -364,7 +363,7 @@ class Scenes:
         return rewards, lost
 
     def advance(self, actions: NDArray) -> None:
-        """Take the steps of the simulation that make one step of the environment."""
+        """Take the simulation's steps of one environment step."""
         task, rows = self.task, {}
         for k, (one, u) in enumerate(zip(task.actuators, split(task.actuators, actions), strict=True)):
             self._now[k], rows[one.parameter] = one.advance(self._now[k], u, task.substeps, task.time_step)
@@ -385,7 +384,7 @@ class Scenes:
 
     @property
     def _driven(self) -> dict[str, NDArray]:
-        """Present values of the parameters that actions drive, (scenes, 1, ...) by name."""
+        """Current values of the parameters that actions drive, (scenes, 1, ...) by name."""
         each = zip(self.task.actuators, self._now, strict=True)
         return {one.parameter: one.value(now[:, None, 0]) for one, now in each}
 
@@ -434,7 +433,7 @@ class Scenes:
         return {name: np.array([value_of(sensor, one) for one in end]) for name, sensor in self._sensors.items()}
 
     def _free(self, state: State, name: str) -> NDArray:
-        """Return for a free body (scenes, 7): place, cosine and sine of its turn, velocity and angular velocity."""
+        """Return for a free body (scenes, 7): position, cosine and sine of its angle, velocity, angular velocity."""
         fields = position_name(name), f"{name}.{AXES[0]}", velocity_name(name)
         place, axis, velocity = (state[field].numpy()[:, :2] for field in fields)
         rate = state[angular_velocity_name(name)].numpy()[:, None]

@@ -1,5 +1,5 @@
-"""A batch of environments as Stable-Baselines3 takes them: `StableBaselinesVecEnv`, a `VecEnv` whose scenes are stepped
-in one launch; or one sentence where that library is not installed."""
+"""`StableBaselinesVecEnv`, a `VecEnv` of Stable-Baselines3 whose scenes are stepped in one launch. If that library is
+not installed, an error says so in a sentence."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -22,7 +22,8 @@ __all__ = ["StableBaselinesVecEnv"]
 
 
 class OneOfBatch:
-    """One environment of a batch, with what `get_attr`, `set_attr` and `env_method` reach of it."""
+    """One environment of a batch, with the attributes and methods that `get_attr`, `set_attr` and `env_method` can
+    use."""
 
     def __init__(self, envs: FluidVectorEnv, number: int):
         self._envs, self._number = envs, number
@@ -44,15 +45,15 @@ class OneOfBatch:
         return self._envs.twin(self._number, actions)
 
     def save(self) -> EnvState:
-        """Return where the episode is, for a single environment or as a part of batches; see `FluidEnv.save`."""
+        """Return the state of the episode, for a single environment or to build batches from; see `FluidEnv.save`."""
         return self._envs.save()[self._number]
 
 
 class StableBaselinesVecEnv(VecEnv):
     """A batch of environments of one task as a `VecEnv` of Stable-Baselines3; see `docs/environments.md`.
 
-    Episodes that are over begin anew in the same step; ``infos[b]["terminal_observation"]`` is what they ended with,
-    and ``infos[b]["TimeLimit.truncated"]`` is True unless the scene diverged.
+    An ended episode begins again in the same step. ``infos[b]["terminal_observation"]`` is the last observation of the
+    old episode; ``infos[b]["TimeLimit.truncated"]`` is True unless the scene diverged.
     """
 
     def __init__(self, task: str | Task, num_envs: int = 1, **settings: Any):
@@ -67,7 +68,7 @@ class StableBaselinesVecEnv(VecEnv):
         super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
 
     def reset(self) -> Observation:
-        """Begin all episodes, with the seeds of `seed` and the options of `set_options`, which are used once."""
+        """Begin all episodes with the seeds of `seed` and the options of `set_options`; both are used only once."""
         options = self._options[0]
         if any(one is not options and one != options for one in self._options):
             raise InputError("options differ from environment to environment, but must be the same for a whole batch.")
@@ -77,11 +78,12 @@ class StableBaselinesVecEnv(VecEnv):
         return seen
 
     def step_async(self, actions: NDArray) -> None:
-        """Keep the actions (num_envs, a) of the next `step_wait`."""
+        """Store the actions (num_envs, a) for the next `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Advance all episodes by the actions, and return observations, rewards, which episodes are over, and infos."""
+        """Advance all episodes by the stored actions; return observations, rewards, flags of ended episodes, and
+        infos."""
         if self._actions is None:
             raise InputError("step_wait is called without actions, but must come after step_async(actions).")
         actions, self._actions = self._actions, None
@@ -94,7 +96,7 @@ class StableBaselinesVecEnv(VecEnv):
         return seen, rewards.astype(np.float32), terminated | truncated, infos
 
     def close(self) -> None:
-        """End all episodes for good: no other may begin."""
+        """Close the environments: no further episode can begin."""
         self.envs.close()
 
     def get_images(self) -> list[NDArray[np.uint8] | None]:
@@ -106,7 +108,8 @@ class StableBaselinesVecEnv(VecEnv):
         return [getattr(one, attr_name) for one in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Set an attribute of each environment, one of the caller's own; raises `InputError` for those of a batch."""
+        """Set a new attribute on each environment; raises `InputError` for attributes that belong to the whole
+        batch."""
         if attr_name not in vars(self._each[0]) and hasattr(self._each[0], attr_name):
             raise InputError(f"{attr_name} cannot be set, as the batch decides it; make another environment.")
         for one in self._chosen(indices):
@@ -119,7 +122,7 @@ class StableBaselinesVecEnv(VecEnv):
         return [getattr(one, method_name)(*arguments, **named) for one in self._chosen(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: int | Iterable[int] | None = None) -> list[bool]:
-        """Return False for each environment: a batch has no wrappers of single ones."""
+        """Return False for each environment, because single environments of a batch have no wrappers."""
         return [False for _ in self._chosen(indices)]
 
     def _chosen(self, indices: int | Iterable[int] | None) -> list[OneOfBatch]:

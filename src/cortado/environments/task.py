@@ -1,8 +1,8 @@
-"""What an environment is about: a scene, what actions move, what a step is rewarded with, and how episodes begin.
+"""Base classes of control tasks: the scene, the actuators that actions drive, the reward of a step, and the goals.
 
-A `Task` is all of that; those of Cortado are in `cortado.environments.catalogue`. An `Actuator` makes of actions,
-numbers between -1 and 1 that are held for a step of an environment, a parameter over time. All of it is linear in the
-actions, so that derivatives with respect to them are a matrix.
+Cortado's tasks are in `cortado.environments.catalogue`. An `Actuator` converts actions, numbers between -1 and 1 that
+are constant during an environment step, to a parameter over time. The parameter is affine in the actions, so its
+derivative is a constant matrix.
 """
 
 from abc import ABC, abstractmethod
@@ -23,31 +23,32 @@ from cortado.simulation import Simulation
 
 @dataclass(frozen=True)
 class Actuator(ABC):
-    """A driver of some components of one parameter over time. In a step of the environment its command moves linearly
-    from the last one to ``greatest`` times the action, without jumps."""
+    """An actuator sets some components of one parameter over time. During an environment step its command changes
+    linearly from the previous command to ``greatest`` times the action."""
 
     parameter: str
     """Name of the driven parameter, such as "cup.displacement"."""
     rest: tuple[float, ...]
-    """Value (d,) of the parameter before any action; a single entry where it is a number."""
+    """Value (d,) of the parameter before any action; one entry if the parameter is a number."""
     axes: tuple[int, ...]
     """Indices (a,) of the driven components."""
     greatest: tuple[float, ...]
-    """Commands (a,) for an action of 1."""
+    """Commands (a,) that an action of 1 gives."""
     is_number: bool = False
-    """True if the parameter is a number at each step, as a turn in the plane is."""
+    """True if the parameter is a number at each step, such as an angle in the plane."""
 
     @abstractmethod
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
-        """Return the driven components (..., a) after a step of the simulation."""
+        """Return the driven components (..., a) after one simulation step, from their values ``q`` and the
+        ``command``."""
 
     def at_rest(self, members: int) -> NDArray:
         """Return the driven components and the commands before any action, (members, 2, a)."""
         return np.zeros((members, 2, len(self.axes)))
 
     def advance(self, now: NDArray, u: NDArray, steps: int, time_step: float) -> tuple[NDArray, NDArray]:
-        """Return the components and commands (members, 2, a) after so many steps under actions ``u`` (members, a), and
-        the parameter after each step, (members, steps, d) or (members, steps)."""
+        """Take ``steps`` simulation steps with actions ``u`` (members, a). Return components and commands (members, 2,
+        a) at the end, and the parameter after each step, (members, steps, d) or (members, steps)."""
         driven, last = [now[:, 0]], now[:, 1]
         wanted = np.array(self.greatest) * u
         for j in range(steps):
@@ -62,7 +63,7 @@ class Actuator(ABC):
 
     def over(self, actions: int, steps: int, time_step: float, begun: NDArray | None = None) -> Affine:
         """Return the parameter as an affine function of actions (actions, a), each held for ``steps`` steps of the
-        simulation; ``begun``: the driven components and commands (1, 2, a) before them, at rest if left out."""
+        simulation; ``begun``: driven components and commands (1, 2, a) at the start, by default those at rest."""
         a = len(self.axes)
         units = np.concatenate([np.zeros((1, actions, a)), np.eye(actions * a).reshape(-1, actions, a)])
         now, parts = np.repeat(self.at_rest(1) if begun is None else begun, len(units), axis=0), []
@@ -94,14 +95,14 @@ class Position(Actuator):
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """A task of control: a scene, its actuators, rewards and goals, in a small or a large size."""
+    """A control task: a scene with actuators, reward and goals, in a small or a large size."""
 
     size: str = "small"
-    """"small", for a processor, or "large", with `finer` times as many particles along each axis, for a GPU."""
+    """"small", for a CPU, or "large", for a GPU, with `finer` times as many particles along each axis."""
     dimension: ClassVar[int] = 2
     """2 in the plane, 3 in space."""
     finer: ClassVar[int] = 3
-    """Factor of refinement of the large size, whose steps are shorter by it."""
+    """Factor by which the large size has a smaller spacing and a shorter time step."""
     name: ClassVar[str]
     horizon: ClassVar[int]
     """Steps of the environment after which an episode is truncated."""
@@ -112,9 +113,9 @@ class Task(ABC):
     coarse_step: ClassVar[float]
     """Time step of the small size [s]."""
     lowest: ClassVar[float]
-    """Least reward of a step, which a diverged episode gets for each step that it lacks."""
+    """Smallest reward of a step; a diverged episode gets it for every missing step."""
     free_solids: ClassVar[tuple[str, ...]] = ()
-    """Names of the solids that the fluid moves, which are observed."""
+    """Names of the solids moved by the fluid; their motion is observed."""
     goal_names: ClassVar[tuple[str, ...]] = ()
     """Descriptions of the numbers of a goal, with their units."""
 
@@ -127,7 +128,7 @@ class Task(ABC):
 
     @property
     def fineness(self) -> int:
-        """How many times finer than the small size the scene is."""
+        """Factor by which the scene's spacing is smaller than in the small size."""
         return self.finer if self.size == "large" else 1
 
     @property
@@ -166,7 +167,7 @@ class Task(ABC):
 
     @property
     def goals(self) -> tuple[NDArray, NDArray]:
-        """Lower and upper bounds (g,) within which goals of episodes are drawn."""
+        """Lower and upper bounds (g,) of the random goals of episodes."""
         return np.zeros(0), np.zeros(0)
 
     def scene_of(self, **tables: Any) -> Scene:
@@ -180,8 +181,8 @@ class Task(ABC):
 
 
 def checked_scene(task: Task) -> Scene:
-    """Return the scene of a task. Raises `InputError` unless its time step is that of the task: actuators move what
-    they drive by it, at another speed in steps of another length."""
+    """Return the scene of a task. Raises `InputError` unless its time step equals the task's, because actuators compute
+    velocities with the task's time step."""
     scene = task.scene
     found, wanted = scene.solver.time_step, task.time_step
     if found == "auto" or not np.isclose(found, wanted, rtol=1e-6, atol=0.0):

@@ -1,6 +1,5 @@
-"""What rewards are made of: terms, numbers of a state each with its derivative; and the reward of a step, and the same
-as a loss of the state after it. All are computed for all scenes at once, and sums over particles stay on the
-device."""
+"""Rewards and their derivatives: terms computed from a state, the reward of a step as a sum of terms, and the reward as
+a loss. Everything is computed for all scenes together, with sums over particles on the device."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -53,7 +52,7 @@ class StepEnd:
 
 
 class Term(Protocol):
-    """Protocol of a part of a reward: a number for each scene, with its derivative."""
+    """Protocol of a reward term: one number for each scene, with its derivative."""
 
     def values(self, at: StepEnd) -> NDArray:
         """Return the value of the term for each scene, (scenes,)."""
@@ -89,7 +88,7 @@ class OverParticles:
         """Store the arguments of the constructor, for copies and pickles."""
         self._given = given
         self._made: dict[Any, Any] = {}
-        """Sums, and arrays on devices."""
+        """Reductions and device arrays, made once by `_kept`."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle or copy the term as its constructor's arguments."""
@@ -103,7 +102,7 @@ class OverParticles:
         return total(value.flatten()).numpy() / self._over(at)
 
     def adjoint(self, at: StepEnd, factor: NDArray, bar: State, **others: wp.array) -> None:
-        """Add ``factor`` times the derivative to ``bar``; ``others``: further arrays that the kernel writes."""
+        """Add ``factor`` times the derivative to ``bar``; ``others``: further output arrays of the kernel."""
         scaled = _reals(at, factor / self._over(at))
         self._launch(f"{self.kernel}_adjoint", at, factor=scaled, x_bar=bar.positions, **others)
 
@@ -117,7 +116,7 @@ class OverParticles:
         return (at.scenes * at.per,)
 
     def _over(self, at: StepEnd) -> float:
-        """Return the number that the sum over particles is divided by."""
+        """Return the divisor of the sum over particles."""
         return 1.0
 
     def _arguments(self, at: StepEnd) -> dict[str, Any]:
@@ -133,14 +132,14 @@ class OverParticles:
 
 
 class Share(OverParticles):
-    """A reward term: the share of the fluid in some boxes. Each particle counts 1 / (1 + e^2 / w^2) at the distance e
-    of its nearest image to the nearest box: 1 within, a half at w, with a gradient everywhere."""
+    """A reward term: the share of the fluid in boxes, counted smoothly. A particle at distance e from the nearest box
+    counts 1 / (1 + e^2 / w^2): 1 inside, 1/2 at distance w, with a gradient everywhere outside."""
 
     kernel = "share"
 
     def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
-        """Set the boxes and the width w [m]; with a ``solid``, boxes move with its middle and turn with it, in space
-        about z alone."""
+        """Set the boxes and the width w [m]. With a ``solid``, boxes move and turn with this solid; in 3-D it may turn
+        about z only."""
         super().__init__(boxes, width, solid)
         self._boxes, self._width, self._solid = boxes, width, solid
 
@@ -170,7 +169,7 @@ class Share(OverParticles):
         return {**found, "place": fixed[0], "turn": fixed[1]}
 
     def _turn(self, at: StepEnd) -> wp.array:
-        """Return the angle (scenes,) of the solid about z. Raises `InputError` where it turns about another axis."""
+        """Return the angle (scenes,) of the solid about z. Raises `InputError` if it turns about another axis."""
         turn = at.state[turn_name(self._solid or "")]
         if turn.dtype is precision_of(at.state).real:
             return turn
@@ -181,8 +180,8 @@ class Share(OverParticles):
 
 
 class Spread(OverParticles):
-    """A reward term: the mean distance ``|dx| + |dy|`` of all pairs of some particles, over ``everywhere``; along a
-    periodic axis to the nearest image."""
+    """A reward term: the mean distance ``|dx| + |dy|`` over all pairs of chosen particles, divided by ``everywhere``.
+    Along periodic axes the nearest images count."""
 
     kernel = "apart"
 
@@ -206,7 +205,8 @@ class Spread(OverParticles):
 class Missed(OverParticles):
     """A reward term: the weighted sum of squared distances of particles to targets that change from step to step.
 
-    Along periodic axes positions and targets are not wrapped: a period too far is a distance.
+    Positions and targets are not wrapped along periodic axes: a particle one period away from its target counts as far
+    away.
     """
 
     kernel = "missed"
@@ -225,7 +225,8 @@ class Missed(OverParticles):
 
 @dataclass(frozen=True)
 class Miss:
-    """A reward term: by how much another term misses the first number of the goal, ``|value - goal|``."""
+    """A reward term: the difference ``|value - goal|`` between another term's value and the first number of the
+    goal."""
 
     term: Term
 
@@ -238,7 +239,7 @@ class Miss:
 
 @dataclass(frozen=True)
 class Distance:
-    """A reward term: the distance ``|x - x*|`` [m] of a solid's middle from its goal along the first axis."""
+    """A reward term: the distance ``|x - x*|`` [m] along the first axis between a solid's middle and its goal."""
 
     solid: str
 
@@ -251,8 +252,8 @@ class Distance:
 
 @dataclass(frozen=True)
 class Pose:
-    """A reward term of a free body in the plane: (x - x*)^2 / l^2 + 2 (1 - cos angle), its distance from the goal along
-    the first axis and its lean."""
+    """A reward term of a free body in the plane: (x - x*)^2 / l^2 + 2 (1 - cos angle), with the goal x* along the first
+    axis and the body's angle."""
 
     solid: str
     length: float
@@ -270,7 +271,8 @@ class Pose:
 
     @property
     def _axes(self) -> list[tuple[int, str]]:
-        """Fields of the displaced ends of the body's axes, with the component of each that is cos angle - 1."""
+        """Names of the fields with the displaced ends of the body's axes, each with the index of the component that is
+        cos angle - 1."""
         return [(axis, f"{self.solid}.{name}") for axis, name in enumerate(AXES[:2])]
 
 
@@ -316,7 +318,7 @@ class MinusReward:
 
     @property
     def fingerprint(self) -> str:
-        """Text that tells losses of different steps apart, for checkpoints."""
+        """Text that identifies the loss and its step; checkpoints store it."""
         return f"{[(weight, type(term).__name__) for weight, term in self.reward.terms]} {self.goal} {self.step}"
 
     def value(self, end: Snapshot) -> float:
