@@ -227,8 +227,8 @@ class Simulation(Stepping):
         sensors: Mapping[str, Sensor] | None = None,
         observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
-        """Run a rollout forward and return its frames. The other arguments, the warnings and the errors are those of
-        `run`."""
+        """Run a rollout forward and return its frames. ``record_every``, ``record``, ``sensors``, ``observe``, warnings
+        and errors are as in `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         expected = expected_frames(rollout, record_every)
