@@ -1,4 +1,4 @@
-"""Algorithms for a step: what a solver is, what all of them are made of, and PCISPH."""
+"""Solvers, the algorithms for a step: their protocol, their common parts, PCISPH and the projection."""
 
 from typing import TYPE_CHECKING
 

@@ -1,6 +1,6 @@
-"""Makers of forces and solvers. `Simulation` takes them as ``forces`` and ``solver``, and a scene names them by their
-kinds, with the parameters that these bring. Any solver of a scene is made of neighbours, forces, phases, nozzle, and
-the places where particles may go.
+"""Makers of forces and solvers. `Simulation` takes makers as ``forces`` and ``solver``; a scene names them by kind, and
+each maker may define parameters. Every solver is made from the scene's neighbour search, forces, phases, nozzle, and
+region of particles.
 """
 
 from collections.abc import Callable, Sequence
@@ -62,23 +62,24 @@ from cortado.sph.stress_forces import LAWS
 
 
 class ForceMaker(Protocol):
-    """A maker of a force for each solver of a simulation, which says which parameters the force has.
+    """A maker that makes a force for each solver of a simulation and lists the force's parameters.
 
-    It is pickled with the simulation. A ``fingerprint``, a text, tells it from others, so that a search is not resumed
-    with another force; without one its type and its attributes do. A method ``check(values, simulation)`` raises an
-    `InputError` for values of parameters, by name, with which there can be no run.
+    The maker is pickled with the simulation. An optional ``fingerprint``, a text, identifies it, so that a search is
+    not resumed with another force; by default its type and its attributes do. An optional method ``check(values,
+    simulation)`` raises `InputError` for parameter values, by name, with which no run is possible.
     """
 
     parameters: Sequence[Parameter]
-    """Of the force, with names that no others have: ``drag.k`` is found by kernels as ``drag_k``. `known.TIME` is among
-    them where kernels read ``time``."""
+    """Parameters of the force, with unique names: kernels have ``drag.k`` as their argument ``drag_k``. If kernels read
+    ``time``, `known.TIME` must be among the parameters."""
 
     def force(self, setting: Setting) -> Force | None:
-        """Make the force in one precision and on one device; None where nothing acts."""
+        """Make the force in one precision and on one device; return None if no force acts."""
 
 
 def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
-    """Return what a user gives as ``forces`` if these are makers of forces; else raise `InputError`."""
+    """Return the value that a user gives as ``forces`` if it consists of makers of forces; otherwise raise
+    `InputError`."""
     if not isinstance(forces, (list, tuple)):
         wanted = "a list of forces, such as [cortado.forces.Body(function, k=2.0)]"
         raise InputError(f"forces is {shown(forces)}, but must be {wanted}.")
@@ -91,7 +92,7 @@ def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
 
 
 def checked_parameters(what: str, maker: Any, parameters: Any) -> Sequence[Parameter]:
-    """Return the parameters of a maker of ``what``; raise `InputError` where they are no list of parameters."""
+    """Return the parameters of a maker of ``what``; raise `InputError` if they are not a list of parameters."""
     if not isinstance(parameters, (list, tuple)) or not all(isinstance(p, Parameter) for p in parameters):
         wanted = "a list of cortado.scene.parameters.Parameter, which may be empty"
         raise InputError(f"the {what} {shown(maker)} has parameters {shown(parameters)}, but must have {wanted}.")
@@ -100,7 +101,7 @@ def checked_parameters(what: str, maker: Any, parameters: Any) -> Sequence[Param
 
 def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
     """Return the parameters of a simulation with these forces, this solver's maker and the scene's solids and springs;
-    raise `InputError` where two have one name, or replace the same force."""
+    raise `InputError` if two have one name or replace the same force."""
     taken: dict[str, ForceMaker] = {}
     for maker in forces:
         if (place := getattr(maker, "replaces", None)) is not None and taken.setdefault(place, maker) is not maker:
@@ -116,8 +117,7 @@ def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
 
 
 def check_own(known: Known, source: Source) -> None:
-    """Raise `InputError` where values that forces and a solver give their parameters have a shape that does not suit
-    the scene."""
+    """Raise `InputError` if a force or a solver gives a parameter a value whose shape does not fit the scene."""
     for parameter in known.own:
         shapes = parameter.shapes(0, len(source.scene.phase), source.positions.shape)
         checked_value(parameter.name, parameter.value(source), shapes, known=known)
@@ -135,7 +135,8 @@ def fingerprint(makers: Sequence[Any], source: Source) -> str:
 
 @dataclass(frozen=True)
 class SolverSetting:
-    """The arguments from which a solver is made; `cortado.solvers.build.particle_system` makes particles of them."""
+    """The arguments from which a solver is made; `cortado.solvers.build.particle_system` makes the particles from
+    them."""
 
     scene: Scene
     discrete: DiscreteScene
@@ -144,20 +145,21 @@ class SolverSetting:
     device: Any
     batch: int | None
     forces: Sequence[ForceMaker]
-    """Makers of the forces that are not named in the scene."""
+    """Makers of the forces besides those that the scene names."""
     known: Known
-    """The parameters of the simulation, those of these forces and of the solver among them."""
+    """The parameters of the simulation, including those of these forces and of the solver."""
     called: str
     """The name of the solver in messages."""
     lanes: int | None = None
-    """Threads of a GPU that share a particle; None takes as many as suit the scene (`cortado.device.precision`)."""
+    """Number of GPU threads that share a particle; None chooses a number that suits the scene
+    (`cortado.device.precision`)."""
 
 
 class SolverMaker(Protocol):
-    """Makes the solver of a simulation that is given it, and of each that is made from it in another precision or size.
+    """Makes the solver of a simulation, and of every simulation derived from it in another precision or size.
 
-    It is pickled with the simulation, and may have, as makers of forces do, ``parameters``, which kernels find by their
-    names, and a ``fingerprint``. ``batches = True`` says that its solver runs in batches.
+    The maker is pickled with the simulation. Like makers of forces it may have ``parameters``, which kernels read by
+    name, and a ``fingerprint``. ``batches = True`` declares that its solver runs in batches.
     """
 
     def build(self, setting: SolverSetting) -> Solver:
@@ -165,7 +167,7 @@ class SolverMaker(Protocol):
 
 
 def checked_solver(solver: Any) -> SolverMaker:
-    """Return what a user gives as ``solver`` if it is a maker of solvers; else raise `InputError`."""
+    """Return the value that a user gives as ``solver`` if it is a maker of solvers; otherwise raise `InputError`."""
     if isinstance(solver, type) or not callable(getattr(solver, "build", None)):
         wanted = "an object with a method build(setting), which returns a solver: see docs/own_parts.md"
         raise InputError(f"solver is {shown(solver)}, but must be {wanted}.")
@@ -179,11 +181,11 @@ def called(table: SolverTable, given: SolverMaker | None) -> str:
 
 
 NEEDED = ("new_parameters", "new_log", "set_substeps", "reset", "make_room", "step")
-"""Methods without which a solver takes no steps."""
+"""Methods that a solver must have to take steps."""
 
 
 def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
-    """Let a maker build its solver; raise `InputError` where the solver does not fit the simulation."""
+    """Let a maker build its solver; raise `InputError` if the solver does not fit the simulation."""
     if setting.batch is not None and not getattr(maker, "batches", False):
         raise InputError(f"batch is {setting.batch}, but must be left out, as {setting.called} has no batches.")
     solver = maker.build(setting)
@@ -199,7 +201,7 @@ def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
 
 
 MODULES = {kind: f"cortado.solvers.{kind}.solver" for kind in OWN}
-"""The module of each of Cortado's own kinds of solvers, whose ``maker`` takes the table of a scene."""
+"""Modules of Cortado's own solvers by kind; each has a function ``maker`` that takes the table [solver] of a scene."""
 
 
 def solver_named(table: SolverTable) -> SolverMaker:
@@ -221,8 +223,8 @@ def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
 
 
 def known_in(scene: Scene) -> Known:
-    """Return the parameters of a scene, with those of parts of packages and of moving solids; raise `InputError` where
-    two have one name."""
+    """Return the parameters of a scene, including those of parts from packages and of moving solids; raise `InputError`
+    if two have one name."""
     own = scene.force or any(phase.rheology for phase in scene.phase) or isinstance(scene.solver, PackageSolver)
     if not (own or scene.emitter or scene.drain or moving(scene.solid)):
         return REGISTRY
@@ -232,17 +234,18 @@ def known_in(scene: Scene) -> Known:
 FORCE_ATTRIBUTES = ("shares", "accelerate", "tangent", "adjoint")
 """Attributes that every `Force` must have."""
 PART_METHODS = ("begin", "sort", "settle", "target", "end", "new_tangent", "new_adjoint")
-"""Methods of a `Part` that a `Force` alone does not have."""
+"""Methods that a `Part` has and a plain `Force` lacks."""
 
 
 def first_capacity(support: float, dimension: int) -> int:
-    """Room for neighbours to begin with: half again as many as the lattice has, for a support in spacings."""
+    """Return the first capacity of lists of neighbours: 1.5 times the number on the lattice, for a support in
+    spacings."""
     filled = np.pi * support**2 if dimension == 2 else 4.0 / 3.0 * np.pi * support**3
     return int(1.5 * filled) + 6
 
 
 def particle_system(setting: SolverSetting) -> ParticleSystem:
-    """Cut the scene of a setting into particles on a device, with the scene's forces and those of the setting."""
+    """Discretise the scene of a setting into particles on a device, with the forces of the scene and of the setting."""
     scene, discrete, precision, device = setting.scene, setting.discrete, setting.precision, setting.device
     layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, setting.batch, setting.known)
     lanes, moves = lanes_for(layout.particles, device, setting.lanes), bool(moving(scene.solid))
@@ -334,8 +337,8 @@ def _forces(
 
 
 def _check_force(force: Force, maker: Any) -> None:
-    """Raise `InputError` for a maker's result that lacks an attribute of a `Force`, or for a part that would leave its
-    fields unwritten. So it does for an object with methods of a part that is no force, as no step would call them."""
+    """Raise `InputError` if a maker's result lacks an attribute of a `Force`, if it is a part that would not write its
+    fields, or if it has methods of a part without being a `Part`: no step would call them."""
     name = type(force).__name__
     if missing := [one for one in FORCE_ATTRIBUTES if not hasattr(force, one)]:
         made = f"the force {name}, which {shown(maker)} made, has no {missing[0]}"
@@ -359,7 +362,7 @@ def _parts(
     search: NeighbourSearch,
     layout: Layout,
 ) -> list[PartMaker]:
-    """Make the parts of a solver that are no forces, in the order in which they end a step."""
+    """Make the parts of a solver that are not forces, in the order in which their `end` is called."""
     found: list[PartMaker | None] = [_phases(scene, discretisation, free_energy), *nozzles_of(scene, discrete)]
     found.append(_free_solids(scene, discrete, search, layout))
     if tables := moving(scene.solid):  # this also writes the walls of free bodies
@@ -420,7 +423,8 @@ def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnerg
 
 
 def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
-    """Describe where particles may go: container and solids. Without pressure walls hold nothing and are left out."""
+    """Describe the region open to particles: container and solids. Without pressure walls do not stop particles and are
+    left out."""
     holds = scene.container if scene.forces.pressure else NoContainer()
     region = holds.region(scene.dimension).opened(discrete.periods)
     spacing = scene.discretisation.spacing

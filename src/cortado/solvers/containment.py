@@ -1,6 +1,6 @@
-"""A search for lost particles at the end of every step, on the device: those outside of their container or in a solid,
-too far away, or not finite. It also finds walls that face one another nearer than a spacing, so that they leave
-particles no room. Any solver can use it."""
+"""A search for lost particles at the end of every step, on the device. Particles are lost if they are outside of their
+container, in a solid, too far away, or not finite. Another function finds walls that face one another at less than a
+spacing, which leave particles no room. Any solver can use this module."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ from cortado.particles.state import Layout, State, padded
 from cortado.solvers.obstacles import FURTHEST, Obstacle, Walled, middle_of, obstacle_mesh
 
 NO_PARTICLE = 2**31 - 1
-"""Stands in place of the first lost particle's number while every particle is well."""
+"""Value in place of the first lost particle's number while no particle is lost."""
 
 
 @cache
 def bounds_type(precision: Precision) -> Any:
-    """Make the Warp struct of the region in which particles may be, with tolerance and greatest distance."""
+    """Make the Warp struct of the region open to particles, with tolerance and greatest distance."""
     real, vector = precision.real, precision.vector
 
     class Bounds:
@@ -35,11 +35,11 @@ def bounds_type(precision: Precision) -> Any:
         base: vector
         across: vector
         up: vector
-        """Along the axis of an open cup; 0 where there is none."""
+        """Unit vector along the axis of an open cup; 0 for other containers."""
         radius: real
         rim: real
         nearest: vector
-        """The corners of the box in which positions are precise enough."""
+        """Corners of the box within which the precision resolves positions well enough."""
         furthest: vector
 
     Bounds.__name__ = Bounds.__qualname__ = f"Bounds_{precision.name}"
@@ -56,20 +56,21 @@ def solids_type(precision: Precision) -> Any:
         still: wp.int32
         """Number of solids that do not move, which come first."""
         middles: wp.array(dtype=vector)
-        """Points that meshes are centred on, in space for solids at rest, in their own frames for others [m]."""
+        """Points on which meshes are centred [m]: in space for solids at rest, in the solid's own frame for moving
+        solids."""
         before: wp.array2d(dtype=vector)
-        """(members, solids) where the middles of those that move are before a step [m]."""
+        """(members, solids) middles of moving solids before a step [m]."""
         turns_before: wp.array2d(dtype=matrix)
         after: wp.array2d(dtype=vector)
         turns: wp.array2d(dtype=matrix)
         scales: wp.array2d(dtype=real)
-        """(members, solids) how many times as large as their meshes they are."""
+        """(members, solids) factors by which solids are larger than their meshes."""
         sides: wp.array(dtype=real)
         """1 where fluid is outside of a mesh, -1 where it is inside."""
         tolerances: wp.array(dtype=real)
         """How deep in a solid a particle may be [m]."""
         reach: wp.float32
-        """How far from a surface one is looked for [m]."""
+        """Greatest distance from a surface at which particles are tested against it [m]."""
         period: vector
         """[m], 0 along an axis that is not periodic."""
         frequency: vector
@@ -152,8 +153,9 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def has_entered(before: vector, x: vector, member: int, solids: solids_struct) -> bool:
-        """Test whether a particle is deep in a solid now and was in none before the step. Depths change by no more than
-        the way gone, so only surfaces within that way and the tolerance are looked at, as telling sides takes long."""
+        """Test whether a particle is deep in a solid now and was in no solid before the step. Finding the side of a
+        surface is slow, so only surfaces within the distance moved plus the tolerance are tested: depth cannot change
+        by more."""
         for k in range(solids.meshes.shape[0]):
             y = seen_from(x, k, member, solids.after, solids.turns, solids)
             gone = wp.length(y - seen_from(before, k, member, solids.before, solids.turns_before, solids))
@@ -192,13 +194,13 @@ def lost_kernel(precision: Precision) -> Any:
         count,
     ):
         """Write to ``bad`` the first lost particle of each scene, in scene order, and to ``count`` the number of lost
-        ones. After a bad step nothing is looked for.
+        particles. Scenes with an earlier bad step are skipped.
 
-        Lost is what is not finite, too far away, of a mixture without a volume, or what went through a wall. It was
-        inside before the step and is outside after it, or it is in a solid then. Over the rim of an open cup fluid may
-        go, and what a nozzle leads or a drain took, so that it is not where it would be otherwise, passes walls with
-        it. Such are only among the particles from ``first_waiting`` on, in scene order. ``x`` is the new state in that
-        order; the others are sorted, and ``x_free`` and ``v_free`` are the new state without nozzle and drains.
+        A particle is lost if it is not finite, too far away, a mixture without volume, or went through a wall: it was
+        inside before the step and is outside after it, or then is in a solid. Fluid may cross the rim of an open cup.
+        Particles moved by a nozzle or a drain may pass walls; only particles from ``first_waiting`` on, in scene order,
+        can be such. ``x`` is the new state in that order. All other arrays are sorted; ``x_free`` and ``v_free`` are
+        the new state without nozzle and drains.
         """
         i = wp.tid()
         member = i // particles
@@ -230,10 +232,10 @@ def lost_kernel(precision: Precision) -> Any:
 
 
 REACH = 4.0
-"""In spacings: how far from a surface particles are looked at."""
+"""In spacings: greatest distance from a surface at which particles are tested against it."""
 
 Distance = Callable[[Points], Points]
-"""(n,) how far points (n, d) [m] are outside of a wall [m]."""
+"""Function that returns distances (n,) of points (n, d) [m] outside of a wall [m]."""
 
 
 @dataclass(frozen=True)
@@ -241,11 +243,11 @@ class Lost:
     """The first particles that one scene has lost, all in one step."""
 
     step: int
-    """From 0."""
+    """Number of the step, from 0."""
     particle: int
-    """The first of them, in the scene's order."""
+    """Number of the first lost particle, in the scene's order."""
     others: int
-    """How many more there are."""
+    """Number of further lost particles."""
 
 
 class Containment:
@@ -255,7 +257,7 @@ class Containment:
         self, walled: Walled, layout: Layout, launch: KernelLauncher, first_waiting: int, moving: MovingWalls | None
     ):
         """Prepare the search: ``first_waiting`` is the first particle, in the scene's order, that may wait in a nozzle
-        or be taken by a drain, and ``moving`` has the poses of moving solids."""
+        or be removed by a drain, and ``moving`` has the poses of moving solids."""
         self.walled, self._precision, self._launch = walled, layout.precision, launch
         self._kernel = lost_kernel(layout.precision)
         members, device = layout.members, layout.device
@@ -272,7 +274,7 @@ class Containment:
         self.bad_step = wp.full(members, -1, dtype=wp.int32, device=device)
         """(members,) the first step in which a scene lost a particle; -1 while it has lost none."""
         self.bad_particle = wp.full(members, NO_PARTICLE, dtype=wp.int32, device=device)
-        """(members,) the first particle that was lost in it; `NO_PARTICLE` while none was."""
+        """(members,) the first particle lost in the bad step; `NO_PARTICLE` while no particle is lost."""
         self._count = wp.zeros(members, dtype=wp.int32, device=device)
         self._seen = HostCopy(self.bad_step)
 
@@ -289,8 +291,8 @@ class Containment:
     def look(
         self, order: wp.array, x_before: wp.array, rho_0: wp.array, x_free: wp.array, v_free: wp.array, state: State
     ) -> None:
-        """Look for particles that a step has lost. It takes sorted positions and rest densities before the step, sorted
-        positions and velocities after it without what a nozzle leads, and the new state."""
+        """Look for particles that a step has lost, given sorted positions and rest densities before the step, sorted
+        positions and velocities after it before a nozzle prescribes any, and the new state."""
         self._launch(
             self._kernel,
             self._constants,
@@ -320,7 +322,7 @@ class Containment:
         return self._precision.furthest * self.walled.spacing < distance < np.inf
 
     def where(self, position: np.ndarray) -> str:
-        """Tell in words what happened to a lost particle that is now at a position (d,) [m]."""
+        """Describe in words how a particle that is now at a position (d,) [m] was lost."""
         place = f"({', '.join(f'{x:g}' for x in position)}) m"
         if not np.isfinite(position).all():
             return "has no finite position"
@@ -344,14 +346,16 @@ class Containment:
             yield f"the solid {one.name!r}", distance
 
     def _entered(self, position: np.ndarray) -> str | None:
-        """Name the solid that holds a position (d,) [m], as solids are in the first scene; None where none does."""
+        """Name the solid that contains a position (d,) [m], with solids as in the first scene; None if no solid
+        does."""
         for one, distance in self._solids(0):
             if distance(position[None])[0] < -self.walled.tolerance(one):
                 return one.name
         return None
 
     def _solids(self, member: int) -> Iterator[tuple[Obstacle, Distance]]:
-        """Yield the solids of a scene as they are after the last step, each with a function of distance from it."""
+        """Yield the solids of a scene with their poses after the last step, each with a function of the distance from
+        the solid."""
         yield from ((one, one.solid.distance) for one in self.walled.solids)
         poses = (self._poses[name].numpy()[member] for name in ("after", "turns", "scales"))
         for one, *pose in zip(self.walled.moving, *poses, strict=True):
@@ -397,16 +401,16 @@ def _moved_distance(one: Obstacle, middle: np.ndarray, turn: np.ndarray, scale: 
 
 
 NARROW = 0.95
-"""In spacings: walls that are nearer to one another press on what is between them."""
+"""In spacings: walls nearer to one another than this press on particles between them."""
 FACING = -0.5
-"""The product of the normals of two walls, below which they face one another: corners of 90 degrees have 0."""
+"""Two walls face one another if the scalar product of their normals is below this; corners of 90 degrees have 0."""
 STEP = 1e-3
-"""In spacings: half of the difference of places that normals are computed with."""
+"""In spacings: the step h of the central differences, from x - h to x + h, by which normals are computed."""
 
 
 def shut_in(containment: Containment, member: int, points: Points) -> str | None:
-    """Name in words the walls of a scene between which some of the points (n, d) [m] are shut in; None with room around
-    all. Moving solids are where they are after the last step."""
+    """Name the walls of a scene between which some of the points (n, d) [m] are shut in; None if all points have room.
+    Moving solids have their poses after the last step."""
     spacing = containment.walled.spacing
     best, found = NARROW * spacing, None
     near = [

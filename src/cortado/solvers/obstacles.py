@@ -1,8 +1,9 @@
-"""Where particles may go: the region of their container, and solids as solvers know them. Solids come by their wall
-particles, and as meshes for those who ask how deep something is. Flat faces of moving solids mirror the fluid
+"""The region open to particles: the container and solids in the form that solvers use. Solids are given by wall
+particles, and by meshes for computing depths in solids. Flat faces of moving solids mirror the fluid
 (`cortado.particles.mirrors`).
 
-Emitters and drains are here too, as the parts of a step know them, and where particles rest that they hold.
+This module also has emitters and drains in the form that parts of a step use, and the places where their particles
+rest.
 """
 
 import itertools
@@ -30,12 +31,12 @@ from cortado.sph.drains import BALL, BOX, PLANE, Drained, Mouth, Pull
 from cortado.sph.emitter import Nozzle
 
 FINE = 0.2
-"""In spacings: the width of faces by which round solids are looked at."""
+"""In spacings: the width of the mesh faces of round solids."""
 HEIGHT = 100.0
-"""Height over width of the mesh that stands for a plane shape."""
+"""Height over width of the mesh of a plane shape."""
 DEEPEST, THINNEST = 1.0, 0.45
-"""In spacings, and of the thickness of a solid: particles that are deeper in it are lost. Sharp edges, behind which
-there are few wall particles, let some in by half a spacing."""
+"""Depths in a solid, in spacings and as a part of its thickness, beyond which particles are lost. At sharp edges,
+behind which there are few wall particles, some fluid particles enter by half a spacing."""
 FURTHEST = 1e6
 """In spacings from the region of the first particles and walls: particles beyond are lost."""
 
@@ -47,19 +48,19 @@ class Obstacle:
     name: str
     solid: Solid
     is_hollow: bool
-    """True where fluid is inside of the shape."""
+    """True if the fluid is inside of the shape."""
     thickness: float
-    """Thickness of its thinnest part [m], as far as it is known; infinite otherwise."""
+    """Thickness of the solid's thinnest part [m]; infinite if it is unknown."""
 
 
 @dataclass(frozen=True)
 class NamedSolid:
-    """A solid of a scene, by the number of its wall particles and its middle at the start."""
+    """A solid of a scene: the number that its wall particles have, and its middle at the start."""
 
     number: int
     """Number of its wall particles (`cortado.scene.motions.wall_numbers`)."""
     middle: NDArray
-    """(3,) where its middle is at the start [m]"""
+    """(3,) middle of the solid at the start [m]"""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Walled:
     """The places where particles may go: the region of the container and the solids in it."""
 
     region: Region
-    """The container, without the sides that nothing closes: along a period, or where no pressure acts."""
+    """The container, without open sides: those across a periodic axis, and all sides if no pressure acts."""
     near: Region
     """A box around the first particles and the walls."""
     spacing: float
@@ -89,8 +90,8 @@ class Walled:
         return min(DEEPEST * self.spacing, THINNEST * one.thickness)
 
     def furthest(self, precision: Precision) -> Region:
-        """Return the box that positions must not leave [m]: far away, within the distance from the origin that a
-        precision resolves; what is spilled over the rim of an open cup may fall on."""
+        """Return the box that positions must not leave [m]: a large box within which the precision resolves positions.
+        Fluid spilled over the rim of an open cup may fall on inside it."""
         spilled, reach = np.isfinite(self.region.rim), FURTHEST * self.spacing
         limit = np.inf if spilled else precision.furthest * self.spacing
         return Region.between(np.maximum(self.near.lower - reach, -limit), np.minimum(self.near.upper + reach, limit))
@@ -138,25 +139,25 @@ def placed_sheets(scene: Scene) -> list[PlacedSheet]:
 LENGTH = 4.0
 """Length of the shortest face that mirrors, in support radii."""
 ON = 1e-6
-"""In spacings: distance from a face at which a point is on it."""
+"""In spacings: a point nearer to a face than this is on the face."""
 
 
 @dataclass(frozen=True)
 class FlatFaces:
-    """Flat faces of moving solids, in the frames of these."""
+    """Flat faces of moving solids, in the frames of the solids."""
 
     solids: Numbers
-    """(f,) numbers of their solids"""
+    """(f,) numbers of the faces' solids"""
     places: Points
-    """(f, 3) their middles [m]"""
+    """(f, 3) middles of the faces [m]"""
     frames: Points
     """(f, 3, 3) rows: the normal towards the fluid and two unit vectors along the face"""
     sizes: Points
     """(f, 3) 0, and half lengths along these two vectors [m]"""
 
     def behind(self, solid: Numbers, positions: Points, feet: Points, near: float) -> Numbers:
-        """Return for wall particles (b,) of these solids the number of the face that each is behind, or -1. A foot ends
-        on a face where it is as ``near`` as that [m]."""
+        """Return, for wall particles (b,), the number of the face that each is behind, or -1. The foot of a wall
+        particle ends on a face if its end is nearer to the face than ``near`` [m]."""
         found = np.full(len(solid), -1)
         for number, (own, place, frame, size) in enumerate(
             zip(self.solids, self.places, self.frames, self.sizes, strict=True)
@@ -170,9 +171,9 @@ class FlatFaces:
 
 
 def flat_faces(scene: Scene, support: float, most: int) -> FlatFaces:
-    """Find the faces that mirror, so many at ``most``, of a scene with a ``support`` radius [m]. They are long enough
-    edges of boxes and polygons in the plane, and sides of boxes in space. Their solids have paths, and fluid slips
-    freely along them. There are none with other solvers, and in a scene with periods."""
+    """Find the mirroring faces, at ``most`` so many, of a scene with a ``support`` radius [m]. They are long enough
+    edges of boxes and polygons in the plane, and sides of boxes in space. Their solids have prescribed paths, and fluid
+    slips freely along them. Other solvers, and scenes with periods, have no such faces."""
     found = []
     if isinstance(scene.solver, ProjectionSolver) and not np.any(scene.container.periods(scene.dimension)[1]):
         for number, table in enumerate(moving(scene.solid)):
@@ -195,7 +196,8 @@ def _edges(solid: Solid, spacing: float) -> Iterator[tuple[Points, Points, Point
 
 
 def _sides(solid: Solid) -> Iterator[tuple[Points, Points, Points]]:
-    """Yield the same of the six sides of a box in space, and nothing of another solid."""
+    """Yield the middle, the frame and half the size of each of the six sides of a box in space; nothing for other
+    solids."""
     box, outwards = (solid.cavity, -1.0) if isinstance(solid, Hollow) else (solid, 1.0)
     if isinstance(box, Box):
         for axis, sign in itertools.product(range(3), (-1.0, 1.0)):
@@ -222,8 +224,8 @@ def nozzles_of(scene: Scene, discrete: DiscreteScene) -> list[Nozzle]:
 
 
 def drained_of(scene: Scene, discrete: DiscreteScene, precision: Precision) -> Drained | None:
-    """Find where drains are and what they do; None for a scene without drains. Raises `InputError` where
-    there is no place for what they take."""
+    """Return the drains of a scene; None for a scene without drains. Raises `InputError` if there is no place for the
+    particles that drains remove."""
     if not scene.drain:
         return None
     fluid, d, spacing = discrete.fluid, scene.dimension, scene.discretisation.spacing

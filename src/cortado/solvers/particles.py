@@ -1,7 +1,7 @@
-"""What solvers of particles have in common: everything of a step but what makes the fluid incompressible.
+"""The common base of solvers of particles: everything in a step except the loops that make the fluid incompressible.
 
-A solver of this kind is a `ParticleSolver` with loops of its own; `cortado.solvers.particle_derivatives` has the same
-for its tangent and its adjoint.
+A solver of this kind is a `ParticleSolver` with loops of its own; `cortado.solvers.particle_derivatives` has the bases
+of its tangent and its adjoint.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,8 @@ from cortado.sph.parts import Carried, Force, Part, PartMaker, StepContext, inte
 
 @dataclass(frozen=True)
 class ParticleSystem:
-    """A scene cut into particles on a device, as solvers take it: `cortado.solvers.build.particle_system` makes it."""
+    """A scene discretised into particles on a device, the input of solvers; `cortado.solvers.build.particle_system`
+    makes it."""
 
     called: str
     """The name of the solver in messages."""
@@ -47,28 +48,28 @@ class ParticleSystem:
     periods: Sequence[float]
     """(3,) [m], 0 along an axis that is not periodic."""
     parts: Sequence[PartMaker]
-    """Makers of the parts that are no forces."""
+    """Makers of the parts that are not forces."""
     waiting: int
-    """Number of the first particle of a scene that may wait in a nozzle, or be taken by a drain."""
+    """Number of the first particle of a scene that may wait in a nozzle or be removed by a drain."""
     walled: Walled
     mirrors: tuple[Points, Points]
-    """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite where none
-    does."""
+    """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite at ends
+    without a mirror."""
     faces: FlatFaces
     """Faces of moving solids that mirror the fluid."""
     solids: Mapping[str, NamedSolid]
     """The solids of the scene by their names."""
     sheets: Sheets | None
-    """Its walls of no thickness; None without any."""
+    """The scene's walls of no thickness; None without any."""
     of_one_lane: Callable[[], "ParticleSystem"]
-    """Makes a system over this search for neighbours, with kernels that Warp's tape can differentiate."""
+    """Makes a system with the same search for neighbours and with kernels that Warp's tape can differentiate."""
 
 
 class ParticleSolver(Staying):
     """The base of solvers that take steps of one set of particles on one device; every step reuses its arrays.
 
-    The methods that `Solver` has are explained there. A solver of this kind has `step`, `replay` and `write_state`
-    of its own, with loops also `reserve`, and if it has derivatives `tangent`, `adjoint` and `differentiable`.
+    `Solver` documents the methods of its protocol. A subclass defines `step`, `replay` and `write_state`, with loops
+    also `reserve`, and if it has derivatives also `tangent`, `adjoint` and `differentiable`.
     """
 
     carried_fields: tuple[StateField, ...] = ()
@@ -76,9 +77,9 @@ class ParticleSolver(Staying):
     topic = "density"
     """Topic of the Warp modules that have the kernels of the density."""
     density_power = 2
-    """The pressure force of a pair has p_i over this power of its number density n_i."""
+    """The k in p_i / n_i^k, the factor in the pressure force of a pair, with the number density n_i."""
     shares: tuple[str, ...] = ()
-    """Parameters of its own to whose adjoints every particle adds a share, as those of a `Force`."""
+    """The solver's own parameters to whose adjoints every particle adds a share; see `Force.shares`."""
 
     def __init__(self, system: ParticleSystem, requires_grad: bool = False):
         discretisation, search, layout = system.discretisation, system.search, system.layout
@@ -89,7 +90,7 @@ class ParticleSolver(Staying):
         self.layout, self.device, self.forces = layout, device, tuple(system.forces)
         self.launch = KernelLauncher(particles, device, record_tape=requires_grad)
         self.turn = Turn(device)
-        """Whose arrays these are now."""
+        """The present user of these arrays."""
         self.density, self.integration = self.new_density(), integration_kernels(precision, requires_grad)
         self.parts = (
             *(maker.part(layout, requires_grad) for maker in system.parts),
@@ -111,7 +112,7 @@ class ParticleSolver(Staying):
         if layout.phases == 1:
             self.fractions.fill_(1.0)
         self.accelerations = [self.vectors() for _ in range(len(self.forces) + 1)]
-        """``accelerations[t]``: of the first t forces; the first is 0 and never written."""
+        """``accelerations[t]`` is the sum over the first t forces; ``accelerations[0]`` is 0 and never written."""
         self.loops: tuple[Loop, ...] = ()
         """The loops of a step, in the order in which they run."""
         self.step_number = wp.zeros(layout.members, dtype=wp.int32, device=device)
@@ -119,7 +120,7 @@ class ParticleSolver(Staying):
         self._neighbourhood: Any = None
         self._context: StepContext | None = None
         self.generation = 0
-        """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
+        """Counts how often arrays, or the launches of a step, were replaced; graphs captured before that are stale."""
         self.resize(search.capacity)
 
     def new_density(self) -> Density:
@@ -127,17 +128,18 @@ class ParticleSolver(Staying):
         return Density(self.discretisation, self.topic)
 
     def wall_push(self) -> WallAction:
-        """Return the sums over walls, along which a particle's V^2 p_i / n_i^`density_power` pushes them."""
+        """Return the sums over walls that, multiplied by a particle's V^2 p_i / n_i^`density_power`, are its force on
+        walls."""
         return WallSums(wall_slope_term(self.discretisation), self.layout)
 
     def image_loads(self) -> Any:
-        """Return what walls that mirror get beside `wall_push`: `cortado.solvers.projection.mean_stress.ImageLoads`;
-        None where none does."""
+        """Return the additional forces on mirroring walls, `cortado.solvers.projection.mean_stress.ImageLoads`; None if
+        no wall mirrors."""
         return None
 
     def kick_of(self, carried: Carried) -> wp.array | None:
-        """Return what pressure added to velocities in the step before, or its tangent or adjoint, of what a step
-        carries; None where it is not carried."""
+        """Return, from the ``carried`` fields, the velocity change by pressure in the previous step, or its tangent or
+        adjoint; None if no such field exists."""
         return None
 
     def vectors(self) -> wp.array:
@@ -217,7 +219,8 @@ class ParticleSolver(Staying):
         return self._context
 
     def sort(self, state: State, parameters: Parameters) -> StepContext:
-        """Begin a step, which reads all of a state: sort particles, list neighbours, measure density, begin parts."""
+        """Begin a step: sort particles, list neighbours, compute the density and begin the parts. Nothing later in the
+        step reads the state."""
         context = self.context(parameters)
         for part in self.parts:
             part.begin(context, state)
@@ -244,8 +247,8 @@ class ParticleSolver(Staying):
         return self.accelerations[-1]
 
     def unsort(self, context: StepContext, x: wp.array, v: wp.array, new_state: State, **carried: wp.array) -> None:
-        """Write the new state from sorted positions and velocities, but for what parts prescribe, and from the
-        ``carried`` arrays, one for each of `carried_fields`."""
+        """Write the new state from sorted positions and velocities and from the ``carried`` arrays, one for each of
+        `carried_fields`; parts then write the values that they prescribe."""
         free, ends = new_state, []
         for part in reversed(self.parts):
             ends.append((part, free))
@@ -256,8 +259,8 @@ class ParticleSolver(Staying):
             part.end(context, new_state, moved)
 
     def end_step(self, x: wp.array, v: wp.array, new_state: State, log: IterationLog) -> None:
-        """Look for lost particles, given sorted positions and velocities after the step without what a nozzle leads;
-        record the loops, and count the step."""
+        """Look for lost particles, record the loops, and count the step. Sorted positions and velocities are those
+        after the step before a nozzle prescribes any."""
         f, containment = self.fields, self.containment
         containment.look(self.search.order, f["x"], f["rho_0"], x, v, new_state)
         for solve in log.solves:
@@ -274,7 +277,7 @@ class ParticleSolver(Staying):
             )
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
-        """Return densities (n,) of a state in the scene's order, of a batch one scene behind the other [kg / m3].
+        """Return densities (n,) of a state in the scene's order [kg / m3]; in a batch the scenes are concatenated.
         Solids are where they are at the end of a ``step``, counted from 0. The solver's arrays are overwritten."""
         self.reset(step)
         self.sort(state, parameters)
@@ -283,8 +286,8 @@ class ParticleSolver(Staying):
         return self.in_scene_order(self.fields["m"].numpy() * self.fields["n"].numpy())
 
     def pressures(self) -> wp.array | None:
-        """Return the pressures (n,) with which sorted particles push walls in the last `step` [Pa], unless one was
-        replayed since; None of a solver or a scene without pressures."""
+        """Return the pressures (n,) with which sorted particles push walls in the last step [Pa], which must not be a
+        replayed one; None for a solver or a scene without pressures."""
         return None
 
     def stresses(self) -> wp.array | None:
@@ -292,7 +295,7 @@ class ParticleSolver(Staying):
         return self.pressures()
 
     def in_scene_order(self, values: NDArray) -> NDArray:
-        """Return (n,) numbers of sorted particles in the scene's order, of a batch one scene behind the other."""
+        """Return (n,) numbers of sorted particles in the scene's order; in a batch the scenes are concatenated."""
         found = np.empty(self.layout.all_particles)
         found[self.search.order.numpy()[: len(found)]] = values
         return found
@@ -317,7 +320,7 @@ class ParticleSolver(Staying):
 
 
 def _neighbourhood(system: ParticleSystem) -> Any:
-    """Make the struct by which kernels read a particle's neighbours, with the present arrays of the search."""
+    """Make the struct from which kernels read a particle's neighbours, with the present arrays of the search."""
     search, lattice, periods, precision = system.search, system.lattice, system.periods, system.discretisation.precision
     s = neighbourhood_type(precision)()
     s.particles = system.layout.particles

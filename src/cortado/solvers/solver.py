@@ -1,7 +1,7 @@
-"""What a solver is: an algorithm that takes steps, and can take one again, along tangents, and back.
+"""The protocol of a solver, an algorithm that takes steps, replays a step, and computes its tangent and its adjoint.
 
-Rollouts, gradients and the certificate know a solver by this protocol, and so do files and reports of runs.
-`cortado.solvers.particles` has what solvers of particles share; `cortado.solvers.pcisph` is one.
+Rollouts, gradients, the certificate, files and reports of runs use a solver only through this protocol.
+`cortado.solvers.particles` is the common base of solvers of particles; `cortado.solvers.pcisph` is one of them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,24 +19,24 @@ from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext, Tangents
 
 Counts = tuple[int, ...]
-"""Numbers of rounds of each loop of a step, with which the step can be taken again, bit for bit."""
+"""Numbers of iterations of each loop of a step; with them the step can be replayed bit for bit."""
 
 
 class StepLog(Protocol):
-    """The notes of a solver on each step of a run, on the device until they are read."""
+    """A solver's diagnostics of each step of a run, on the device until they are read."""
 
     @property
     def diagnostics(self) -> Mapping[str, NDArray]:
         """Return diagnostics (steps,) by name, in a batch (steps, batch), of the steps that were read. Every solver has
-        ``converged``; PCISPH also ``iterations``, ``density_errors``, the average of the compressions (rho* - rho_0)+ /
-        rho_0, and ``greatest_density_errors``. The projection has ``divergence`` too. Reports draw ``density_errors``,
-        and whole numbers as the iterations of loops."""
+        ``converged``. PCISPH also has ``iterations``, ``density_errors``, the average of the compressions (rho* -
+        rho_0)+ / rho_0, and ``greatest_density_errors``; the projection also has ``divergence``. Reports plot
+        ``density_errors``, and take whole numbers for iterations of loops."""
 
     def read(self, steps: int) -> None:
-        """Read the notes of the first ``steps`` steps from the device."""
+        """Read the diagnostics of the first ``steps`` steps from the device."""
 
     def assign(self, other: Self) -> None:
-        """Hold the notes that another log of the same solver and length has read."""
+        """Copy the diagnostics that another log of the same solver and length has read."""
 
     def seek(self, step: int) -> Counts:
         """Return the numbers of iterations that a step of the run took, and prepare the solver's loops to repeat it;
@@ -69,8 +69,8 @@ class PressureTangent(StepTangent, Protocol):
     dot: Tangents
 
     def pressures(self, rounds: Sequence[int]) -> NDArray:
-        """Return tangents (n,) of the pressures of the last step, of sorted particles, with which they push walls;
-        ``rounds`` has the rounds of its first loop in each scene."""
+        """Return tangents (n,) of the pressures with which sorted particles push walls in the last step; ``rounds`` is
+        the number of iterations of the step's first loop in each scene."""
 
     def stresses(self, rounds: Sequence[int]) -> NDArray:
         """Return tangents (n,) of the pressures that a gauge would read, of sorted particles."""
@@ -85,7 +85,7 @@ class WithinBar:
     p: wp.array
     """Adjoint (n,) of the pressures with which particles push walls."""
     stress: wp.array | None
-    """Adjoint (n,) of the pressures that a gauge would read; None where there is none."""
+    """Adjoint (n,) of the pressures that a gauge would read; None if there is no such adjoint."""
     v_star: wp.array
     """Adjoint (n,) of the velocities v* = v + dt a by explicit forces; their dependence on dt is counted elsewhere."""
 
@@ -94,14 +94,14 @@ class PressureAdjoint(StepAdjoint, Protocol):
     """The adjoint of a solver with pressures, through which quantities and sensors can be differentiated."""
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
-        """Write to ``state_bar`` the adjoint of the replayed step's state, for adjoints ``within`` the step and none of
-        its result."""
+        """Write to ``state_bar`` the adjoint of the replayed step's state, given adjoints ``within`` the step; the
+        adjoint of the step's result is 0."""
 
 
 class Solver(Protocol):
-    """The solver of a scene, or of a batch of scenes, on one device, which rollouts share. Of its methods `make_room`
-    and `reset` alone wait for the device and read from it. `tangent`, `adjoint` and `differentiable`
-    raise `InputError`, one sentence, where a solver has no such derivative.
+    """The solver of a scene, or of a batch of scenes, on one device; rollouts share it. Only the methods `make_room`
+    and `reset` wait for the device and read from it. If a solver lacks a derivative, `tangent`, `adjoint` and
+    `differentiable` raise `InputError` with one sentence.
     """
 
     discretisation: Discretisation
@@ -111,9 +111,10 @@ class Solver(Protocol):
     turn: Turn
     containment: Containment
     step_number: wp.array
-    """The number (members,) of the step to take, which `step` counts; it is equal in all scenes of a batch."""
+    """The number (members,) of the next step, which `step` increments; it is equal in all scenes of a batch."""
     generation: int
-    """How often arrays, or the work of a step, were replaced; graphs captured before are stale."""
+    """Counts how often arrays, or the launches of a step, were replaced; graphs captured before the last replacement
+    are stale."""
 
     def new_state(self, requires_grad: bool = False) -> State:
         """Make a state of this solver's particles, all 0."""
@@ -131,10 +132,11 @@ class Solver(Protocol):
         """Prepare to take a step; forget the counts and flags from that step on, also of an interrupted run."""
 
     def make_room(self) -> bool:
-        """Lengthen lists of neighbours that were too short, and return True if so: what used them must be repeated."""
+        """Lengthen lists of neighbours that were too short; return True if any were: the steps that used them must be
+        repeated."""
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: Any) -> None:
-        """Take one step, and note it in a log of `new_log`; the two states may be one object."""
+        """Take one step, and record it in a log of `new_log`; the two states may be one object."""
 
     def reserve(self, counts: Counts) -> None:
         """Make room for all intermediate values of a step."""
@@ -158,10 +160,11 @@ class Solver(Protocol):
         """Return a copy of this solver with arrays that Warp's tape can differentiate."""
 
     def match(self, other: Self) -> None:
-        """Take over the room and the substeps of another solver, which is equal but for its arrays."""
+        """Copy the capacities and the number of substeps of another solver, which differs only in its arrays."""
 
     def follow(self, other: Self) -> None:
-        """Prepare to replay the step that another solver, equal but for its arrays, is ready to replay."""
+        """Prepare to replay the step that another solver is ready to replay; the solvers differ only in their
+        arrays."""
 
     def gradient_memory(self, log: Any) -> Mapping[str, float]:
-        """Return the memory [bytes] that going back through the steps of a log takes, by purpose."""
+        """Return the memory [bytes] that reverse mode through the steps of a log needs, by purpose."""

@@ -1,1 +1,1 @@
-"""The velocity projection: it pulls as well as it pushes, and keeps particles even."""
+"""The velocity projection: its pressures push and pull, and it keeps particles evenly spaced."""

@@ -13,11 +13,11 @@ from cortado.scene.discrete_scene import DiscreteScene
 from cortado.scene.scene import Scene
 
 MARGIN = 1.05
-"""By how much the relaxation stays below that of the lattice's stiffest wave."""
+"""Factor by which the relaxation is below the one that suits the lattice's stiffest wave."""
 SMOOTHED = 1.0 / 3.0
-"""Part of the stiffest wave's stiffness above which waves of the density are repaired evenly."""
+"""Density waves with more than this part of the stiffest wave's stiffness are repaired about equally fast."""
 DEPARTURE = 0.05
-"""Part of a_0 that is added to the diagonal: particles with few neighbours have a small one."""
+"""Part of a_0 that is added to the diagonal, which is small for particles with few neighbours."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class ProjectionConstants:
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "ProjectionConstants":
         """Compute the constants on a lattice with a spacing [m], for a support radius [m].
 
-        lambda = max_q |sum_j g_j sin(q . x_j)|^2 / a_0 is how many times too far one undamped Jacobi iteration goes in
-        the stiffest pressure wave exp(i q . x) of the lattice.
+        lambda = max_q |sum_j g_j sin(q . x_j)|^2 / a_0 is the factor by which an undamped Jacobi iteration overshoots
+        for the stiffest pressure wave exp(i q . x) of the lattice.
         """
         offsets = lattice_offsets(spacing, support, dimension)
         volume = rest_volume(kernel, spacing, support, dimension)
@@ -50,9 +50,9 @@ class ProjectionConstants:
         return cls(spacing, 1.0 / (MARGIN * stiffest), DEPARTURE * square, nearest)
 
     def repair_relaxations(self, repairs: int) -> list[float]:
-        """Return omega of each repair of the density, by Chebyshev's roots (Golub and Varga 1961). Of the errors of all
-        waves between `SMOOTHED` and 1 of the stiffest, these leave the least part that Jacobi iterations can. The
-        longest comes first, as the last ones smooth what it stirs up."""
+        """Return omega of each repair of the density, by Chebyshev's roots (Golub and Varga 1961). For waves with
+        stiffness between `SMOOTHED` and 1 times the greatest, these Jacobi iterations leave the least possible part of
+        the error. The greatest omega comes first, because later repairs smooth the waves that it excites."""
         middle, half = 0.5 * (1.0 + SMOOTHED), 0.5 * (1.0 - SMOOTHED)
         roots = np.cos(np.pi * (np.arange(repairs) + 0.5) / repairs)
         return [self.relaxation / float(middle - half * root) for root in roots]
@@ -65,20 +65,21 @@ def lattice_constants(scene: Scene, discrete: DiscreteScene) -> ProjectionConsta
 
 
 SPACING = 2.0
-"""Distance of the coarse grid's nodes, in spacings of particles."""
+"""Distance between nodes of the coarse grid, in spacings of particles."""
 
 
 def endless(discrete: DiscreteScene) -> bool:
-    """Return True if all axes are periodic: nothing sets such a scene's level of pressure for a coarse correction."""
+    """Return True if all axes are periodic: then the level of pressure in a coarse correction is undetermined."""
     return bool((np.asarray(discrete.periods) > 0.0).all())
 
 
 def coarse_grid(scene: Scene, discrete: DiscreteScene, particles: int) -> Grid:
-    """Make the grid of the coarse correction about everything that particles can reach; beyond, it wraps around. Along
-    each axis there are 4 to 7 times a power of two, so that coarser grids have half as many.
+    """Make the grid of the coarse correction around the region that particles can reach; beyond, the grid is periodic.
+    The number of nodes along each axis is 4 to 7 times a power of two, so that each coarser grid has half as many.
 
-    Nodes lie on the lower walls of a container, and the first row of particles half a spacing above them. If one row
-    had the cells beside a wall for itself, some combinations of nodes would push nothing, and solves would take long.
+    Nodes lie on the lower walls of a container, and the first row of particles half a spacing above them. If the cells
+    beside a wall contained a single row of particles, some combinations of nodes would push no particle, and solves
+    would be slow.
     """
     reach, most = SPACING * scene.discretisation.spacing, max(4 * particles, 512)
     grid = Grid.around(discrete.near.lower, discrete.near.upper, discrete.periods, reach, most)

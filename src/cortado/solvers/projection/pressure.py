@@ -5,30 +5,30 @@ With k = dt p, the divergence D, in which walls that move have velocities v_b, a
     (D v)_i = L_i : A_i + gamma_i . v_i - sum_b gamma_ib . v_b,   A_i = sum_j v_ij g_ij^T,
     (D^T k)_i = sum_j (k_i L_i + k_j L_j) g_ij + k_i gamma_i,
 
-and what images add to both (`cortado.solvers.projection.effects`),
+both with terms by images (`cortado.solvers.projection.effects`),
 
 an iteration from y, an extrapolation of k (Nesterov 1983), is
 
     v = v* - D^T y / m,   z+ = y + omega (D v - b) / a,   z- = y + omega D v / a,
     k' = z+ if z+ > 0;  sigma z- if z- < 0;  else 0,   y' = k' + beta (k' - k).
 
-b = (1 - f) max(1 - n, 0) / dt lets fluid that is scattered come together before it resists. The first k and v are told
-below. Tension is let through by sigma, where particles are surrounded. Slopes of the clamp and of the maximum have
-corners, at which one of the two derivatives is taken. The result is v* - D^T k / m.
+b = (1 - f) max(1 - n, 0) / dt lets scattered fluid come together before it resists. The first k and v are defined
+below. sigma, which is near 1 for surrounded particles, admits tension. At the corners of the clamp and of the maximum
+one of the two derivatives is used. The result is v* - D^T k / m.
 
-A step begins with the pressure of the step before: k is f times as large as it was, and v is v* + f w, with
-the kick w = -D^T k / m that it gave.
+A step begins with the pressure of the previous step: the first k is f times the last k, and the first v is v* + f w,
+with the previous step's kick w = -D^T k / m.
 
-Not so for a particle that its kick would take towards a wall, gamma . w > 0, by more than a tenth of a spacing in the
-step. Between walls that are nearer to one another than a spacing it has come from one to the other. What held it off
-the first would throw it at the second, harder in each step. Such a particle begins with v* and without a pressure; of
-that choice there is no derivative.
+The exception is a particle that this kick would move towards a wall, gamma . w > 0, by more than a tenth of a spacing
+in the step. Between walls less than a spacing apart such a particle has come from one wall to the other. The pressure
+that repelled it from the first wall would throw it at the second, harder in each step. So it begins with v* and no
+pressure; this choice has no derivative.
 
-In a shut scene, where every particle has a share c of the coarse pressure, tension is let through beside walls too,
-sigma = 1: fluid that fills a container cannot leave its walls. Of that choice there is no derivative either.
+A scene is shut if every particle has a share c of the coarse pressure. Then tension is admitted beside walls too, sigma
+= 1, because fluid that fills a container cannot leave the walls. This choice has no derivative either.
 
-A scene is warm in which a particle begins with a pressure. In a cold one, as in the first step of a run, the coarse
-correction comes before the first iteration too (`cortado.solvers.projection.steps`).
+A scene is warm if any particle begins with a pressure, and otherwise cold, as in the first step of a run. In a cold
+scene a coarse correction also precedes the first iteration (`cortado.solvers.projection.steps`).
 """
 
 from collections.abc import Callable
@@ -59,7 +59,7 @@ class ClampFunctions:
     wanted_tangent: Any
     """The tangent of b, given n, f, dt and their tangents."""
     parts: Any
-    """The parts of the slopes of z+ and sigma z- that k' has."""
+    """The weights of the slopes of z+ and sigma z- in the slope of k'."""
 
 
 @cache
@@ -81,9 +81,9 @@ def clamp_functions(precision: Precision) -> ClampFunctions:
 
     @wp.func
     def parts(up: real, down: real):
-        """Return the parts of the slopes of z+ and of sigma z- that k' has: all of one, or at a corner the mean of both
-        sides. Fluid that moves as a whole is on the corner z+ = z- = 0 everywhere. Inside sigma is 1, and there is no
-        true corner."""
+        """Return the weights of the slopes of z+ and of sigma z- in the slope of k': 1 and 0, or at a corner the mean
+        of both sides. Fluid in rigid motion is on the corner z+ = z- = 0 everywhere; inside sigma is 1, and the slopes
+        are equal."""
         rise, fall = real(0.0), real(0.0)
         if up > real(0.0):
             rise = real(1.0)
@@ -104,9 +104,10 @@ class PressureKernels:
     """The kernels of one iteration of the projection's pressure."""
 
     update: Kernels
-    """k' and y'; their adjoint is three kernels: of the clamp, and of D without and with another adjoint of A."""
+    """k' and y'. Their adjoint is three kernels: one of the clamp, and two of D, without and with a further adjoint of
+    A."""
     whole_adjoint: wp.Kernel
-    """Adds to the adjoint of A the part by that of D."""
+    """Adds to the adjoint of A the part that comes from the adjoint of D."""
 
 
 @cache
@@ -144,7 +145,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     def update(
         s, omega: real, beta: real, time_step, x, n, of: shared, at, k_out, y_out, T, error: wp.array(dtype=pair_of)
     ):
-        """Take a pressure iteration. ``error``: the square of the unwanted divergence times the time step, weighted
+        """Do a pressure iteration. ``error`` is a pair: the squared unwanted divergence times the time step, weighted
         with c, and c, which is 1 inside and beside walls and 0 at free surfaces. A and the divergence are written to
         ``at``; T is y' L."""
         i = s.first + wp.tid() // LANES
@@ -240,7 +241,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         return d_bar_i * L_i
 
     def divergence_adjoint_of(name: str, back: Any, kind: Any, times: Callable[..., Any]) -> wp.Kernel:
-        """Make the kernel from the adjoint of D, and of A for a whole matrix S, to that of u."""
+        """Make the kernel that turns the adjoint of D, and for a full matrix S also the adjoint of A, into that of
+        u."""
 
         @typed.arrays
         def divergence_adjoint(s, x, g, of, u, A, d_bar, S: wp.array(dtype=kind), bar, u_bar):
@@ -272,8 +274,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
 
 
 TOWARDS = 0.1
-"""In spacings: how far the kick of the step before may take a particle towards a wall in a step. In dams, jets, a beach
-and a fountain it took none further than that, but particles that wait in a nozzle."""
+"""In spacings: how far the kick of the previous step may move a particle towards a wall in a step. In dams, jets, a
+beach and a fountain no kick exceeded this, except for particles that wait in a nozzle."""
 
 
 @cache
@@ -288,7 +290,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     def start(
         spacing, time_step, k_before_i, kick_before_i, weights_i, beside_i, surfaced, v_star_i
     ) -> tuple[weights4, real, real, vector]:
-        """Return the weights, k, y and u of a particle, without what it had if its kick would take it towards a
+        """Return the weights, k, y and u of a particle; k, y and the kick are 0 if the kick would move it towards a
         wall."""
         full, tension = weights_i[1], weights_i[0]
         if wp.dot(kick_before_i, beside_i) > real(0.0) and time_step * wp.length(kick_before_i) > towards * spacing:

@@ -1,17 +1,17 @@
-"""Density is repaired in positions alone, by Jacobi iterations from x', the positions after the shift:
+"""Repairs of the density change positions only. They are Jacobi iterations from x', the positions after the shift:
 
     lambda' = z if z > 0, else r z,   z = lambda + omega_k (n(x_k) - 1) / a,
     d = -(sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m,   x_k+1 = x' + d min(1, s / 6 |d|),
 
 with images in n and d (`cortado.solvers.projection.effects`).
 
-No repair takes a particle further than a sixth of a spacing s. Where walls leave no room, or where they press on the
-particles within, densities cannot be right, and a particle would be thrown through a wall.
+The repairs of a step move a particle by at most a sixth of a spacing s. If walls leave no room, or press on the
+particles between them, densities cannot be right, and unbounded repairs would throw a particle through a wall.
 
-Each iteration has its own omega_k (`cortado.solvers.projection.lattice`). Velocities stay as they are: in them a repair
-would be a force that acts once more in the next step. The factor r of `cortado.solvers.projection.effects` lets low
-densities be repaired in the interior alone. Both g and a belong to the start of the step; n belongs to the positions,
-over the neighbours of the start.
+Each iteration has its own omega_k (`cortado.solvers.projection.lattice`). Velocities are not changed: otherwise a
+repair would act once more in the next step. The factor r of `cortado.solvers.projection.effects` restricts repairs of
+low densities to the interior. g and a are those at the start of the step; n is that of the positions x_k, over the
+neighbours at the start.
 """
 
 from dataclasses import dataclass
@@ -33,8 +33,8 @@ from cortado.solvers.projection.wall_sums import weights_type
 from cortado.sph.density import density_sums
 
 FARTHEST = 1.0 / 6.0
-"""In spacings: how far the repairs of a step take a particle at most. In dams, with an obstacle, on a beach and with a
-cube that falls they went 0.155 at most."""
+"""In spacings: the greatest displacement of a particle by the repairs of a step. In dams, with an obstacle, on a beach
+and with a falling cube repairs moved particles by at most 0.155."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     def move(
         pushed: vector, lifted: vector, spacing: real, m_i: real, gamma_i: vector, c_i: real, x_moved_i: vector
     ) -> tuple[real, vector]:
-        """Move a particle by the repair's lambda', by a limited distance; ``held`` is the part of the full way."""
+        """Move a particle by the repair's lambda', within the bound; ``held`` is the part of the full displacement."""
         back = (pushed + lifted + c_i * gamma_i) / m_i
         most, length, part = farthest * spacing, wp.length(back), real(1.0)
         if length > most:
@@ -155,7 +155,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     def begin_adjoint(
         m_i: real, x_now_i: vector, x_moved_i: vector, held_i: real, x_now_bar_i: vector
     ) -> tuple[real, vector, vector]:
-        """Apply the adjoint of a particle's own part in x_k+1; f is the adjoint of the sum over neighbours."""
+        """Apply the adjoint of the particle's own terms in x_k+1; f is the adjoint of the sum over neighbours."""
         back = (x_moved_i - x_now_i) / held_i
         bar = along(x_now_bar_i, back, held_i)
         return wp.dot(bar, back) / m_i, x_now_bar_i, -bar / m_i

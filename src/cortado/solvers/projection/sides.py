@@ -1,17 +1,16 @@
-"""Particles stay on their side of a sheet: the positions at the end of a step are moved back where they would not.
+"""Particles stay on their side of a sheet: a position at the end of a step on the other side is moved back.
 
-About the middle of a sheet, in its frame, a particle is at y_0 before the step and at y after it, with the sheet in its
-pose after the step. Where the way from y_0 to y goes through a face of the sheet, with the normal n and the height
-h = n . (y - a) above it, or ends above the face but nearer than e = s / 20, the particle is put on the side of y_0:
+In the frame of a sheet, about its middle, a particle is at y_0 before the step and at y after the step. A face of the
+sheet has the normal n, and h = n . (y - a) is the particle's height above it. If the path from y_0 to y crosses the
+face, or ends nearer to it than e = s / 20, the particle is put back on the side of y_0:
 
     y' = y + (e sign h_0 - h) n.
 
-This is done up to three times, with the face that is met first each time. Where the way still goes through the sheet,
-as in a sharp corner, the particle stays beside the sheet where it was, y' = y_0. Velocities stay as they are.
+This is done up to three times, each time with the face that the path meets first. If the path still crosses the sheet,
+as in a sharp corner, the particle keeps its place relative to the sheet, y' = y_0. Velocities are not changed.
 
-Where a pose changes by c', w' and g' (`MovingWalls`), a point x of the solid does by t(x) = c' + w' x (x - c) +
-g' (x - c).
-With N = R n, what remains of a change D = x' - t(x) is D - N (N . D + e sign h_0 g'), to which t is added again.
+If a pose changes by c', w' and g' (`MovingWalls`), a point x of the solid moves by t(x) = c' + w' x (x - c) + g' (x -
+c). With N = R n, a relative change D = x' - t(x) becomes D - N (N . D + e sign h_0 g'), and then t is added again.
 """
 
 from functools import cache
@@ -31,11 +30,11 @@ from cortado.particles.wall_terms import share_kinds
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 NEAREST = 0.05
-"""In spacings: e, how near to a sheet a particle may be at the end of a step."""
+"""In spacings: e, the least distance of a particle from a sheet at the end of a step."""
 ROUNDS = 3
-"""How often a particle is put on its side at most."""
+"""Greatest number of times that a particle is put back in a step."""
 NONE = -1
-"""In place of a face."""
+"""Value in place of a face's number."""
 
 
 @cache
@@ -51,7 +50,7 @@ def side_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def way_of(x: vector, x_now: vector, k: int, member: int, s: neighbourhood, sheets: sheets_of):
-        """Return where a particle begins a step and where it ends it, as the sheet has both."""
+        """Return the places of a particle at the start and at the end of a step in the frame of the sheet."""
         start = seen_from(x, s.before, s.turns_before, k, member, s, sheets)
         return start, seen_from(x_now, s.after, s.turns, k, member, s, sheets)
 
@@ -69,7 +68,8 @@ def side_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def time_of(start: vector, y: vector, face: int, least: real, sheets: sheets_of) -> real:
-        """Return which part of its way a particle has gone where it meets a face; 1 if it ends too near, or 2."""
+        """Return the part of the path at which a particle meets a face; 1 if it only ends too near the face, otherwise
+        2."""
         n, a = sheets.faces.normals[face], sheets.faces.places[face, 0]
         side = side_of(start, face, sheets)
         h_0, h = side * wp.dot(n, start - a), side * wp.dot(n, y - a)
@@ -128,7 +128,7 @@ def side_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def twist(x: vector, middles: poses, moved: poses, turned: poses, k: int, member: int, s: neighbourhood) -> vector:
-        """Return t(x) of a solid with a middle that changes by ``moved`` and a turn that does by ``turned``."""
+        """Return t(x) of a solid whose middle changes by ``moved`` and whose rotation changes by ``turned``."""
         arm = x - middles[member, k]
         grown = s.scales_dot[member, k] / s.scales[member, k]
         return moved[member, k] + wp.cross(turned[member, k], arm) + grown * arm
@@ -202,8 +202,8 @@ def side_kernels(precision: Precision) -> Kernels:
 
 
 class Sides:
-    """Keeps the particles of a solver on their sides of all sheets: of one after the other, and where there are several
-    of each once more."""
+    """Keeps the particles of a solver on their sides of all sheets, one sheet after the other; with several sheets each
+    is treated a second time."""
 
     def __init__(self, sheets: Sheets, spacing: float, layout: Layout):
         """Prepare for particles a ``spacing`` [m] apart."""
@@ -216,15 +216,14 @@ class Sides:
         """Shares of a sheet that does not move."""
 
     def keep(self, step: StepContext, x_now: wp.array) -> wp.array:
-        """Return the positions (n,) of sorted particles at the end of a step, given what they would be without
-        sheets."""
+        """Return the positions (n,) of sorted particles at the end of a step, given the positions without sheets."""
         for k, x_kept in zip(self._passes, self._kept, strict=True):
             step.launch(self._kernels.forward, self._known, k=k, x_now=x_now, x_kept=x_kept)
             x_now = x_kept
         return x_now
 
     def tangent(self, step: StepContext, dot: Tangents, x_now: wp.array, x_now_dot: wp.array) -> None:
-        """Replace the tangent of positions without sheets by that of the positions that are kept."""
+        """Replace the tangent of the positions without sheets by the tangent of the returned positions of `keep`."""
         self.keep(step, x_now)
         for k, x_kept in zip(self._passes, self._kept, strict=True):
             own = {"x_now": x_now, "x_kept": x_kept, "x_now_dot": x_now_dot}
@@ -232,8 +231,8 @@ class Sides:
             x_now = x_kept
 
     def adjoint(self, step: StepContext, bar: Adjoints, x_now: wp.array, x_now_bar: wp.array) -> None:
-        """Replace the adjoint of the positions that are kept by that of positions without sheets. It adds to those of
-        positions at the start of the step and of solids."""
+        """Replace the adjoint of the returned positions of `keep` by that of the positions without sheets. Add to the
+        adjoints of solids and of positions at the start of the step."""
         self.keep(step, x_now)
         given = [x_now, *self._kept]
         for k, before, x_kept in reversed([*zip(self._passes, given, self._kept, strict=False)]):

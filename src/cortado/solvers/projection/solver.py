@@ -1,5 +1,5 @@
-"""The velocity projection as the solver of a scene: its steps, the tangent of a replayed step, and its transpose, the
-adjoint; every sum is a gather.
+"""The velocity projection as the solver of a scene: steps, the tangent of a replayed step, and the adjoint, which is
+the tangent's transpose. Every sum is a gather.
 """
 
 from collections.abc import Sequence
@@ -97,14 +97,14 @@ class ProjectionTangent(ParticleTangent):
         return self._over_time(solver.mean_stress.impulses(context, solver.around, at), change)
 
     def _over_time(self, impulses: wp.array, change: NDArray) -> NDArray:
-        """Return the tangent of impulses over the time step, given the impulses' tangent."""
+        """Return the tangent of impulses divided by the time step, given the tangent of the impulses."""
         particles = self._solver.layout.particles
         dt, dt_dot = (of.parameters["time_step"].numpy().repeat(particles) for of in (self._solver, self.dot))
         found: NDArray = change / dt - impulses.numpy() * dt_dot / dt**2
         return found
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
-        """Take the tangents of the first pressure impulse k and of the iterations."""
+        """Compute the tangents of the first pressure impulse k and of the iterations."""
         solver, kernels = self._solver, self._solver.kernels.pressure
         beginning = solver.kernels.beginning
         before = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
@@ -125,7 +125,7 @@ class ProjectionTangent(ParticleTangent):
             self._bodies.settle(context, self.dot, solver.iterates[iterations]["y"], self._y_dot)
 
     def _correct(self, context: StepContext, known: tuple[Named, ...], k: int, change: dict[str, wp.array]) -> None:
-        """Take the tangent of the coarse correction before iteration k."""
+        """Compute the tangent of the coarse correction before iteration k."""
         before = {**self._solver.iterates[k], **change}
         drift = self._drift(context, before)
         self._coarse.correct(context, k, (drift, *known), before, self._solver.corrected[k])
@@ -138,7 +138,7 @@ class ProjectionTangent(ParticleTangent):
         return {"drift_dot": self._bodies.drifted(context, self.dot, drift_dot, at["y"], self._y_dot)}
 
     def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array]) -> None:
-        """Write the tangent of the velocities that the pressure y of an iterate leaves."""
+        """Write the tangent of the velocities u = v* - D^T y / m by the pressure y of an iterate."""
         solver, kernels = self._solver, self._solver.kernels.velocity
         pull = {**self._pull, "y": at["y"], "y_dot": self._y_dot}
         context.launch(kernels.pull_tangent, *known, pull)
@@ -191,7 +191,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._go_back(counts, state_bar, parameters, within)
 
     def _begin(self, state_bar: State, parameters: Parameters) -> None:
-        """Go back from the adjoint of a step's result to those of the last positions, velocities and k."""
+        """Turn the adjoint of a step's result into the adjoints of the last positions, velocities and k."""
         solver, context = self._solver, self._solver.context(parameters)
         free_bar = self.unsort(context, state_bar)
         scene = {
@@ -213,7 +213,7 @@ class ProjectionAdjoint(ParticleAdjoint):
     def _go_back(
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
-        """Go back from the adjoints that `_begin` wrote to that of the state, through the step in reverse: velocities
+        """Turn the adjoints that `_begin` wrote into the adjoint of the state, through the step in reverse: velocities
         that follow, repairs, shift, iterations, first k, prediction with all forces, sorting."""
         solver, kernels, context = self._solver, self._solver.kernels, self._solver.context(parameters)
         known = (*self.bar.named, self._around, solver.around)
@@ -246,7 +246,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         self.sort(context, state_bar, **{IMPULSE: self._k_before_bar, KICK: self._kick_before_bar})
 
     def _mend(self, context: StepContext, known: tuple[Named, ...], repairs: int) -> None:
-        """Apply the adjoint of the density repairs, to the adjoint of the positions before them."""
+        """Apply the adjoint of the density repairs; the result is the adjoint of the positions before the repairs."""
         solver, kernels = self._solver, self._solver.kernels.repair
         begin, move = kernels.move.adjoint
         for k in reversed(range(repairs)):
@@ -266,7 +266,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         add(self._x_now_bar, self._x_moved_bar)
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
-        """Apply the adjoint of the pressure iterations, to those of v*, of the first k and of the first u."""
+        """Apply the adjoint of the pressure iterations; the results are the adjoints of v*, of the first k and of the
+        first u."""
         solver = self._solver
         if self._bodies is not None:
             self._bodies.settle(context, self.bar, solver.iterates[iterations]["y"], self._y_bar)
@@ -289,7 +290,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         add(self._f, self._u_bar)
 
     def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array]) -> None:
-        """Apply the adjoint of the velocities that the pressure y leaves, to those of v* and of y."""
+        """Apply the adjoint of u = v* - D^T y / m; the results are the adjoints of v* and of y."""
         solver, velocity = self._solver, self._solver.kernels.velocity
         found = {"u": at["u"], "u_bar": self._u_bar, "kick_bar": self._kick_bar, "v_star": solver.v_star}
         steps = {"f": self._f, "T": self._pull, "y": at["y"]}
@@ -300,8 +301,8 @@ class ProjectionAdjoint(ParticleAdjoint):
     def _back(
         self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], beta: float, moves: bool
     ) -> None:
-        """Apply the adjoint of one pressure iteration, from those of k' and y' to those of k, y and u. With ``moves``
-        its A has an adjoint of its own, as it moves particles."""
+        """Apply the adjoint of one pressure iteration: from the adjoints of k' and y' to those of k, y and u. With
+        ``moves`` A has an adjoint too, because the iteration's A moves particles."""
         solver, pressure = self._solver, self._solver.kernels.pressure
         clamp, divergence, whole = pressure.update.adjoint
         steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar, "S": self._push}
@@ -315,7 +316,8 @@ class ProjectionAdjoint(ParticleAdjoint):
     def _diverge(
         self, context: StepContext, known: tuple[Named, ...], kernel: wp.Kernel, at: dict[str, wp.array], steps: Named
     ) -> None:
-        """Turn the adjoints d_bar and S in ``steps`` into that of u, by a kernel for one of the two kinds of S."""
+        """Turn the adjoints d_bar and S in ``steps`` into the adjoint of u, by a kernel for one of the two kinds of
+        S."""
         context.launch(kernel, *known, at, steps, u_bar=self._u_bar)
         around = context.fields.named(), self._solver.around
         self._faces.add(context, self.bar, *around, u=at["u"], spread=steps["d_bar"])
@@ -342,8 +344,8 @@ class ProjectionMaker:
         self._table = table
 
     def build(self, setting: SolverSetting) -> Solver:
-        """Make the projection solver of a scene that is cut into particles, on a device. Without pressure nothing is
-        projected, and all solvers take the same step."""
+        """Make the projection solver of a scene that is cut into particles, on a device. Without pressure there is no
+        projection, and the steps of all solvers are equal."""
         system, table = particle_system(setting), self._table
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)

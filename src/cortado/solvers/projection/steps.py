@@ -1,28 +1,29 @@
-"""A step of the projection: pressures that make velocities free of divergence, a shift, and the repair of density.
+"""A step of the projection: pressures that make velocities divergence-free, a shift of particles, and repairs of the
+density.
 
 `ProjectionSteps.step` overwrites its iterates; `ProjectionSteps.replay` keeps them all, for
 `cortado.solvers.projection.solver`.
 
-Besides the repairs of density a step moves particles in three ways (`moving_kernels`): by the velocity x + dt v, by the
-shift delta, and by velocities that follow both.
+Besides the repairs of density a step changes particles in three ways (`moving_kernels`): by the velocity, x + dt v; by
+the shift delta; and optionally by velocities that follow the new positions.
 
-Particles of the interior are shifted to where they are fewer (Lind et al. 2012; Skillen, Lind, Stansby and Rogers
-2013). Pairs that are nearer than 0.65 s are moved apart, wherever they are. The rate follows the velocity gradient and
+Particles of the interior are shifted towards regions with fewer particles (Lind et al. 2012; Skillen, Lind, Stansby and
+Rogers 2013). Pairs that are nearer than 0.65 s are moved apart everywhere. The rate follows the velocity gradient and
 the tension, so that a fluid at rest is not stirred:
 
     delta = r (4 sum_j p_ij - s^2 u P grad C),   p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij,
     grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
     r = 20 dt |grad v| + 60 c^2 / (c + 0.004)^1.5,   c = w dt^2 max(-p, 0) / (rho s^2),
 
-with r softly at most 0.5, and |delta| softly at most 0.1 s. Where the pressure pulls, particles clump at the rate of
-sqrt(-p / rho) / s (the tensile instability, Monaghan 2000), and the shift is faster. P takes out the direction
-of the surface, g + gamma. Of the weights of `cortado.solvers.projection.effects`, u is 0 at surfaces, and w, that
-of low densities in repairs, near them and beside walls. Velocities stay as they are: with a correction by
-(delta . grad) v the fluid gains energy. In spray and in thin sheets pairs come together, to 0.00 s without p, which no
-repair of the density parts, as theirs is too low.
+with smooth bounds of 0.5 on r, and of 0.1 s on |delta|. Under tension particles clump at the rate sqrt(-p / rho) / s
+(the tensile instability, Monaghan 2000), so the shift is faster there. P projects out the direction of the surface, g +
+gamma. u and w are weights of `cortado.solvers.projection.effects`: u is 0 at surfaces; w, by which low densities are
+repaired, is 0 near surfaces and beside walls. The shift does not change velocities: with a correction by (delta . grad)
+v the fluid gains energy. In spray and in thin sheets pairs without the term p would come as near as 0.00 s. Repairs do
+not separate such pairs, because their density is too low.
 
-With ``velocities_follow`` velocities are those of the places to which the shift and the repairs take particles, to
-first order (Xu, Stansby and Laurence 2009):
+With ``velocities_follow`` velocities are corrected, to first order, to the velocity field at the places to which the
+shift and the repairs move particles (Xu, Stansby and Laurence 2009):
 
     v' = v - A (1.05 (M + 0.05 I)^-1) (x_K - x - dt v),   A = sum_j v_ij g_ij^T,
 
@@ -65,19 +66,19 @@ from cortado.sph.parts import Carried, StepContext, integration_module
 RATE = 20.0
 """Factor of dt |grad v| in the rate r of the shift."""
 GREATEST = 0.5
-"""The greatest 20 dt |grad v|, softly: beyond it a shift goes too far, and its derivatives grow from step to step."""
+"""Smooth bound on 20 dt |grad v|: a faster shift overshoots, and its derivatives grow from step to step."""
 FARTHEST = 0.1
 """In spacings: the greatest shift of a particle in a step."""
 SURFACE = 0.03
-"""|g| s below which the direction of a surface is not known."""
+"""|g| s below which the direction of a surface is unknown."""
 AWAY = 4.0
-"""Factor by which pairs that are near are moved apart faster than others are shifted."""
+"""Factor by which near pairs are moved apart faster than other particles are shifted."""
 LEAST = 1e-5
-"""The softness e in 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|, which is 0 with a slope at rest."""
+"""The softness e in 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|; at rest the value is 0, and smooth."""
 PULLED = 60.0
 """Factor of the rate of the shift where the pressure pulls."""
 WEAK = 0.004
-"""The c below which a pull counts with its square."""
+"""The c below which the effect of tension is about quadratic in c."""
 
 
 @cache
@@ -111,8 +112,8 @@ def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
 
 @cache
 def following_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of velocities v' that follow the shift and the repairs; the adjoint of v' is stored where that
-    of v is written."""
+    """Make the kernels of velocities v' that follow the shift and the repairs; the adjoint of v overwrites the adjoint
+    of v'."""
     precision, modules = d.precision, d.modules(f"projection_following_{dimension}d")
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     inverse = effect_functions(precision, dimension, modules[0]).inverse
@@ -126,8 +127,8 @@ def following_kernels(d: Discretisation, dimension: int) -> Kernels:
 
 @cache
 def moving_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of the positions before the first repair, whose adjoint stands where that of delta is
-    written."""
+    """Make the kernels of the positions before the first repair; the adjoint of delta overwrites the adjoint of these
+    positions."""
     modules = [integration_module(precision, forward, topic="moving") for forward in (True, False, False)]
     real, vector = precision.real, precision.vector
 
@@ -140,12 +141,12 @@ def moving_kernels(precision: Precision) -> Kernels:
 IMPULSE = "pressure_impulse"
 """The name of k = dt p in a state."""
 KICK = "pressure_kick"
-"""The name of -D^T k / m, which a step's pressures added to velocities, in a state."""
+"""The name, in a state, of the kick -D^T k / m that a step's pressures added to velocities."""
 MOMENTUM = 8.0 / (1.0 + 101.0**0.5)
-"""beta of the first iteration, (t - 1) / t' with t' = (1 + sqrt(1 + 4 t^2)) / 2 (Nesterov 1983). It is from t = 5 and
-not from 1, as the first k is that of the step before. Later ones, which begin with a coarse correction, have none: with
-it, many of them would not come to rest. From step to step errors shrink where iterations leave between -1/3 and 1 of
-them: two of them do up to 1.6 times the stiffest wave of the lattice."""
+"""beta of the first iteration, (t - 1) / t' with t' = (1 + sqrt(1 + 4 t^2)) / 2 (Nesterov 1983). The sequence begins at
+t = 5 instead of 1, because the first k comes from the previous step. Later iterations, which begin with a coarse
+correction, have beta = 0: with momentum many would not converge. Errors shrink from step to step if iterations leave
+between -1/3 and 1 of them: two iterations do so up to 1.6 times the stiffness of the lattice's stiffest wave."""
 
 
 @dataclass(frozen=True)
@@ -192,8 +193,8 @@ class ProjectionSteps(ParticleSolver):
         endless: bool,
     ):
         """Prepare steps with pressure iterations within ``limits`` and ``repairs`` repairs of density each; velocities
-        ``follow`` the shift and the repairs, or stay as they are. A coarse ``grid`` corrects the pressure between
-        iterations, in a cold scene before the first one too, and never in an ``endless`` scene."""
+        ``follow`` the shift and the repairs, or are not corrected. A coarse ``grid`` corrects the pressure between
+        iterations, in a cold scene also before the first iteration, and never in an ``endless`` scene."""
         self.constants = constants
         super().__init__(system)
         self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
@@ -204,21 +205,23 @@ class ProjectionSteps(ParticleSolver):
         kinds = {"u": vector, "A": matrix_type(precision), "d": real, "y": real, "k": real}
         self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real, "held": real}
         self.iterates = [self.layout.arrays(**self._iterate_kinds)]
-        """u, A and the divergence of u, y and k before each iteration; the last has u and y = k of all."""
+        """u, A and the divergence of u, y and k before each iteration; the last slot has u and y = k after all
+        iterations."""
         self.repaired = [self.layout.arrays(**self._repair_kinds)]
-        """x_k, lambda and n - 1 before each repair, and which part of its way a particle has gone to x_k."""
+        """x_k, lambda and n - 1 before each repair, and the part of the full displacement by which a particle moved to
+        x_k."""
         self.x_star, self.v_star, self.kick, self.x_moved, self.delta = (self.vectors() for _ in range(5))
         self.sides = None if system.sheets is None else Sides(system.sheets, constants.spacing, self.layout)
-        """What keeps particles on their sides of sheets; None without any."""
+        """The object that keeps particles on their sides of sheets; None without sheets."""
         self.following = following_kernels(self.discretisation, system.walled.dimension) if follow else None
-        """Those of velocities that follow the shift and the repairs; None where they do not."""
+        """The kernels of velocities that follow the shift and the repairs; None if velocities do not follow."""
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
         self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
-        """Those that fluid moves; None without any."""
+        """The bodies that fluid moves; None without any."""
         own = self.discretisation, self.layout, system.walled.dimension
         self.coarse = Coarse(*own, grid, constants.spacing, self.bodies, endless)
         self.corrected = [self._new_corrected()]
-        """The iterates as iterations of the pressure begin with them."""
+        """The iterates, after the coarse correction, from which pressure iterations begin."""
         self.repair_relaxations = constants.repair_relaxations(repairs)
         """omega of each repair."""
         self.loops = (
@@ -248,12 +251,12 @@ class ProjectionSteps(ParticleSolver):
 
     @cached_property
     def relaxed(self) -> dict[str, float]:
-        """Return the relaxation omega of the pressure iterations by the name that kernels have for it."""
+        """Return the relaxation omega of the pressure iterations by the name of its kernel argument."""
         return {"omega": self.constants.relaxation}
 
     @cached_property
     def spaced(self) -> dict[str, float]:
-        """Return the surroundings' constants and the spacing by the names that kernels have for them."""
+        """Return the surroundings' constants and the spacing by the names of kernel arguments."""
         return {**self.density.constants, "spacing": self.constants.spacing}
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
@@ -337,7 +340,7 @@ class ProjectionSteps(ParticleSolver):
         return context
 
     def iterate(self, context: StepContext, k: int, before: int, after: int) -> None:
-        """Take pressure iteration k, from the iterates of slot ``before`` to those of slot ``after``."""
+        """Do pressure iteration k, from the iterates of slot ``before`` to those of slot ``after``."""
         old, at, new = self.iterates[before], self.corrected[before], self.iterates[after]
 
         def correct() -> None:
@@ -363,7 +366,7 @@ class ProjectionSteps(ParticleSolver):
         return drift if self.bodies is None else self.bodies.drifted(context, drift, at["y"])
 
     def press(self, context: StepContext, at: dict[str, wp.array]) -> None:
-        """Write the velocities that the y of an iterate leaves, with its pull y L."""
+        """Write the velocities u = v* - D^T y / m by the y of an iterate, and the pull y L."""
         own = {"y": at["y"], "u": at["u"], "T": self.pull, "kick": self.kick}
         context.launch(self.kernels.velocity.velocity.forward, self.around, own, v_star=self.v_star)
 
@@ -373,7 +376,7 @@ class ProjectionSteps(ParticleSolver):
             self.bodies.settle(context, self.iterates[last]["y"])
 
     def move(self, context: StepContext, last: int) -> None:
-        """Write the positions to which the new velocities and the shift lead, by the k of a slot."""
+        """Write the positions after moving by the new velocities and the shift, with the k of a slot."""
         kernels, first = self.kernels, self.repaired[0]
         flow = {"A": self.last_gradient(last), "k": self.iterates[last]["k"]}
         context.launch(kernels.shift.forward, self.around, self.spaced, flow, delta=self.delta)
@@ -383,7 +386,7 @@ class ProjectionSteps(ParticleSolver):
         first["c"].zero_()
 
     def last_gradient(self, slot: int) -> wp.array:
-        """Return A, the velocity gradient sums of the last iteration, whose result is in a slot."""
+        """Return A, the velocity gradient sums of the last iteration, given the slot with its result."""
         return self.corrected[max(slot - 1, 0)]["A"]
 
     def mend(self, context: StepContext, k: int, before: int, after: int) -> None:

@@ -1,8 +1,8 @@
-"""Sums over neighbours of the projection, with their derivatives, and the velocity that pressures leave of a predicted
-one, v* - D^T y / m, see `cortado.solvers.projection.pressure`; g_ij = V grad W_ij.
+"""Sums over neighbours of the projection, with their derivatives, and the velocity after applying pressures to the
+predicted velocity, v* - D^T y / m, see `cortado.solvers.projection.pressure`; g_ij = V grad W_ij.
 
-The force of pressures and the divergence of velocities are each other's transpose, and do most of the work, forward
-and back.
+The operators for the force of pressures and the divergence of velocities are each other's transpose. They take most of
+the computing time, forward and in reverse.
 """
 
 from dataclasses import dataclass
@@ -21,23 +21,22 @@ from cortado.solvers.projection.wall_sums import types_by_name
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions, symmetric
 
 CROWDED = 0.25
-"""R: how much more close pairs count in a shift (Monaghan 2000), boundedly: unbounded, the derivative of the shift is
-so steep among clumped particles that gradients of a splash grow by ten orders more."""
+"""R: the greatest additional weight of close pairs in a shift (Monaghan 2000). Without a bound the derivative of the
+shift is so steep among clumped particles that gradients of a splash are ten orders of magnitude greater."""
 APART = 0.65
-"""In spacings: how near pairs are that a shift moves apart. With 0.7 and 0.6 particles of a dam break 25 deep come
-equally seldom to half a spacing. Energy rises more with 0.7, by 0.03 in place of 0.02 % in a dam 12 deep, and with
-0.8."""
+"""In spacings: the distance below which a shift moves pairs apart. With 0.6 and 0.7 particles of a dam break 25 deep
+come equally seldom within half a spacing. With 0.7 and 0.8 the energy rises more: with 0.7 by 0.03 instead of 0.02 % in
+a dam 12 deep."""
 UNEQUAL = 2.0
-"""By how much more a lighter neighbour counts in the diagonal of the projection's matrix. Without it an iteration goes
-too far where one light particle takes the pressures of many that are heavy. On the lattice it goes 1.2 and 1.5 times as
-far at ratios of 100 and 1,000, 2.3 times for one light particle among heavy ones. With it, it goes as far as among
-equals."""
+"""Additional weight of a lighter neighbour in the diagonal of the projection's matrix. Without it an iteration
+overshoots if many heavy particles push one light particle: on the lattice 1.2 and 1.5 times at mass ratios of 100 and
+1,000, and 2.3 times for one light particle among heavy ones. With it a step is as long as among equal masses."""
 
 
 @dataclass(frozen=True)
 class ProjectionSums:
-    """Warp functions of the projection's sums over neighbours; a symmetric matrix comes as its diagonal and its entries
-    yz, xz and xy."""
+    """Warp functions of the projection's sums over neighbours; a symmetric matrix is returned as its diagonal and its
+    entries yz, xz and xy."""
 
     moments: Kernels
     """M = -sum g_ij x_ij^T, Q = sum h_ij g_ij g_ij^T / m_j, g = sum g_ij, the crowding sum (1 + R q / (1 + q / 4))
@@ -46,15 +45,15 @@ class ProjectionSums:
     ``per_apart``; and sum V W_ij, to which what fills lists up adds. The adjoint is that of x and m, with ``n_bar`` of
     the last sum."""
     force: Kernels
-    """sum_j T_j g_ij, for T = k L, which T_i g_i completes. From adjoints f of it: the symmetric part of
-    sum f_ij g_ij^T, and the adjoint of x."""
+    """sum_j T_j g_ij, for T = k L, which T_i g_i completes. From the force's adjoints f: the symmetric part of sum f_ij
+    g_ij^T, and the adjoint of x."""
     velocity_gradient: Kernels
-    """The rows of A = sum v_ij g_ij^T, which lacks M^-1 to be the gradient. From an adjoint of A: that of v without
-    A_bar_i g_i, and that of x."""
+    """The rows of A = sum v_ij g_ij^T; the velocity gradient is A M^-1. From the adjoint of A: the adjoint of v without
+    A_bar_i g_i, and the adjoint of x."""
     divergence_back: Any
-    """The adjoints of v and x where that of A is symmetric, S = d L for an adjoint d of the divergence L : A."""
+    """The adjoints of v and x if the adjoint of A is symmetric: S = d L for an adjoint d of the divergence L : A."""
     push: Kernels
-    """sum (c_i + c_j) g_ij. From adjoints f of it: sum g_ij . f_ij, and the adjoint of x."""
+    """sum (c_i + c_j) g_ij. From this sum's adjoints f: sum g_ij . f_ij, and the adjoint of x."""
 
 
 @cache
@@ -246,21 +245,21 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
 
 @dataclass(frozen=True)
 class VelocityKernels:
-    """The kernels of u = v* - D^T y / m, the velocity that the pressure y leaves of the predicted one."""
+    """The kernels of u = v* - D^T y / m, the predicted velocity v* corrected by the pressure y."""
 
     velocity: Kernels
     """u and the kick u - v*; their adjoint starts from the f of all particles that `own_adjoint` writes."""
     pull_tangent: wp.Kernel
-    """T = y L with its tangent, which the tangent of the velocity reads of neighbours."""
+    """T = y L with its tangent; the tangent of the velocity reads both of neighbours."""
     own_adjoint: wp.Kernel
-    """Comes before the adjoint of the velocity: from the adjoints of u and of the kick to those of v* and f."""
+    """Runs before the adjoint of the velocity: turns the adjoints of u and of the kick into those of v* and f."""
     time_adjoint: wp.Kernel
-    """The part of v* = v + dt a in the adjoint of dt."""
+    """Adds the term from v* = v + dt a to the adjoint of dt."""
 
 
 @cache
 def velocity_kernels(discretisation: Discretisation, dimension: int) -> VelocityKernels:
-    """Make the kernels of the velocity that pressures leave, in 2 or 3 dimensions."""
+    """Make the kernels of the velocity after applying pressures, in 2 or 3 dimensions."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     sums, mirrors, packed = projection_sums(discretisation), image_sums(discretisation), symmetric(precision)
@@ -314,7 +313,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     def velocity_adjoint(
         diagonal, others, x_part, widened, x_lift, y_i, L_i, gamma_i, image_i, f_i
     ) -> tuple[real, real, matrix, vector, vector]:
-        """Add to the adjoints of y, L, gamma and x by the f of all particles; T is y L."""
+        """Add to the adjoints of y, L, gamma and x, given f of all particles; T is y L."""
         A = whole(diagonal, others)
         y_part = wp.ddot(L_i, A) + wp.dot(gamma_i, f_i) + image_i * widened
         return y_part, y_i * widened, y_i * A, y_i * f_i, x_part + x_lift

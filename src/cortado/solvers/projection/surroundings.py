@@ -1,5 +1,5 @@
 """The surroundings of particles, with their derivatives: the number density (`cortado.sph.density`), the moments of
-neighbours, sums over walls, and what follows from these (`cortado.solvers.projection.effects`).
+neighbours, sums over walls, and the quantities of `cortado.solvers.projection.effects`.
 """
 
 from functools import cache, partial
@@ -38,14 +38,15 @@ def entries(precision: Precision) -> dict[str, Any]:
 
 
 def bar_entries(precision: Precision) -> dict[str, Any]:
-    """Return names and types of the adjoints of surroundings that add up: all but Q, on which only a depends."""
+    """Return names and types of the adjoints of surroundings to which several kernels add: all except Q, because only a
+    depends on Q."""
     return {name: kind for name, kind in entries(precision).items() if name != "Q"}
 
 
 @cache
 def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of n and the moments of neighbours, and of L, a and the weights that follow. The adjoint's two
-    kernels hand on the adjoints of M and Q as six numbers each, M_pull and Q_pull."""
+    """Make the kernels of n, of the moments of neighbours, and of L, a and the weights computed from these. Between the
+    adjoint's two kernels the adjoints of M and Q are six numbers each, M_pull and Q_pull."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
@@ -126,7 +127,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def surroundings_tangent(
         s, least: real, per_nearest: real, per_apart: real, x, x_dot, v, v_dot, m, m_dot, of, n_dot, dot
     ):
-        """Write the tangent of surroundings, put together from the gradients of each entry."""
+        """Write the tangent of surroundings, computed from the gradient of each entry."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g_i_dot, crowd_dot, apart_dot, near_dot = moments_tangent(
             i, x, x_dot, m, m_dot, per_nearest, per_apart, s
@@ -199,7 +200,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     @wp.kernel(module=adjoint_module, enable_backward=False)
     @typed.arrays
     def own_adjoint(least: real, m, n_bar, of, m_bar, bar, M_pull, Q_pull):
-        """Add to the adjoints of the moments from those of L, a, the weights and all else that follows."""
+        """Add to the adjoints of the moments, given the adjoints of L, a, the weights and all other quantities computed
+        from moments."""
         i = wp.tid()
         M_bar, Q_bar, g_bar, gamma_bar, mirror_bar, nu_bar, behind_bar, m_i_bar = back(
             of.M[i],
@@ -273,9 +275,9 @@ class Surroundings(Density):
         self.around = layout.arrays(**entries(layout.precision))
         per_nearest, per_apart = 1.0 / constants.nearest_weight, (APART * constants.spacing) ** -2
         self.constants = {"least": constants.least_diagonal, "per_nearest": per_nearest, "per_apart": per_apart}
-        """As kernels call them."""
+        """Constants by the names of kernel arguments."""
         self.surfaced = wp.zeros(layout.members, dtype=wp.int32, device=layout.device)
-        """Whether scenes have a free surface: a particle without a share of the coarse pressure."""
+        """By scene, whether it has a free surface: a particle without a share of the coarse pressure."""
 
     def measure(self, context: StepContext) -> None:
         self.surfaced.zero_()
@@ -320,7 +322,7 @@ class SurroundingsAdjoint(DensityAdjoint):
             array.zero_()
 
     def measure(self, context: StepContext, bar: Adjoints) -> None:
-        """Turn the adjoints of n and of all surroundings into those of positions, masses and solids."""
+        """Turn the adjoints of n and of all surroundings into the adjoints of positions, masses and solids."""
         own, known = self._density, (*bar.named, self.around, self._density.around)
         for kernel in own.kernels.adjoint:
             context.launch(kernel, *known, self._moments, own.constants)
