@@ -185,6 +185,7 @@ BASES = {
         picture={"width": 64, "height": 64, "camera_path": {"kind": "orbit"}},
     ),
 }
+MOTORS = "speed", "speeds", "file"
 ASIDE = {
     ("BoxDrain", "name"): "what the balance calls it",
     ("EmitterTable", "name"): "what parameters call it",
@@ -200,6 +201,8 @@ ASIDE = {
     ("HingeTable", "name"): "what messages call it",
     ("HingeTable", "axis"): "in space alone: tests/test_hinges.py",
     ("HingeTable", "torque"): "in place of torques: tests/test_springs.py",
+    **{("HingeTable", key): "beside a damping, or in place of torques: tests/test_springs.py" for key in MOTORS},
+    ("HingeTable", "to"): "another solid than the world: tests/test_hinges.py",
     ("SolidTable", "friction"): "where bodies touch: tests/test_free_bodies.py",
     ("SolidTable", "restitution"): "where bodies touch: tests/test_free_bodies.py",
     ("SolidTable", "inertia"): "in place of gyration_radius: tests/test_body_masses.py",

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from test_facts import sources
+
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "validation"
 with pytest.MonkeyPatch.context() as patch:
@@ -27,7 +29,7 @@ def fault(command: str) -> str | None:
     path = ROOT / file if "/" in file else FOLDER / file
     if not path.exists():
         return f"there is no {file}"
-    text = path.read_text(encoding="utf-8")
+    text = sources(path)
     if file.startswith("tests/"):
         test = not words or (words[0] == "-k" and re.search(rf"^def test_\w*{words[1]}", text, re.MULTILINE))
         return None if test else f"{file} has no test {words[1]}"
