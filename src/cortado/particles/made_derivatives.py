@@ -1,18 +1,18 @@
 """Derivatives of sums over the fluid, made by Warp from the term of one pair (`cortado.particles.pair_sums`).
 
-For the sums S_i = sum_j T(x_ij, c_i, c_j, v_ij, theta) and their adjoints S_i^, the adjoint gathers what the pair gives
-to particle i, from its own sum and from that of its neighbour:
+For the sums S_i = sum_j T(x_ij, c_i, c_j, v_ij, theta) and their adjoints S_i^, the adjoint of particle i gathers a
+pair's terms from particle i's own sum and from its neighbour's sum:
 
     x_i^ = sum_j d(T_ij . S_i^) / dx_ij - d(T_ji . S_j^) / dx_ji
     c_i^ = sum_j d(T_ij . S_i^) / dc_i + d(T_ji . S_j^) / dc_i
 
-and likewise for all entries of arrays; theta^ is sum_j d(T_ij . S_i^) / dtheta of each particle. The tangent is put
-together of the gradients of the components of T. Both are exact. They are slower than what one can write by hand, and
-are meant for forces of one's own and for what is seldom computed.
+and likewise for all entries of arrays; theta^ is sum_j d(T_ij . S_i^) / dtheta of each particle. The tangent is
+computed from the gradients of the components of T. Both are exact. They are slower than handwritten derivatives, and
+are meant for users' forces and for sums that are seldom computed.
 
-A term is given as the function that makes it for a `Discretisation`, and is made for one that is ``taped``, whose
-functions Warp can differentiate. Call a made derivative from the kernel itself: from a `wp.func` that the kernel calls,
-its C++ does not compile.
+The argument is a function that makes the term for a `Discretisation`. It is called with a ``taped`` one, whose
+functions Warp can differentiate. Call a made derivative only from a kernel: called from a `wp.func` its C++ does not
+compile.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -77,7 +77,7 @@ def _made(
 
 
 def work_of(term: Term, precision: Precision, module: Any) -> Any:
-    """Make the Warp function T . bar of the arguments of a term T and an adjoint for each of its results."""
+    """Make the Warp function T . bar; it takes the arguments of a term T and an adjoint for each result of T."""
     types, bars = {**term.parameters, **bars_of(term)}, bars_of(term)
     products = (
         f"_term_{n} * {bar}" if kind is precision.real else f"_wp.{dot_of(kind)}(_term_{n}, {bar})"
@@ -96,7 +96,7 @@ def _work({", ".join(types)}):
 
 
 def warp_function(function: Callable[..., Any], module: Any) -> Any:
-    """Make a Warp function in a module of a Python function, which has its text as ``source`` if it is in no file."""
+    """Make a Warp function in a module from a Python function; give its text as ``source`` if no file contains it."""
     if not hasattr(function, "source"):
         return wp.func(function, module=module)
     return wp.Function(function, function.__name__, "", module=module, source=function.source)
@@ -117,7 +117,8 @@ def _with_tangents(types: Types) -> dict[str, Any]:
 
 
 def _gradient(label: str, term: Term, arguments: str, bars: Iterable[str]) -> str:
-    """Return the line that assigns the derivative of T . bar by each parameter to ``label_parameter``."""
+    """Return the source line that assigns the derivative of T . bar with respect to each parameter to
+    ``label_parameter``."""
     names = ", ".join(f"_{label}_{name}" for name in (*term.parameters, *bars_of(term)))
     return f"{names} = _wp.grad(_work)({arguments}, {', '.join(bars)})"
 
@@ -140,7 +141,8 @@ def _adjoint(term: Term) -> Body:
 
 
 def _tangent(term: Term, d: Discretisation) -> Body:
-    """Return a loop's lines that add up, for each component of each result, gradient times parameters' tangents."""
+    """Return a loop's source lines that add, for each component of each result, gradient times tangents of
+    parameters."""
     kinds = {**term.parameters, **bars_of(term)}
 
     def change_of(name: str, of_j: Mapping[str, str]) -> str:
@@ -169,7 +171,7 @@ def _tangent(term: Term, d: Discretisation) -> Body:
 
 
 def _unit(kind: Any, d: Discretisation, k: int) -> str:
-    """Return the text of a result whose component k is 1, and all others 0."""
+    """Return the source text of a result whose component k is 1 and whose other components are 0."""
     if kind is d.precision.real:
         return "_real(1.0)"
     return f"{type_name(kind, d)}({', '.join(f'_real({float(m == k)})' for m in range(len(kind())))})"

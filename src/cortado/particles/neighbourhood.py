@@ -1,8 +1,8 @@
-"""The neighbourhood of a particle: other particles, walls and images in these, as one argument of kernels that sum over
+"""The neighbourhood of a particle: other particles, wall particles and images, as one argument of kernels that sum over
 them. Functions here read the entries of particles and of wall particles in a sum.
 
-Entries are read without the count from an array's end that Warp's own indices allow: a negative index takes a
-comparison and an addition, for every neighbour and every array.
+Entries are read by functions without Warp's negative indices from an array's end: these need a comparison and an
+addition for every neighbour and every array.
 """
 
 from dataclasses import dataclass, replace
@@ -22,8 +22,9 @@ from cortado.particles.mirrors import mirror_functions
 @cache
 def loads(precision: Precision, taped: bool) -> SimpleNamespace:
     """Make the Warp functions that read one element of an array, at indices that are not negative: ``load_neighbour``
-    of a list [neighbour, particle], and ``load_vector``, ``load_number`` and ``load_six`` of an array of such, one
-    after the other in memory. Six numbers take three loads on a GPU. A tape can differentiate ``taped`` functions."""
+    of a list [neighbour, particle], and ``load_vector``, ``load_number`` and ``load_six`` of a contiguous array of
+    vectors, numbers or six numbers. Six numbers take three loads on a GPU. A tape can differentiate ``taped``
+    functions."""
     return _of_warp(precision) if taped else _direct(precision)
 
 
@@ -72,8 +73,8 @@ def _direct(precision: Precision) -> SimpleNamespace:
 
 
 UNROLL = 4
-"""Fluid neighbours that a loop takes at a time, so that their loads overlap. Lists are filled up to a multiple of it
-with the particle itself, which adds nothing to any sum except W(0) to the density."""
+"""Number of fluid neighbours that a loop processes together, so that their loads overlap. Lists are padded to a
+multiple of this with the particle itself, which only adds W(0) to the density."""
 
 
 @dataclass(frozen=True)
@@ -83,22 +84,24 @@ class Discretisation:
     smoothing: SmoothingKernel
     precision: Precision
     lanes: int = 1
-    """Threads for each particle, in kernels that are made for them: see `cortado.device.precision`."""
+    """Number of threads for each particle, in kernels that share a particle's neighbours: see
+    `cortado.device.precision`."""
     periodic: bool = False
-    """True where particles see the nearest images of one another: see ``period`` in the neighbourhood."""
+    """True if separations are those of nearest periodic images: see ``period`` in the neighbourhood."""
     moving: bool = False
-    """True where walls move: sums know their velocities."""
+    """True if walls move: then sums use the velocities of walls."""
     taped: bool = False
-    """True for forward kernels that a tape can differentiate: they get Warp's own adjoint, which takes one lane."""
+    """True for forward kernels that a tape can differentiate: they get Warp's own adjoint, which needs a single
+    lane."""
 
     @property
     def types(self) -> tuple[Any, Any, Any]:
-        """Return the Warp types of numbers, of vectors, and of what lies around a particle, ``s`` of kernels."""
+        """Return the Warp types of numbers, of vectors, and of the neighbourhood, which kernels call ``s``."""
         return self.precision.real, self.precision.vector, neighbourhood_type(self.precision)
 
     @property
     def lane(self) -> Any:
-        """Return the Warp function that says which of its particle's threads a thread is, from 0 on."""
+        """Return the Warp function of a thread's number, from 0 on, among the threads of its particle."""
         return lane_functions(self.precision, self.lanes).lane
 
     @property
@@ -107,8 +110,8 @@ class Discretisation:
         return replace(self, moving=False)
 
     def module(self, forward: bool, topic: str) -> Any:
-        """Return the Warp module of forward kernels or of adjoint kernels; `tangent_module` has the others. ``topic``
-        tells the modules of one file or solver from those of others."""
+        """Return the Warp module of forward or adjoint kernels; `tangent_module` is for tangent kernels. ``topic``
+        distinguishes the modules of one file or solver from others."""
         return self._module(kind_of(forward, self.taped), topic, forward and self.taped)
 
     def tangent_module(self, topic: str) -> Any:
@@ -141,12 +144,12 @@ def neighbourhood_type(precision: Precision) -> Any:
         particles: wp.int32
         """Number of particles of one scene: particle i belongs to scene i // particles of a batch."""
         neighbours: wp.array2d(dtype=wp.int32)
-        """First the fluid neighbours of a particle, filled up with itself, then its wall neighbours, then images that
-        it sees."""
+        """First a particle's fluid neighbours, padded with the particle itself; then its wall neighbours; then images
+        within its reach."""
         fluid_count: wp.array(dtype=wp.int32)
         """Length of the filled list, a multiple of `UNROLL`."""
         filling: wp.array(dtype=wp.int32)
-        """How many entries of it are the particle itself."""
+        """Number of entries of the padded list that are the particle itself."""
         count: wp.array(dtype=wp.int32)
         """Number of fluid and wall neighbours."""
         all_count: wp.array(dtype=wp.int32)
@@ -186,7 +189,7 @@ def neighbourhood_type(precision: Precision) -> Any:
         response_scale: real
         """(sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], for the relaxation beside walls."""
         laplacian_correction: real
-        """Factor of second derivatives [-], see `cortado.discretise.smoothing`."""
+        """Correction factor of second derivatives [-], see `cortado.discretise.smoothing`."""
         volume: real
         """Volume V of a particle on the rest lattice [m^d]: with it that lattice has the rest density."""
         period: vector
@@ -228,15 +231,15 @@ def neighbourhood_type(precision: Precision) -> Any:
 
 @cache
 def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
-    """Make Warp functions of a separation in a neighbourhood.
+    """Make Warp functions of a separation x in a neighbourhood.
 
-    ``separation`` (x_i - x_j, of the nearest image), ``weight``, ``slope`` (a of G = a x), ``slope_change``
-    (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x);
-    ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
-    per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
-    list of i), ``several`` (the numbers of `UNROLL` of them from the k-th on), and the functions of `loads` and of
+    ``separation`` (x_i - x_j, of the nearest image), ``weight``, ``slope`` (a of G = a x), ``slope_change`` (grad a .
+    u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x); ``per_size`` (1
+    / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction per_size x . G, of
+    second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the list of i),
+    ``several`` (the numbers of `UNROLL` of them from the k-th on), and the functions of `loads` and of
     `mirror_functions`. Three more, ``vectors``, ``numbers`` and ``sixes``, load the values of several neighbours before
-    any of them is used. So the loads do not wait for one another (on a GPU a tenth of a whole step).
+    any of them is used. So the loads do not wait for one another, which saves a tenth of a whole step on a GPU.
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)

@@ -1,5 +1,5 @@
-"""Sums over neighbours, each made from the term of one pair of particles, a function whose parameters say by their
-names what they are.
+"""Sums over neighbours, each made from the term of one pair of particles: a function whose parameter names define its
+inputs.
 
     @pair_sum(discretisation)
     def force(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:
@@ -19,21 +19,21 @@ is the Warp function ``force(i, x, c, s)`` of particle i, the arrays x and c, an
     s                  the neighbourhood
     any other          what is the same for all neighbours of a particle, and stands between the arrays and s
 
-A term that returns several things makes as many sums in one loop. For a particle of a wall, which is at rest and has no
-pressure, every value with an index j is 0, and its term counts w_b times. Walls that act in another way have a term of
+A term that returns several values makes as many sums in one loop. For a wall particle, which is at rest and has no
+pressure, every value with an index j is 0, and the term is multiplied by w_b. Walls with another effect have a term of
 their own.
 
-With ``ahead=False`` entries of a neighbour are loaded when it is its turn, and not ahead of it. Loading ahead saves a
-tenth of a step on a GPU, but is of little use where terms take longer than loads.
+With ``ahead=False`` a neighbour's entries are loaded just before its term is computed. Loading them earlier saves a
+tenth of a step on a GPU, but little if terms take longer than loads.
 
-Sums are texts of loops over the neighbours of a particle, which Warp compiles; all such loops are written here. The
-lanes of a particle share its neighbours (`cortado.device.precision`). All names in a text but those of parameters begin
-with an underscore, which those of parameters must not.
+Sums are source texts of loops over a particle's neighbours, which Warp compiles; this module contains all such loops.
+The lanes of a particle share its neighbours (`cortado.device.precision`). In such a text all names except those of
+parameters begin with an underscore; names of parameters must not.
 
 Derivatives of sums are written by hand (`tangent_of`, `adjoint_of`) where a step is faster with them than with the ones
-that Warp makes of a term (`cortado.particles.made_derivatives`); `benchmarks/by_hand.py` measures by how much. They
-have the same arrays and one more for the tangent of each array, or for the adjoint of the sum. Each is noted beside its
-sum, so that tests compare all of them with the made ones.
+that Warp makes of a term (`cortado.particles.made_derivatives`); `benchmarks/by_hand.py` measures by how much. A
+derivative takes the sum's arrays and one more for the tangent of each array, or for the adjoint of the sum. `BY_HAND`
+lists all of them, and tests compare each with the derivative made by Warp.
 """
 
 import inspect
@@ -51,18 +51,18 @@ from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhoo
 NUMBERS = ("i", "j")
 INDICES = ("i", "j", "ij")
 OF_WALLS = {"foot": "_foot", "turn_dot": "_turn_dot", "mirrored": "_mirrored"}
-"""Names of a wall particle's data in terms of walls, with their texts."""
+"""Names of a wall particle's data in terms of walls, with their source texts."""
 
 
 @dataclass(frozen=True)
 class Term:
-    """The function of a pair of particles, taken apart into its parameters and its results."""
+    """The parameters and the results of a function of a pair of particles."""
 
     function: Callable[..., Any]
     parameters: Mapping[str, Any]
-    """Types of its parameters by name."""
+    """Types of the function's parameters by name."""
     results: tuple[Any, ...]
-    """Types of its results."""
+    """Types of the function's results."""
 
     @classmethod
     def of(cls, function: Callable[..., Any]) -> "Term":
@@ -124,13 +124,13 @@ class Term:
 
 
 def array_of(parameter: str) -> str:
-    """Return the name of the array that a parameter is an entry of; an empty text for others."""
+    """Return the name of the array of which a parameter is an entry; an empty text for other parameters."""
     array, _, index = parameter.rpartition("_")
     return array if index in INDICES else ""
 
 
 def own_entry(array: str) -> str:
-    """Return the variable of generated source that holds particle i's entry of an array."""
+    """Return the name of the variable, in generated source, with particle i's entry of an array."""
     return f"_{array}_i"
 
 
@@ -157,23 +157,23 @@ OVER_WALLS = """\
         {body}
 """
 ALL, RUBBING = "_load_number(s.wall_weights, _b)", "_load_number(s.wall_grips, _b)"
-"""Texts of the weights of wall particles, and of those along which fluid does not slip."""
+"""Source texts of the weights of wall particles, and of those without slip."""
 PLACE, FOOT = "_load_vector(s.wall_positions, _b)", "_load_vector(s.wall_feet, _b)"
 TURN, GROWTH = "_load_vector(s.wall_turns_dot, _b)", "_load_number(s.wall_growths_dot, _b)"
-"""Texts of what else a wall particle has."""
+"""Source texts of further data of a wall particle: the tangents of its rotation and of its weight."""
 MOVING = {
     "v": "_load_vector(s.wall_velocities, _b)",
     "x_dot": "_load_vector(s.wall_positions_dot, _b)",
     "v_dot": "_load_vector(s.wall_velocities_dot, _b)",
 }
-"""Texts of the entries of arrays that wall particles have where they move."""
+"""Source texts of the array entries of moving wall particles."""
 
 Function = Callable[..., Any]
 Decorator = Callable[[Function], Any]
 Types = Mapping[str, Any]
 """Types by name."""
 Body = Callable[[Mapping[str, str]], Iterable[str]]
-"""The lines of a loop, given the text of a neighbour's entry of each array. They know _x_ij, and add to _total_0 ..."""
+"""Returns a loop's lines, given the source of a neighbour's entry of each array. They use _x_ij, add to _total_0 ..."""
 
 
 def over_fluid(
@@ -181,8 +181,8 @@ def over_fluid(
 ) -> str:
     """Return the text of a loop over the fluid, which reads neighbours' entries of these arrays.
 
-    ``ahead`` loads what `UNROLL` neighbours have before any of it is used, so that loads do not wait for one another;
-    ``numbered`` loops know the number _j of a neighbour, ``separated`` ones _x_ij.
+    ``ahead`` loads the entries of `UNROLL` neighbours before using any, so that loads do not wait for one another.
+    ``numbered`` loops define the neighbour's number _j, ``separated`` loops _x_ij.
     """
     kinds = {d.precision.vector: "_vectors", d.precision.real: "_numbers", d.precision.six: "_sixes"}
     loads = kinds if ahead else {}
@@ -197,8 +197,8 @@ def over_fluid(
 
 
 def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
-    """Return the text of a loop over the images of the fluid and of the particle itself, which have their particles'
-    numbers, mirrored vectors, and matrices that are mirrored from the left."""
+    """Return the source of a loop over the images of the fluid and of the particle itself. Images have their particles'
+    numbers, mirrored vectors, and matrices mirrored from the left."""
 
     def of_j(array: str, kind: Any) -> str:
         of = array.removesuffix("_dot")
@@ -213,9 +213,9 @@ def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
 
 
 def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], weight: str) -> str:
-    """Return the text of a loop over the walls, whose particles have a place, a ``weight``, and the entries ``known``
-    of `OF_WALLS`. Where walls move they have a velocity, too, which is their entry of the array v, and tangents of
-    both."""
+    """Return the source of a loop over the walls. Wall particles have a place, a ``weight``, and the entries ``known``
+    of `OF_WALLS`; moving walls also have a velocity, as their entry of the array v, and tangents of place and
+    velocity."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
     of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays}
     turned = TURN if d.moving else zero(d.precision.vector, d)
@@ -237,7 +237,7 @@ def summed(
     scope: Types,
     module: Any,
 ) -> Any:
-    """Make the Warp function ``name(i, *arrays, *others, s)`` that runs loops and returns sums of types ``results``."""
+    """Make the Warp function ``name(i, *arrays, *others, s)``, which runs ``loops`` and returns sums of given types."""
     results = tuple(results)
     for kind in results:
         if kind is not d.precision.real and not _is_vector_of(d.precision.real, kind):
@@ -274,7 +274,7 @@ def _is_vector_of(real: Any, kind: Any) -> bool:
 
 
 def scope_of(d: Discretisation) -> dict[str, Any]:
-    """Return the names that texts of loops over neighbours know: types, and the functions of pairs."""
+    """Return the names that sources of loops over neighbours use: types, and the functions of pairs."""
     precision = d.precision
     types = {"_real": precision.real, "_vector": precision.vector, "_neighbourhood": neighbourhood_type(precision)}
     return {**{f"_{name}": function for name, function in vars(pair_functions(d)).items()}, **types}
@@ -315,9 +315,9 @@ def pair_sum(
     d: Discretisation, walls: Function | None = None, ahead: bool = True, rubs: bool = False, grows: Any = None
 ) -> Decorator:
     """Return a decorator that turns the term of a pair into the Warp function of its sum over fluid and walls.
-    ``walls`` is the term of walls if they act in another way; its parameters are among those of the fluid's. A sum that
-    ``rubs`` has nothing of walls that slip freely. A tangent is given the sum that it is of, which ``grows`` with the
-    weights of walls: their tangents count as many times as the term of that."""
+    ``walls`` is a separate term of walls, if any; the fluid's term must have all of its parameters. A sum that ``rubs``
+    leaves out walls that slip freely. For a tangent ``grows`` is the sum that it belongs to: the tangents of walls'
+    weights are multiplied by the term of that sum."""
 
     def loops(term: Term, wall: Term) -> str:
         _check_walls(wall, term)
@@ -327,8 +327,8 @@ def pair_sum(
 
 
 def fluid_sum(d: Discretisation, ahead: bool = True, module: Any = None) -> Decorator:
-    """Return a decorator that turns the term of a pair into its sum over the fluid alone. ``module`` is the Warp module
-    of the function, if not that of the file."""
+    """Return a decorator that turns the term of a pair into its sum over the fluid alone, in a Warp ``module`` or the
+    file's."""
     return _summing(d, lambda term, _: _over_fluid(term, d, ahead), module=module)
 
 
@@ -339,8 +339,8 @@ def image_sum(d: Discretisation) -> Decorator:
 
 
 def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
-    """Return a function that makes a decorator of a sum over all that fluid rubs against, for the term of walls:
-    `pair_sum` where some walls have no slip, and `fluid_sum` where all slip freely."""
+    """Return a function that takes the term of walls and returns the decorator of a sum with friction: `pair_sum` over
+    fluid and walls without slip if fluid ``sticks`` to some walls, otherwise `fluid_sum`."""
 
     def summed(walls: Function, ahead: bool = True, grows: Any = None) -> Decorator:
         return pair_sum(d, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, ahead)
@@ -349,12 +349,12 @@ def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
 
 
 def wall_sum(d: Discretisation, grows: Any = None, weight: str = ALL) -> Decorator:
-    """Return a decorator that turns a term into its sum over the walls alone, with the text of a ``weight``."""
+    """Return a decorator that turns a term into its sum over the walls alone, with the source text of a ``weight``."""
     return _summing(d, lambda _, wall: _over_walls(wall, d, grows, weight), grows=grows)
 
 
 def solid_sum(d: Discretisation) -> Decorator:
-    """Return a decorator that turns a term into its sum over the walls of one moving ``solid``, told by its number."""
+    """Return a decorator that turns a term into its sum over the walls of one moving ``solid``, given by its number."""
     return wall_sum(d, weight=f"wp.where(s.wall_solids[_b] == solid, {ALL}, _real(0.0))")
 
 
@@ -364,7 +364,7 @@ def mirror_sum(d: Discretisation, grows: Any = None) -> Decorator:
 
 
 def _check_walls(wall: Term, term: Term) -> None:
-    """Raise `TypeError` for a term of walls that does not fit that of the fluid."""
+    """Raise `TypeError` for a term of walls that does not fit the term of the fluid."""
     more = [name for name, kind in (wall.arrays | wall.others).items() if (term.arrays | term.others).get(name) != kind]
     if wall.results != term.results or more:
         found = f"has {', '.join(more)}" if more else f"returns {wall.results}"
@@ -425,14 +425,14 @@ class ByHand:
     """A derivative of a sum that was written by hand, as a Warp function."""
 
     kind: str
-    """"tangent" or "adjoint". An adjoint returns the adjoints of the entries of particle i in each array of the sum, in
-    their order, and behind them those of the other arguments, or whatever else a kernel needs."""
+    """"tangent" or "adjoint". An adjoint returns the adjoints of particle i's entries in each array of the sum, in
+    their order, and after them the adjoints of the other arguments or further values that a kernel needs."""
     of: Any
     function: Any
 
 
 BY_HAND: list[ByHand] = []
-"""The derivatives by hand of all sums that were made."""
+"""The handwritten derivatives of all sums made so far."""
 
 
 def tangent_of(sum_of: Any) -> Callable[[Any], Any]:

@@ -1,29 +1,29 @@
-"""Kernels with a thread for each particle, made of what they compute: names say what arguments are.
+"""Kernels with a thread for each particle, made from functions whose parameter names define the kernel's arguments.
 
     @particle_kernel(module, "c_new", [over(spread, "total", w="m")], numbers=["scale"])
     def flux(total: fractions, c_i: fractions, m_i: real, time_step: real, scale: real) -> fractions:
         return c_i + (time_step * scale / m_i) * total
 
 is a kernel that sums ``spread`` over the neighbours of particle i, and then writes what the function returns to
-c_new[i]. Parameters of the function are results of its sums; entries c_i of arrays c; ``i``, and ``member``, the number
-of its scene; the neighbourhood ``s``; numbers and whole arrays of a launch; and all others, such as ``time_step``,
-entries of the particle's scene. A sum finds its arrays by the names that they have in its term, unless it is told
-others. A result "+x_bar" is added to the array's entry, and "acceleration:acceleration_in" is the result added to the
-entry of acceleration_in.
+c_new[i]. Parameters of the function are results of its sums; entries c_i of arrays c; the particle's number ``i`` and
+its scene's number ``member``; the neighbourhood ``s``; and numbers and whole arrays of a launch. All others, such as
+``time_step``, are entries of the particle's scene. A sum reads arrays with the names in its term, unless `over` renames
+them. A result "+x_bar" is added to the array's entry; "acceleration:acceleration_in" writes the result plus the entry
+of acceleration_in to acceleration.
 
-A sum whose derivatives are known needs no function if only a multiple of it is computed (`sum_kernels`). A function of
-a particle's own numbers needs none for its derivatives, which Warp makes (`pointwise_kernels`). For results
-r = f(x_i, ..., time_step, ...) they are
+If only a multiple of a sum with known derivatives is computed, no function is needed (`sum_kernels`). For a function of
+a particle's own values Warp makes the derivatives (`pointwise_kernels`). For results r = f(x_i, ..., time_step, ...)
+they are
 
     tangent:  r_dot[i] = df/dx x_dot[i] + ... + df/dtime_step time_step_dot[scene]
     adjoint:  x_bar[i] += (df/dx)^T r_bar[i],   time_step_bar[i] += df/dtime_step . r_bar[i]
 
-so that particles keep their shares of the adjoints of a scene's parameters, which are summed later. Both are exact; the
-tangent is put together of the gradients of the components of r. A rotation R changes by the vector w by which it turns
-further, R_dot u = w x (R u): w stands for its tangent, and the adjoint of w for its adjoint.
+where each particle stores its share of the adjoint of a scene's parameter; shares are summed later. Both derivatives
+are exact; the tangent is computed from the gradients of the components of r. The tangent of a rotation R is the vector
+w by which R turns further, R_dot u = w x (R u), and the adjoint of R is the adjoint of w.
 
-Two traps of Warp: after ``a, b = array[j], c`` writing to a component of ``a`` writes to the array, where after ``a =
-array[j]`` it is a copy. And in a function that the function of a kernel calls, ``wp.grad`` does not compile.
+Two traps of Warp: after ``a, b = array[j], c`` writing to a component of ``a`` writes to the array, whereas ``a =
+array[j]`` makes a copy. And ``wp.grad`` does not compile in a function that the kernel's function calls.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -48,10 +48,10 @@ def {name}({parameters}):
     {body}
 """
 MADE = "made_"
-"""Begins the names of kernels that nobody has written."""
+"""Prefix of the names of generated kernels."""
 MOST_ARRAYS = 8
-"""Arrays of particles that a kernel which no tape differentiates takes one by one. More are bundles, as each takes 2 us
-of a launch on a CPU."""
+"""Most arrays of particles that a kernel without tape takes as single arguments. More are bundled: each argument adds 2
+us to a launch on a CPU."""
 TANGENT = """\
 _total_{n} = _kind_{n}()
     _components = int({components})
@@ -60,11 +60,12 @@ _total_{n} = _kind_{n}()
         {unit}[{entry}] = _one
         {gradient}
         _total_{n} += ({change}) * {unit}"""
-"""The text of the tangent of a vector or a matrix. The number of components is a variable, so that Warp loops."""
+"""Source text of the tangent of a vector or matrix; its number of components is a variable, so that Warp does not
+unroll."""
 
 
 def made_kernel(name: str, types: Types, body: Iterable[str], scope: Types, module: Any) -> Any:
-    """Make the Warp kernel with arguments of these types from lines of text that know the names in ``scope``."""
+    """Make the Warp kernel with arguments of these types from source lines, which may use the names in ``scope``."""
     text = KERNEL.format(name=name, parameters=", ".join(types), body="\n    ".join(body))
     known = {"wp": wp, **scope}
     exec(text, known)
@@ -79,7 +80,7 @@ class Over:
 
     function: Any
     names: Sequence[str]
-    """Names of its results in the kernel."""
+    """Names of the sum's results in the kernel."""
     renamed: Mapping[str, str]
 
     def read(self, types: Types) -> dict[str, Any]:
@@ -87,7 +88,7 @@ class Over:
         return {self.renamed.get(name, name): kind for name, kind in types.items()}
 
     def call(self, entries: Mapping[str, str], function: str) -> str:
-        """Return the line that computes the sum, given the texts of arguments that are equal for all neighbours."""
+        """Return the source line that computes the sum, given source texts of arguments equal for all neighbours."""
         names = (*self.read(self.function.arrays), *self.read(self.function.others))
         results = ", ".join(f"_{name}" for name in self.names)
         return f"{results} = {function}(i, {', '.join(entries.get(name, name) for name in names)}, s)"
@@ -141,8 +142,8 @@ def sum_kernel(
     numbers: Collection[str] = (),
     **renamed: str,
 ) -> Any:
-    """Make the kernel of one sum, each of whose results is written, or added, ``times`` a text such as "s.volume", and
-    divided by another one."""
+    """Make the kernel of one sum. Each result is multiplied by the source text ``times``, such as "s.volume", divided
+    by the text ``per``, and written or added to an array."""
     arguments = _Arguments([Over(total, [f"total_{n}" for n in range(len(total.results))], renamed)], numbers)
     for number in numbers:
         arguments.entry(number, total.discretisation.precision.real)
@@ -165,9 +166,9 @@ def sum_kernels(
     **renamed: str,
 ) -> Kernels:
     """Make the kernels of a sum over neighbours, of its tangent and of its adjoint, each in its own of the Warp
-    ``modules``; ``sums`` are the three as `cortado.particles.pair_sums` notes them. The first computes ``result`` =
-    ``before`` + ``times`` sum / ``per``: ``before`` is an array, the others are source texts, and all may be left out.
-    Adjoints of inputs are added to, but those of arrays that are ``written`` are overwritten."""
+    ``modules``; ``sums`` are the three sums that `cortado.particles.pair_sums` records. The first kernel computes
+    ``result`` = ``before`` + ``times`` sum / ``per``: ``before`` is an array, the others are source texts, and all
+    three may be left out. Adjoints of inputs are added to, but those of arrays that are ``written`` are overwritten."""
     total, tangent, adjoint = sums
     told = {**renamed, **dotted(renamed)}
     known = [*total.arrays, *(name for name in total.others if name not in numbers)][: len(adjoint.results)]
@@ -208,7 +209,7 @@ class _Arguments:
             self._calls.append(one.call(entries, f"_sum_{n}"))
 
     def entry(self, name: str, kind: Any) -> str:
-        """Return the text of a parameter's value in the kernel, and note the argument that it needs."""
+        """Return the source expression that reads a parameter in the kernel, and record the argument that it needs."""
         if name == "s":
             self._around = kind
         if name == "member":
@@ -225,7 +226,7 @@ class _Arguments:
     def kernel(
         self, name: str, lines: Iterable[str], writes: Iterable[tuple[str, str, Any]], scope: Types, module: Any
     ) -> Any:
-        """Make the kernel that computes the sums, goes on with some lines, and writes values to arrays."""
+        """Make the kernel that computes the sums, runs the source ``lines``, and writes values to arrays."""
         stored, written, read = [], {}, {}
         for result, value, kind in writes:
             array, _, other = result.removeprefix("+").partition(":")
@@ -262,10 +263,10 @@ def pointwise_kernels(
     """Make forward, tangent and adjoint kernels, each in its own of the Warp ``modules``, of the function that ``make``
     makes for a module.
 
-    The function has a type at each parameter, and ``results`` are the arrays that it writes; what it returns for
-    "acceleration:acceleration_in" is added to the latter. ``replaced`` maps a result to the input in whose place its
-    adjoint stands at first, and the adjoint kernel leaves that of the input there. Adjoints of other inputs are added
-    to. For all other ``names`` see `Kinds`."""
+    The function has a type at each parameter, and ``results`` are the arrays that it writes; for
+    "acceleration:acceleration_in" the result plus acceleration_in is written. ``replaced`` maps a result to an input:
+    both adjoints share one array, in which the adjoint kernel replaces the result's adjoint by the input's. Adjoints of
+    other inputs are added to. For all other ``names`` see `Kinds`."""
     functions = [make(module) for module in modules]
     terms = [Term.of(function) for function in functions]
     of = _Pointwise(precision, terms[0], results, replaced or {}, Kinds(**names), modules[0].options["enable_backward"])
@@ -281,7 +282,7 @@ def pointwise_kernels(
 
 @dataclass(frozen=True)
 class Kinds:
-    """Names of parameters and results by what they are to pointwise kernels, all of which may be left out."""
+    """Names of parameters and results grouped by their roles in pointwise kernels; all groups may be empty."""
 
     numbers: Collection[str] = ()
     """Parameters that are numbers of a launch, without derivatives."""
@@ -290,16 +291,16 @@ class Kinds:
     known: Collection[str] = ()
     """Inputs without derivatives."""
     where: str = ""
-    """An array of numbers that are 0 where results are so, with their tangents."""
+    """An array of numbers; where one is 0, results and their tangents are 0."""
     told: Collection[str] = ()
-    """Inputs with a column for each step of a scene, the number of which is ``step``; a thread is a scene."""
+    """Inputs with a column for each step; ``step`` is the number of the column, and each thread is a scene."""
     summed: Collection[str] = ()
-    """Results of which the sum over a scene has an adjoint, ``name_sum_bar`` (scenes,)."""
+    """Results whose sums over scenes have adjoints, ``name_sum_bar`` (scenes,)."""
     turned: Mapping[str, str] = field(default_factory=dict)
-    """Rotations, and what further turns of them are called."""
+    """Rotations, and the names of further turns of them."""
     read: Mapping[str, str] = field(default_factory=dict)
-    """Parameters by which a function reads a table (`cortado.sph.own_arrays`), with their texts in a kernel. In the
-    adjoint each of so many ``rows`` of a scene is a thread then, which goes through particles."""
+    """Parameters by which a function reads a table (`cortado.sph.own_arrays`), with their source texts in a kernel. The
+    adjoint kernel then has ``rows`` threads for each scene, which loop over particles."""
 
 
 class _Pointwise:
@@ -338,7 +339,7 @@ class _Pointwise:
                 self._inputs[array] = kind
         turning, leaning = turn_functions(precision)
         self.scope = {"_turning": turning, "_leaning": leaning, "_one": wp.constant(precision.real(1.0))}
-        """What the kernels know: functions of rotations, 1 and 0, and types of results and of their changes."""
+        """Names that the kernels use: functions of rotations, 1 and 0, and types of results and of their changes."""
         self.scope["_no"] = wp.constant(precision.real(0.0))
         self.scope |= {f"_kind_{n}": self._change(name, kind) for n, (name, kind) in enumerate(self._results.items())}
         self.scope |= {f"_whole_{n}": kind for n, kind in enumerate(term.results)}
@@ -399,24 +400,24 @@ class _Pointwise:
         return name, types, [*body, *start, loop, *(f"    {line}" for line in lines)]
 
     def _kernel(self, others: Types, more: Types, lines: Iterable[str]) -> tuple[Types, Iterable[str]]:
-        """Types and lines of a kernel with so many other arrays and ``more`` arguments."""
+        """Return types and source lines of a kernel with so many other arrays and ``more`` arguments."""
         own, body = {name: kind for name, kind in self._arrays.items() if name not in others}, ["i = wp.tid()"]
         arrays, names = _arrays(own, others, self._taped)
         body += [*names, *(["_row = -1"] if self._kinds.read else [])]
         return {"particles": int, **self._numbers, **arrays, **more}, [*body, *lines]
 
     def _change(self, name: str, kind: Any) -> Any:
-        """The type of a tangent or adjoint."""
+        """Return the type of a tangent or adjoint."""
         return self._precision.vector if name in self._kinds.turned else kind
 
     def _changed(self, name: str, way: str, index: str = "i") -> str:
-        """The text of an input's tangent or adjoint, ``way`` "dot" or "bar"."""
+        """Return the source text of an input's tangent or adjoint, with ``way`` "dot" or "bar"."""
         if name in self._kinds.told:
             return f"{name}_{way}[i, step[i]]"
         return f"{way}.{self._kinds.turned.get(name, name)}[{index}]"
 
     def _changes(self, way: str) -> Types:
-        """Types of the tangents or adjoints of inputs."""
+        """Return the types of the tangents or adjoints of inputs."""
         kinds, told = {}, {}
         for name, kind in self._inputs.items():
             if name in self._kinds.told:
@@ -435,7 +436,7 @@ class _Pointwise:
         return f"{called}[i] = " + (f"{before}{suffix}[i] + " if before else "")
 
     def _written(self, suffix: str) -> dict[str, Any]:
-        """Types of the arrays that results, or their tangents, are written to, and added to."""
+        """Return the types of the arrays to which results, or their tangents, are written or added."""
         written = {}
         for result, kind in self._results.items():
             if result in self._before:

@@ -1,16 +1,16 @@
 """Sheets: walls of no thickness, through which particles do not see each other.
 
-Lists of neighbours are made as if there were no sheets. Then what is hidden is taken out of them, once in each step:
+Lists of neighbours are first made as if there were no sheets. Once in each step these hidden neighbours are removed:
 
 - particle j, where the segment from i to j goes through a sheet;
 - the image of j, where the segment to it goes through a sheet, or that from the image of i to j does;
 - a wall particle of a sheet, where the segment to it does not go through this sheet, or goes through another one;
 - any other wall particle, where the segment to it goes through a sheet.
 
-So whatever part of its support a particle does not see for a sheet has this sheet's wall particles, and tips and holes
-need no rule of their own. All are where they are before the step, the sheets too: a particle that begins a step on one
-side of a sheet ends it there (`cortado.solvers.projection.sides`). Lists are symmetric, as a segment begins at the
-particle with the lower number. What is seen does not change within a step, and has no derivative.
+So the sheet's wall particles fill the part of the support that the sheet hides, and tips and holes need no special
+rule. Positions, also of sheets, are those before the step: a particle that begins a step on one side of a sheet ends it
+there (`cortado.solvers.projection.sides`). Lists are symmetric, because a segment begins at the particle with the lower
+number. Visibility does not change within a step, and has no derivative.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,9 +36,10 @@ class PlacedSheet:
     """A sheet of a scene."""
 
     number: int
-    """Number of its wall particles (`cortado.scene.motions.wall_numbers`): from 0 on for one that moves."""
+    """Number that the sheet's wall particles have (`cortado.scene.motions.wall_numbers`): from 0 on for a moving
+    sheet."""
     sheet: Sheet
-    """One that moves about its middle and not turned, another one in its place."""
+    """The sheet's geometry: a moving sheet about its middle and not turned, a sheet at rest in its place."""
 
 
 @cache
@@ -47,7 +48,8 @@ def sheets_type(precision: Precision) -> Any:
 
     class Sheets:
         faces: faces_type(precision)
-        """Their edges or triangles, of those that move in the frames of their solids, of others in space."""
+        """Edges or triangles of the sheets: of moving sheets in the frames of their solids, of other sheets in
+        space."""
         numbers: wp.array(dtype=wp.int32)
         """Number of the wall particles of each sheet."""
 
@@ -57,8 +59,8 @@ def sheets_type(precision: Precision) -> Any:
 
 @cache
 def sheet_functions(precision: Precision) -> tuple[Any, Any]:
-    """Make Warp functions: ``scale_of`` sheet k; and ``seen_from``, a place as the sheet has it about its middle, in
-    units of its scale, where solids have the poses ``middles`` and ``turns``."""
+    """Make Warp functions: ``scale_of`` sheet k; and ``seen_from``, which returns a place in the frame of the sheet,
+    about its middle and divided by its scale, for solids with the poses ``middles`` and ``turns``."""
     real, vector, sheets_of = precision.real, precision.vector, sheets_type(precision)
     neighbourhood, poses = neighbourhood_type(precision), wp.array2d(dtype=vector)
     turnings = wp.array2d(dtype=matrix_of(precision))
@@ -84,7 +86,7 @@ def sheet_functions(precision: Precision) -> tuple[Any, Any]:
 
 @cache
 def hiding_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel that takes out of lists of neighbours what sheets hide, with a thread for each particle."""
+    """Make the kernel that removes neighbours hidden by sheets from the lists, with a thread for each particle."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     sheets_of, (scale_of, seen_from) = sheets_type(precision), sheet_functions(precision)
     query, _, goes_through = face_functions(precision)
@@ -96,8 +98,8 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
 
     @wp.func
     def crossed(p: vector, q: vector, own: int, member: int, s: neighbourhood, sheets: sheets_of) -> int:
-        """Return 1 where a segment goes through the sheet of the wall particles ``own``, 2 where it does through
-        another one, 3 for both."""
+        """Return 1 if a segment crosses the sheet with the wall particles ``own``, 2 if it crosses another sheet, 3 for
+        both."""
         found = int(0)
         for k in range(sheets.numbers.shape[0]):
             start = seen_from(p, s.before, s.turns_before, k, member, s, sheets)
@@ -108,7 +110,7 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
 
     @wp.func
     def is_near(x: vector, member: int, reach: real, s: neighbourhood, sheets: sheets_of) -> bool:
-        """Test whether a face of a sheet may be so near that its wall particles are within reach."""
+        """Test whether a face of a sheet may be near enough for its wall particles to be within reach."""
         for k in range(sheets.numbers.shape[0]):
             y = seen_from(x, s.before, s.turns_before, k, member, s, sheets)
             face = int(0)
@@ -177,10 +179,10 @@ class Sheets:
     """The sheets of a scene, in one precision and on one device."""
 
     def __init__(self, placed: Sequence[PlacedSheet], spacing: float, layout: Layout):
-        """Take sheets beside particles a ``spacing`` [m] apart."""
+        """Take the ``placed`` sheets, in a fluid with particles a ``spacing`` [m] apart."""
         self.numbers, device = [one.number for one in placed], layout.device
         self.struct = sheets_type(layout.precision)()
-        """As kernels know them."""
+        """The sheets as an argument of kernels."""
         faces = [(one.sheet.pieces, one.sheet.normals) for one in placed]
         self.struct.faces, self._trees = faces_on(faces, spacing, layout.precision, device)
         self.struct.numbers = wp.array(self.numbers, dtype=wp.int32, device=device)
@@ -188,7 +190,7 @@ class Sheets:
     def hide(
         self, launch: Callable[..., None], discretisation: Discretisation, search: NeighbourSearch, **known: Any
     ) -> None:
-        """Take what sheets hide out of the lists of a search, given the neighbourhood ``s`` and the sorted positions
+        """Remove hidden neighbours from the lists of a search, given the neighbourhood ``s`` and the sorted positions
         ``x``."""
         names = "fluid_count", "filling", "count", "all_count"
         lists = {name: getattr(search, name) for name in names}

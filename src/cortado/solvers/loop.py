@@ -1,5 +1,5 @@
-"""The loops of a step, which go round until an error is small enough. Kernels decide on the device whether to go on,
-and record iterations and errors of every step, also those of the systems of equations that forces solve."""
+"""The loops of a step, which iterate until an error is small enough. Kernels decide on the device whether to continue,
+and record iterations and errors of every step, also iterations of solves by forces."""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -20,18 +20,18 @@ from cortado.solvers.containment import NO_PARTICLE, Containment
 from cortado.solvers.solver import Counts
 
 UNKNOWN = 2**31 - 1
-"""Stands in place of a loop's number of rounds before it is known."""
+"""Value in place of a loop's number of iterations before the number is known."""
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A rule that reduces the errors of all particles, which come in pairs, to one or two numbers a step."""
+    """A rule that reduces the errors of all particles, a pair of numbers each, to one or two numbers a step."""
 
     columns: tuple[str, ...]
     """Names of these numbers in a run's diagnostics, made from the loop's name; a tolerance bounds the first."""
     is_weighted: bool
-    """Whether a pair is a weighted square and its weight, of which the root of the mean is taken. Otherwise both are
-    the error, of which the average and the maximum are."""
+    """True if a pair is a weighted square and its weight: the result is the root of the weighted mean. Otherwise both
+    are the error: the results are average and maximum."""
 
 
 AVERAGE = Measure(("{}", "greatest_{}"), is_weighted=False)
@@ -43,7 +43,7 @@ class ConvergenceKernels:
     """Kernels that count iterations and steps on the device, with one thread a scene."""
 
     decide: Any
-    """Decides whether to go on iterating."""
+    """Decides whether to continue iterating."""
     record: Any
     """Records a loop that has ended; the last loop of a step ends the step."""
     count_step: Any
@@ -79,7 +79,7 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
     def decide(
         done: int, most: int, particles: int, tolerance: real, greatest_tolerance: real, sums, iteration, rounds, active
     ):
-        """Decide which scenes go on iterating: add ``done`` iterations to their counts, set ``rounds`` where the error
+        """Decide which scenes continue: add ``done`` iterations to their counts, set ``rounds`` of scenes whose error
         is below the tolerances, and count the other scenes in ``active``."""
         b = wp.tid()
         if rounds[b] != wp.static(UNKNOWN):
@@ -143,10 +143,10 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
 
 
 class IterativeSolve(Protocol):
-    """The iterative solution of a force's equations, which a force has as ``solve``."""
+    """The iterative solution of a force's equations, the attribute ``solve`` of the force."""
 
     name: str
-    """Name of its number of iterations in the diagnostics of a run."""
+    """Name of the solve's number of iterations in the diagnostics of a run."""
     count: wp.array
     """(members,) iterations of the last solve."""
 
@@ -167,7 +167,7 @@ class SolveRecord:
         """(steps,), in a batch (steps, batch), of the steps that were read."""
 
     def assign(self, other: "SolveRecord") -> None:
-        """Copy the counts that another record has read, on the device and off it."""
+        """Copy the counts that another record has read, both on the device and on the host."""
         wp.copy(self.iterations, other.iterations)
         self.found = other.found
 
@@ -184,9 +184,9 @@ class LoopLimits:
     minimum_iterations: int
     maximum_iterations: int
     tolerance: float
-    """Bound on the average of the particles' errors, or on what else the loop's measure has first."""
+    """Bound on the first number of the loop's `Measure`, such as the average of the particles' errors."""
     greatest_tolerance: float
-    """Bound on the maximum of the particles' errors; infinite where none is asked for."""
+    """Bound on the maximum of the particles' errors; infinite if there is no such bound."""
 
 
 class LoopRecord:
@@ -197,7 +197,7 @@ class LoopRecord:
         self.iterations = wp.zeros(shape, dtype=wp.int32, device=layout.device)
         """(steps, members) on the device."""
         self.errors = wp.zeros(shape, dtype=layout.precision.pair, device=layout.device)
-        """(steps, members) what errors come to, as the loop's measure says, on the device."""
+        """(steps, members) errors reduced by the loop's measure, on the device."""
         self.loop = loop
         self._seen = HostCopy(self.iterations), HostCopy(self.errors)
         self.read(0)
@@ -208,14 +208,14 @@ class LoopRecord:
         iterations, errors = (copy.read(steps) for copy in self._seen)
         iterations = iterations.astype(int)
         self.counts = iterations.max(axis=1)
-        """(steps,) how often the loop went round, in the scene of a batch that took most."""
+        """(steps,) number of iterations; in a batch that of the scene with the most."""
         self.diagnostics: dict[str, NDArray] = {loop.iterations_name: iterations[kept]}
         for number, name in enumerate(loop.columns):
             self.diagnostics[name] = errors[..., number][kept].astype(np.float64)
         """(steps,) by name, in a batch (steps, batch), of the steps that were read."""
 
     def assign(self, other: "LoopRecord") -> None:
-        """Copy the iterations and errors that another record has read, on the device and off it."""
+        """Copy the iterations and errors that another record has read, both on the device and on the host."""
         wp.copy(self.iterations, other.iterations)
         wp.copy(self.errors, other.errors)
         self.counts, self.diagnostics = other.counts, other.diagnostics
@@ -232,8 +232,8 @@ class LoopRecord:
 
 
 class IterationLog:
-    """The records of a step's loops and of the equations that forces solve: a `StepLog`. A solver that has neither has
-    only to say that it converged."""
+    """A `StepLog` of the records of a step's loops and of solves by forces. Without either it only has ``converged``,
+    which is True."""
 
     def __init__(self, steps: int, loops: Sequence["Loop"], solves: Sequence[IterativeSolve], layout: Layout):
         self.records = tuple(LoopRecord(steps, loop) for loop in loops)
@@ -281,16 +281,16 @@ class Loop:
         errors_name: str = "density_errors",
         measure: Measure = AVERAGE,
     ):
-        """Prepare a loop; with ``limits`` None it never goes round. The names are used in the diagnostics of a run."""
+        """Prepare a loop; with ``limits`` None it never iterates. The names are used in the diagnostics of a run."""
         precision, device = layout.precision, layout.device
         self.limits, self.iterations_name, self.layout = limits, iterations_name, layout
         self.columns = [column.format(errors_name) for column in measure.columns]
-        """The names of what errors come to."""
+        """Names of the numbers to which errors are reduced."""
         self.errors = wp.zeros(layout.all_particles, dtype=precision.pair, device=device)
-        """(n,) the error of a particle, as the `Measure` has it: every iteration writes it."""
+        """(n,) the pair of errors of each particle for the `Measure`; every iteration writes it."""
         self.rounds = wp.full(layout.members, UNKNOWN, dtype=wp.int32, device=device)
-        """(members,) how often the loop goes round in each scene of a batch, `UNKNOWN` until that is known: iteration k
-        must leave a scene as it is where k is not below."""
+        """(members,) number of iterations of each scene of a batch, `UNKNOWN` until it is known. Iteration k must not
+        change scenes whose number is k or less."""
         self._launch, self._kernels = launch, convergence_kernels(precision, measure)
         self._sum = (
             layout.sum_of(precision.pair)
@@ -300,7 +300,7 @@ class Loop:
         self._sums = wp.zeros(layout.members, dtype=precision.pair, device=device)
         is_fixed = limits is not None and limits.minimum_iterations == limits.maximum_iterations
         self._fixed = limits.minimum_iterations if limits is not None and is_fixed else 0
-        """Iterations of every step, where nothing is to be decided; else 0."""
+        """Number of iterations of every step if it is fixed; otherwise 0."""
         self._iteration = wp.zeros(layout.members, dtype=wp.int32, device=device)
         self._active = wp.full(1, layout.members, dtype=wp.int32, device=device)
 
@@ -311,15 +311,15 @@ class Loop:
         self._active.fill_(self.layout.members)
 
     def seek(self, record: LoopRecord, step: int) -> int:
-        """Prepare the loop to go round as often as in a recorded step, and return that number. Only in a batch do
-        scenes differ."""
+        """Prepare the loop for as many iterations as in a recorded step, and return that number. Scenes of a batch may
+        differ in it."""
         if self.layout.members > 1:
             wp.copy(self.rounds, record.iterations[step])
         return int(record.counts[step])
 
     def run(self, iterate: Callable[[int], None]) -> None:
-        """Go round until the errors are small enough. ``iterate`` is given the number of the iteration, from 0; beyond
-        the least number of them it is captured once, and always given the greatest number."""
+        """Iterate until the errors are small enough. ``iterate`` takes the number of the iteration, from 0. Beyond the
+        least number of iterations a graph captures it once, with the greatest number as its argument."""
         limits = self.limits
         if limits is None:
             return
