@@ -1,6 +1,6 @@
-"""How a function becomes a command, the arguments that several commands have, and words that name a command.
+"""Turn functions into commands; arguments that several commands share; and the command line as the user typed it.
 
-What is asked of the values of arguments is checked here, before a command begins and imports what it needs.
+Values of arguments are checked here, before a command starts and imports its packages.
 """
 
 import io
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from cortado.runs.recording import FrameChoice
 
 Work = Callable[[], str]
-"""The work of a command once its arguments are understood; returns the text that it prints."""
+"""Runs a command with parsed arguments and returns the text to print."""
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Task = Annotated[Positional[Path], arg(metavar="TASK.toml")]
 Flag = Annotated[bool, arg(help_behavior_hint="")]
-"""An option without a value, of which the help says no default."""
+"""An option without a value, whose default the help does not show."""
 Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
 Device = Annotated[str, arg(help='"cpu", or "cuda:0" for the first GPU.')]
 Precision = Annotated[str, arg(help='"float32" or "float64".')]
@@ -40,12 +40,12 @@ Json = Annotated[bool, arg(help="Print JSON for machines.", help_behavior_hint="
 Quiet = Annotated[bool, arg(help="Say nothing but results, warnings and errors.", help_behavior_hint="")]
 
 STEPS = 200
-"""Steps of a run whose length is not given."""
+"""Number of steps of a run if the user gives neither steps nor a time."""
 
 
 def command(group: SubcommandApp, answers: bool = False) -> Callable[[Callable[..., Work]], Callable[..., Work]]:
-    """Return a decorator that makes a function a command of a group, with an option --quiet. At its end a command
-    prints its answer, if it ``answers``, or a line about the files that it wrote."""
+    """Return a decorator that turns a function into a command of a group, with an option --quiet. A command that
+    ``answers`` prints its result; another command prints which files it wrote."""
 
     def register(function: Callable[..., Work]) -> Callable[..., Work]:
         @wraps(function)
@@ -72,23 +72,23 @@ def _quiet(work: Work, answers: bool) -> str:
 
 @dataclass(frozen=True)
 class Program:
-    """A group of commands, with the name by which one runs it."""
+    """A group of commands, with the name of the program that runs them."""
 
     name: str
     app: SubcommandApp
     description: str
     overview: Callable[[], str] | None = None
-    """Returns the text that it prints without arguments, if not its help."""
+    """Returns the text that the program prints without arguments; if None, it prints its help."""
 
     def parsed(self, arguments: Sequence[str]) -> Any:
-        """Return the work of the command that the arguments name; print help and exit where they ask for it or are
-        misused."""
+        """Parse the arguments and return what their command has to do. Print help and exit if they ask for it or are
+        wrong."""
         config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
         return self.app.cli(prog=self.name, description=self.description, args=arguments, config=config)
 
     def completion_script(self, shell: str) -> str:
-        """Return the completion script for a shell, as tyro prints it; bash completes names of files where nothing else
-        fits."""
+        """Return the completion script for a shell, as tyro prints it; in bash, names of files are completed where no
+        command or option fits."""
         box = io.StringIO()
         with redirect_stdout(box), suppress(SystemExit):
             self.parsed(["--tyro-print-completion", shell])
@@ -97,21 +97,22 @@ class Program:
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Which states of a run are frames of its trajectory."""
+    """Options that choose which states of a run are recorded as frames of its trajectory."""
 
     record_every: int | None = None
-    """Steps from one frame of the trajectory to the next; if left out 1, or in a sweep a 100th of all steps."""
+    """Steps from one frame of the trajectory to the next; 1 if left out, and in a sweep a 100th of all steps."""
     fps: float | None = None
-    """Frames of the trajectory in a second that is simulated, not of a film; in the place of --record-every."""
+    """Frames of the trajectory per simulated second (not of a film); instead of --record-every."""
 
     def check(self) -> None:
-        """Raise `InputError` for --record-every that is too small, and where --fps is given besides."""
+        """Raise `InputError` if --record-every is too small, or if --fps is given too."""
         if self.fps is not None and self.record_every is not None:
             raise InputError("--fps is given, but must be left out, as --record-every says which states are recorded.")
         require_at_least(1, 1 if self.record_every is None else self.record_every, "--record-every")
 
     def choice(self, otherwise: int = 1) -> "FrameChoice":
-        """Return the choice of frames by checked options: every ``otherwise`` steps if none is given."""
+        """Return the choice of frames after checking the options: one every ``otherwise`` steps if no option is
+        given."""
         from cortado.runs.recording import EverySteps, FramesPerSecond
 
         return EverySteps(self.record_every or otherwise) if self.fps is None else FramesPerSecond(self.fps)
@@ -122,11 +123,10 @@ ALL_FRAMES = FrameOptions()
 
 @dataclass(frozen=True)
 class Where:
-    """The options --scheduler and --workers of a command; raises `InputError` for both of them, and for more processes
-    than make sense."""
+    """The options --scheduler and --workers of a command. Giving both, or too many processes, raises `InputError`."""
 
     scheduler: str | None = None
-    """The address of a scheduler of Dask's."""
+    """The address of a Dask scheduler."""
     workers: int | None = None
     """Number of worker processes on this machine."""
 
@@ -140,14 +140,14 @@ class Where:
 
     @property
     def option(self) -> str | None:
-        """Return the option that was given."""
+        """Return the name of the option that was given."""
         return "--scheduler" if self.scheduler is not None else None if self.workers is None else "--workers"
 
     @contextmanager
     def executor(self, device: str, items: int) -> "Iterator[Executor]":
-        """Yield the executor: a Dask scheduler if one is given, workers if they are asked for, or else this process.
-        Workers end with the block, and on a GPU each has one of its own. There are no more of them than ``items``,
-        the computations that run at a time."""
+        """Yield the executor: a Dask scheduler or workers if the options say so, else this process. Workers end with
+        the block. On GPUs each worker has its own GPU. At most ``items`` workers start: that many computations run at a
+        time."""
         from cortado.executors import Distributed, InProcess, local_workers
 
         if self.scheduler is not None:
@@ -166,25 +166,26 @@ HERE = Where()
 
 
 def require_shared(out: Path, what: str) -> None:
-    """Raise `InputError` where a worker process does not see a folder in which its command is at work."""
+    """Raise `InputError` if a worker process cannot see the folder that the command works in."""
     if not (out / LOCK).exists():
         raise InputError(f"A worker does not see {out}, but {what} must be in a file system that all machines share.")
 
 
 def require_at_least(least: int, value: int, option: str) -> None:
-    """Raise `InputError` for a value that is smaller, with the option's name in the sentence."""
+    """Raise `InputError`, naming the option, for a value below ``least``."""
     if value < least:
         raise InputError(f"{option} is {value}, but must be at least {least}.")
 
 
 def require_one_of_both(resume: bool, overwrite: bool) -> None:
-    """Raise `InputError` where a command is to go on with a run and to replace it."""
+    """Raise `InputError` if both --resume and --overwrite are given."""
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
 
 
 def steps_or_time(steps: int | None, time: float | None) -> int | None:
-    """Return the number of steps, `STEPS` if neither was given; None with a time [s]. Raise `InputError` for both."""
+    """Return the number of steps, None if a time [s] is given instead, or `STEPS` without either. Giving both raises
+    `InputError`."""
     if time is None:
         return STEPS if steps is None else steps
     if steps is not None:
@@ -195,15 +196,15 @@ def steps_or_time(steps: int | None, time: float | None) -> int | None:
 
 
 def text_overrides(file: Path, overrides: Sequence[str]) -> list[str]:
-    """Return the overrides of --set for a file as text. Raise `SceneError` for a file that cannot be read, or for
-    overrides of keys that it has not: at once, as the imports of a command after that take a second."""
+    """Return the overrides of --set for a file as text. Raise `SceneError` for an unreadable file or an unknown key.
+    This check comes before the command's imports, which take a second."""
     words = as_text(overrides)
     read_toml(file, words)
     return words
 
 
 def as_text(options: Sequence[str]) -> list[str]:
-    """Return the values of --set or --only; raise `InputError` for bytes that are no text."""
+    """Return the values of --set or --only; raise `InputError` if a value is not valid text."""
     for option in options:
         try:
             option.encode()
@@ -213,5 +214,5 @@ def as_text(options: Sequence[str]) -> list[str]:
 
 
 def command_line() -> list[str]:
-    """Return the command as it was typed, which a run writes into its folder."""
+    """Return the command line as the user typed it; a run stores it in its folder."""
     return ["cortado", *sys.argv[1:]]

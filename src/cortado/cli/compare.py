@@ -1,7 +1,7 @@
-"""Runs beside others: ``cortado compare`` of two, or of sensors and measured data, and ``cortado convergence``.
+"""``cortado compare``: two runs, or a run's sensors and measured data; and ``cortado convergence``: several runs.
 
-Two runs: how far apart they ended, and why that may be. Several at other resolutions: the order of convergence, and the
-limit.
+For two runs: how far apart their last states are, and possible reasons. For several runs of different resolution: the
+order of convergence and the limit.
 """
 
 import json
@@ -24,9 +24,9 @@ from cortado.runs.sensor import MeasuredColumn, measured_beside, summary
 from cortado.runs.trajectory import Trajectory
 
 IGNORED = ("command", "started", "resumed", "settings", "kind")
-"""Keys of environment.json that differ between any two runs, or are compared apart."""
+"""Keys of environment.json that differ between any two runs, or that are compared separately."""
 SAME_TIME = 1e-9
-"""Relative difference below which times are equal, as sums of steps of other lengths are."""
+"""Relative difference below which two times count as equal: sums of different step lengths have round-off."""
 FIELD_UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
 """Units of the fields of a frame."""
 
@@ -34,13 +34,13 @@ FIELD_UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
 SPACING, TIME_STEP = "discretisation.spacing", "solver.time_step"
 SIZE_UNITS = {SPACING: "m", TIME_STEP: "s"}
 LEAST_RUNS = 3
-"""Fewest runs that an order of convergence takes."""
+"""Smallest number of runs from which an order of convergence is computed."""
 SAME_MASS = 0.005
-"""Relative difference below which masses of fluid are equal."""
+"""Relative difference below which two masses of fluid count as equal."""
 
 
 def compare_runs(first: Path, second: Path, as_json: bool) -> str:
-    """Tell what is equal and what differs in two runs, as text or as JSON. Two runs that differ are no failure."""
+    """Return what is equal and what differs in two runs, as text or as JSON. Different runs are not an error."""
     found = _compared(RunFolder.open(first), RunFolder.open(second))
     return json.dumps(found, indent=2) if as_json else _in_words(found)
 
@@ -66,7 +66,7 @@ def _compared(one: RunFolder, other: RunFolder) -> dict[str, Any]:
 
 
 def _is_equal(found: Mapping[str, Any]) -> bool:
-    """Test whether two runs differ in nothing but where they were made."""
+    """Test whether two runs are equal except for the machine and the time of the run."""
     state = found["last_state"]
     same_state = state is None or (
         "unlike" not in state
@@ -82,7 +82,7 @@ def _table(value: Any) -> dict[str, Any]:
 
 
 def _other_steps(settings: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the note on metrics of two runs whose line k is at another time in each; empty for equal times."""
+    """Return a note if line k of the metrics belongs to a different time in each run; empty if the times are equal."""
     steps = [_table(scene.get("solver")).get("time_step") for scene in scenes]
     same = steps[0] == steps[1] and (steps[0] != "auto" or scenes[0] == scenes[1])
     if same or any(table["kind"] != "run" for table in settings):
@@ -92,7 +92,8 @@ def _other_steps(settings: list[dict[str, Any]], scenes: list[dict[str, Any]]) -
 
 
 def _metrics(one: RunFolder, other: RunFolder) -> dict[str, Any]:
-    """Return the first line of metrics that differs, and every number's greatest difference over the lines of both."""
+    """Return the number of the first line of metrics that differs, and each metric's greatest difference over all
+    lines."""
     rows, others = one.read_metrics(), other.read_metrics()
     found: dict[str, Any] = {} if len(rows) == len(others) else {"lines": [len(rows), len(others)]}
     differ = [k for k, (row, twin) in enumerate(zip(rows, others, strict=False)) if row != twin]
@@ -109,8 +110,8 @@ def _metrics(one: RunFolder, other: RunFolder) -> dict[str, Any]:
 
 
 def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
-    """Return the distances of positions and velocities in the last frames that are at one time, and their ``times_s``;
-    None where a run has no trajectory."""
+    """Return the distances of positions and velocities in the last frames of equal time, and these ``times_s``. None if
+    a run has no trajectory."""
     if not (one.trajectory.exists() and other.trajectory.exists()):
         return None
     runs = [Trajectory.load(folder.trajectory) for folder in (one, other)]
@@ -141,13 +142,13 @@ def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
 
 
 def _at_one_time(one: Any, other: Any) -> Any:
-    """Test whether times [s] are equal but for round-off; of arrays element by element."""
+    """Test whether times [s] are equal except for round-off, element by element for arrays."""
     return np.isclose(one, other, rtol=SAME_TIME, atol=0.0)
 
 
 def _last_at_one_time(one: np.ndarray, other: np.ndarray) -> tuple[int, int] | None:
-    """Return the last frame of each run, given their times (frames,) [s], at a time that both have; the first frame,
-    from which both began, does not count."""
+    """Return the numbers of each run's frame at the last time that both runs share, given their times (frames,) [s].
+    The first frames do not count."""
     if len(one) < 2 or len(other) < 2:
         return None
     after = np.clip(np.searchsorted(other, one), 1, len(other) - 1)
@@ -157,7 +158,8 @@ def _last_at_one_time(one: np.ndarray, other: np.ndarray) -> tuple[int, int] | N
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> dict[str, Any]:
-    """Return the distances of vectors (n, d) of the same particles: root mean square, greatest, and its particle."""
+    """Return distances of vectors (n, d) of the same particles: root mean square, greatest, and the particle with the
+    greatest."""
     apart = np.linalg.norm(one - other, axis=1)
     return {
         "root_mean_square": float(np.sqrt(np.mean(apart**2))),
@@ -216,7 +218,8 @@ def _metric_line(metrics: Mapping[str, Any]) -> str:
 
 
 def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
-    """Compare a run's sensors with measured data as text or as JSON, and plot it into the run's figures."""
+    """Compare a run's sensors with measured data, as text or as JSON, and write a plot into the run's figures
+    folder."""
     folder = RunFolder.open(run)
     readings = folder.read_sensors()
     if not readings:
@@ -240,10 +243,11 @@ def _line(one: MeasuredColumn) -> str:
 
 
 class Resolved:
-    """One run of a study of convergence, with its size and its numbers."""
+    """One run of a convergence study, with its resolution and its results."""
 
     def __init__(self, folder: RunFolder, quantities: Sequence[OwnQuantity]):
-        """Read a run, with ``quantities`` of the user's own; raise `InputError` for a run that has not ended well."""
+        """Read a run and compute the user's ``quantities``; raise `InputError` for a run that failed or has not
+        ended."""
         result = folder.read_result()
         if result is None or result["failures"] or "energy" not in result or not folder.trajectory.exists():
             raise InputError(f"{folder.path} is no run that has ended well, but all of them must be.")
@@ -254,7 +258,7 @@ class Resolved:
         """[s]"""
         masses = last.constants["reference_density"].astype(np.float64)
         self.mass = float(masses.sum()) * float(self.scene["discretisation"]["spacing"]) ** last.dimension
-        """Of all fluid [kg], in 2-D of a layer 1 m thick."""
+        """Mass of all fluid [kg], in 2-D of a layer 1 m thick."""
         numbers = {f"{kind} energy": ("J", float(result["energy"]["last"][kind])) for kind in ("kinetic", "potential")}
         if self.scene.get("emitter") or self.scene.get("drain"):  # what is in none of them counts
             masses = masses * is_out(folder.read_scene(), last[0].others, len(masses))
@@ -266,10 +270,10 @@ class Resolved:
                 unit = readings[name].units[column]
                 numbers |= {f"{name} {column}": (unit, found["last"]), f"{name} {column}, mean": (unit, found["mean"])}
         self.numbers = numbers | {one.name: ("", one(trajectory)) for one in quantities}
-        """The unit and the value of each, by name."""
+        """Unit and value of each result, by name."""
 
     def size(self, key: str) -> float:
-        """Return the spacing [m] or the time step [s]; raise `InputError` for one that is chosen."""
+        """Return the spacing [m] or the time step [s]; raise `InputError` if the solver chooses the time steps."""
         table, name = key.split(".")
         value = self.scene[table][name]
         if not isinstance(value, float | int):
@@ -278,7 +282,7 @@ class Resolved:
 
 
 def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_json: bool) -> str:
-    """Return the table of convergence, as text or as JSON; raise `InputError` for runs that do not belong together."""
+    """Return the table of convergence, as text or as JSON; raise `InputError` for runs that cannot be compared."""
     own = [OwnQuantity(one) for one in quantities]
     runs = [Resolved(folder, own) for folder in named_runs(folders)]
     if len(runs) < LEAST_RUNS:
@@ -316,7 +320,7 @@ def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_jso
 
 
 def _warn_of_masses(runs: Sequence[Resolved]) -> None:
-    """Warn where runs have unlike amounts of fluid, which no order of convergence is about."""
+    """Warn if runs differ in their mass of fluid: an order of convergence does not describe that difference."""
     least, most = (choose(runs, key=lambda run: run.mass) for choose in (min, max))
     if most.mass > (1.0 + SAME_MASS) * least.mass:
         warn(
@@ -327,7 +331,7 @@ def _warn_of_masses(runs: Sequence[Resolved]) -> None:
 
 
 def _varied(runs: Sequence[Resolved]) -> str:
-    """Return the key in which runs differ: spacing, or time step. Raise `InputError` where they differ in more."""
+    """Return the key in which runs differ: spacing or time step. Raise `InputError` if other keys differ too."""
     changed: set[str] = set()
     for run in runs[1:]:
         changed |= differences(runs[0].scene, run.scene).keys()
@@ -341,7 +345,7 @@ def _varied(runs: Sequence[Resolved]) -> str:
 
 
 def _convergence_in_words(table: dict[str, Any]) -> str:
-    """Write a line for each number of a table of convergence, the finest run on the right."""
+    """Return the convergence table as text: a line for each result, with the finest run on the right."""
     key = table["by"]
     lines = [["", *(f"run {k}" for k in range(1, len(table["runs"]) + 1)), "order", "limit", "error", ""]]
     sizes = (key, *(other for other in SIZE_UNITS if other != key and other in table))
@@ -365,20 +369,20 @@ def _convergence_in_words(table: dict[str, Any]) -> str:
 
 
 def _aligned(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Align cells of lines in columns, the first one to the left."""
+    """Align the cells of lines in columns; the first column is left-aligned."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines]
 
 
 LEAST_ORDER, MOST_ORDER = 1e-3, 20.0
-"""Range of orders in which one is looked for."""
+"""Range in which the observed order is searched."""
 LOWEST, HIGHEST = 0.5, 2.0
-"""Orders that are believed; the methods have 1 to 2. Values with another one are not in the range where differences
-shrink by a power of the size."""
+"""Orders that are trusted; the methods have 1 to 2. With any other order, the sizes are not yet in the asymptotic
+range."""
 ROUND_OFF = 1e-6
-"""Relative deviation within which an order at either end of the range is believed."""
+"""Relative tolerance at both ends of the trusted range of orders."""
 SAFE, UNSURE = 1.25, 3.0
-"""Safety factors of Roache (1994): of three sizes whose order is believed, and of all others."""
+"""Safety factors of Roache (1994): for three sizes with a trusted order, and for all other cases."""
 
 
 @dataclass(frozen=True)
@@ -387,23 +391,23 @@ class Extrapolation:
 
     Source: L. F. Richardson, Phil. Trans. R. Soc. A 210 (1911), 307; the grid convergence index of P. J. Roache, J.
     Fluids Eng. 116 (1994), 405, by the procedure of I. B. Celik et al., J. Fluids Eng. 130 (2008), 078001, for sizes
-    whose ratios differ. Where there is no order, the error is that of L. Eca and M. Hoekstra, J. Comput. Phys. 262
-    (2014), 104: three times the greatest difference.
+    whose ratios differ. Without an observed order, the error is three times the greatest difference (L. Eca and M.
+    Hoekstra, J. Comput. Phys. 262 (2014), 104).
     """
 
     order: float | None
-    """Observed order; None where there is none."""
+    """Observed order; None if the values have no order."""
     limit: float | None
-    """Limit in the values' unit, by the order within `LOWEST` and `HIGHEST` that is nearest to the observed one."""
+    """Limit in the values' unit, computed with the observed order clipped to `LOWEST` and `HIGHEST`."""
     error: float | None
-    """Error of the value at the finest size, in its unit, with a safety factor: the limit is probably no further away.
-    None where a value is not a number."""
+    """Estimated error of the value at the finest size, in its unit, times a safety factor: the limit is probably within
+    it. None if a value is NaN."""
     flag: str = ""
-    """Why no order is observed, or the observed one not believed, in words; empty in the asymptotic range."""
+    """Reason why no order is observed or why the observed order is not trusted; empty in the asymptotic range."""
 
     @classmethod
     def of(cls, sizes: Sequence[float], values: Sequence[float]) -> "Extrapolation":
-        """Extrapolate ``values`` (k,) at ``sizes`` (k,), k of at least 3, the finest one last."""
+        """Extrapolate ``values`` (k,) at ``sizes`` (k,), finest last; k is at least 3."""
         (h_3, h_2, h_1), (f_3, f_2, f_1) = sizes[-3:], values[-3:]
         fine, coarse = f_2 - f_1, f_3 - f_2
         if not np.isfinite([fine, coarse]).all():

@@ -1,4 +1,4 @@
-"""``cortado dataset``: many runs of a scene with varied values, in files of LagrangeBench's layout."""
+"""``cortado dataset``: compute many runs of a scene with varied values, and write files in LagrangeBench's layout."""
 
 import json
 import warnings
@@ -33,14 +33,14 @@ from cortado.simulation import Simulation
 from cortado.version import __version__
 
 ASKED = "dataset.json"
-"""The file with the choices of a data set, by which the same command goes on with it, and another one does not. The
-number of runs is none of them."""
+"""The file with the settings of a data set: only a command with equal settings may continue it. The number of runs may
+change."""
 MOST_RUNS = 100_000
 
 
 @dataclass(frozen=True)
 class Member:
-    """The computation of the runs of a data set, which a worker process is sent."""
+    """The function object, sent to worker processes, that computes one run of a data set."""
 
     file: Path
     overrides: tuple[str, ...]
@@ -50,13 +50,13 @@ class Member:
     precision: str
 
     def scene(self, number: int) -> Scene:
-        """Return the scene of the run of a number."""
+        """Return the scene of run ``number``."""
         return load_scene(self.file, [*self.overrides, *Sample(self.table, number).overrides]).lasting(
             steps=self.table.steps
         )
 
     def __call__(self, number: int) -> tuple[bool, list[str]]:
-        """Compute a run and write it; return True if there is one, and its warnings."""
+        """Compute a run and write it; return whether it succeeded, and its warnings."""
         require_shared(self.out, "the scene and the folder of a data set")
         folder = DatasetFolder(self.out)
         with warnings.catch_warnings(record=True) as caught, untracked():
@@ -74,8 +74,8 @@ class Member:
 def make_dataset(
     file: Path, runs: int, out: Path, overrides: list[str], device: str, precision: str, where: Where
 ) -> str:
-    """Compute the missing runs of a data set, new or there already, and put all together; return a sentence that says
-    where they are. Raise `ComputationError` where the disk is full, and where a purpose is left without a run."""
+    """Compute the missing runs of a new or existing data set, and write its files; return a sentence that names the
+    folder. Raise `ComputationError` if the disk is full, or if training, validation or test has no run."""
     table = _table(file, overrides)
     of_scene = [one for one in overrides if one not in overrides_of(overrides, ("dataset",))]
     member = Member(file.absolute(), tuple(of_scene), table, out.absolute(), device, precision)
@@ -124,7 +124,7 @@ def make_dataset(
 
 @contextmanager
 def _saying(kept: Callable[[], str]) -> Iterator[None]:
-    """Add what is ``kept`` to the message of a disk that refuses, or of an interruption."""
+    """Add the sentence ``kept`` to the message of an interruption or of an error of the disk."""
     try:
         with keeping(kept):
             yield
@@ -133,7 +133,7 @@ def _saying(kept: Callable[[], str]) -> Iterator[None]:
 
 
 def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int) -> dict[str, Any]:
-    """Write the files of the data set from its finished runs, and return the metadata; raise `ComputationError` where a
+    """Write the files of the data set from its finished runs, and return the metadata; raise `ComputationError` if a
     purpose has no run."""
     folder = DatasetFolder(member.out)
     there = {purpose: [number for number in own if number in folder.runs] for purpose, own in split.items()}
@@ -172,8 +172,8 @@ def _checked_runs(runs: int, table: DatasetTable) -> int:
 
 
 def _asked(member: Member) -> dict[str, Any]:
-    """Return the choices of a data set. The first scene and those with the ends of all ranges are read, so that a
-    mistake is found before anything is computed. Raise `SceneError`."""
+    """Return the settings of a data set. To find mistakes early, this reads the first scene and the scenes at the ends
+    of all ranges. Raise `SceneError`."""
     table = member.table
     with unwarned():
         ends = [[f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()] for end in (0, 1)]
@@ -197,14 +197,13 @@ def _asked(member: Member) -> dict[str, Any]:
 
 
 def _put_digests(tables: Any) -> None:
-    """Put a digest of the content beside the name of each file in the tables of a scene, such as one with a mesh."""
+    """Store, beside each file name in the tables of a scene (such as a mesh), a digest of the file's content."""
     for table, key in files_named(tables):
         table[f"{key} content"] = sha256(Path(table[key]).read_bytes()).hexdigest()
 
 
 def _are_one(member: Member, *overrides: list[str]) -> bool:
-    """Test whether the scenes of a run with some overrides and with others compute the same; False where one is
-    refused."""
+    """Test whether two sets of overrides give scenes with equal results; False if one of the scenes is invalid."""
     try:
         scenes = [load_scene(member.file, [*member.overrides, *some]).computed_json() for some in overrides]
     except SceneError:
@@ -213,14 +212,14 @@ def _are_one(member: Member, *overrides: list[str]) -> bool:
 
 
 def _scene(member: Member) -> Scene:
-    """Read the scene of the file, whose warnings come with the runs."""
+    """Read the scene of the file without printing its warnings: the runs print them."""
     with unwarned():
         return load_scene(member.file, member.overrides)
 
 
 def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
-    """Note the choices of a data set in a new folder, and remove what a killed process left half-written; raise
-    `InputError` for a folder of something else."""
+    """Write the settings of a data set into its folder, and remove unfinished files of a killed process. Raise
+    `InputError` if the folder contains anything else."""
     note = out / ASKED
     for left_behind in [*out.glob(UNFINISHED), *(out / PARTS).glob(UNFINISHED)]:
         left_behind.unlink(missing_ok=True)
@@ -239,13 +238,13 @@ def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
 
 
 def _sizes(content: Mapping[str, Any]) -> str:
-    """Write the number of runs for each purpose, and their length."""
+    """Return a text with the number of runs for each purpose, and their length."""
     runs = ", ".join(f"{content[f'num_trajs_{purpose}']} to {purpose}" for purpose in ("train", "valid", "test"))
     return f"{counted(content['sequence_length_train'], 'frame')} each, {runs}".replace("to valid", "to validate")
 
 
 def _warn(told: Mapping[int, list[str]], failures: Mapping[int, str], runs: int) -> None:
-    """Tell once the warnings of runs, and which runs are left out."""
+    """Print each warning of the runs once, and which runs are left out."""
     warned = {number: sentences for number, sentences in told.items() if sentences}
     if warned:
         first = min(warned)

@@ -1,5 +1,5 @@
-"""``cortado describe``: a scene before it is run: particles, limits of the time step, memory, time, and the film; and
-``cortado gradients check``, the certificate of a scene."""
+"""``cortado describe``: estimate particles, time step limits, memory, computing time and film of a scene before a run.
+``cortado gradients check``: compute the certificate of a scene's gradients."""
 
 import json
 import math
@@ -43,20 +43,21 @@ from cortado.solvers.particles import ParticleSolver
 from cortado.watching import Watch
 
 MANY = 1_000_000
-"""Number of particles that is announced before they are made, as that takes some seconds or minutes."""
+"""Number of particles from which on their count is printed first, as making them takes seconds or minutes."""
 FIRST_STEPS, MOST_STEPS, ENOUGH = 4, 100, 0.5
-"""Steps that are timed: a few, or more if they are fast, until they take so many seconds together."""
+"""Least and greatest number of steps that are timed, and the total time [s] after which timing stops."""
 SAME = 1e-6
-"""Relative difference of a time step that was rounded to float32."""
+"""Relative difference that rounding a time step to float32 can cause."""
 MOST_FRAMES = 1_000_000
-"""Most frames of a film; nobody looks at more."""
+"""Greatest number of frames of a film."""
 HEADS, PER_PARTICLE, PER_STEP = 28e3, 24.0, 50.0
-"""Bytes of a trajectory file besides its frames, measured: its heads, what no step changes, what the solver notes."""
+"""Measured bytes of a trajectory file besides its frames: headers, constant fields (per particle), diagnostics (per
+step)."""
 
 
 def measured_speed(simulation: Simulation) -> tuple[int, float]:
-    """Return how many first steps of a scene were timed, after twice as many that were not, and the time of one [s],
-    with the readings of sensors. Raise `DivergedError` for a scene that does not even bear these steps."""
+    """Return how many first steps of a scene were timed (after twice as many untimed ones), and the time of one step
+    [s], including sensors. Raise `DivergedError` if the scene diverges within these steps."""
     steps = FIRST_STEPS
     while True:
         rollout = simulation.rollout(steps)
@@ -73,34 +74,34 @@ def measured_speed(simulation: Simulation) -> tuple[int, float]:
 
 
 class RunLength:
-    """The length of a run that is asked for by a number of steps or by a time, with its frames and its film."""
+    """The length of a run, given as a number of steps or as a time, with its frames and its film."""
 
     def __init__(self, simulation: Simulation, steps: int | None, time: float | None, choice: FrameChoice):
-        """Compute the length of a run with ``steps`` steps, or for a time [s]; raise `InputError` for what is
-        neither."""
+        """Compute the length of a run of ``steps`` steps or of a ``time`` [s]; raise `InputError` for invalid
+        values."""
         solver, picture = simulation.scene.solver, simulation.scene.picture or Picture()
         self.is_about = solver.chooses and time is not None
         """Whether the number of steps is an estimate."""
         self.steps = steps_of_run(simulation, steps, time, {}) // (ROOM if self.is_about else 1)
-        """About as many, where it ends at a time and chooses its steps."""
+        """Number of steps; an estimate if the run ends at a given time and the solver chooses the steps."""
         self.time = time = time if solver.chooses else self.steps * float(solver.time_step)
-        """That it simulates [s]; None of a number of steps that are chosen."""
+        """Simulated time [s]; None for a number of steps whose lengths the solver chooses."""
         self.frames = frames = choice.count(self.steps, time)
-        """That it records, the first and the last among them; None where that depends on a time that is not known."""
+        """Number of recorded frames, including first and last; None if it depends on an unknown time."""
         self.trajectory: float | None = None
-        """[bytes] of them on disk."""
+        """Size of the recorded frames on disk [bytes]."""
         if frames is not None:
             numbers = simulation.numbers_in_frame(components=3)  # as in the file
             size = sum(frame_parts(frames, numbers, simulation.precision.bytes).values())
             self.trajectory = size + (HEADS + PER_PARTICLE * simulation.particles + PER_STEP * self.steps)
         self.film: Pace | None = None
-        """Which frames its film shows, and how fast; None where there is no film, or its length is not known."""
+        """Which frames the film shows, and how fast; None without a film or if its length is unknown."""
         if frames is not None and time is not None and 1 < frames <= MOST_FRAMES and picture.film_frames != 0:
             times = np.linspace(0.0, time, frames)
             self.film = Pace.of(times, picture.film_frames, picture.film_speed, choice.rate)
 
     def for_machines(self) -> dict[str, Any]:
-        """Return the length by names that end in units."""
+        """Return the numbers of this object by names that end in their units."""
         film = {} if self.film is None else {"film_seconds": self.film.seconds, "film_speed": self.film.speed}
         return {
             "steps": self.steps,
@@ -114,7 +115,7 @@ class RunLength:
 
     @property
     def in_words(self) -> str:
-        """Return steps, and seconds of motion, in words."""
+        """Return a text with the number of steps and the simulated time."""
         motion = "" if self.time is None else f", {self.time:g} s of motion"
         about = "about " if self.is_about else ""
         guess = ", if fluid gets as fast as by a fall through the whole container" if self.is_about else ""
@@ -132,7 +133,7 @@ def describe_scene(
     picture: Path | None,
     as_json: bool,
 ) -> str:
-    """Describe a scene as text, or as JSON; write a picture of the first state where one is asked for."""
+    """Describe a scene as text or as JSON; write a picture of the first state if ``picture`` is a path."""
     if picture is not None and picture.suffix.lower() != ".png":
         raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
     of_search = overrides_of(overrides, ("problem", "optimise")) if "optimise" in read_toml(scene_file) else []
@@ -188,7 +189,7 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
 
 
 def _fluid_size(simulation: Simulation) -> list[float]:
-    """Return the size (d,) [m] of the fluid with the particles in line in emitters, and without their reserves."""
+    """Return the size (d,) [m] of the fluid, including particles queued in emitters but not the emitters' reserves."""
     scene, spacing = simulation.scene, simulation.scene.discretisation.spacing
     columns = [emitter.particles(spacing) for emitter in scene.emitter]
     shown = np.concatenate([simulation.positions[: simulation.free_particles], *columns])
@@ -196,8 +197,8 @@ def _fluid_size(simulation: Simulation) -> list[float]:
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
-    """Return the time step [s], its limits [s] by name, and the name of the limit by which it is chosen: the first step
-    then; None for one that is fixed."""
+    """Return the time step [s], its limits [s] by name, and the name of the limit that determines the first step; None
+    for a fixed step."""
     scene = simulation.scene
     if scene.solver.time_step != "auto":
         return scene.solver.time_step, stability_limits(scene), None
@@ -212,7 +213,7 @@ def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | N
 
 
 def _viscosity(scene: Scene) -> str:
-    """Say which form the viscous force has, and why it acts at the start or at the end of a step."""
+    """Return a text that says which form the viscous force has, and why it acts at the start or the end of a step."""
     form, limit = scene.forces.viscosity, viscous_limit(scene, {})
     if form != "stress" or not math.isfinite(limit):
         return str(form)
@@ -221,7 +222,7 @@ def _viscosity(scene: Scene) -> str:
 
 
 def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
-    """Return how long a number of steps will take; for a scene that does not bear the first ones, what happened."""
+    """Return how long a number of steps will take, or the error if the scene diverges in its first steps."""
     try:
         measured, seconds = measured_speed(simulation)
     except DivergedError as error:
@@ -235,7 +236,7 @@ def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
 
 
 def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
-    """Return the memory [bytes] of a run, and of a gradient."""
+    """Return the estimated memory [bytes] of a run, and of a gradient."""
     real = simulation.precision.bytes
     if not isinstance(simulation.solver, ParticleSolver):
         return {"memory_bytes": None, "gradient_memory_bytes": None}
@@ -247,15 +248,15 @@ def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
 
 
 def of_emitter(emitter: EmitterTable, spacing: float) -> dict[str, Any]:
-    """Return when an emitter is empty, None where never; what feeds it, its greatest speed, and the areas of its
-    particles' cells and of its opening."""
+    """Return when an emitter is empty (None if never), the drains that feed it, its greatest speed, and the areas of
+    its particles' cells and of its opening."""
     dry, areas = emitter.dry_after(spacing), {"area": emitter.area(spacing), "area_asked": emitter.asked_area()}
     known = {"name": emitter.name, "fed_by": list(emitter.fed_by), "speed_m_s": emitter.speed(spacing), **areas}
     return {**known, "runs_dry_at_s": dry if math.isfinite(dry) else None}
 
 
 def seconds_of_picture(simulation: Simulation, quality: str) -> float | None:
-    """Time a picture of the first state on all cores, in a quality; None where no fluid is seen then."""
+    """Measure the time [s] to draw the first state on all cores in a given quality; None if no fluid is visible."""
     scene, positions = simulation.scene, simulation.positions[: simulation.free_particles or None]
     scene = scene.model_copy(update={"picture": (scene.picture or Picture()).model_copy(update={"quality": quality})})
     colours = colours_of(scene, simulation.mass_fractions, simulation.particles)[: len(positions)]
@@ -283,7 +284,7 @@ def estimated_bytes(simulation: Simulation, rollout: Rollout) -> tuple[float, fl
 
 
 def _drawn(simulation: Simulation, path: Path) -> Path:
-    """Draw the scene with its fluid where it is at the start, in the colours of its phases."""
+    """Draw the scene with its initial fluid, in the colours of its phases."""
     free = slice(simulation.free_particles)
     colours = colours_of(simulation.scene, simulation.mass_fractions, simulation.particles)
     return write_picture(path, plan(simulation.scene, simulation.positions[free], colours[free], simulation.device))
@@ -324,8 +325,7 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
 
 
 def emitter_row(found: dict[str, Any], dimension: int, length: RunLength) -> tuple[str, str]:
-    """Return the row of a table that says when an emitter is empty, before or after the end of the run, and its
-    speed."""
+    """Return a table row with an emitter's speed and the time when it is empty, before or after the end of the run."""
     given, asked, dry = found["area"], found["area_asked"], found["runs_dry_at_s"]
     speed = f"fluid comes out of {found['name']} at {found['speed_m_s']:.3g} m/s"
     if abs(given - asked) > EXCESS * asked:
@@ -339,7 +339,7 @@ def emitter_row(found: dict[str, Any], dimension: int, length: RunLength) -> tup
 
 
 def _size(found: dict[str, Any]) -> str:
-    """Write lengths and masses, by which one sees a wrong unit."""
+    """Return a text with lengths and masses, in which a wrong unit is easy to see."""
     fluid, held = (
         " x ".join(f"{length:.3g}" for length in found[key] or ()) for key in ("fluid_size_m", "container_size_m")
     )
@@ -365,7 +365,7 @@ def _time(found: dict[str, Any], length: RunLength) -> str:
 
 
 def _trajectory(length: RunLength) -> str:
-    """Write how much is recorded on disk."""
+    """Return a text with the number of frames and their size on disk."""
     if length.frames is None:
         return "unknown, as nobody knows what time so many chosen steps simulate; --time says it"
     return (
@@ -374,7 +374,8 @@ def _trajectory(length: RunLength) -> str:
 
 
 def _film(length: RunLength, traced: float | None, quick: float | None) -> str:
-    """Write what the film of the run shows, its length, and the times to draw it, by those of pictures [s]."""
+    """Return a text on the film's frames and length, with its drawing times estimated from the times of single pictures
+    [s]."""
     if length.film is None:
         return "of unknown length; --time says it" if length.time is None else "none"
     if traced is None:
@@ -386,7 +387,7 @@ def _film(length: RunLength, traced: float | None, quick: float | None) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Write a time in the unit that one would say."""
+    """Return a time as text, in the unit that suits: seconds up to days."""
     for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
         if seconds >= 2.0 * size:
             return f"about {seconds / size:.2g} {unit}"
@@ -414,7 +415,7 @@ def check_scene(
     as_json: bool,
     seed: int,
 ) -> str:
-    """Compute the certificate of a scene's gradients as text; raise `ComputationError` when an adjoint is wrong."""
+    """Compute the certificate of a scene's gradients as text; raise `ComputationError` if an adjoint is wrong."""
     if loss not in LOSSES:
         raise InputError(f"--loss is {shown(loss)}, but must be one of {', '.join(LOSSES)}.")
     scene = load_scene(scene_file, overrides).lasting(steps=check_steps(steps))
@@ -434,7 +435,7 @@ def check_scene(
 
 
 def _loss(name: str, simulation: Simulation) -> Loss:
-    """Make the loss of a name: how far the fluid has come from where it starts."""
+    """Return the loss with this name: a measure of how far the fluid has moved from its initial state."""
     if name == "positions":
         return FinalPositions(simulation.positions)
     if name == "centre-of-mass":

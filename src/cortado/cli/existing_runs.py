@@ -1,5 +1,5 @@
-"""What commands do with runs that are there: ``cortado picture`` and ``cortado export``, functions of the user's own of
-runs, and which runs are named."""
+"""Commands for existing runs, ``cortado picture`` and ``cortado export``; user-defined functions of runs; and the runs
+that arguments name."""
 
 import csv
 import json
@@ -28,12 +28,12 @@ from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
 SWEEP = "sweep.csv"
-"""Name of the table of a sweep."""
+"""File name of the table of a sweep."""
 
 
 def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
-    """Return the runs that are named, in each folder of a sweep all of them, in the order of its table. Raise
-    `InputError` for a folder without a run."""
+    """Return the runs in the given folders; from the folder of a sweep all of its runs, in the order of its table. A
+    folder without a run raises `InputError`."""
     if not folders:
         raise InputError("RUN is missing, but must be the folder of a run, or of a sweep.")
     found: list[RunFolder] = []
@@ -45,7 +45,7 @@ def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
 
 
 def folders_in(folder: Path) -> list[str]:
-    """Return the names of the folders in the table of a sweep, in its order; none without a table that can be read."""
+    """Return the folder names in the table of a sweep, in its order; an empty list if the table cannot be read."""
     try:
         with open(folder / SWEEP, newline="", encoding="utf-8") as file:
             return [row["folder"] for row in csv.DictReader(file)]
@@ -57,8 +57,7 @@ class OwnQuantity:
     """A user's function of a trajectory that returns a number."""
 
     def __init__(self, where: str):
-        """Run the file of ``FILE.py:FUNCTION``; raise `InputError` for one that cannot be run, or has no such
-        function."""
+        """Run the file in ``FILE.py:FUNCTION``; raise `InputError` if it fails or does not define the function."""
         file, _, name = where.rpartition(":")
         if not file.endswith(".py") or not name.isidentifier():
             raise InputError(f"--quantity is {shown(where)}, but must be FILE.py:FUNCTION.")
@@ -71,7 +70,8 @@ class OwnQuantity:
         self.where, self.name, self._function = where, name, function
 
     def __call__(self, trajectory: Trajectory) -> float:
-        """Return the number of a trajectory; raise `InputError` where the function fails, or returns something else."""
+        """Return the function's number for a trajectory; raise `InputError` if the function fails or returns no
+        number."""
         try:
             found = self._function(trajectory)
             value = np.asarray(found, dtype=np.float64)
@@ -85,18 +85,18 @@ class OwnQuantity:
 
 
 def _told(problem: Exception) -> str:
-    """Return the kind and the words of an error, on one line."""
+    """Return the class and the message of an error, on one line."""
     return " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".")
 
 
 def picture_settings(lines: int | None, colour: str | None) -> dict[str, Any]:
-    """Return the keys of [picture] that are given by options, as those of `Trajectory.film`."""
+    """Return keys of [picture] made from the options --lines and --colour, in the form that `Trajectory.film` takes."""
     given = {"lines": lines, "colour": colour}
     return {name: value for name, value in given.items() if value is not None}
 
 
 def camera_override(camera: str | None) -> list[str]:
-    """Return the override that ``--camera`` means, before those of ``--set``, which may add to it."""
+    """Convert ``--camera`` to an override, which comes before those of ``--set`` so that they can add to it."""
     kind, _, solid = (camera or "").partition(":")
     keys = {"kind": kind, **({"solid": solid} if solid else {})}
     path = ", ".join(f"{name} = {json.dumps(value)}" for name, value in keys.items())
@@ -104,7 +104,7 @@ def camera_override(camera: str | None) -> list[str]:
 
 
 def scene_of_run(folder: RunFolder, overrides: list[str]) -> Scene:
-    """Read the scene of an existing run, with other keys of [picture]."""
+    """Read the scene of an existing run, with overridden keys of [picture]."""
     for override in overrides:
         if not override.startswith("picture."):
             raise InputError(f"--set is {override}, but must begin with picture., as the run is there already.")
@@ -121,8 +121,8 @@ def draw_runs(
     device_name: str,
     settings: Mapping[str, Any],
 ) -> str:
-    """Draw one recorded frame of a run, counted from the end where it is negative, or a film of all; of several runs
-    side by side. Return a sentence that says where it is. The report of a run shows what is drawn in its folder."""
+    """Draw one recorded frame (a negative number counts from the end), or a film of all frames, of one run or of
+    several side by side. Return a sentence that names the file. A run's report shows pictures drawn into its folder."""
     folders, device = named_runs(runs), device_of(device_name)
     look = scene_of_run(folders[0], overrides)
     others = [scene_of_run(folder, []) for folder in folders[1:]]
@@ -168,14 +168,13 @@ def _trajectory(folder: RunFolder) -> Trajectory:
 
 
 def _names(folders: Sequence[RunFolder]) -> list[str]:
-    """Return the names of the folders, or numbers where some have one name."""
+    """Return the names of the folders; if two names are equal, numbers instead."""
     found = [folder.path.name for folder in folders]
     return found if len(set(found)) == len(found) else [f"run {k}" for k in range(1, len(found) + 1)]
 
 
 def export_run(run: Path, to: str, out: Path | None, every: int, overrides: list[str]) -> str:
-    """Write frames ``every`` frames apart of an existing run in a format; return a sentence that says where they
-    are."""
+    """Write every ``every``-th frame of an existing run in format ``to``; return a sentence that names the files."""
     folder = RunFolder.open(run)
     if not folder.trajectory.exists():
         raise InputError(f"{folder.path} has no trajectory, but must be the folder of a run of a scene.")

@@ -1,5 +1,5 @@
 """``cortado optimise``: solve the inverse problem of a task, resume the search, and judge the result. ``cortado fit``:
-parameters with error bars from measured experiments, and the report of them.
+estimate parameters with error bars from measured experiments, and write a report.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,9 +47,9 @@ from cortado.runs.run_folder import TO_RESUME, RunFolder
 from cortado.scene.scene import scene_in_words
 
 LITTLE = 2.0
-"""Factor by which a loss must be smaller for a search to have come to something."""
+"""Factor by which a search must reduce the loss to count as successful."""
 LONG = 100
-"""Steps from which on a fruitless search may have had meaningless gradients."""
+"""Number of steps from which on chaotic, useless gradients may explain an unsuccessful search."""
 
 
 def optimise_task(
@@ -64,8 +64,8 @@ def optimise_task(
     where: Where = HERE,
     pictures: bool = False,
 ) -> str:
-    """Optimise a task, write the run folder, shaded ``pictures`` too if wished, and return a sentence that says where
-    the results are. The samples of an ensemble are computed ``where`` is asked for."""
+    """Optimise a task, write the run folder, with shaded ``pictures`` if wanted, and return a sentence that names the
+    results. ``where`` gives the processes that compute the samples of an ensemble."""
     task = load_task(task_file, overrides)
     if where.option and task.optimise.gradient.samples == 1:
         raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")
@@ -79,7 +79,7 @@ def optimise_task(
 
 
 def _run_folder(made: Setup, out: Path, resume: bool, overwrite: bool, command: list[str]) -> RunFolder:
-    """Make a run folder, or open the one that is there; a search may go on with other iterations and another check."""
+    """Create a run folder, or open the existing one; a resumed search may have other iterations and another check."""
     task, simulation = made.task, made.problem.simulation
     settings = search_settings(task, simulation.precision.name)
     noted: dict[str, Any] = {"kind": "optimise", "settings": settings, "device": str(simulation.device)}
@@ -89,7 +89,7 @@ def _run_folder(made: Setup, out: Path, resume: bool, overwrite: bool, command: 
 
 
 def search_settings(task: Task, precision: str) -> dict[str, Any]:
-    """Return the settings that must be equal, beside the scene, where a search goes on."""
+    """Return the settings which, like the scene, must be unchanged when a search is resumed."""
     return {
         "precision": precision,
         "problem": task.problem.model_dump(),
@@ -98,12 +98,12 @@ def search_settings(task: Task, precision: str) -> dict[str, Any]:
 
 
 def _kept(folder: RunFolder) -> str:
-    """Say where the evaluations are; empty where there are none."""
+    """Return a text that says where the evaluations are stored; empty before the first evaluation."""
     return f"the evaluations so far are in {folder.checkpoint}" if folder.read_metrics() else ""
 
 
 def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pictures: bool) -> str:
-    """Search, judge, and write the results; return the sentence about them."""
+    """Run the search, judge its result and write all files; return a sentence that names the results."""
     shades = pictures and _can_shade(made)
     if shades:
         begin_shaded(made)
@@ -141,7 +141,7 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
 
 
 def _can_shade(made: Setup) -> bool:
-    """Test whether there can be shaded pictures and films; say so where a package is missing."""
+    """Test whether shaded pictures and films can be made; if a package is missing, say so."""
     missing = lacking(made.task.scene)
     if missing:
         say(missing)
@@ -156,7 +156,7 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
     with track(len(made.searches) * settings.iterations, "optimise") as advance:
 
         def show(made: int, **fields: Any) -> None:
-            """The progress after so many updates of this search; a search before it may have ended early."""
+            """Update the progress bar after ``made`` updates of this search; an earlier search may have ended early."""
             nonlocal shown
             advance(k * settings.iterations + made - shown, **fields)
             shown = k * settings.iterations + made
@@ -205,8 +205,8 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
 
 
 def _advice(made: Setup, result: Result, verdict: Verdict) -> list[str]:
-    """Return advice where a search came to next to nothing, was misled, or may be in a wrong valley, and its bounds on
-    which it ended."""
+    """Return advice if a search reduced the loss too little, had wrong gradients, may be in a wrong local minimum, or
+    ended on a bound."""
     met = [name for name, pair in made.bounds.items() if _on_bound(result.parameters[name], *pair)]
     found = [f"The search of {name} ended on its bounds: what is best may lie beyond them." for name in met]
     task, steps = made.task, made.task.problem.steps
@@ -231,7 +231,7 @@ def _advice(made: Setup, result: Result, verdict: Verdict) -> list[str]:
 
 
 def _on_bound(value: Any, lower: Any, upper: Any) -> bool:
-    """Test whether a number of a parameter's coordinates is as small or as large as it may be."""
+    """Test whether a coordinate of a parameter is on its lower or upper bound."""
     least, most = np.asarray(-np.inf if lower is None else lower), np.asarray(np.inf if upper is None else upper)
     return bool(((value <= least) | (value >= most)).any())
 
@@ -268,7 +268,7 @@ def fit_task(
     overwrite: bool,
     command: list[str],
 ) -> str:
-    """Fit the parameters of a task, write the run folder, and return a sentence that says where the results are."""
+    """Fit the parameters of a task, write the run folder, and return a sentence that names the results."""
     task = load_fit(task_file, overrides)
     experiments = [one.experiment(device, precision) for one in task.experiments]
     with locked(out):
@@ -303,7 +303,7 @@ def _profiles(task: FitTask, fitted: Fit) -> list[Profile]:
 
 
 def fit_sections(task: FitTask, fitted: Fit, profiles: Sequence[Profile], folder: Path) -> list[Section]:
-    """Return the sections of the report of a fit, in the order in which one would tell it."""
+    """Return the sections of the report of a fit, in their order in the report."""
     head = ("", "unit", "start", "found", "standard error", "95 %, from", "to", "degrees of freedom", "counted error")
     noise = ("", "unit", "frames", "numbers", "residuals", "noise", "correlation time [s]", "independent frames")
     return [
@@ -393,7 +393,7 @@ def _effort(fitted: Fit) -> str:
 
 
 def fit_for_machines(fitted: Fit, profiles: Sequence[Profile]) -> dict[str, Any]:
-    """Return the results of a fit by names."""
+    """Return the results of a fit by name, for result.json."""
     lower, upper = ({n: np.asarray(pair[k]) for n, pair in fitted.intervals().items()} for k in range(2))
     return {
         "parameters": {name: np.asarray(value) for name, value in fitted.values.items()},

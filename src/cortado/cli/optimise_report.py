@@ -1,4 +1,4 @@
-"""What ``cortado optimise`` found: how near to what was asked, in sentences, in the report, and for programs."""
+"""The results of ``cortado optimise`` and how well they meet the task's goals: as sentences, report and JSON."""
 
 import math
 from collections.abc import Mapping
@@ -18,29 +18,30 @@ from cortado.scene.scene import scene_in_words
 Rows = list[tuple[object, ...]]
 
 MOST_ERROR = 0.3
-"""Greatest relative error of a parameter that counts as found."""
+"""Greatest relative error with which a parameter still counts as found."""
 
 
 MOST_IN_RESULT = 1000
-"""Most numbers of a parameter whose estimate is in result.json; larger ones are in the checkpoint."""
+"""Greatest size of a parameter whose estimate is written to result.json; larger ones are only in the checkpoint."""
 VIEWED = 60
-"""Most states of a run that the view in the report shows."""
+"""Greatest number of states that the animation in the report shows."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The judgement on an optimisation: how near it came to the check of its task."""
+    """The result of an optimisation compared with the goals in its task's [optimise.check]."""
 
     first: float
-    """Loss of the start."""
+    """Loss at the start."""
     reduction: float
-    """Loss of the start / best loss; infinite where the best is 0."""
+    """Loss at the start / best loss; infinite if the best loss is 0."""
     errors: dict[str, float]
-    """By parameter: distance (L2) of the estimate from the true value, relative to its size unless that is 0."""
+    """For each parameter the L2 distance of the estimate from the true value, divided by the norm of the true value
+    unless that is 0."""
     psnr: float | None
-    """Peak signal-to-noise ratio of the last image [dB]; None where positions are compared."""
+    """Peak signal-to-noise ratio of the last image [dB]; None if the task compares positions."""
     failures: list[str]
-    """Sentences about goals that were not reached."""
+    """Sentences about goals that the result misses."""
 
 
 def judge(
@@ -52,8 +53,8 @@ def judge(
 ) -> Verdict:
     """Judge a result by the task's [optimise.check].
 
-    ``estimate``: its parameters, where the result has coordinates; ``noise``: the peak signal-to-noise ratio that was
-    reached [dB]; ``first``: the loss of the start, where the history begins with another loss.
+    ``estimate``: the parameters, as the result has only coordinates; ``noise``: the peak signal-to-noise ratio reached
+    [dB]; ``first``: the loss at the start, if the history begins with another loss.
     """
     check, estimate = task.optimise.check, result.parameters if estimate is None else estimate
     first = result.history[0].loss if first is None else first
@@ -74,7 +75,7 @@ def judge(
 
 
 def found_in_words(error: float) -> str:
-    """Say how well a parameter is found, by its distance from the true value relative to it."""
+    """Return a text on how well a parameter is found, given its relative error."""
     if error > MOST_ERROR:
         why = "the search is too short, it ended in a wrong valley of the loss, or other values do as well"
         return f"not found, {100 * error:.3g}% off: {why}"
@@ -82,14 +83,15 @@ def found_in_words(error: float) -> str:
 
 
 def distance(estimate: ArrayLike, true: ArrayLike) -> float:
-    """Return |estimate - true| / |true|, each repeated over the steps where only the other one changes with time."""
+    """Return |estimate - true| / |true|. If only one of the two changes with time, the other is repeated over the
+    steps."""
     estimate, true = np.broadcast_arrays(estimate, true)
     return float(np.linalg.norm(estimate - true) / (np.linalg.norm(true) or 1.0))
 
 
 def worst_in_words(made: Setup, name: str, estimate: np.ndarray, error: float) -> str:
-    """Name the number of a few that is farther off than twice the error of all of them together, and how far. Empty
-    where none is, or where the true ones are not known or 0."""
+    """Return a text on the worst of a parameter's few numbers, if its error exceeds twice the error of all together.
+    Empty otherwise, and if the true values are unknown or 0."""
     true, names = made.true_parameter(name), component_names(made.task, name, estimate)
     if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):
         return ""
@@ -99,7 +101,7 @@ def worst_in_words(made: Setup, name: str, estimate: np.ndarray, error: float) -
 
 
 def found_lines(made: Setup, estimate: Mapping[str, np.ndarray], knots: Mapping[str, KnotValues]) -> list[str]:
-    """Return a line for each parameter, or for each of its knots; none for a parameter of very many numbers."""
+    """Return a line for each parameter, or for each of its knots; parameters with very many numbers have no line."""
     lines = []
     for name, value in estimate.items():
         if name in knots:
@@ -123,8 +125,8 @@ def found_rows(
     knots: Mapping[str, KnotValues],
     errors: Mapping[str, float],
 ) -> Rows:
-    """Return rows (parameter, unit, first guess, found, hidden, error) of each number that was searched, of each knot,
-    and of parameters with very many numbers; ``errors`` by parameter."""
+    """Return table rows (parameter, unit, first guess, found, hidden, error): one for each number searched, each knot,
+    and each parameter with very many numbers. ``errors`` are by parameter."""
     rows: Rows = []
     start = made.search.parameters(made.start)
     for name, value in estimate.items():
@@ -178,8 +180,7 @@ def sections(
     figures: TaskFigures,
     rows: Rows,
 ) -> list[Section]:
-    """Return the sections of the report of a search, in the order in which one would tell it; ``told``: found
-    parameters in words."""
+    """Return the sections of the report of a search, in their order; ``told``: the found parameters in words."""
     head = ("", "unit", "first guess", "found", "hidden", "error")
     return [
         asked(made),
@@ -198,7 +199,7 @@ def sections(
 
 
 def _view(made: Setup, estimate: dict[str, np.ndarray]) -> str:
-    """Return HTML that shows the found run, and the target where it is a run, in motion."""
+    """Return HTML that animates the found run, and the target if it is a run."""
     steps = np.unique(np.linspace(0, made.problem.steps, VIEWED).astype(int)).tolist()
     runs = {"found": estimate}
     if made.task.problem.picture is None:
@@ -228,7 +229,7 @@ def _rows(made: Setup, result: Result, verdict: Verdict) -> Rows:
 def for_machines(
     result: Result, estimate: Mapping[str, np.ndarray], verdict: Verdict, knots: Mapping[str, KnotValues]
 ) -> dict[str, Any]:
-    """Return the results of a search by names."""
+    """Return the results of a search by name, for result.json."""
     found: dict[str, Any] = {
         "evaluations": len(result.history),
         "refused": result.refused,

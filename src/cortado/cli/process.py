@@ -1,7 +1,7 @@
-"""A command from its words to its exit code, with a sentence where it fails.
+"""Run a command from the command line to its exit code; a failure prints one sentence.
 
-The sentence is ours where tyro cannot understand the words, and where the computer, or a limit set to the process, has
-no more memory, open files or threads to give.
+Complaints of tyro about arguments, and errors from a lack of memory, open files or threads, are replaced by sentences
+written here.
 """
 
 import io
@@ -23,11 +23,11 @@ from cortado.files.terminal import Interrupted, say, tell, to_stdout
 from cortado.version import __version__
 
 BROKEN_PIPE = 141
-"""Exit code where nobody reads the result: that of a process which the signal SIGPIPE ended."""
+"""Exit code if the reader of the output has gone: that of a process ended by the signal SIGPIPE."""
 
 
 def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> None:
-    """Run a command of a program; exit with its code unless that is 0."""
+    """Run a command of a program; exit with its exit code unless it is 0."""
     arguments = sys.argv[1:] if arguments is None else arguments
     os.environ["MPLBACKEND"] = "agg"  # pictures go to files, whatever the user has chosen for windows
     try:
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
 
 
 def _understood(program: Program, arguments: Sequence[str]) -> Work:
-    """Return the work of the command that the arguments name; print help or the version and exit where they ask for
+    """Parse the arguments and return what their command has to do. Print help or the version and exit if they ask for
     it."""
     box = io.StringIO()
     try:
@@ -115,11 +115,12 @@ _SENTENCES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"Error parsing (\S+): no type .*\|FLOAT .*? from \[(.*?)\]\. .*", r"\1 is \2, but must be a number"),
     (r"Error parsing (\S+): (.*)", r"\1 cannot be used: \2"),
 )
-"""What tyro says, and what we say; where its words are none of these, as of another release, they come as they are."""
+"""Patterns of tyro's complaints and the sentences that replace them. Unknown complaints, for example of another
+release, are printed unchanged."""
 
 
 def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado") -> str:
-    """Turn tyro's complaint in its box about the arguments of a program into a sentence of ours."""
+    """Replace tyro's complaint about a program's arguments, printed in a box, by a sentence of ours."""
     words = " ".join(arguments)
     lines = ["" if set(line) <= set(_EDGES) else line.strip("│| ") for line in box.splitlines()[1:]]
     text = " ".join(line for line in lines if line)
@@ -134,12 +135,13 @@ def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado")
 _MEMORY = (os.strerror(ENOMEM), "failed to map segment")
 _FILES = (os.strerror(EMFILE), os.strerror(ENFILE))
 _THREADS = ("can't start new thread",)
-"""Told by their words: an error of the dynamic linker is an `ImportError`, or an `OSError` without a number."""
+"""Texts in messages that reveal a shortage: the dynamic linker raises an `ImportError`, or an `OSError` without a
+number."""
 
 
 def shortage(error: BaseException) -> str | None:
-    """Return a sentence for an error that came of a shortage, directly or as the cause of another; None for any
-    other."""
+    """Return a sentence for an error caused by a lack of memory, files or threads, directly or through its causes. None
+    for other errors."""
     for cause in _causes(error):
         if isinstance(cause, MemoryError) or _says(cause, _MEMORY):
             what = f" ({cause})" if str(cause) else ""
@@ -152,7 +154,7 @@ def shortage(error: BaseException) -> str | None:
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield the error, its cause, the cause of that, and so on."""
+    """Yield the error and its chain of causes."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__

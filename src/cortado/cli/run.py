@@ -1,6 +1,6 @@
-"""``cortado run``: a scene, forward, with what it writes meanwhile.
+"""``cortado run``: run a scene forward and write its folder while it runs.
 
-So it can go on after it was stopped, or killed, at any moment.
+A run that was stopped or killed at any moment can therefore be resumed.
 """
 
 import time
@@ -34,36 +34,37 @@ from cortado.simulation import Simulation
 from cortado.watching import Watch
 
 OFTEN, SHARE = 5.0, 20.0
-"""What was noted of the steps is written every so many seconds, or as often as that takes a 20th of the time."""
+"""Notes on steps are written every `OFTEN` seconds, or less often if writing them would take more than `SHARE` of the
+time."""
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """The choices for one run of a scene."""
+    """The user's options for one run of a scene."""
 
     out: Path
     """Folder of the run."""
     steps: int | None = None
     time: float | None = None
-    """Simulated time [s], in the place of the steps."""
+    """Simulated time [s], instead of a number of steps."""
     overrides: Sequence[str] = ()
     device: str = "cpu"
     precision: str = "float32"
     frames: FrameChoice = field(default_factory=lambda: EverySteps(1))
     record: Sequence[str] = ()
-    """Quantities of the particles for every frame."""
+    """Quantities of the particles that every frame records."""
     state: Path | None = None
-    """A run or a trajectory at whose end it begins."""
+    """A run folder or trajectory file; this run starts from its last state."""
     resume: bool = False
     overwrite: bool = False
     pictures: bool = False
-    """True for shaded pictures, and the film."""
+    """True if shaded pictures and the film are drawn."""
     command: Sequence[str] = ()
     report: bool = True
-    """True where figures are drawn, and report.html is written."""
+    """True if figures are drawn and report.html is written."""
 
     def settings(self, simulation: Simulation, rollout: Rollout, state: RestartState | None) -> dict[str, Any]:
-        """Return the settings that tell one run of a scene from another."""
+        """Return the settings that must be unchanged when the run is resumed."""
         in_time = bool(np.isfinite(rollout.step_sizes.end))
         asked = run_settings(rollout.steps, self.precision, self.frames)
         return {
@@ -74,13 +75,13 @@ class RunRequest:
 
 
 def run_settings(steps: int, precision: str, frames: FrameChoice) -> dict[str, Any]:
-    """Return the settings that tell one run of a number of steps from another of the same scene."""
+    """Return the settings that must be unchanged when a run of ``steps`` steps of a scene is resumed."""
     return {"steps": steps, "precision": precision, **frames.settings}
 
 
 @dataclass
 class RunRecording:
-    """A run of a rollout that writes its frames, the solver's notes on steps, and the readings of sensors."""
+    """Runs a rollout and writes its frames, the solver's notes on steps, and the readings of sensors."""
 
     simulation: Simulation
     rollout: Rollout
@@ -88,11 +89,11 @@ class RunRecording:
     frames: FrameChoice
     watch: Watch
     kept: Trajectory | None = None
-    """Frames of an earlier process, from the last of which the rollout goes on."""
+    """Frames of an earlier process; the rollout continues from the last of them."""
 
     def go_on(self) -> int:
-        """Let the rollout go on from the last frame in the folder up to which everything is known; return the number of
-        steps before it, 0 without such a frame."""
+        """Set the rollout to continue from the last frame in the folder with all notes and readings up to it. Return
+        the number of steps before that frame, 0 without one."""
         if not self.folder.trajectory.exists():
             return 0
         found, begun = Trajectory.load(self.folder.trajectory), self.rollout.clocks[0].steps
@@ -109,7 +110,8 @@ class RunRecording:
         return step
 
     def run(self) -> State:
-        """Take the steps, and return the last state; raise `DivergedError` with everything before written."""
+        """Take the steps and return the last state. If the run diverges, write everything before and raise
+        `DivergedError`."""
         rollout, steps = self.rollout, self.rollout.steps
         times, first = self.frames.announced(rollout), self.simulation.frame(rollout.initial)
         constants, origin, start = self.simulation.constants(rollout), rollout.origins[0], rollout.clocks[0].time
@@ -159,7 +161,7 @@ class RunRecording:
 
 
 class Notes:
-    """A writer of all that is known of the steps besides frames, in time."""
+    """Writes sensor readings and the solver's notes at intervals during a run."""
 
     def __init__(self, recording: RunRecording, writer: TrajectoryWriter):
         self._recording, self._writer = recording, writer
@@ -175,7 +177,7 @@ class Notes:
             self._next = ended + max(OFTEN, SHARE * (ended - begun))
 
     def write(self) -> None:
-        """Write the readings of sensors, and the solver's notes on the steps that were observed."""
+        """Write the readings of sensors, and the solver's notes on all steps so far."""
         rollout = self._recording.rollout
         self._recording.watch.look()
         if self._step > len(rollout.diagnostics["converged"]):  # an interrupt within a chunk of steps
@@ -186,7 +188,7 @@ class Notes:
 
 
 def run_scene(scene_file: Path, asked: RunRequest) -> str:
-    """Run a scene, write its folder, and return a sentence that says where the results are."""
+    """Run a scene, write its folder, and return a sentence that names the results."""
     state = None if asked.state is None else _last_state(asked.state)
     scene = load_scene(scene_file, asked.overrides)
     scene = scene.lasting(asked.time, asked.steps) if state is None else scene.going_on(state)
@@ -219,7 +221,7 @@ def _kept(folder: RunFolder) -> str:
 
 
 def _last_state(path: Path) -> RestartState:
-    """Return the last state of a trajectory, or of the run in a folder; raise `InputError`."""
+    """Return the last state of a trajectory file or of the run in a folder; raise `InputError` if there is none."""
     file = RunFolder.open(path, ", but --state must be the folder of one").trajectory if path.is_dir() else path
     found = Trajectory.load(file)
     if not len(found):
@@ -228,13 +230,13 @@ def _last_state(path: Path) -> RestartState:
 
 
 def _checksum(state: RestartState) -> str:
-    """Return a checksum by which one state is told from another."""
+    """Return a checksum of a state, to tell whether two states are equal."""
     told = repr((state.clock.steps, state.clock.time, state.clock.time_step)).encode()
     return sha256(told + b"".join(state[name].tobytes() for name in sorted(state.fields))).hexdigest()[:16]
 
 
 def _compute(recording: RunRecording, asked: RunRequest) -> None:
-    """Run a scene, say how it went, and fill the folder, also where the run diverges."""
+    """Run a scene, print a summary, and write the folder's files, even if the run diverges."""
     simulation, rollout, folder = recording.simulation, recording.rollout, recording.folder
 
     def report(told: Section) -> None:
@@ -258,7 +260,7 @@ def _compute(recording: RunRecording, asked: RunRequest) -> None:
 
 
 def _for_machines(simulation: Simulation, rollout: Rollout) -> dict[str, Any]:
-    """Return how a run went, by names: mean and greatest value of each of the solver's notes, over the steps taken."""
+    """Return by name the mean and the greatest value over all steps of each of the solver's notes."""
     noted = {name: np.asarray(values, dtype=np.float64) for name, values in rollout.diagnostics.items() if len(values)}
     return {
         "particles": simulation.particles,

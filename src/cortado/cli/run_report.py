@@ -1,7 +1,7 @@
-"""What ``cortado run`` tells at its end: a summary in its last lines, with the balance of particles that came in and
-went out, and the report.
+"""The summary that ``cortado run`` prints at its end, with the balance of particles that entered and left, and its
+report.
 
-The report is written at first without shaded pictures, which take long, then with them.
+The report is written twice: first without shaded pictures, which take long, then with them.
 """
 
 from collections.abc import Mapping
@@ -39,12 +39,13 @@ from cortado.solvers.particles import ParticleSolver
 
 @dataclass(frozen=True)
 class Energy:
-    """The energies of all particles but those that wait in an emitter or that drains took [J], in 2-D of a layer one
-    metre thick."""
+    """The energies of the fluid [J], in 2-D of a layer 1 m thick. Particles waiting in emitters or taken by drains do
+    not count."""
 
     kinetic: float
     potential: float
-    """Potential energy in the gravity at that time, from the lowest place of the container, or from the origin."""
+    """Potential energy in the present gravity, measured from the container's lowest place or, without container, the
+    origin."""
 
     @property
     def total(self) -> float:
@@ -53,7 +54,7 @@ class Energy:
 
     @classmethod
     def of(cls, simulation: Simulation, rollout: Rollout, state: State, step: int) -> "Energy":
-        """Compute the energies of a state, in the gravity of a step, counted from 0."""
+        """Compute the energies of a state, with the gravity of step number ``step`` (from 0)."""
         names, out = ("positions", "velocities", "reference_density"), _out(simulation, state)
         fields = {name: array[out] for name, array in state.numpy(simulation.dimension, only=names).items()}
         masses = simulation.lattice.cell * fields["reference_density"].astype(np.float64)
@@ -69,7 +70,7 @@ class Energy:
 
 
 class RunSummary:
-    """The summary of a run that has gone through all of its steps."""
+    """The summary of a run that has taken all of its steps."""
 
     def __init__(
         self,
@@ -79,21 +80,21 @@ class RunSummary:
         seconds: float,
         readings: Mapping[str, Readings] | None = None,
     ):
-        """Summarise a run by its ``last`` state, the ``seconds`` that the present process took, with what was recorded,
-        and the ``readings`` of sensors, by their names."""
+        """Summarise a run from its ``last`` state, the ``seconds`` of computing in this process, and the ``readings``
+        of sensors by name."""
         solver, taken, gravity = rollout.solver, rollout.taken, rollout.parameters["gravity"].numpy()
         self.steps, self.seconds, self.readings = taken, seconds, readings or {}
         self.computed = taken - rollout.progress.step
-        """Of the steps, those that the present process took: the others were there already."""
+        """Number of steps taken by this process, without those of an earlier process."""
         self.time = simulated(rollout)
-        """That was simulated [s]."""
+        """Simulated time [s]."""
         self.sizes = sizes_in_words(rollout)
         self.first = Energy.of(simulation, rollout, rollout.initial, 0)
         self.last = Energy.of(simulation, rollout, last, taken - 1)
         self.turned = bool(np.ptp(gravity[0, :taken], axis=0).any())
-        """Whether gravity changed during the run, and potential energies are those of other gravities."""
+        """True if gravity changed during the run, so that potential energies at start and end cannot be compared."""
         self.densities: tuple[float, float] | None = None
-        """The least and the greatest at the end [kg/m3], of particles that do not wait in an emitter; None of a solver
+        """Least and greatest density at the end [kg/m3], without particles waiting in emitters; None for solvers
         without particles."""
         if isinstance(solver, ParticleSolver):
             found = solver.densities(last, rollout.parameters, taken - 1)[_out(simulation, last)]
@@ -101,17 +102,17 @@ class RunSummary:
         self.balance = (
             Balance.of(simulation.scene, *map(_others, (rollout.initial, last))) if simulation.scene.drain else None
         )
-        """Of particles; None without drains."""
+        """Balance of particles; None without drains."""
         self.spilt = _spilt(simulation, last)
         """Particles beside or below an open cup at the end."""
         self.particles = simulation.free_particles
-        """That did not begin in an emitter."""
+        """Number of particles that did not begin in an emitter."""
         self.masses = simulation.masses
-        """Of the fluid at the start."""
+        """Masses of the fluid at the start."""
 
     @property
     def milliseconds(self) -> float:
-        """Return the milliseconds that a step took."""
+        """Return the mean computing time of a step [ms]."""
         return 1e3 * self.seconds / max(self.computed, 1)
 
     @property
@@ -119,7 +120,7 @@ class RunSummary:
         return "all" if self.computed == self.steps else f"the last {self.computed}"
 
     def for_machines(self) -> dict[str, Any]:
-        """Return the numbers that are equal in every repetition of the run, by names."""
+        """Return by name the numbers that are the same in every repetition of the run."""
         energies = {"first": vars(self.first), "last": vars(self.last)}
         least, greatest = self.densities or (None, None)
         sensors = {"sensors": summary(self.readings)} if self.readings else {}
@@ -183,8 +184,8 @@ class RunSummary:
 
 
 def _out(simulation: Simulation, state: State) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles in the fluid; those that wait in an emitter are prescribed, even within
-    walls, and those that drains took rest elsewhere."""
+    """Return a mask (n,) of the particles in the fluid: all except those waiting in emitters and those taken by
+    drains."""
     return is_out(simulation.scene, _others(state), len(simulation.positions))
 
 
@@ -194,7 +195,7 @@ def _others(state: State) -> dict[str, NDArray[Any]]:
 
 
 def _spilt(simulation: Simulation, state: State) -> int:
-    """Return how many particles that did not begin in an emitter are outside of a cup without a lid."""
+    """Return how many particles are outside an open cup, not counting those that began in an emitter."""
     scene, container, free = simulation.scene, simulation.scene.container, simulation.free_particles
     if not np.isfinite(container.region(simulation.dimension).rim):
         return 0
@@ -204,13 +205,13 @@ def _spilt(simulation: Simulation, state: State) -> int:
 
 
 def simulated(rollout: Rollout) -> float:
-    """Return how long the fluid of a rollout was simulated in its last forward run [s]."""
+    """Return the simulated time of a rollout's last forward run [s]."""
     clock, size = rollout.clocks[0], float(rollout.time_steps[0])
     return clock.after(rollout.taken, size).time - clock.time
 
 
 def sizes_in_words(rollout: Rollout) -> str:
-    """Write how long the steps of the last forward run were."""
+    """Return a text with the lengths of the steps of the last forward run."""
     chosen = rollout.step_sizes.diagnostics(rollout.taken).get("time_steps")
     if chosen is None or not len(chosen):
         return f"{float(rollout.time_steps[0]):g} s"
@@ -225,8 +226,8 @@ def write_run_report(
     pictures: bool,
     read: Mapping[str, Readings] | None = None,
 ) -> None:
-    """Write the report of a run, with shaded ``pictures`` if wished; ``told``: results in words; ``read``: by
-    sensors."""
+    """Write the report of a run, with shaded ``pictures`` if wanted. ``told``: results in words; ``read``: sensor
+    readings."""
     scene, trajectory = simulation.scene, Trajectory.load(folder.trajectory)
     asked = Section("What was asked", _asked(simulation, rollout))
     view = Section("To turn and to play", view=trajectory_view(scene, trajectory))
@@ -275,7 +276,7 @@ def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Fi
 
 
 def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], folder: Path) -> Figures:
-    """Draw pictures of a scene with a table [render], and a video where it can be written."""
+    """Draw pictures of a scene with a table [render], and a video if one can be written."""
     renderer = simulation.renderer()
 
     def image(frame: int) -> np.ndarray:
@@ -292,14 +293,14 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
 
 
 def _sensors(read: Mapping[str, Readings], folder: RunFolder) -> Section:
-    """Return the section of a report about the sensors of a run, with a plot of what they read."""
+    """Return the section of a report about the sensors of a run, with a plot of their readings."""
     path = readings(read, folder.figures / "sensors.png")
     told = f"The sensors of the scene, read in every step; the numbers are in {folder.sensors.name}."
     return Section("Sensors", [told], figures=[("What the sensors read.", path)])
 
 
 def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
-    """Describe the run in words."""
+    """Return a text that describes the run."""
     scene = simulation.scene
     step = float(rollout.time_steps[0])
     length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
@@ -315,7 +316,7 @@ def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
 
 
 def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunFolder) -> Section:
-    """Return the section on the solver: which steps converged, and their errors of density."""
+    """Return the section on the solver: which steps converged, and their density errors."""
     figures: Figures = []
     if len(trajectory.converged) and "density_errors" in trajectory.diagnostics and scene.forces.pressure:
         path = folder.figures / "density_errors.png"
@@ -332,20 +333,20 @@ def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunF
 
 @dataclass(frozen=True)
 class Balance:
-    """Numbers of particles, of which ``first`` + ``came`` = ``last`` + all that ``went``."""
+    """Numbers of particles that entered and left: ``first`` + ``came`` = ``last`` + the sum of ``went``."""
 
     first: int
-    """In the fluid at the start."""
+    """Particles in the fluid at the start."""
     came: int
-    """Out of emitters."""
+    """Particles that came out of emitters."""
     went: Mapping[str, int]
-    """Into each drain, by name."""
+    """Particles that each drain took, by its name."""
     last: int
-    """In the fluid at the end."""
+    """Particles in the fluid at the end."""
 
     @classmethod
     def of(cls, scene: Scene, first: Mapping[str, Any], last: Mapping[str, Any]) -> Self:
-        """Count the particles of two frames of a run of a scene, of which it takes `Frame.others`."""
+        """Count the particles in the first and the last frame of a run, given the `Frame.others` of both."""
         counts = {drain.name: count_name(drain.name) for drain in scene.drain}
         went = {name: int(np.ravel(last[key])[0] - np.ravel(first[key])[0]) for name, key in counts.items()}
         inside, left = (
@@ -355,7 +356,7 @@ class Balance:
         return cls(inside, left - inside + sum(went.values()), went, left)
 
     def for_machines(self) -> dict[str, Any]:
-        """Return the numbers by names."""
+        """Return the numbers by name, for result.json."""
         return {"first": self.first, "in": self.came, "out": dict(self.went), "last": self.last}
 
     def rows(self) -> list[tuple[str, int, str]]:

@@ -1,4 +1,4 @@
-"""Commands of runs that are there, to compare and to show them, and of many runs: sweeps and data sets."""
+"""Commands that compare and show existing runs, and commands that make many runs: sweeps and data sets."""
 
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,7 @@ def compare(
 
     Args:
         first: The folder of a run.
-        second: The folder of another, or a table of measured data with the columns of sensors.csv.
+        second: The folder of another run, or a table of measured data with the columns of sensors.csv.
     """
     from cortado.cli.compare import compare_runs, compare_with_data
 
@@ -55,20 +55,20 @@ def sweep(
     scheduler: str | None = None,
     workers: int | None = None,
 ) -> Work:
-    """Run a scene, or optimise a task, with every combination of some values, each in a folder of its own; folders that
-    are finished already are not repeated.
+    """Run a scene, or optimise a task, with every combination of some values, each in its own folder; finished folders
+    are kept.
 
     Args:
         file: The scene file, or the task file.
-        sets: What changes, such as solver.time_step=0.001,0.002; may be given again, for every combination.
-        zips: What changes together: the first value of one with the first of the others; given again for each of them.
-        steps: Time steps of a scene with the smallest one of the sweep, 200 if left out; longer ones end at its time.
-        time: Seconds that a scene is simulated, in the place of steps.
+        sets: A key and its values, such as solver.time_step=0.001,0.002; several --set make every combination.
+        zips: Keys that change together: the first values of all --zip make one run, the second values the next.
+        steps: Number of steps with the smallest time step of the sweep, 200 if left out; all runs end at the same time.
+        time: Simulated time of a scene [s], instead of steps.
         out: Folder of the sweep, with a folder for each combination and a table of them all.
-        pictures: Leave out the figures and the reports of runs of a scene, which take longer than short runs do.
+        pictures: Leave out the figures and reports of a scene's runs, which take longer than short runs.
         device: "cpu", or "cuda:0" for the first GPU, of each worker.
-        scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
-        workers: Number of worker processes on this machine; on a GPU each has one of its own.
+        scheduler: Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers compute.
+        workers: Number of worker processes on this machine; with "cuda" each worker has its own GPU.
     """
     frames.check()
     combinations, together = as_text(sets), as_text(zips)
@@ -85,11 +85,11 @@ def convergence(
     quantities: Annotated[UseAppendAction[tuple[str, ...]], arg(name="quantity", metavar="FILE.py:FUNCTION")] = (),
     json: Json = False,
 ) -> Work:
-    """Tell how fast a scene converges: of runs with different spacings or time steps the order, limit and error.
+    """Compute order, limit and error of convergence from runs with different spacings or time steps.
 
     Args:
-        runs: Folders of at least three runs until the same time, or of a sweep of them.
-        quantities: A number of your own besides: a function of a cortado.Trajectory; may be given again.
+        runs: Folders of at least three runs that end at the same time, or the folder of a sweep.
+        quantities: An additional number: your own function of a cortado.Trajectory; may be given again.
     """
     from cortado.cli.compare import convergence_table
 
@@ -106,17 +106,17 @@ def dataset(
     scheduler: str | None = None,
     workers: int | None = None,
 ) -> Work:
-    """Compute many runs of a scene with varied values, to train learned simulators on; the same command goes on with
-    those that are missing, and with more runs the data set grows.
+    """Compute many runs of a scene with varied values, as training data for learned simulators. The same command again
+    computes missing runs; a larger number of runs extends the data set.
 
     Args:
-        file: A file with the table [dataset], which says what varies.
-        runs: How many, those for validation and tests included.
+        file: A scene file with the table [dataset], which says which values vary.
+        runs: Number of runs, including those for validation and tests.
         out: Folder of the data set: train.h5, valid.h5, test.h5 and metadata.json, as LagrangeBench reads them.
         overrides: Replace a value of the file, such as dataset.steps=200; may be given again.
         device: "cpu", or "cuda:0" for the first GPU, of each worker.
-        scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
-        workers: Number of worker processes on this machine; on a GPU each has one of its own.
+        scheduler: Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers compute.
+        workers: Number of worker processes on this machine; with "cuda" each worker has its own GPU.
     """
     words = text_overrides(file, overrides)
     from cortado.cli.dataset import make_dataset
@@ -138,13 +138,13 @@ def picture(
     """Draw a shaded picture, or a film, of a run that `cortado run` wrote, or of several side by side.
 
     Args:
-        runs: Folders of up to nine runs, or of a sweep of them.
-        frame: Number of a recorded frame, counted from the end where it is negative; the last one if left out.
-        film: A film of all frames in its place; stopped by Ctrl-C, it goes on with the same command.
-        lines: Rows of pixels, such as 720, 1080 or 2160, with 16 columns for 9 of them.
-        camera: How the camera of a film moves: "orbit", "dolly", or "follow:NAME" for a solid of that name.
-        colour: What colours the fluid, such as speed, pressure, vorticity, age or phase.
-        out: Where to write it, a film as .mp4 or .webp; if left out into the run's figures, of several beside them.
+        runs: Folders of up to nine runs, or the folder of a sweep.
+        frame: Number of a recorded frame; a negative number counts from the end; the last frame if left out.
+        film: Draw a film of all frames instead; after Ctrl-C the same command continues it.
+        lines: Rows of pixels, such as 720, 1080 or 2160; the picture has the ratio 16:9.
+        camera: Motion of a film's camera: "orbit", "dolly", or "follow:NAME" for a solid of that name.
+        colour: Quantity that colours the fluid, such as speed, pressure, vorticity, age or phase.
+        out: File to write (film: .mp4 or .webp); if left out, in the run's figures, or beside several runs.
         overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
     """
     words = as_text(overrides)
@@ -169,13 +169,13 @@ def export(
     every: int = 1,
     overrides: Overrides = (),
 ) -> Work:
-    """Write a run that `cortado run` wrote for other programs: its surface, its particles and its solids over time.
+    """Export a run of `cortado run` to other programs: its surface, particles and solids over time.
 
     Args:
         run: The folder of the run.
-        to: "usd" for Blender and Houdini, one file; or a series of files, "glb", "ply", "obj", or "vtp" for ParaView.
-        out: The folder to write, empty or missing; one of that name in the run's folder if left out.
-        every: Frames of the run from one that is written to the next.
+        to: "usd" for one file for Blender and Houdini; "glb", "ply", "obj", or "vtp" (ParaView) for a series of files.
+        out: The folder to write, empty or missing; if left out, a folder in the run's folder with the format's name.
+        every: Write every so many frames of the run, such as 2 for every second one.
         overrides: Replace a key of [picture], such as picture.colour=speed; may be given again.
     """
     require_at_least(1, every, "--every")
@@ -197,13 +197,13 @@ def view(
     precision: str | None = None,
     port: int = 8080,
 ) -> Work:
-    """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders; Ctrl-C ends it.
+    """Show a run in the browser, or run a scene there, with sliders for gravity; Ctrl-C ends it.
 
     Args:
         path: The folder of a run, or a scene file.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        precision: "float32" or "float64", of a scene that runs; "float32" if left out.
-        port: Of the page on this machine; the next one that is free if it is taken.
+        precision: "float32" or "float64" for a scene; "float32" if left out.
+        port: Port of the page on this machine; if it is taken, the next free one.
     """
     from cortado.cli.views import view as show
 
@@ -211,7 +211,7 @@ def view(
 
 
 def _refuse(overrides: list[str], keys: tuple[str, ...], why: str) -> None:
-    """Raise `InputError` where --set replaces one of some keys of [picture]."""
+    """Raise `InputError` if --set replaces one of the given ``keys`` of [picture]."""
     for override in overrides:
         name = override.partition("=")[0].strip()
         if name.removeprefix("picture.") in keys:

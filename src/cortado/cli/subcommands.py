@@ -1,7 +1,7 @@
-"""The commands of ``cortado`` alone and of ``cortado gradients``: their arguments and their help.
+"""Commands of ``cortado`` and of ``cortado gradients``: their arguments and help texts.
 
-Those of runs that are there, and of many runs, are functions of `cortado.cli.runs_and_sweeps`. ``cortado new`` and
-``cortado examples``, with which one begins, are whole here.
+Commands for existing runs and for many runs are in `cortado.cli.runs_and_sweeps`. ``cortado new`` and ``cortado
+examples`` are implemented here.
 """
 
 import ast
@@ -58,18 +58,19 @@ def check(
     json: Flag = False,
     seed: int = 0,
 ) -> Work:
-    """Check the gradients of a scene, in float64: are they right, up to which step are they useful, what to use beyond.
+    """Check a scene's gradients in float64: whether they are right, up to which step they are useful, and what to use
+    beyond.
 
     Args:
         scene: The scene file.
         steps: Number of time steps.
         parameters: Parameters whose horizon is measured; the adjoint is checked for all of them.
-        loss: How far the fluid has come, by "positions" of particles, "centre-of-mass" or "image".
-        perturbation: How large a meaningful perturbation of a parameter is, relative to its size.
+        loss: Measure of the fluid's motion: "positions" of particles, "centre-of-mass" or "image".
+        perturbation: Size of a meaningful change of a parameter, relative to its value.
         out: Folder for a figure and the numbers.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
         json: Print JSON for machines instead of a table.
-        seed: Of the random directions.
+        seed: Seed of the random directions.
     """
     require_at_least(0, seed, "--seed")
     words = text_overrides(scene, overrides)
@@ -90,8 +91,8 @@ def new(
     """Write a commented scene that runs at once, and the schema with which editors check it.
 
     Args:
-        name: The file, dam.toml or only dam.
-        template: What happens in it: dam, baffled_tank, drop, honey, jet, moored_raft, pillar, pour, raft,
+        name: Name of the file, such as dam.toml or dam.
+        template: The kind of scene: dam, baffled_tank, drop, honey, jet, moored_raft, pillar, pour, raft,
             rayleigh_taylor, shaken, stirred, stirred_tank or tap_and_drain.
         dimension: 2 or 3, of the dam; 2 if left out.
     """
@@ -106,8 +107,8 @@ def examples(
     """List the examples that come with Cortado, or copy some of them.
 
     Args:
-        copy: One to copy, or all of them with the name "all"; may be given again.
-        to: The folder to copy to, this one if left out; made if it is missing.
+        copy: Name of an example to copy, or "all"; may be given again.
+        to: Folder to copy to, created if missing; the current folder if left out.
     """
     if to is not None and not copy:
         raise InputError("--to is given, but must be left out, as --copy says of nothing that it is copied.")
@@ -126,14 +127,14 @@ def describe(
     precision: Precision = "float32",
     json: Json = False,
 ) -> Work:
-    """Describe a scene before it is run: its particles, the limits of its time step and its memory. Of a run it also
-    tells the duration, the size on disk and the length of its film.
+    """Describe a scene before a run: its particles, time step limits, memory, computing time, size on disk and length
+    of the film.
 
     Args:
         scene: The scene file, or a task file.
-        steps: Number of time steps that it shall run; 200 if neither they nor a time are given.
-        time: Seconds that it shall simulate, in the place of steps.
-        picture: Draw its first state into this PNG file.
+        steps: Number of time steps of the run; 200 if neither steps nor time is given.
+        time: Simulated time of the run [s], instead of steps.
+        picture: Draw the first state into this PNG file.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
     """
     frames.check()
@@ -164,15 +165,15 @@ def run(
 
     Args:
         scene: The scene file.
-        steps: Number of time steps; 200 if neither they nor a time are given.
-        time: Seconds that the scene is simulated, in the place of steps: the last step ends then or later.
+        steps: Number of time steps; 200 if neither steps nor time is given.
+        time: Simulated time [s], instead of steps; the last step ends at this time or later.
         out: Folder of the run.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        state: Begin at the end of another run, which is the folder of one or a trajectory file.
-        resume: Go on with the run in the folder, after it was stopped or killed.
+        state: Start from the last state of another run, given by its folder or a trajectory file.
+        resume: Continue the run in the folder after it was stopped or killed.
         overwrite: Replace an earlier run in the same folder.
         pictures: Leave out the shaded pictures and the film.
-        record: A quantity of the particles for the trajectory, such as pressure or vorticity; may be given again.
+        record: A quantity of the particles to record in every frame, such as pressure or vorticity; may be given again.
     """
     require_one_of_both(resume, overwrite)
     frames.check()
@@ -200,16 +201,16 @@ def optimise(
     workers: int | None = None,
     pictures: Flag = True,
 ) -> Work:
-    """Optimise what a task file names, and check the result as the file asks.
+    """Optimise the parameters that a task file names, and check the result as the file asks.
 
     Args:
         task: A scene file with the tables [problem] and [optimise].
         out: Folder of the run.
         overrides: Replace a value of the file, such as optimise.iterations=50; may be given again.
-        resume: Go on with the run in the folder, bit for bit.
+        resume: Continue the run in the folder, bit for bit as without a stop.
         overwrite: Replace an earlier run in the same folder.
-        scheduler: Address of a scheduler of Dask's, whose workers compute the samples of an ensemble.
-        workers: Number of worker processes on this machine that do; on a GPU each has one of its own.
+        scheduler: Address of a Dask scheduler, whose workers compute the samples of an ensemble.
+        workers: Number of local worker processes for the samples; with "cuda" each worker has its own GPU.
         pictures: Leave out the shaded pictures and the films.
     """
     require_one_of_both(resume, overwrite)
@@ -229,10 +230,10 @@ def fit(
     precision: Precision = "float32",
     overwrite: Flag = False,
 ) -> Work:
-    """Fit parameters to measured experiments, such as a video or a series of forces, with error bars.
+    """Fit parameters with error bars to measured experiments, such as a video or a time series of forces.
 
     Args:
-        task: A scene file with the tables [problem], of measured data, and [fit].
+        task: A scene file with the tables [fit] and [problem]; [problem] names the measured data.
         out: Folder of the run.
         overrides: Replace a value of the file, such as fit.profiles=0; may be given again.
         overwrite: Replace an earlier run in the same folder.
@@ -251,7 +252,7 @@ command(app)(dataset)
 
 @command(app, answers=True)
 def schema() -> Work:
-    """Print the JSON schema of scenes and tasks, with which editors complete and check them."""
+    """Print the JSON schema of scenes and tasks; editors use it to complete and check them."""
     from cortado.optimisation.task_tables import file_schema_text
 
     return lambda: file_schema_text().rstrip("\n")
@@ -259,7 +260,7 @@ def schema() -> Work:
 
 @command(app, answers=True)
 def completion(shell: Annotated[Positional[Literal["bash", "zsh"]], arg(metavar="SHELL")]) -> Work:
-    """Print what makes a shell complete commands and options: eval "$(cortado completion bash)".
+    """Print the completion script of a shell; it is loaded by: eval "$(cortado completion bash)".
 
     Args:
         shell: bash or zsh.
@@ -294,11 +295,11 @@ _GROUPS = {
     ),
 }
 COMMANDS = [command for group in _GROUPS.values() for command, _ in group]
-"""Every example, as one would type it."""
+"""The command line of every example."""
 
 
 def overview() -> str:
-    """Return the text that ``cortado`` alone prints: what one can do, each with an example."""
+    """Return the text that ``cortado`` without arguments prints: each task with an example command."""
     lines = [f"Cortado {__version__}, a differentiable SPH fluid simulator."]
     for title, entries in _GROUPS.items():
         lines += ["", f"{title}:"]
@@ -318,16 +319,17 @@ CORTADO = Program(
 
 
 DAM = "dam"
-"""The template that explains every line, in 2-D and in 3-D."""
+"""The template with a comment on every line, in 2-D and in 3-D."""
 TEMPLATES = Path(__file__).with_name("templates")
-"""The folder of the templates, each a scene whose first line says what it is and how it is run."""
+"""The folder of the templates: scenes whose first line says what the scene is and how to run it."""
 IN_3D = "_3d"
-"""Ending of the name of a file of `DAM` in 3-D."""
+"""Ending of the file name of the template `DAM` in 3-D."""
 SCENE_FILE, SCENE_NAME = "SCENE.toml", 'name = "SCENE"'
-"""What the first line calls the file, and the line with the name that a scene takes from its file."""
+"""The file name in a template's first line, and the line with the scene's name; both are replaced by the new file's
+name."""
 ALL = "all"
 DATA = (".csv", ".mp4")
-"""Endings of files that an example may read, with its own name at the beginning: example_ANY.csv."""
+"""Suffixes of data files of an example; their names begin with the example's name: example_ANY.csv."""
 
 
 def templates() -> list[str]:
@@ -336,7 +338,8 @@ def templates() -> list[str]:
 
 
 def new_scene(path: Path, template: str, dimension: int | None) -> str:
-    """Write a scene, and beside it the schema by which editors complete and check it; no existing file is replaced."""
+    """Write a scene, and beside it the schema that editors use to complete and check scenes. Existing files are
+    kept."""
     if template not in templates():
         raise InputError(f"--template is {shown(template)}, but must be one of {', '.join(templates())}.")
     if dimension is not None and template != DAM:
@@ -358,7 +361,7 @@ def new_scene(path: Path, template: str, dimension: int | None) -> str:
 
 
 def scene_text(file: Path, template: str) -> tuple[str, str]:
-    """Return the scene of a template's file for a new file, and the options with which it is run."""
+    """Return the text of a template's scene for a new ``file``, and the options for running it."""
     text = (TEMPLATES / f"{template}.toml").read_text(encoding="utf-8")
     name = "".join(letter if letter.isprintable() and letter not in '"\\' else "_" for letter in file.name)
     own = text.replace(SCENE_FILE, name, 1).replace(SCENE_NAME, f'name = "{name.removesuffix(".toml")}"')
@@ -366,7 +369,7 @@ def scene_text(file: Path, template: str) -> tuple[str, str]:
 
 
 def list_examples(names: list[str], folder: Path) -> str:
-    """List the examples, a line each; or copy the named ones into a folder, which is made."""
+    """List the examples, one per line, or copy the named examples into a folder, which is created if missing."""
     found = {path.stem: path for path in sorted(examples_folder().iterdir()) if path.suffix in (".toml", ".py")}
     if not found:
         raise InputError(f"{examples_folder()} holds no examples: install Cortado again.")
@@ -384,8 +387,7 @@ def _chosen(names: list[str], known: list[str]) -> list[str]:
 
 
 def _copied(sources: list[Path], folder: Path) -> str:
-    """Copy examples with the files that they read; nothing is copied unless all of it can be: existing files are
-    kept."""
+    """Copy examples with the files that they read. If one of the files exists already, nothing is copied."""
     examples = [folder / source.name for source in sources]
     beside = (path for source in sources for path in sorted(source.parent.glob(f"{source.stem}_*")))
     sources = [*sources, *(path for path in beside if path.suffix in DATA)]
@@ -409,7 +411,7 @@ def _command(path: Path) -> str:
 
 
 def _line(path: Path) -> str:
-    """Return an example's name and the first words of its description."""
+    """Return a line with an example's name and the beginning of its description."""
     text = path.read_text("utf-8")
     if path.suffix == ".py":
         first = (ast.get_docstring(ast.parse(text)) or "").split("\n")[0]

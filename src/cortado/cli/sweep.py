@@ -1,5 +1,5 @@
-"""``cortado sweep``: a scene or a task with every combination of some values, on any number of processes, and the table
-of their results."""
+"""``cortado sweep``: run a scene or a task with every combination of some values, in parallel, and write a table of the
+results."""
 
 import csv
 import io
@@ -29,12 +29,12 @@ from cortado.runs.run_folder import RunFolder
 from cortado.scene.scene import load_scene, read_toml
 
 MOST_COMBINATIONS = 100_000
-"""Most combinations of a sweep; more are taken for a mistake."""
+"""Greatest number of combinations of a sweep; a larger number is taken for a mistake."""
 _LONGEST_NAME = 120
-"""Most characters of a folder's name."""
+"""Greatest number of characters of a folder's name."""
 _PAIRS = {"[": "]", "{": "}"}
 _PLAIN = re.compile(r"[A-Za-z0-9_=,.+-]+")
-"""Names of folders that need no quotes in a shell."""
+"""Pattern of folder names that need no quotes in a shell."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Combination:
     """One value for each key of a sweep."""
 
     values: tuple[tuple[str, str], ...]
-    """(key, value as the user wrote it) in the order of the options."""
+    """Pairs (key, value as the user wrote it), in the order of the options."""
 
     @property
     def overrides(self) -> list[str]:
@@ -51,8 +51,8 @@ class Combination:
 
     @property
     def name(self) -> str:
-        """Return the name of its folder: the values; where these are long or strange, some of them with a checksum. It
-        does not depend on the other combinations of a sweep."""
+        """Return the folder's name, made of the values; if these are long or have special characters, of some values
+        and a checksum. The name does not depend on the other combinations of a sweep."""
         name = ",".join(self.overrides)
         if _PLAIN.fullmatch(name) and len(name) <= _LONGEST_NAME and not name.startswith(("-", ".")):
             return name
@@ -61,8 +61,8 @@ class Combination:
 
 
 def combinations(options: Sequence[str], zipped: Sequence[str] = ()) -> list[Combination]:
-    """Return every combination of the values of all keys, the first key changing slowest; the values of ``zipped`` keys
-    go together, the first of one with the first of the others, and change fastest. Raises `InputError`."""
+    """Return every combination of the values of all keys; the first key changes slowest. The k-th values of all
+    ``zipped`` keys belong to one combination; these change fastest. Wrong options raise `InputError`."""
     if not options and not zipped:
         raise InputError("--set is missing, but must name what changes, such as --set solver.time_step=0.001,0.002.")
     keys, together = _values(options, "--set"), _values(zipped, "--zip")
@@ -81,7 +81,7 @@ def combinations(options: Sequence[str], zipped: Sequence[str] = ()) -> list[Com
 
 
 def _values(options: Sequence[str], name: str) -> dict[str, list[str]]:
-    """Return the values of each key; raise `InputError` in a sentence with the name of the option."""
+    """Return the values of each key; raise `InputError`, naming the option, for wrong ones."""
     keys: dict[str, list[str]] = {}
     for option in options:
         key, equals, text = option.partition("=")
@@ -97,7 +97,7 @@ def _values(options: Sequence[str], name: str) -> dict[str, list[str]]:
 
 
 def _split(text: str) -> list[str]:
-    """Split a text at its commas, but not at those within brackets or quotes."""
+    """Split a text at its commas, except commas within brackets or quotes."""
     parts, closing, quote = [""], [], ""
     for letter in text:
         if quote:
@@ -116,14 +116,14 @@ def _split(text: str) -> list[str]:
 
 
 MOST_NUMBERS = 12
-"""Most numbers of a list that the table shows; longer ones are in the result.json of each folder alone."""
+"""Greatest length of a list that the table shows; longer lists are only in the result.json of each folder."""
 
 
 def write_table(folder: Path, combinations: Sequence[Combination], results: Mapping[int, Mapping[str, Any]]) -> None:
     """Write the table, whole or not at all.
 
-    ``results``: what came out, as in result.json, by the number of the combination. Columns: the folder, every key that
-    changes, "done" or "failed", every number that came out, and why it failed.
+    ``results``: contents of result.json, by the number of the combination. Columns: the folder, every key that changes,
+    "done" or "failed", every resulting number, and the reason of a failure.
     """
     rows = [
         {
@@ -149,7 +149,7 @@ def failed(result: Mapping[str, Any]) -> bool:
 
 
 def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Return tables within tables as one, with names joined by full stops; short lists as JSON, longer ones not."""
+    """Flatten nested tables, joining names by full stops. Short lists become JSON; long lists are left out."""
     found: dict[str, Any] = {}
     for name, value in result.items():
         if isinstance(value, Mapping):
@@ -162,28 +162,28 @@ def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
 
 
 SAME_TIME = 1e-9
-"""Relative difference below which times are equal."""
+"""Relative difference below which two times count as equal."""
 
 
 @dataclass(frozen=True)
 class Member:
-    """The computation of the combinations of a sweep, which a worker process is sent."""
+    """The function object, sent to worker processes, that computes one combination of a sweep."""
 
     file: Path
     """The scene or the task."""
     duration: float | None
-    """Duration of a scene's run [s]; None for a task, which says its own."""
+    """Duration of a scene's run [s]; None for a task, whose file gives the number of steps."""
     out: Path
     """The folder of the sweep."""
     device: str
     precision: str
     frames: FrameOptions
-    """Frames of runs of a scene."""
+    """Options for the frames of a scene's runs."""
     report: bool
-    """True where each run of a scene has figures and a report."""
+    """True if figures and a report are made for each run of a scene."""
 
     def __call__(self, combination: Combination) -> dict[str, Any]:
-        """Return a combination's result, as in result.json, computed if need be. Warnings name the folder."""
+        """Return a combination's result, as in result.json; compute it if it is missing. Warnings name the folder."""
         require_shared(self.out, "the task and the folder of a sweep")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -194,8 +194,8 @@ class Member:
         return found
 
     def finished(self, combination: Combination) -> dict[str, Any] | None:
-        """Return the result of a combination; None where it has not ended. Raise `InputError` where its scene or task
-        is wrong, or another one than that in its folder."""
+        """Return the result of a combination; None if its run has not ended. Raise `InputError` if its scene or task is
+        wrong, or differs from the one in its folder."""
         overrides = combination.overrides
         if self.duration is None:
             task = load_task(self.file, overrides)
@@ -210,17 +210,17 @@ class Member:
         return folder.read_result()
 
     def _folder(self, combination: Combination) -> RunFolder | None:
-        """Return the folder of a combination; None where there is no run in it."""
+        """Return the run folder of a combination; None if it contains no run."""
         path = self.out / combination.name
         return RunFolder.open(path) if (path / "environment.json").exists() else None
 
     def steps(self, combination: Combination) -> int:
-        """Return the number of steps that comes nearest to the duration; at least one."""
+        """Return the number of steps nearest to the duration, at least 1."""
         assert self.duration is not None
         return check_steps(max(round(self.duration / _time_step(self.file, combination)), 1))
 
     def _computed(self, combination: Combination) -> dict[str, Any]:
-        """Compute a combination, or go on with it; the result reports a failure."""
+        """Compute a combination, or resume its run; the result reports a failure."""
         out, overrides = self.out / combination.name, combination.overrides
         begun = self._folder(combination) is not None
         words = [str(self.file), *(word for one in overrides for word in ("--set", one)), "--out", str(out)]
@@ -242,7 +242,7 @@ class Member:
         return folder.read_result() or {"failures": ["It left no result."]}
 
     def _request(self, combination: Combination, begun: bool, words: list[str]) -> RunRequest:
-        """Return the run of a combination; one that was begun goes on."""
+        """Return the request for the run of a combination; a run that was begun is resumed."""
         steps = self.steps(combination)
         frames = self._frames(steps)
         ((name, value),) = frames.settings.items()
@@ -253,7 +253,7 @@ class Member:
         )
 
     def _frames(self, steps: int) -> FrameChoice:
-        """Return the choice of frames, about a hundred where none is given."""
+        """Return the choice of frames; without options about a hundred."""
         return self.frames.choice(max(steps // 100, 1))
 
 
@@ -270,8 +270,8 @@ def run_sweep(
     frames: FrameOptions = ALL_FRAMES,
     pictures: bool = True,
 ) -> str:
-    """Compute the missing combinations of a sweep; return a sentence that says where the table is. Raise
-    `ComputationError` where some combinations failed."""
+    """Compute the missing combinations of a sweep; return a sentence that names the table. Raise `ComputationError` if
+    some combinations failed."""
     chosen = combinations(options, zipped)
     duration = _duration(file, chosen, steps, time)
     of_scenes = {"no-pictures": not pictures, "record-every": frames.record_every, "fps": frames.fps}
@@ -313,16 +313,16 @@ def run_sweep(
 
 
 def _there(member: Member, chosen: list[Combination]) -> dict[int, dict[str, Any]]:
-    """Return the results of the combinations that have ended, by their numbers. All of them are looked at, so that a
-    mistake is found before anything is computed; warnings come when they are."""
+    """Return the results of finished combinations, by number. Every combination's scene is read here, to find mistakes
+    before computing; its warnings are printed when it runs."""
     with unwarned():
         found = {number: member.finished(one) for number, one in enumerate(chosen)}
     return {number: result for number, result in found.items() if result is not None}
 
 
 def _duration(file: Path, chosen: list[Combination], steps: int | None, time: float | None) -> float | None:
-    """Return how long a scene is simulated [s]: ``steps`` smallest time steps, or the time itself. None for a task,
-    which is a file with the table [optimise]."""
+    """Return the simulated time of a scene [s]: ``steps`` times the smallest time step, or ``time``. None for a task, a
+    file with the table [optimise]."""
     if "optimise" in read_toml(file):
         for name, value in (("steps", steps), ("time", time)):
             if value is not None:
@@ -336,13 +336,13 @@ def _duration(file: Path, chosen: list[Combination], steps: int | None, time: fl
 
 
 def _time_step(file: Path, combination: Combination) -> float:
-    """Return the time step of a combination's scene [s]; warnings come when it is run."""
+    """Return the time step of a combination's scene [s]; its warnings are printed when it runs."""
     with unwarned():
         return load_scene(file, combination.overrides).solver.fixed_time_step("a sweep")
 
 
 def _warn_of_times(member: Member, done: list[Combination]) -> None:
-    """Warn where runs end at different times, as no whole number of their time steps is the duration."""
+    """Warn if runs end at different times because the duration is no multiple of their time steps."""
     duration = member.duration
     if duration is None or not done:
         return

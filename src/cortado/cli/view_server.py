@@ -1,14 +1,12 @@
-"""viser's server, with a door before it, and with ears that hear only what a page may say.
+"""A viser server that checks who connects, and which messages a page sends.
 
-Whoever has the address of the window, which ends in a random token, gets in. Every page that is open in a browser can
-ask this machine for pages and open websockets to it, with the browser's own ``Origin``. Such a page can also give
-itself a name that leads to this machine (DNS rebinding). So a request is refused if it has not the token, if it calls
-the machine by another name, or if it comes from another page than the window's own. A program that is no browser sends
-no ``Origin``, and needs the token alone.
+The window's address ends in a random token, which gives access. Any page in a browser can send requests to this
+machine, with an ``Origin`` that the browser sets. A page's host name can also be made to point to this machine (DNS
+rebinding). Three kinds of requests are therefore refused: without the token, with another host name, or from another
+page. Programs other than browsers send no ``Origin`` and need only the token.
 
-A page may send the position of the camera, and values that controls can have. The server of viser takes any value of
-any attribute of a control, and offers more that no window here has, such as a tunnel to the internet. All of that is
-left aside.
+A page may send only the camera's position and valid values of controls. Viser's own server accepts any value of any
+attribute of a control, and further messages, such as one that opens a tunnel to the internet. All of these are ignored.
 """
 
 import logging
@@ -31,35 +29,35 @@ from cortado.errors import InputError
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")
-"""Names by which a browser on this machine may call it."""
+"""Host names under which a browser on this machine may request the page."""
 ADVICE = "This window has a token in its address: open the whole address that `cortado view` has printed.\n"
 HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Content-Security-Policy": "frame-ancestors 'none'",
     "Cache-Control": "no-store",
 }
-"""So that the token goes nowhere else, and no other page shows the window within its own."""
+"""HTTP headers that keep the token from other sites, and the window out of frames in other pages."""
 Answer = Callable[[ServerConnection, Request], Response | None]
-"""The type of websockets' ``process_request``: returns a page, or None for a websocket."""
+"""The type of ``process_request`` in websockets: it returns a page, or None to open a websocket."""
 LARGEST_NUMBER = 1e9
-"""Largest number of the camera."""
+"""Greatest absolute value of a number in a camera message."""
 LONGEST_MESSAGE = 2**16
-"""Most bytes of a message; those of viser's page have some hundreds."""
+"""Greatest size of a message [bytes]; messages of viser's page have some hundreds."""
 Number = Annotated[float, msgspec.Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 Direction = tuple[Number, Number, Number]
 Controls = Callable[[str], Any]
-"""A control by its id; None where there is none."""
+"""Returns a control by its id; None for an unknown id."""
 KNOWN = "1.1.1"
-"""A version of viser that can be guarded."""
+"""The only version of viser that this module can guard."""
 FAREWELL = 0.3
-"""Time [s] that a page has to answer when the window closes; one that is busy does not."""
+"""Time [s] to wait for a page's answer when the window closes; a busy page does not answer."""
 _silent = logging.getLogger(__name__)
-"""Of connections that fail, which is the matter of those who made them."""
+"""A logger that drops messages about failed connections, which concern only the other side."""
 _silent.disabled = True
 
 
 class Door:
-    """Lets browsers into a window that know the token in its address."""
+    """Admits only requests that know the token in the window's address."""
 
     def __init__(self) -> None:
         self._token = token_hex(16)
@@ -69,7 +67,7 @@ class Door:
         return f"http://{HOST}:{port}/{self._token}/"
 
     def before(self, answer: Answer | None) -> Answer:
-        """Wrap the answer behind the door: it is given to those who know the token, and a refusal to others."""
+        """Wrap ``answer``: requests with the token get it, others get a refusal."""
 
         def guarded(connection: ServerConnection, request: Request) -> Response | None:
             token, _, rest = request.path.removeprefix("/").partition("?")[0].partition("/")
@@ -85,14 +83,15 @@ class Door:
 
 
 def _is_from_here(request: Request, port: int) -> bool:
-    """Test whether a request calls this machine by its own name, and comes from the page at that name or from none."""
+    """Test whether a request uses this machine's own host name, and comes from the page at that name or from no
+    page."""
     hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
     own = [f"{name}:{port}" for name in NAMES] + (list(NAMES) if port == 80 else [])  # browsers leave out 80
     return len(hosts) == 1 and hosts[0] in own and origins in ([], [f"http://{hosts[0]}"])
 
 
 class CameraMessage(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
-    """A message with the camera of a page; viser calls a page connected from the first one on."""
+    """A message with the camera of a page; viser counts a page as connected after its first camera message."""
 
     wxyz: tuple[Number, Number, Number, Number]
     position: Direction
@@ -106,21 +105,21 @@ class CameraMessage(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage",
 
 
 class Update(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
-    """A message with the value to which a control is set."""
+    """A message that sets a control to a value."""
 
     uuid: str
     updates: dict[str, Any]
 
 
 class Hearing(sockets.ServerConnection):
-    """A websocket that ignores messages which a page may not send."""
+    """A websocket that drops messages which a page may not send."""
 
     def __init__(self, *arguments: Any, controls: Controls, **options: Any):
         super().__init__(*arguments, **options)
         self._controls = controls
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """The next message that `judged` lets through."""
+        """Return the next message that `judged` accepts."""
         while True:
             heard = judged(await super().recv(decode), self._controls)
             if heard is not None:
@@ -128,7 +127,7 @@ class Hearing(sockets.ServerConnection):
 
 
 class GuardedServer:
-    """A guarded server of viser's on this machine, or, where ``port`` is taken, on one of the next ports."""
+    """A guarded viser server on this machine; if ``port`` is taken, it uses one of the next ports."""
 
     def __init__(self, port: int, label: str):
         self._door, self._guarded = Door(), False
@@ -142,11 +141,11 @@ class GuardedServer:
 
     @property
     def address(self) -> str:
-        """Return the address at which a browser finds it."""
+        """Return the address at which a browser finds the window."""
         return self._door.address(self.viser.get_port())
 
     def close(self) -> None:
-        """Stop the server: nobody can see it from now on."""
+        """Stop the server and end all connections."""
         with redirect_stdout(StringIO()):
             self.viser.stop()
 
@@ -168,8 +167,8 @@ class GuardedServer:
 
 @contextmanager
 def _serving(serve: Callable[..., Any]) -> Iterator[None]:
-    """Make websockets open servers in the block by ``serve``, whose first argument is its usual function. Viser has no
-    options for it, and a later guard would leave the first moments open."""
+    """Within the block, let the package websockets open servers with ``serve``, whose first argument is its usual
+    function. Viser has no option for this, and a later guard would leave the first moments unguarded."""
     usual = sockets.serve
     sockets.serve = partial(serve, usual)  # type: ignore[misc, assignment]
     try:
@@ -183,7 +182,8 @@ _encoder = msgspec.msgpack.Encoder()
 
 
 def judged(message: bytes | str, controls: Controls) -> bytes | None:
-    """Return a message as viser may read it, written again so that both read it alike; None for one to be ignored."""
+    """Return an accepted message, encoded anew so that viser reads the same content as this check; None for a refused
+    one."""
     with suppress(msgspec.MsgspecError, RecursionError, TypeError):
         said = _decoder.decode(message)  # type: ignore[arg-type]  # a text is refused
         if isinstance(said, CameraMessage) or (said.updates.keys() == {"value"} and _can_be(said, controls)):
@@ -192,7 +192,7 @@ def judged(message: bytes | str, controls: Controls) -> bytes | None:
 
 
 def _can_be(said: Update, controls: Controls) -> bool:
-    """Test whether the page lets its user set a control to this value."""
+    """Test whether a user of the page could set a control to this value."""
     control, value = controls(said.uuid), said.updates["value"]
     if control is None or control.disabled or not control.visible:
         return False
@@ -209,7 +209,7 @@ def _can_be(said: Update, controls: Controls) -> bool:
 
 
 def _is_between(slider: Any, value: Any) -> bool:
-    """Test whether a number is within a slider's ends, which the page rounds to the digits that it shows."""
+    """Test whether a number is within a slider's ends, allowing for the page's rounding to the digits shown."""
     if isinstance(value, bool) or not isinstance(value, type(slider.value) | int):
         return False
     slack = 0.5 * 10.0**-slider.precision if isinstance(slider.value, float) else 0

@@ -1,6 +1,6 @@
-"""``cortado view``: a run, or a scene that runs while one looks at it, in the browser.
+"""``cortado view``: show a recorded run in the browser, or run a scene and show it live.
 
-What particles may be coloured by is computed when it is asked for.
+Quantities that colour the particles are computed only when the user selects them.
 """
 
 import atexit
@@ -37,39 +37,39 @@ from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 
 UNITS = {"speed": "m/s", "density": "kg/m³", "pressure": "Pa", "vorticity": "1/s", "wall_force": "N"}
-"""Units of the quantities that every state has."""
+"""Units of quantities that every state has."""
 RADIUS = 0.4
-"""Radius of a particle that is drawn, in spacings."""
+"""Radius of a drawn particle, in spacings."""
 DISTANCE = 1.7
-"""Distance of the camera at the start, in radii of the contents."""
+"""Initial distance of the camera, in radii of the scene's contents."""
 PALETTE = "viridis"
 BRIGHTEST = 99.5
-"""Percentile at the upper end of the colours, so that a few particles do not darken all the others."""
+"""Percentile of the values at the upper end of the colour scale: single particles do not darken the rest."""
 LINES = (130, 125, 118)
 """sRGB colour of the container and of solids."""
 THIN: Any = {"thickness": 1.5, "thickness_units": "screen"}
 
 Quantity = Callable[[], np.ndarray]
-"""Something of the particles that are shown, computed when it is asked for; may raise a `CortadoError`."""
+"""Computes a quantity of the shown particles; may raise a `CortadoError`."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """The particles that a window shows at a moment, with the quantities that may colour them."""
+    """The particles that a window shows at one time, with the quantities that can colour them."""
 
     positions: Points
     """(n, d) [m]"""
     colours: Points
-    """(n, 3) their own, linear."""
+    """(n, 3) the particles' own colours, linear."""
     quantities: Mapping[str, Quantity]
-    """(n,) by name."""
+    """(n,) quantities by name."""
 
 
 class Window:
-    """A window in the browser, a page of viser's; y is up, whatever the axes of the scene."""
+    """A window in the browser, served by viser; y is up, whatever the axes of the scene."""
 
     def __init__(self, scene: Scene, port: int, units: Mapping[str, str]):
-        """Open a window with ``units`` of the quantities that colours may show, by name, besides "phase"."""
+        """Open a window; ``units`` are those of the quantities that can colour particles, by name, besides "phase"."""
         try:
             import viser  # noqa: F401  for the sentence
 
@@ -84,7 +84,7 @@ class Window:
         self._cloud: Any = None
         self._shown: Shown | None = None
         self._stale = False
-        """Whether the user wants to see something else of what is shown; `refresh` draws it."""
+        """True if the user has changed what to show; `refresh` then draws again."""
         self.server.scene.set_up_direction("+y")
         gui, first = self.server.gui, "phase" if len(scene.phase) > 1 else next(iter(units))  # one colour has no depth
         self.colour = gui.add_dropdown("Colour", ["phase", *units], initial_value=first)
@@ -95,27 +95,27 @@ class Window:
 
     @property
     def address(self) -> str:
-        """Return the address at which a browser finds it, with the token that lets it in."""
+        """Return the window's address for a browser, with the token that gives access."""
         return self._guarded.address
 
     def close(self) -> None:
-        """Close the window: nobody can see it from now on."""
+        """Close the window and its server."""
         self._guarded.close()
 
     def show(self, shown: Shown) -> None:
-        """Draw particles instead of those before, along a periodic axis within the period."""
+        """Replace the drawn particles; along a periodic axis they are drawn within one period."""
         self._drawn = drawn_for_each(self.scene, shown.positions)
         self._shown = replace(shown, positions=self.scene.domain.wrapped(shown.positions))
         self._draw()
 
     def place_solids(self, scene: Scene) -> None:
-        """Show the solids where a scene has them, which is otherwise unchanged."""
+        """Move the drawn solids to their poses in ``scene``, which otherwise equals the scene shown."""
         with self.server.atomic():
             for frame, solid in zip(self._solids, shown_solids(scene), strict=False):
                 frame.position, frame.wxyz = self._space(solid.position), _quaternion(self._turn @ solid.turn)
 
     def refresh(self) -> None:
-        """Draw again where the user has chosen other colours."""
+        """Draw again if the user has chosen other colours."""
         if self._stale and self._shown is not None:
             self._draw()
 
@@ -132,7 +132,7 @@ class Window:
             self._cloud.points, self._cloud.colors = points, colours
 
     def _colours(self, shown: Shown) -> np.ndarray:
-        """Return sRGB colours (n, 3); the legend says their range, or why there are none."""
+        """Return sRGB colours (n, 3); the legend shows their range, or why the quantity is not available."""
         from matplotlib import colormaps
 
         name, own = self.colour.value, to_srgb(shown.colours[None])[0][self._drawn]
@@ -159,7 +159,8 @@ class Window:
             self.server.scene.add_line_segments("/container", lines, LINES, **THIN)
 
     def _draw_solid(self, name: str, solid: ShownSolid) -> Any:
-        """Draw the edges of a solid, and in 3-D its faces unless it is a tank; return the frame that has its pose."""
+        """Draw the edges of a solid, and in 3-D its faces unless it is a tank; return viser's frame, which sets the
+        solid's pose."""
         pose = {"position": self._space(solid.position), "wxyz": _quaternion(self._turn @ solid.turn)}
         frame = self.server.scene.add_frame(name, show_axes=False, **pose)
         self.server.scene.add_line_segments(f"{name}/edges", in_space(np.float32(own_lines(solid))), LINES, **THIN)
@@ -172,7 +173,8 @@ class Window:
         return frame
 
     def look_at(self, positions: Points) -> None:
-        """Put the camera where the container and solids, or else the particles (n, d) [m], fill the window."""
+        """Place the camera so that the container and solids fill the window, or without them the particles at
+        ``positions`` (n, d) [m]."""
         lines = self._space(outline(self.scene)).reshape(-1, 3)
         points = lines if len(lines) else self._space(positions)
         lower, upper = points.min(axis=0), points.max(axis=0)
@@ -184,14 +186,14 @@ class Window:
 
 
 def _quaternion(turn: Points) -> np.ndarray:
-    """Return the quaternion w, x, y and z (4,) of a rotation matrix (d, d)."""
+    """Convert a rotation matrix (d, d) to a quaternion (w, x, y, z), (4,)."""
     from scipy.spatial.transform import Rotation
 
     return np.roll(Rotation.from_matrix(turn_in_space(turn)).as_quat(), 1)
 
 
 def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> str:
-    """Return HTML of a bar with the colours, and the numbers at its ends."""
+    """Return HTML of a colour bar with the numbers at its ends."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
@@ -205,15 +207,15 @@ def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> 
 
 
 def in_words(words: str) -> str:
-    """Return HTML of plain words."""
+    """Return plain text as HTML."""
     return f'<p style="padding: 0 .8em .4em; margin: 0; font-size: .85em">{escape(words)}</p>'
 
 
 def quantities_of(
     velocities: np.ndarray, simulation: Callable[[], Simulation], state: RestartState, controls: Mapping[str, Any]
 ) -> dict[str, Quantity]:
-    """Return by name the quantities of particles with velocities (n, d) [m/s] in a state, under ``controls`` as of
-    `Simulation.run`. All but the speed raise `InputError` where the solver does not know them."""
+    """Return by name functions for quantities of particles with velocities (n, d) [m/s] in a state, under ``controls``
+    as in `Simulation.run`. All except the speed raise `InputError` if the solver cannot compute them."""
     return {
         "speed": lambda: np.linalg.norm(velocities, axis=1),
         "density": lambda: densities(simulation().rollout(1, controls, state)),
@@ -224,14 +226,13 @@ def quantities_of(
 
 
 def own_fields(fields: Mapping[str, np.ndarray], particles: int) -> dict[str, Quantity]:
-    """Return by name a state's further fields, such as ones that parts keep, that have a number or a vector for each
-    particle."""
+    """Return by name further fields of a state (such as a part's own) that have a number or a vector per particle."""
     own = {name: array for name, array in fields.items() if name not in ADJOINT_FIELDS and array.ndim in (1, 2)}
     return {name: partial(sizes_of, array) for name, array in own.items() if len(array) == particles}
 
 
 def sizes_of(values: np.ndarray) -> np.ndarray:
-    """Return numbers (n,) as they are, or the lengths of vectors (n, k)."""
+    """Return numbers (n,) unchanged, and of vectors (n, k) their lengths."""
     return values if values.ndim == 1 else np.linalg.norm(values, axis=-1)
 
 
@@ -244,14 +245,14 @@ def densities(rollout: Rollout) -> np.ndarray:
 
 
 STRIDE = 1.0 / 100.0
-"""About how much time [s] of the fluid lies between two pictures."""
+"""Simulated time [s] between two pictures, approximately."""
 SHORTEST_PAUSE = 1.0 / 40.0
-"""Shortest time [s] from one picture to the next, so that one sees the fluid move."""
+"""Shortest real time [s] from one picture to the next, so that the motion of the fluid can be followed."""
 LEAN = 2.0
-"""Ends of the sliders of gravity, in sizes of the scene's gravity."""
+"""Ends of the gravity sliders, relative to the size of the scene's gravity."""
 AXES = "xyz"
 SHORTEST_PLAY = 4.0
-"""Time [s] that a run takes to play at speed 1, or as long as it lasted if that is longer."""
+"""Time [s] that a run takes to play at speed 1, unless its simulated time is longer."""
 
 
 class RecordedView:
@@ -264,7 +265,7 @@ class RecordedView:
         simulation: Callable[[], Simulation],
         port: int,
     ):
-        """Open a view; ``simulation`` makes that of the scene when something has to be computed."""
+        """Open a view; ``simulation`` is called to make the scene's simulation once a quantity has to be computed."""
         self.scene, self.trajectory, self._simulation = scene, trajectory, simulation
         own = own_fields(trajectory[0].others, trajectory.particles)
         large = sized(scene, solid_motions(scene, trajectory.others))
@@ -279,7 +280,7 @@ class RecordedView:
         self.show(0)
 
     def tick(self) -> None:
-        """Show the frame that is due now."""
+        """Show the frame that is due at the present time."""
         now = time.monotonic()
         passed, self._former = now - self._former, now
         last = len(self.trajectory) - 1
@@ -308,12 +309,12 @@ class RecordedView:
 
 
 class LiveView:
-    """A view that runs a scene, a few steps at a time, from where it is."""
+    """A view that runs a scene live, a few steps for each picture."""
 
     def __init__(self, simulation: Simulation, port: int):
         scene, self.simulation = simulation.scene, simulation
         self.steps = max(round(STRIDE / longest_step(scene)), 1)
-        """Between two pictures."""
+        """Number of steps between two pictures."""
         own = own_fields(simulation.initial.numpy(simulation.dimension), simulation.particles)
         units = {field.name: field.unit for field in simulation.initial.fields if field.name in own}
         self.window = Window(scene, port, {**UNITS, **units})
@@ -332,7 +333,7 @@ class LiveView:
         self._begin()
 
     def tick(self) -> None:
-        """Take a few steps, with gravity and nozzles as the sliders are now; none while it stands still."""
+        """Take a few steps with gravity and nozzles as set by the sliders; no steps while the view is paused."""
         if self._wish_to_begin:
             self._begin()
         if not self.running.value:
@@ -351,7 +352,7 @@ class LiveView:
         time.sleep(max(SHORTEST_PAUSE - (time.monotonic() - begun), 0.0))
 
     def _begin(self) -> None:
-        """Show the first state, with the sliders where the scene has them."""
+        """Show the first state, and set the sliders to the scene's values."""
         self._wish_to_begin = False
         scene = self.simulation.scene
         self._outlets = {emitter.name: np.array(emitter.outlet) for emitter in scene.emitter}
@@ -376,12 +377,12 @@ class LiveView:
         self.window.show(Shown(state["positions"], colours, quantities))
 
     def _gravity(self) -> np.ndarray:
-        """Return gravity (d,) as the sliders set it."""
+        """Return gravity (d,) from the sliders."""
         return np.array([slider.value for slider in self.gravity])
 
     def _controls(self) -> dict[str, np.ndarray]:
-        """Return the controls of the next steps: gravity, and a path of each nozzle from where it is to where it shall
-        be."""
+        """Return the controls of the next steps: gravity, and each nozzle's path from its present to its wanted
+        place."""
         controls = {"gravity": self._gravity()}
         share = np.arange(1, self.steps + 1)[:, None] / self.steps
         for name, sliders in self.nozzles.items():
@@ -391,7 +392,7 @@ class LiveView:
         return controls
 
     def _sliders(self, title: str, unit: str, values: Any, ends: Any) -> list[Any]:
-        """Make a slider for each component, between ends (2, d)."""
+        """Make a slider for each component of ``values``, between ``ends`` (2, d)."""
         gui, found = self.window.server.gui, []
         for axis, value, least, greatest in zip(AXES, values, *ends, strict=False):
             step = float(f"{(greatest - least) / 200.0:.1g}")
@@ -405,7 +406,7 @@ class LiveView:
         return np.stack([-most, most])
 
     def _reach(self, emitter: EmitterTable) -> np.ndarray:
-        """Return the ends of the places where a nozzle may be: above the container, at its height."""
+        """Return the ends of the nozzle's range: above the container, at the nozzle's present height."""
         outlet, ends, half = np.array(emitter.outlet), self.simulation.scene.container.extent(), 0.5 * emitter.width
         if ends is None:
             return outlet + np.array([[-20.0], [20.0]]) * half
@@ -417,7 +418,7 @@ class LiveView:
 
 
 def view(path: Path, overrides: list[str], device: str, precision: str | None, port: int) -> str:
-    """Show a run folder, or run a scene, until Ctrl-C ends it."""
+    """Show a run folder, or run and show a scene, until Ctrl-C."""
     shown = opened(path, overrides, device, precision, port)
     say(f"{shown.window.address} shows it; Ctrl-C ends it.")
     atexit.register(gc.freeze)  # Python would look through all that is there once more, which takes as long as the rest
