@@ -1,6 +1,6 @@
-"""From particles to a picture and back: colour field on a grid, camera, image.
+"""Differentiable rendering of particles: colour field on a grid, camera, image.
 
-Its names are imported when they are first used, so that ``cortado.render`` is quick.
+Names are imported on first use, so that importing ``cortado.render`` is fast.
 """
 
 from typing import TYPE_CHECKING

@@ -1,15 +1,15 @@
 """Emission and absorption along a ray, front to back (Max 1995), through the colour field (P, A).
 
-A sample of the thickness kappa ds (the extinction times the step) lets exp(-u) of what comes from behind through, where
-u = kappa ds A. It adds kappa ds P E(u), where E(u) = (1 - exp(-u)) / u: the emission of a layer whose colour is P / A,
-without the division. With T_0 = 1,
+A sample of optical thickness u = kappa ds A (extinction kappa, step ds) transmits the fraction exp(-u) of the light
+from behind. It adds kappa ds P E(u), with E(u) = (1 - exp(-u)) / u: the emission of a layer of colour P / A, without
+the division. With T_0 = 1,
 
     image = sum_s T_s kappa ds P_s E(u_s) + T_S background,    T_(s + 1) = T_s exp(-u_s).
 
-On the way back what comes from behind a sample is the image less what came up to there. So one pass over the samples
-does, and these may be as dark as they like.
+In the adjoint, the light from behind a sample is the image minus the light summed up to the sample. So one pass over
+the samples suffices, however dark they are.
 
-`RayMarcher` makes a picture of a field, and goes back from it.
+`RayMarcher` computes the picture of a field, its tangent and its adjoint.
 """
 
 from dataclasses import dataclass
@@ -35,13 +35,14 @@ SAMPLES_PER_CELL = 2
 
 @cache
 def pose_type(precision: Precision) -> Any:
-    """Return the Warp vector type of a pose's adjoint: three numbers for the position, three for a turn about it."""
+    """Return the Warp vector type of a pose's adjoint: three numbers for the position, three for a rotation about
+    it."""
     return wp.types.vector(length=6, dtype=precision.real)
 
 
 @cache
 def brightness_functions(precision: Precision) -> tuple[Any, Any]:
-    """Return Warp functions E(u) = (1 - exp(-u)) / u and E'(u); both take exp(-u) besides."""
+    """Return Warp functions E(u) = (1 - exp(-u)) / u and E'(u); both take u and exp(-u)."""
     real = precision.real
 
     @wp.func
@@ -103,7 +104,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def march(camera, nodes, thickness: real, background: vector, field, image, spans):
-        """Write the image of a field, and as ``spans`` the range of samples of each ray that may lie in the field."""
+        """Compute the image of a field, and in ``spans`` the range of samples of each ray that may lie in the field."""
         pixel = wp.tid()
         o = start(pixel, camera)
         d = direction(pixel, camera)
@@ -156,7 +157,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
     def march_adjoint(
         camera, nodes, thickness: real, field, image, spans, image_bar, samples_bar: samples, pose_bar: poses
     ):
-        """Write the adjoints of samples, [sample of the span, pixel], and of the pose, ray by ray."""
+        """Compute the adjoints of samples, [sample of the span, pixel], and of the pose, for each ray."""
         pixel = wp.tid()
         bar = image_bar[pixel]
         o = start(pixel, camera)
@@ -188,7 +189,8 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def gather(camera, nodes, spans, samples_bar: samples, field_bar):
-        """Sum each node's adjoint from the samples in the eight cells around it, found by way of the screen."""
+        """Sum each node's adjoint over the samples in the eight cells around it; the cells' projection on the screen
+        gives the rays."""
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)
         lower = x_g - diagonal(nodes)
@@ -261,16 +263,16 @@ class RayMarcher:
         launch(self._kernels.forward, self.pixels, self._device, self._known, background=self._background, field=field)
 
     def tangent(self, field: wp.array, field_dot: wp.array, along: ViewTangent) -> wp.array:
-        """Return the tangent (pixels,) of the image, along that of the field and that of the view. The next call
-        overwrites it, and so does `adjoint`."""
+        """Return the tangent (pixels,) of the image, along tangents of the field and of the view. The next call of
+        `tangent` or `adjoint` overwrites the result."""
         camera_dot = camera_tangent(along, self._step, self._precision)
         given = {"background": self._background, "field": field, "field_dot": field_dot, "camera_dot": camera_dot}
         launch(self._kernels.tangent, self.pixels, self._device, self._known, given, image_dot=self._image_bar)
         return self._image_bar
 
     def adjoint(self, image_bar: np.ndarray, field: wp.array) -> tuple[wp.array, np.ndarray]:
-        """Return the derivative with respect to the field and to the pose (6,), from that with respect to the image
-        (pixels, 3)."""
+        """Return derivatives with respect to the field and the pose (6,), given that with respect to the image (pixels,
+        3)."""
         self._image_bar.assign(image_bar)
         bars = {"image_bar": self._image_bar, "samples_bar": self._samples_bar, "pose_bar": self._pose_bar}
         launch(self._kernels.adjoint, self.pixels, self._device, self._known, bars, field=field)
@@ -279,8 +281,8 @@ class RayMarcher:
 
     @cached_property
     def _samples_bar(self) -> wp.array:
-        """Adjoints of samples (samples, pixels): by far the greatest array, made when first needed. No ray has more
-        samples in the field than its diagonal has room for."""
+        """Adjoints of samples (samples, pixels): by far the largest array, allocated on first use. The field's diagonal
+        limits the number of samples of a ray."""
         cells = np.linalg.norm(np.array(self._nodes.shape) + 1)
         samples = min(int(cells * SAMPLES_PER_CELL) + 4, self._camera.samples)
         parts = sample_parts(samples, self.pixels, self._precision.bytes)

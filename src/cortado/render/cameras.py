@@ -1,7 +1,7 @@
-"""Cameras: where they stand, where they look, and what they see of the depth; and views: a camera, how opaque the fluid
-is, what stands behind it, and how such a view changes.
+"""Cameras (position, direction, range of depth), and views: a camera, the fluid's extinction, the background, and
+changes of all these.
 
-A view may not be known exactly: `Calibration` has the numbers of its camera as parameters.
+If a view is not known exactly, `Calibration` makes its camera's numbers parameters.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ Vector = tuple[float, ...]
 
 
 def vector(name: str, values: Sequence[float] | np.ndarray, length: int = 3) -> Vector:
-    """Return finite numbers as a tuple of a length; raises an `InputError` that calls them ``name``."""
+    """Return finite numbers as a tuple of a length; raises `InputError`, naming the argument ``name``."""
     found = as_numbers(name, values)
     if found.shape != (length,) or not np.isfinite(found).all():
         raise InputError(f"{name} is {shown(values)}, but must be {length} finite numbers.")
@@ -34,14 +34,14 @@ def positive(name: str, value: float) -> None:
 
 @dataclass(frozen=True)
 class Camera:
-    """The base of all cameras. Samples along a ray stand at fixed distances between ``near`` and ``far``."""
+    """The base of all cameras. Samples along a ray have fixed distances between ``near`` and ``far``."""
 
     position: Vector
     """Position of the camera [m], (3,)."""
     look_at: Vector
     """Point in the middle of the picture [m], (3,)."""
     up: Vector
-    """Direction (3,) that points upwards in the picture, not along the view."""
+    """Direction (3,) that points upwards in the picture; not parallel to the viewing direction."""
     resolution: tuple[int, int] = field(default=(256, 256), kw_only=True)
     """Numbers of columns and rows; pixels are square."""
     near: float = field(default=0.0, kw_only=True)
@@ -67,7 +67,7 @@ class Camera:
 
     @property
     def reach(self) -> float:
-        """Distance at which samples end [m]: ``far``, which is a number once the camera is made."""
+        """Distance at which samples end [m]: ``far``, after its default has been filled in."""
         assert self.far is not None
         return self.far
 
@@ -89,7 +89,7 @@ class Camera:
         """Return the camera shifted by a vector (3,) [m] and turned about its own position by a rotation vector (3,)
         [rad].
 
-        These are the coordinates, at zero, in which the renderer gives the derivative with respect to the pose.
+        The renderer returns derivatives with respect to these six numbers, at zero.
         """
         from scipy.spatial.transform import Rotation
 
@@ -104,8 +104,8 @@ class Camera:
 class Orthographic(Camera):
     """A camera with parallel rays.
 
-    It stands at ``position`` (3,) [m] and looks at ``look_at`` [m], with ``up`` above; it sees a ``width`` [m], from
-    ``near`` to ``far`` [m] away, in ``resolution`` (columns, rows).
+    The camera at ``position`` (3,) [m] looks at ``look_at`` [m], with ``up`` upwards. The picture is ``width`` [m]
+    wide, shows depths from ``near`` to ``far`` [m], and has ``resolution`` (columns, rows).
 
     Example::
 
@@ -130,8 +130,8 @@ class Orthographic(Camera):
 class Perspective(Camera):
     """A camera with rays from one point.
 
-    It stands at ``position`` (3,) [m] and looks at ``look_at`` [m], with ``up`` above; ``field_of_view`` is across
-    [degrees]. It sees from ``near`` to ``far`` [m] away, in ``resolution`` (columns, rows).
+    The camera at ``position`` (3,) [m] looks at ``look_at`` [m], with ``up`` upwards and a horizontal ``field_of_view``
+    [degrees]. The picture shows depths from ``near`` to ``far`` [m] and has ``resolution`` (columns, rows).
 
     Example::
 
@@ -164,11 +164,11 @@ def check_resolution(resolution: tuple[int, int]) -> None:
 WHITE = (1.0, 1.0, 1.0)
 ZERO = (0.0, 0.0, 0.0)
 NUDGE = 1e-6
-"""Step of a rotation vector [rad], for the direction in which a turned camera turns further."""
+"""Step of a rotation vector [rad], for finite differences of a turned camera's rotation."""
 
 
 class View(Protocol):
-    """Protocol of a view as the renderer needs it: camera, extinction and background."""
+    """Protocol of a view for the renderer: camera, extinction and background."""
 
     @property
     def camera(self) -> Camera: ...
@@ -203,16 +203,15 @@ class Volume:
 @public
 @dataclass(frozen=True)
 class TopView:
-    """A view of the free surface's colour from above, as who pours latte art sees it.
+    """A view of the free surface's colour from above, as a barista sees latte art.
 
-    The picture shows the whole container, seen along the axis downwards; it is not mirrored. Columns run along the
-    first of the other two axes, left to right. Then, with y upwards, rows run along z: row 0 has the lowest z, and the
-    viewer stands at the side of the greatest z. With z upwards rows run against y, as in a plot; with x upwards
-    (columns along y) against z.
+    The picture shows the whole container, seen downwards along the up axis, not mirrored. Columns run left to right
+    along the first of the other two axes. With y upwards, rows run along z: row 0 has the lowest z. With z upwards,
+    rows run against y, as in a plot; with x upwards, columns run along y and rows against z.
     """
 
     lower: Vector
-    """Corner of the container [m], (2,) or (3,); in 2-D, where one looks at the plane, ``up_axis`` is 2."""
+    """Corner of the container [m], (2,) or (3,); in 2-D the camera looks at the plane, and ``up_axis`` is 2."""
     upper: Vector
     spacing: float
     """Spacing of the particles [m]."""
@@ -220,7 +219,7 @@ class TopView:
     """Numbers of columns and rows."""
     up_axis: int = 1
     opacity: float = 4.0
-    """Extinction times spacing [-]: how well the first layer of particles hides the second."""
+    """Extinction times spacing [-]: a larger value hides the layers below the first layer of particles better."""
     background: Vector = WHITE
     """Background in linear RGB, (3,)."""
 
@@ -268,7 +267,7 @@ class TopView:
 
 @dataclass(frozen=True)
 class ViewTangent:
-    """A change of a view, as the direction of a derivative."""
+    """A change of a view: the direction of a directional derivative."""
 
     translation: Vector = ZERO
     """Translation of the camera (3,) [m]."""
@@ -282,9 +281,9 @@ class ViewTangent:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The search for unknown numbers of a view, from an aimed one. Names are "translation" (3,) [m] and "rotation" (3,)
-    [rad] of the camera, its "field_of_view" [degrees] or, with parallel rays, "width" [m], and the "extinction" of the
-    fluid [1/m]."""
+    """Unknown numbers of a view as parameters, starting from an approximate (aimed) view. Their names are "translation"
+    (3,) [m] and "rotation" (3,) [rad] of the camera, its "field_of_view" [degrees] or, with parallel rays, "width" [m],
+    and the "extinction" of the fluid [1/m]."""
 
     aimed: View
     names: tuple[str, ...] = ()
@@ -297,13 +296,13 @@ class Calibration:
 
     @property
     def start(self) -> dict[str, np.ndarray]:
-        """Values of the searched numbers in the aimed view."""
+        """Values of the unknown numbers in the aimed view."""
         return {name: self._values[name] for name in self.names}
 
     @property
     def unseen(self) -> dict[str, np.ndarray]:
-        """Masks by name, true for numbers that no picture shows: the shift of a camera with parallel rays along an
-        axis-aligned sight."""
+        """Masks by name, True for numbers without effect on pictures: the shift of a camera with parallel rays along
+        its axis-aligned viewing direction."""
         camera = self.aimed.camera
         if "translation" not in self.names or not isinstance(camera, Orthographic):
             return {}
@@ -323,7 +322,7 @@ class Calibration:
         return Volume(camera, float(all_values["extinction"]), self.aimed.background)
 
     def tangent(self, values: Mapping[str, np.ndarray], directions: Mapping[str, np.ndarray]) -> ViewTangent:
-        """Return the change of the view with these values along directions of some of them."""
+        """Return the change of the view at these values along the given directions of some of them."""
         from scipy.spatial.transform import Rotation
 
         rotation: Vector = ZERO

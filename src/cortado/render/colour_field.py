@@ -1,13 +1,13 @@
-"""The colour field: how much fluid there is at the nodes of a regular grid, and of what colour.
+"""The colour field: coverage by fluid and colour at the nodes of a regular grid.
 
-The colour of a particle is mixed from those of its phases, and both are spread over the nodes around it:
+The colour of a particle is mixed from its phases' colours. Coverage and colour are spread over the nodes around it:
 
     colour_j = sum_k c_jk colours_k
     A_g = V sum_j W(x_g - x_j),    P_g = V sum_j W(x_g - x_j) colour_j
 
-The coverage A is 1 within a filled fluid. P is the colour times the coverage; neither is ever divided by the other.
-Along a periodic axis the images of a particle count like itself.
-Both sums are gathers: of particles, cell by cell, on the way there, of the nodes within the support on the way back.
+The coverage A is 1 inside the fluid. P is colour times coverage; no formula divides by A. Along periodic axes a
+particle's images count like the particle. Both sums are gathers: a node sums over particles, cell by cell; in the
+adjoint a particle sums over the nodes within its support.
 """
 
 from functools import cache, cached_property, partial
@@ -57,11 +57,11 @@ def nodes_type(precision: Precision) -> Any:
         """Number of nodes along x, y and z."""
         periodic: wp.int32
         period: vector
-        """[m], 0 along an axis that is not periodic; greater than two supports."""
+        """Period of each axis [m], greater than two supports; 0 along an axis that is not periodic."""
         turn: vector
         """1 / period [1 / m], or 0."""
         images: wp.vec3i
-        """How many images of a particle, one period after the other, may be felt by nodes."""
+        """Number of periodic images of a particle, along each axis, whose support can reach nodes."""
 
     Nodes.__name__ = Nodes.__qualname__ = f"Nodes_{precision.name}"
     return wp.struct(Nodes)
@@ -69,8 +69,8 @@ def nodes_type(precision: Precision) -> Any:
 
 @cache
 def node_functions(precision: Precision) -> tuple[Any, Any, Any]:
-    """Return Warp functions ``place`` (position of a node [m]), ``nearest`` (a separation to the nearest image) and
-    ``image`` (position of an image of a particle that nodes may feel)."""
+    """Return Warp functions ``place`` (position of a node [m]), ``nearest`` (vector to the nearest periodic image) and
+    ``image`` (position of a particle's image whose support can reach nodes)."""
     real, vector = precision.real, precision.vector
     nodes_struct = nodes_type(precision)
 
@@ -87,7 +87,8 @@ def node_functions(precision: Precision) -> tuple[Any, Any, Any]:
 
     @wp.func
     def image(number: int, x: vector, h: real, nodes: nodes_struct) -> vector:
-        """Return an image of x, from the lowest whose support h reaches the first node along every axis."""
+        """Return image ``number`` of x; image 0 is the lowest whose support h reaches the first node along every
+        axis."""
         t = wp.cw_mul(x - nodes.origin + vector(h, h, h), nodes.turn)
         n_x = nodes.images[0]
         n_y = nodes.images[1]
@@ -132,7 +133,8 @@ def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def phase_colour_adjoint(colours, c_scene, colour_scene_bar, c_scene_bar, colours_bar):
-        """Write the adjoint of mass fractions, and particle by particle that of the phase colours."""
+        """Compute the adjoint of the mass fractions and, for each particle, its part of the adjoint of the phase
+        colours."""
         j = wp.tid()
         bar = colour_scene_bar[j]
         c_scene_bar[j] = colours[0] * bar
@@ -256,8 +258,8 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
 def nodes_over(
     lower: np.ndarray, upper: np.ndarray, periods: np.ndarray, cell: float, support: float, precision: Precision
 ) -> Any:
-    """Return the struct of nodes ``cell`` [m] apart over a region (d,) to (d,) [m], and as far beyond as its particles
-    are felt, except along axes with a period [m]. In 2-D nodes are one layer."""
+    """Return the struct of nodes ``cell`` [m] apart in a region (d,) to (d,) [m] and, along axes without a period, in
+    the margin that particles' supports reach. In 2-D there is one layer of nodes."""
     margin = np.where(periods > 0.0, 0, int(np.ceil(support / cell)))
     counts = np.ceil((upper - lower) / cell * (1 - 1e-12)) + 2 * margin + 1
     if np.prod(counts) > MOST_NODES:
@@ -317,7 +319,7 @@ class ColourField:
         self._known = {"order": self._sort.order, "colours": self._colours, "c_scene": self._fractions}
         self._sum = sum_of(palette, particles, device)
         self.nodes = nodes_over(lower, upper, periods, cell, support, precision)
-        """The struct that kernels see."""
+        """The struct of nodes that kernels take."""
         require(field_parts(prod(self.nodes.shape), precision.bytes), "take a larger cell", device)
         self.values = zeros(tuple(self.nodes.shape)[::-1], dtype=rgba_type(precision))
         """(nz, ny, nx) colour times coverage, and coverage [-]."""
@@ -336,7 +338,7 @@ class ColourField:
 
     def tangent(self, positions_dot: wp.array, fractions_dot: wp.array, colours_dot: np.ndarray) -> wp.array:
         """Return the tangent (nz, ny, nx) of the last field, along tangents of positions (n,), fractions (n,) and
-        colours (phases, 3). The next call overwrites it, and the result of `adjoint`."""
+        colours (phases, 3). A further call overwrites this result and that of `adjoint`."""
         own = {"x": self._x, "colour": self._colour, "x_dot": self._x_bar, "colour_dot": self._colour_bar}
         along = {"x_scene_dot": positions_dot, "c_scene_dot": fractions_dot, "colours_dot": self._colours_dot}
         self._colours_dot.assign(colours_dot[None])
@@ -351,7 +353,7 @@ class ColourField:
         return wp.zeros_like(self.values)
 
     def adjoint(self, field_bar: wp.array) -> tuple[wp.array, wp.array, np.ndarray]:
-        """Return the derivative with respect to positions (n,), fractions (n,) and colours (phases, 3), from that with
+        """Return derivatives with respect to positions (n,), fractions (n,) and colours (phases, 3), given that with
         respect to the field."""
         own = {"x": self._x, "colour": self._colour, "nodes": self.nodes, "field_bar": field_bar}
         bars = {

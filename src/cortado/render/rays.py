@@ -1,14 +1,14 @@
-"""Rays of a camera, and what a sample on one sees of the colour field.
+"""Rays of a camera, and the interpolation of the colour field at samples on a ray.
 
-Where its pixels look, where along a ray samples lie, and which of them lie in a box.
+Functions compute each pixel's ray, the samples along a ray, and the samples inside a box.
 
 In the camera's frame x points to the right, y up and z backwards. Pixel coordinates (u, v) run from -1 to 1 over the
 width of the picture, v upwards and in the same unit. At depth z the pixel (u, v) sees (w u, w v, -z), with the half
-width w = half_width + growth z. So one formula holds for parallel rays (growth 0) and for rays from a point (half_width
+width w = half_width + growth z. The formula holds for parallel rays (growth 0) and for rays from a point (half_width
 0).
 
-A sample is interpolated trilinearly between the nodes of the field, which is 0 at all nodes that are not there. So it
-is continuous everywhere, and a field of one layer (2-D) is a sheet that is one node distance thick.
+A sample is interpolated trilinearly between nodes; outside the grid the field is 0. The interpolated field is therefore
+continuous everywhere, and a field of one layer (2-D) is a sheet one node distance thick.
 """
 
 from dataclasses import dataclass
@@ -33,13 +33,13 @@ def camera_type(precision: Precision) -> Any:
         orientation: matrix
         """Columns: right, up and backwards."""
         half_width: real
-        """Half of the width of what is seen at the camera [m]."""
+        """Half of the visible width at the camera [m]."""
         growth: real
         """Growth of the half width with depth [-]."""
         columns: wp.int32
         rows: wp.int32
         near: real
-        """Where samples begin along a ray [m]."""
+        """Distance along a ray at which samples begin [m]."""
         step: real
         """Distance of neighbouring samples [m]."""
         samples: wp.int32
@@ -79,9 +79,9 @@ class RayFunctions:
 
 @cache
 def ray_functions(precision: Precision) -> RayFunctions:
-    """Return Warp functions of rays: ``start`` and ``direction`` of a pixel's, ``distance`` of a sample along it,
-    ``start_tangent`` and ``direction_tangent`` as the view changes. ``samples_within`` gives samples in a box, and
-    ``pixels_before`` the pixels whose rays may hit it."""
+    """Return Warp functions of rays: ``start`` and ``direction`` of a pixel's ray, ``distance`` of a sample along it,
+    and ``start_tangent`` and ``direction_tangent`` for a changing view. ``samples_within`` returns the samples in a
+    box, ``pixels_before`` the pixels whose rays may hit it."""
     real, vector = precision.real, precision.vector
     camera_struct, tangent_struct = camera_type(precision), camera_tangent_type(precision)
     tiny, huge = wp.constant(real(precision.tiny)), wp.constant(real(1.0 / precision.tiny))
@@ -120,7 +120,8 @@ def ray_functions(precision: Precision) -> RayFunctions:
 
     @wp.func
     def samples_within(o: vector, d: vector, lower: vector, upper: vector, c: camera_struct) -> wp.vec2i:
-        """Return the first sample in a box and the one behind the last; up to one more at either end, never too few."""
+        """Return the first sample in a box and the sample after the last. The range may contain one sample too many at
+        each end, never too few."""
         t_in = -huge
         t_out = huge
         for axis in range(3):
@@ -138,10 +139,10 @@ def ray_functions(precision: Precision) -> RayFunctions:
 
     @wp.func
     def pixels_before(lower: vector, upper: vector, c: camera_struct) -> wp.vec4i:
-        """Return the first column, the one behind the last, first row, and the one behind the last; never too few.
+        """Return the range of columns and rows that may show a box: first and last + 1 of each, never too few.
 
-        Where the map to the screen is regular, over the whole box, its extremes are at corners. A box that
-        reaches behind a camera with a point of view may be anywhere on the screen.
+        If the whole box is in front of the camera, the extremes on the screen are at corners. If the box reaches behind
+        a perspective camera, it may cover any part of the screen, so all rows and columns are returned.
         """
         n_x = real(c.columns)
         n_y = real(c.rows)
@@ -234,7 +235,7 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
 
     @wp.func
     def slope(f: vector, a: int, b: int, c: int) -> vector:
-        """Return the gradient of a corner's weight, in node distances."""
+        """Return the gradient of a corner's weight, per node distance."""
         return vector(
             real(2 * a - 1) * part(f[1], b) * part(f[2], c),
             real(2 * b - 1) * part(f[2], c) * part(f[0], a),
@@ -243,7 +244,8 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
 
     @wp.func
     def gradient(x: vector, bar: rgba, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> vector:
-        """Return the gradient of bar . value; where it jumps, that of the cell which begins there."""
+        """Return the gradient of bar . value. On the face between two cells, where it jumps, it is that of the cell
+        that begins there."""
         i, j, k, f = cell(x, nodes)
         total = vector()
         for a in range(2):
@@ -254,7 +256,8 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
 
     @wp.func
     def derivative(x: vector, x_dot: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
-        """Return the derivative of the value at a point that moves; on the face of a cell as `gradient`."""
+        """Return the derivative of the value at a moving point. On the face between two cells it uses the cell that
+        begins there, as `gradient` does."""
         i, j, k, f = cell(x, nodes)
         total = rgba()
         for a in range(2):

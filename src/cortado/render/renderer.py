@@ -1,4 +1,4 @@
-"""From particles to a picture and back, and the renderer of the pictures that a scene asks for."""
+"""Rendering of particles with derivatives, and the renderer that a scene's table [render] describes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,10 +45,10 @@ class RenderAdjoint:
 @public
 @fixed
 class Renderer:
-    """A renderer of a fixed number of particles into pictures of one view, on one device; pictures are linear RGB.
+    """Renders a fixed number of particles in one view, on one device; pictures are linear RGB.
 
-    They are smooth functions of positions, fractions and colours, and piecewise smooth ones of the camera's pose. Where
-    samples lie on faces between cells of the colour field, as those of a view along an axis may, the derivative with
+    Pictures are smooth functions of positions, fractions and colours, and piecewise smooth functions of the camera's
+    pose. If samples lie on faces between cells of the colour field, as in a view along an axis, the derivative with
     respect to the pose is one-sided.
     """
 
@@ -71,13 +71,13 @@ class Renderer:
         periods: Sequence[float] | np.ndarray | None = None,
         colours: np.ndarray | None = None,
     ):
-        """Prepare a view of the fluid from ``lower`` to ``upper`` (d,) [m], and by the support radius [m] beyond.
+        """Prepare a view of the fluid from ``lower`` to ``upper`` (d,) [m], plus a margin of the support radius [m].
 
-        Along an axis with a period (``periods`` (d,) [m], 0 without one) fluid is seen wherever an image of it is
-        between ``lower`` and ``upper``.
+        Along a periodic axis (``periods`` (d,) [m], 0 without a period) every periodic image of fluid between ``lower``
+        and ``upper`` is visible.
 
-        ``volume`` is that of a particle [m^d], ``cell`` the distance of nodes [m], by default half the
-        support radius. ``colours`` (phases, 3) are those of the phases where a picture is asked for without any.
+        ``volume`` is a particle's volume [m^d], ``cell`` the node distance [m], by default half the support radius.
+        ``colours`` (phases, 3) are the phases' default colours.
         """
         start_warp()
         for name, size in (("support", support), ("volume", volume), ("cell", 1.0 if cell is None else cell)):
@@ -126,22 +126,22 @@ class Renderer:
         return f"Renderer({view}, {columns} x {rows} pixels, {counted(self._particles, 'particle')})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle or copy the renderer as its constructor's arguments."""
+        """Pickle or copy the renderer by storing its constructor's arguments."""
         settings = {**self._settings, "device": self._device.alias}
         return _made_again, (self.view, settings, self._precision.name)
 
     @property
     def fingerprint(self) -> str:
-        """Text that tells views and grids of nodes apart, for checkpoints."""
+        """Text that identifies view and grid of nodes, for checkpoints."""
         nodes = self._field.nodes
         return f"{self.view!r} {tuple(nodes.origin)} {nodes.cell} {tuple(nodes.shape)} {tuple(nodes.period)}"
 
     def in_precision(self, precision: Precision) -> "Renderer":
-        """Return a renderer of equal pictures in another precision."""
+        """Return a renderer of the same pictures in another precision."""
         return Renderer(self.view, **self._settings, precision=precision)
 
     def seen_by(self, view: View) -> "Renderer":
-        """Return a renderer of equal particles in another view."""
+        """Return a renderer of the same particles in another view."""
         return Renderer(view, **self._settings, precision=self._precision)
 
     @property
@@ -171,11 +171,11 @@ class Renderer:
         """Return the picture (rows, columns, 3), in float64, row 0 at the top: ``render(trajectory[-1])``.
 
         Args:
-            positions: a frame, such as ``trajectory[k]`` or ``problem.end(parameters)``, which brings its own mass
-                fractions, and colours if it has any; or (n, d) [m], or a Warp array (n,) of vectors in the renderer's
-                precision, on its device.
-            fractions: (n, phases) mass fractions [-], or such a Warp array; may be left out with one phase.
-            colours: (phases, 3) of the phases; those that the renderer was made with if left out.
+            positions: a frame such as ``trajectory[k]`` or ``problem.end(parameters)``, which includes mass fractions
+            and perhaps colours; or (n, d) [m]; or a Warp array (n,) of vectors in the renderer's precision and on its
+            device.
+            fractions: (n, phases) mass fractions [-], or a Warp array (n,) of vectors; may be left out with one phase.
+            colours: (phases, 3) colours of the phases; if left out, the renderer's own.
         """
         positions, fractions, colours = self._completed(positions, fractions, colours)
         x = self._on_device("positions", positions, self._dimension, self._precision.vector)
@@ -190,13 +190,14 @@ class Renderer:
     def tangent(
         self, positions: Any = None, fractions: Any = None, colours: Any = None, view: ViewTangent | None = None
     ) -> np.ndarray:
-        """Return the derivative (rows, columns, 3) of the last picture along a direction, whose omitted parts are 0.
+        """Return the derivative (rows, columns, 3) of the last picture along a direction; omitted parts of the
+        direction are 0.
 
         Args:
             positions: (n, d) [m], the direction of the positions.
-            fractions: (n, phases) [-], that of the mass fractions.
-            colours: (phases, 3) [-], that of the colours of the phases.
-            view: that of the view.
+            fractions: (n, phases) [-], the direction of the mass fractions.
+            colours: (phases, 3) [-], the direction of the colours of the phases.
+            view: the direction of the view.
         """
         self._require_picture("tangent")
         directions = {"positions": positions, "fractions": fractions, "colours": colours}
@@ -212,8 +213,8 @@ class Renderer:
 
     @WARP
     def adjoint(self, image_bar: np.ndarray) -> RenderAdjoint:
-        """Return the derivative of a function of the last picture, from its derivative with respect to that picture
-        (rows, columns, 3)."""
+        """Turn the derivative of a function with respect to the last picture (rows, columns, 3) into its derivatives
+        with respect to positions, mass fractions, colours and the camera's pose."""
         self._require_picture("adjoint")
         image_bar = _of_shape("image_bar", image_bar, self.shape)
         field_bar, pose = self._rays.adjoint(image_bar.reshape(-1, 3), self._field.values)
@@ -237,7 +238,7 @@ class Renderer:
             raise InputError(f"There is no picture to differentiate; call render before {method}.")
 
     def _completed(self, positions: Any, fractions: Any, colours: Any) -> tuple[Any, Any, Any]:
-        """Return the arguments of `render` with a frame taken apart, and defaults filled in."""
+        """Return the arguments of `render`, with a frame split into its fields and defaults filled in."""
         if hasattr(positions, "positions"):
             frame, positions = positions, positions.positions
             fractions = frame.mass_fractions if fractions is None else fractions
@@ -252,7 +253,8 @@ class Renderer:
         return positions, fractions, self._colours if colours is None else colours
 
     def _on_device(self, name: str, values: Any, components: int, dtype: Any) -> wp.array:
-        """Return a Warp array (n,) of vectors, checked as it is, or made of an array (n, components)."""
+        """Return a Warp array (n,) of vectors: a given Warp array after checks, or one made from an array (n,
+        components)."""
         if not isinstance(values, wp.array):
             array = _of_shape(name, values, (self._particles, components))
             if not np.isfinite(array).all():
@@ -279,16 +281,16 @@ def _of_shape(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
 UP = {2: 2, 3: 1}
 """Axis that points upwards, by dimension; in 2-D the one perpendicular to the plane."""
 FINENESS = {2: 0.5, 3: 1.0}
-"""Node distance over particle spacing, by dimension. On coarser nodes a particle's picture depends on where it lies
-between them, which catches single particles; in 2-D finer nodes cost next to nothing."""
+"""Node distance over particle spacing, by dimension. On coarser grids a particle's picture depends on its place between
+nodes, and optimisers can get stuck there. In 2-D finer nodes cost very little."""
 CLEARNESS = 8.0
-"""Width of the scene over the depth to which one sees into a volume, unless the scene sets it."""
+"""Width of the scene / depth of visibility in a "volume" view, unless the scene sets the extinction."""
 CAMERA = ("position", "look_at", "field_of_view", "extinction")
-"""Keys of the table [render] that belong to one view."""
+"""Keys of the table [render] that are specific to one view."""
 
 
 class Pictured(Protocol):
-    """Protocol of a `cortado.Simulation` as its renderer needs it."""
+    """Protocol of the parts of a `cortado.Simulation` that its renderer uses."""
 
     scene: Scene
     positions: np.ndarray
@@ -304,7 +306,8 @@ class Pictured(Protocol):
 
 
 def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **settings: Any) -> Renderer:
-    """Make a renderer for the particles of a simulation, after its scene's table [render], or from above.
+    """Make a renderer for a simulation's particles from its scene's table [render]; without the table, a view from
+    above.
 
     The extinction is multiplied by ``extinction_factor``. ``settings`` replace keys of the table; see
     `Simulation.renderer`.
@@ -334,7 +337,8 @@ def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **setti
 
 
 def _table(scene: Scene, settings: dict[str, Any]) -> Render:
-    """Return a scene's table [render] with some keys replaced; a camera stays with its view."""
+    """Return a scene's table [render] with some keys replaced; the camera's keys are kept only if the view stays the
+    same."""
     given = {} if scene.render is None else scene.render.model_dump(exclude_unset=True)
     view = settings.get("view")
     if isinstance(view, str) and view != given.get("view"):

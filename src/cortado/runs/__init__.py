@@ -1,4 +1,4 @@
-"""What a run leaves: trajectories, folders, reports; what can be read of its states: quantities and sensors."""
+"""Results of a run: trajectories and run folders; and what is computed from its states: quantities and sensors."""
 
 from typing import TYPE_CHECKING
 

@@ -1,5 +1,5 @@
-"""Sensors of free bodies: forces in springs, as quantities of a state with their tangents and adjoints; and where a
-body is, how it is turned, and how fast it goes.
+"""Sensors of free bodies: the force in a spring, with tangents and adjoints; and the position, rotation and velocities
+of a body.
 """
 
 from functools import cache
@@ -27,7 +27,7 @@ from cortado.sph.springs import NUMBERS, PoseBars, Springs, numbers_of, springs_
 
 @cache
 def six_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Make the kernels of the first components of a load by a vector, and of that vector's adjoint by the load's."""
+    """Make two kernels: one copies a vector to the first components of a load, the other is its adjoint."""
     real, vector, module = precision.real, precision.vector, kernel_module(f"spring_load_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -44,7 +44,7 @@ def six_kernels(precision: Precision) -> tuple[Any, Any]:
 
 
 class SpringLoads:
-    """The quantity of a spring's force and length at the start of a step, which are the first two numbers of a load."""
+    """The quantity of a spring's force and length at the start of a step, stored in the first two numbers of a load."""
 
     def __init__(self, springs: Springs, spring: Ends):
         layout, self._springs, self._spring = springs.layout, springs, spring
@@ -86,8 +86,8 @@ def spring_loads(solver: ParticleSolver) -> dict[str, QuantityFormula]:
 
 @fixed
 class SpringForce(Summed):
-    """A sensor of the force with which a spring pulls, less than 0 where it pushes, and of its length, as the state has
-    them. The part of a damper follows from the velocities of both ends in the step that begins there.
+    """A sensor of a spring's force (positive if it pulls, negative if it pushes) and of its length in a state. The
+    damper's part of the force is computed from the velocities of both ends in the step that begins at the state.
 
     Example: ``run = simulation.run(100, sensors={"line": cortado.sensors.SpringForce("line")})``
     """
@@ -113,10 +113,10 @@ class SpringForce(Summed):
 
 @fixed
 class BodyMotion(Summed):
-    """A sensor of a free body: the position of its middle, its rotation, and how fast it goes and turns.
+    """A sensor of a free body: the position of its middle, its rotation, its velocity and its angular velocity.
 
-    The rotation is the angle in the plane and the rotation vector in space, of at most half a turn: at a half turn it
-    jumps by a whole one, where its derivative goes on.
+    The rotation is an angle in 2-D and a rotation vector in 3-D, of at most half a turn. At half a turn the value jumps
+    by a whole turn; its derivative is continuous there.
 
     Example: ``run = simulation.run(100, sensors={"raft": cortado.sensors.BodyMotion("raft")})``
     """

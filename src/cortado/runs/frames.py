@@ -1,5 +1,5 @@
-"""Frames of a run: when they are due, as a VTKHDF file takes them one by one, which of them a film shows, and where
-solids that move are in them."""
+"""Frames of a run: when they are due, how they are written to a VTKHDF file, which frames a film shows, and the poses
+of moving solids."""
 
 from __future__ import annotations
 
@@ -36,52 +36,51 @@ from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
 
 SAME = 1e-9
-"""Part of the time between frames by which a state may come before a frame is due, as times are rounded."""
+"""Relative tolerance for rounded times: a state this part of a frame interval too early still counts as due."""
 FRACTION = "mass_fraction_"
 SHORTEST, LONGEST = 4.0, 10.0
-"""[s] that a film lasts at least and at most, if it has frames enough and nobody asks for another number of them."""
+"""Least and greatest length of a film [s], if there are enough frames and the user sets no number of frames."""
 FEW = 1.0
-"""Length [s] of a film of a few frames, with at least `SLOWEST` of them in a second."""
+"""Length [s] of a film with few frames, if it then shows at least `SLOWEST` frames per second."""
 SLOWEST, USUAL = 6.0, 25.0
-"""Frames that a film shows in a second: fewer are seen one by one."""
+"""Least and usual number of frames per second of a film; below the least, single frames become visible."""
 SMOOTH = 12.0
-"""Frames in a second below which a film says how more are recorded."""
+"""Frames per second below which a note on the film says how to record more frames."""
 SHORT = 1.5
-"""Factor by which a film goes faster for want of frames before it says so."""
+"""Factor by which a lack of frames may speed up a film before a note says so."""
 EARLY = 1e-6
-"""Part of the time between two frames: the last is early if it comes by more before it is due."""
+"""Part of a frame interval; the last frame counts as early if it is recorded by more than this before it is due."""
 EASY = (5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)
-"""Speeds that are easy to think of, and these times powers of ten."""
+"""Round numbers: a film's speed is one of these times a power of ten."""
 
 
 @dataclass(frozen=True)
 class Marks:
-    """The times at which frames of a run are due: frame k at start + k / rate, the first state at that time or after
-    it."""
+    """The times at which frames of a run are due: frame k is the first state at or after the time start + k / rate."""
 
     start: float
     """[s] when the run began"""
     rate: float
-    """[1/s] frames in a second that is simulated"""
+    """[1/s] frames per simulated second"""
 
     def passed(self, times: NDArray[Any]) -> NDArray[np.int64]:
-        """Return the number (n,) of the last mark at or before each of the times (n,) [s]."""
+        """Return, for each of the times (n,) [s], the number of the last mark at or before that time, (n,)."""
         return np.floor((np.asarray(times) - self.start) * self.rate + SAME).astype(np.int64)
 
     def at(self, numbers: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the times (n,) [s] of marks of these numbers (n,)."""
+        """Return the times (n,) [s] of the marks with the given numbers (n,)."""
         return self.start + np.asarray(numbers) / self.rate
 
     def due(self, times: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the times (frames,) [s] when frames recorded at ``times`` (frames,) were due. The last state of a run,
-        which may be at no mark, and states that are farther apart than marks have their own times."""
+        """Return the times (frames,) [s] when frames recorded at ``times`` (frames,) were due. The last state of a run
+        may be at no mark; it keeps its own time, as do states that are farther apart than marks."""
         numbers = self.passed(times)
         one_by_one = np.diff(numbers, prepend=numbers[:1] - 1) == 1
         return np.where(one_by_one, self.at(numbers), times)
 
     def chosen(self, times: NDArray[Any], stride: int) -> Marks | None:
-        """Return the marks of every ``stride`` frames of those recorded at ``times`` (frames,) [s]; None where they are
-        not evenly spaced among the marks, but for the last."""
+        """Return the marks of every ``stride``-th frame of those recorded at ``times`` (frames,) [s]. None if the
+        frames, except the last, are not evenly spaced on the marks."""
         numbers = self.passed(times)
         apart = np.diff(numbers)
         every = 1 if stride == 1 else int(apart[0]) if len(apart) else 0
@@ -91,8 +90,7 @@ class Marks:
 
 
 def common_rate(each: Iterable[Marks | None]) -> float | None:
-    """Return the number of frames in a second [1/s] that all of several runs record; None where some have none, or
-    another one."""
+    """Return the frame rate [1/s] that all runs have in common; None if rates differ or a run has no rate."""
     rates = {None if marks is None else marks.rate for marks in each}
     return rates.pop() if len(rates) == 1 else None
 
@@ -110,10 +108,10 @@ def frame_writer(
     expected: int | None = None,
     kept: int = 1,
 ) -> vtkhdf.TrajectoryWriter:
-    """Open a trajectory file with room for frames at ``times`` (frames,) [s]. A frame has the fields that ``first``
-    has, and ``quantities`` of these names; a step, of which there are ``steps``, has the numbers of ``diagnostics``.
-    ``marks``: when frames are due, where times choose them. The disk must have room for all frames, or for ``expected``
-    ones. A file of that name is replaced once all of its first ``kept`` frames are written to the new one."""
+    """Open a trajectory file with room for frames at ``times`` (frames,) [s]. A frame has the fields of ``first`` and
+    the named ``quantities``; each of the ``steps`` steps has the ``diagnostics``. ``marks``: due times, for frames
+    chosen by time. The disk must have room for all frames, or for ``expected`` frames. An existing file is replaced
+    only once its first ``kept`` frames are written to the new file."""
     particles, dimension = first["positions"].shape[-2:]
     single = first["positions"].dtype == np.float32
     vectors = [name for name in quantities if len(QUANTITIES[name].shape(particles, dimension)) == 2]
@@ -144,8 +142,8 @@ def append_frame(
     quantities: Mapping[str, NDArray[Any]] | None = None,
     time: float | None = None,
 ) -> None:
-    """Write the fields and the quantities of a frame, after ``step`` steps, to a file of `frame_writer`; its ``time``
-    [s] where that was not known."""
+    """Write the fields and quantities of a frame after ``step`` steps to a file of `frame_writer`, and its ``time`` [s]
+    if it was not known before."""
     fractions = frame["mass_fractions"].T if "mass_fractions" in frame else ()
     scalars = {**dict(zip(fraction_names(len(fractions)), fractions, strict=True)), **(quantities or {})}
     writer.append(frame["positions"], frame["velocities"], step=step, time=time, others=_others(frame), **scalars)
@@ -156,28 +154,28 @@ def _others(frame: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def fraction_names(phases: int) -> list[str]:
-    """Return names of the scalar fields that hold the mass fractions of several phases; none for one phase."""
+    """Return the names of the scalar fields with the mass fractions of several phases; no names for one phase."""
     return [f"{FRACTION}{k}" for k in range(phases)]
 
 
 @dataclass(frozen=True)
 class Pace:
-    """The frames that a film shows, and when."""
+    """The frames that a film shows, and the time of each in the film."""
 
     frames: tuple[int, ...]
-    """Numbers of the frames that it shows."""
+    """Numbers of the frames shown."""
     times: tuple[float, ...]
-    """[s] in the film, of each of them"""
+    """[s] times in the film of these frames"""
     speed: float | None
-    """[-] seconds of the run in a second of the film; 1 is real time; None where times are not known"""
+    """[-] simulated seconds per second of film; 1 is real time; None if times are unknown"""
     recorded: int
     """Number of recorded frames."""
     enough: float = 0.0
-    """[1/s] frames in a second of the run with which the film would show `USUAL` ones; 0 where times are not known"""
+    """[1/s] frames per simulated second that give the film `USUAL` frames per second; 0 if times are unknown"""
     is_asked: bool = False
-    """True where somebody chose the speed."""
+    """True if the user chose the speed."""
     of_search: bool = False
-    """True for frames of a search, whose number [picture] gives, and not of a run."""
+    """True for frames of a search instead of a run; the table [picture] gives their number."""
 
     @classmethod
     def of(
@@ -187,11 +185,11 @@ class Pace:
         speed: float | None = None,
         rate: float | None = None,
     ) -> Pace:
-        """Choose the pace for a run with frames at ``times`` [s]. ``count``: how many frames the film has, evenly
-        chosen; if left out `USUAL` in each of its seconds. ``speed``: if left out, a film of ``count`` frames shows
-        `USUAL` in a second. Any other is in real time, or slower or faster where it would be shorter than `SHORTEST` or
-        longer than `LONGEST`. ``rate`` [1/s]: of frames that were recorded so many in a second; without ``count`` the
-        film has every one of them, or every second, and so on, and no state between two."""
+        """Choose the pace for a run with frames at ``times`` [s]. ``count``: number of frames of the film, evenly
+        chosen; `USUAL` per second of film if left out. ``speed``: if left out, a film of ``count`` frames shows `USUAL`
+        per second. Other films are in real time, or slower or faster if they would be shorter than `SHORTEST` or longer
+        than `LONGEST`. ``rate`` [1/s]: frames recorded per simulated second; without ``count`` the film shows every
+        frame, or every second frame, and so on, without interpolation."""
         span = float(times[-1] - times[0])
         full, is_asked = speed or _easy_speed(span), speed is not None
         if speed is None:
@@ -212,12 +210,12 @@ class Pace:
 
     @property
     def frames_per_second(self) -> float:
-        """Return the mean number of frames in a second of the film."""
+        """Return the mean number of frames per second of the film."""
         return (len(self.frames) - 1) / self.times[-1] if self.times[-1] > 0.0 else USUAL
 
     @property
     def in_words(self) -> str:
-        """Say how fast time goes in the film."""
+        """Return a text with the film's speed relative to real time."""
         if self.speed is None:
             return "step by step"
         return "in real time" if self.speed == 1.0 else f"at {self.speed:g} x"
@@ -229,7 +227,7 @@ class Pace:
 
     @property
     def _more(self) -> str:
-        """Return the option that records enough frames."""
+        """Return the command line option that records enough frames."""
         if self.of_search and self.speed is not None:
             return f"picture.film_frames={self.enough * self._span + 1.0:.0f}"
         return f"--fps {self.enough:.4g}" if self.enough < 1e3 else f"--fps {self.enough:.0f}"
@@ -246,28 +244,28 @@ class Pace:
 
     @property
     def _span(self) -> float:
-        """Return how long the run lasts [s]."""
+        """Return the simulated time of the run [s]."""
         return self.times[-1] * (self.speed or 0.0)
 
     @property
     def _lacks(self) -> bool:
-        """Return True if the film is seen frame by frame, or is much shorter than one of a run with frames enough."""
+        """Return True if single frames are visible in the film, or if it is much shorter than with enough frames."""
         return self.frames_per_second < SMOOTH or (self.speed or 0.0) > SHORT * USUAL / self.enough
 
 
 @dataclass(frozen=True)
 class Film:
-    """A film that is written, with its pace and notes."""
+    """A film file, with its pace and notes."""
 
     path: Path
     pace: Pace
-    """Its frames, and how fast it shows them."""
+    """The film's frames and their times."""
     notes: str = ""
-    """A sentence for those who see it; empty if there is nothing to say."""
+    """A sentence for viewers of the film, or an empty text."""
 
     @property
     def in_words(self) -> str:
-        """Return the pace and the notes of the film, in words."""
+        """Return the film's pace and notes as text."""
         return f"{self.pace}; {self.notes}" if self.notes else str(self.pace)
 
     def __str__(self) -> str:
@@ -277,14 +275,14 @@ class Film:
         return f"Film({self.path}, {self.pace})"
 
     def _repr_html_(self) -> str:
-        """Show the repr, and a player with the film in it, in a notebook."""
+        """Show the repr and a video player in a notebook."""
         page: str = on_top("film_page")(self)
         return page
 
 
 def pace_of(times: Sequence[float] | NDArray, picture: Picture, rate: float | None = None) -> Pace:
-    """Return the pace of a run with frames at ``times`` [s] as a picture table asks for, ``rate`` as for `Pace.of`;
-    warn where it asks for more frames than there are."""
+    """Return the pace that the table [picture] sets for a run with frames at ``times`` [s]; ``rate`` as in `Pace.of`.
+    Warn if the table sets more frames than were recorded."""
     asked = picture.film_frames or None
     if asked is not None and len(times) < asked:
         found = f"the film has {counted(len(times), 'frame')} of the {asked} that picture.film_frames asks for"
@@ -294,14 +292,14 @@ def pace_of(times: Sequence[float] | NDArray, picture: Picture, rate: float | No
 
 
 def _whole(times: Sequence[float] | NDArray, rate: float) -> int:
-    """Return how many frames there are without a last one that comes before it is due."""
+    """Return the number of frames, not counting a last frame that is recorded before it is due."""
     is_early = len(times) > 2 and (times[-1] - times[-2]) * rate < 1.0 - EARLY
     return len(times) - 1 if is_early else len(times)
 
 
 def _speed(span: float, count: int, easy: float) -> float:
-    """Return the speed of a film with at most ``count`` frames of a run that lasts ``span`` [s]. It is ``easy`` if that
-    many are enough, or else the speed at which they are `USUAL` in a second."""
+    """Return the speed of a film with at most ``count`` frames of a run that lasts ``span`` [s]: ``easy`` if that many
+    frames suffice, else the speed with `USUAL` frames per second."""
     if span <= 0.0:
         return 1.0
     room = max((count - 1) / USUAL, min(FEW, count / SLOWEST))
@@ -309,7 +307,7 @@ def _speed(span: float, count: int, easy: float) -> float:
 
 
 def _easy_speed(span: float) -> float:
-    """Return the speed of a film that has frames enough, of a run that lasts ``span`` [s]."""
+    """Return the speed of a film with enough frames, for a run that lasts ``span`` [s]."""
     wanted = span / min(max(span, SHORTEST), LONGEST)
     if wanted <= 0.0:
         return 1.0
@@ -325,15 +323,16 @@ class SolidMotion:
     """The motion of one solid, in every frame."""
 
     positions: NDArray[Any]
-    """(frames, d) positions of its middle [m]"""
+    """(frames, d) positions of the solid's middle [m]"""
     rotations: NDArray[Any]
-    """(frames, 3) rotation vectors, in 2-D (frames,) angles, by which it is turned about its middle [rad]"""
+    """(frames, 3) rotation vectors, in 2-D (frames,) angles, of the rotation about the solid's middle [rad]"""
     velocities: NDArray[Any] | None = None
-    """(frames, d) velocities of the middle of a body that is free [m/s]; None for one with a given path."""
+    """(frames, d) velocities of the middle of a free body [m/s]; None for a solid with a prescribed path."""
     angular_velocities: NDArray[Any] | None = None
-    """(frames, 3), in 2-D (frames,), of a body that is free [rad/s]; None for others."""
+    """(frames, 3), in 2-D (frames,), angular velocities of a free body [rad/s]; None for a solid with a prescribed
+    path."""
     scale: float = 1.0
-    """Scale of a solid with a given path, relative to the scene's."""
+    """Scale of a solid with a prescribed path, relative to its size in the scene."""
 
     def __getitem__(self, frames: slice | NDArray[np.intp]) -> Self:
         """Return the motion in some of the frames."""
@@ -342,8 +341,8 @@ class SolidMotion:
         return replace(self, positions=places, rotations=turns, velocities=velocities, angular_velocities=spins)
 
     def carried(self, shifts: NDArray[Any]) -> Self:
-        """Return a free body's motion a short time later in each frame, or earlier, ``shifts`` (frames,) [s]: it goes
-        on at its velocities."""
+        """Return a free body's motion, extrapolated in each frame by ``shifts`` (frames,) [s] with constant
+        velocities."""
         assert self.velocities is not None and self.angular_velocities is not None
         places, turns = self.positions + shifts[:, None] * self.velocities, (shifts * self.angular_velocities.T).T
         rotations = self.rotations + turns if turns.ndim == 1 else _product(turns, self.rotations)
@@ -351,7 +350,7 @@ class SolidMotion:
 
     def between(self, known: NDArray[Any], times: NDArray[Any], table: SolidTable) -> Self:
         """Return the motion at ``times`` (k,) [s] of a solid with a given path and frames at times ``known`` (frames,)
-        [s]: as its ``table`` tells, but for changes by a run, which are interpolated."""
+        [s]: its path in ``table``, plus the interpolated deviation of the recorded poses from that path."""
         shift, turn = courses(table)
         kept = self.positions - shift.at(known)
         places = np.stack([np.interp(times, known, x) for x in kept.T], axis=1) + shift.at(times)
@@ -366,7 +365,7 @@ class SolidMotion:
 
 
 class SolidMotions(dict[str, SolidMotion]):
-    """The motions of the solids of a run that move, by their names."""
+    """The motions of the moving solids of a run, by name."""
 
     def __missing__(self, name: object) -> SolidMotion:
         """Raise `InputError` for a solid that did not move."""
@@ -374,12 +373,12 @@ class SolidMotions(dict[str, SolidMotion]):
         raise InputError(f"solids has no {shown(name)}, as the run {known}.")
 
     def in_frames(self, frames: slice) -> SolidMotions:
-        """Return the motions in some of the frames."""
+        """Return the motions in the given frames."""
         return SolidMotions({name: motion[frames] for name, motion in self.items()})
 
     def at(self, scene: Scene, known: NDArray[Any], recorded: NDArray[np.intp], times: NDArray[Any]) -> SolidMotions:
-        """Return the motions at ``times`` (k,) [s], each near the frame of a number ``recorded`` (k,), in a run of a
-        scene with frames at times ``known`` (frames,) [s]."""
+        """Return the motions at ``times`` (k,) [s] in a run with frames at times ``known`` (frames,) [s]. Entry k is
+        close to the frame with number ``recorded`` (k,)."""
         shifts, tables = times - known[recorded], {table.name: table for table in told(scene.solid)}
         if not shifts.any():
             return SolidMotions({name: motion[recorded] for name, motion in self.items()})
@@ -416,8 +415,8 @@ def _motion(name: str, fields: Mapping[str, NDArray[Any]], dimension: int) -> So
 
 
 def _turned(axes: NDArray[Any], begun: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Return the rotations of axes (frames, d, 3), columns in the frame of space, after those that a body began with;
-    in 2-D angles, each the nearest to the one before."""
+    """Return the rotation ``begun`` followed by the matrices ``axes`` (frames, d, 3), whose columns are in world
+    coordinates. In 2-D the results are angles, each the nearest to the previous one."""
     if dimension == 2:
         return np.unwrap(np.arctan2(axes[:, 1, 0], axes[:, 0, 0])) + begun
     from scipy.spatial.transform import Rotation
@@ -426,20 +425,20 @@ def _turned(axes: NDArray[Any], begun: NDArray[Any], dimension: int) -> NDArray[
 
 
 def _product(turns: NDArray[Any], begun: NDArray[Any]) -> NDArray[Any]:
-    """Return the rotation vectors (frames, 3) of a first rotation and a turn after it."""
+    """Return the rotation vectors (frames, 3) of the rotation ``begun`` followed by the rotations ``turns``."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray((Rotation.from_rotvec(turns) * Rotation.from_rotvec(begun)).as_rotvec())
 
 
 def sized(scene: Scene, motions: Mapping[str, SolidMotion]) -> Scene:
-    """Return a scene with the solids that move as large as they are in a run."""
+    """Return the scene with its moving solids scaled as in a run."""
     tables = (table.stretched(motions[table.name].scale) if table.name in motions else table for table in scene.solid)
     return scene.model_copy(update={"solid": tuple(tables)})
 
 
 def posed(scene: Scene, motions: Mapping[str, SolidMotion], frame: int) -> Scene:
-    """Return a scene with the solids where they are in a frame, to be drawn."""
+    """Return the scene with its solids at their poses in a frame, for drawing."""
     tables = []
     for table in sized(scene, motions).solid:
         if motion := motions.get(table.name):

@@ -1,10 +1,10 @@
-"""Sums over particles that sensors read: with weights around a place, over a region, and loads on solids. They are
-NumPy in float64, on the host. In a run `cortado.runs.step_sums` computes them on the device.
+"""Sums over particles that sensors read: weighted sums around a place, sums over a region, and loads on solids. This
+module computes them on the host in NumPy, in float64. In a run `cortado.runs.step_sums` computes them on the device.
 
-A sensor may ride on a solid, which carries what is at x as the scene begins to c + T (x - c_0). c_0 is the middle of
-the solid in the scene and c where it is; T = R R_0^T is how far it is turned since. The scale of a solid does not move
-its sensors. A value whose place is shifted by s and turned by a small vector t about c changes by its ``shift`` times s
-and its ``twist`` times t. `Carrier.bars` turns these into derivatives by fields of the state.
+A sensor may ride on a solid, which carries an initial point x to c + T (x - c_0). Here c_0 is the initial middle of the
+solid, c the present one, and T = R R_0^T the rotation since the start. The scale of a solid does not move its sensors.
+If the place is shifted by s and turned by a small vector t about c, the value changes by ``shift`` . s + ``twist`` . t.
+`Carrier.bars` converts both factors to derivatives with respect to fields of the state.
 """
 
 from abc import abstractmethod
@@ -26,15 +26,15 @@ Axes = Literal["world", "body"]
 
 @dataclass(frozen=True)
 class Ride:
-    """The solid that carries the place of a sum over particles."""
+    """The solid on which the place of a sum over particles rides."""
 
     on: str
     """Name of the solid."""
     turns: bool
-    """True where the view of the particles turns with the solid; else it is along axes of the world."""
+    """True if the sensor's axes turn with the solid; else they are the world's axes."""
 
     def table(self, at: SensedScene) -> SolidTable:
-        """Return the table of the solid; raise `InputError` unless it is one that moves."""
+        """Return the table of the solid; raise `InputError` unless the solid moves."""
         moving = {table.name: table for table in at.solids if table.moves}
         if self.on not in moving:
             names = f", of {', '.join(map(shown, moving))}" if moving else "; the scene has none"
@@ -47,13 +47,13 @@ class Ride:
         return moving[self.on]
 
     def carrier(self, at: Reading) -> "Carrier":
-        """Return the solid as it is in a state."""
+        """Return the solid at its pose in the state ``at``."""
         return Carrier.of(self.table(at), at)
 
 
 @dataclass(frozen=True, eq=False)
 class Carrier:
-    """A solid that carries sensors, in a state."""
+    """A solid that carries sensors, at its pose in a state."""
 
     pose: Pose
     begun: NDArray[Any]
@@ -63,7 +63,7 @@ class Carrier:
 
     @classmethod
     def of(cls, table: SolidTable, at: Reading) -> Self:
-        """Find where a solid is in a state."""
+        """Read a solid's pose from a state."""
         pose = Pose.of(table.name, table.motion == "free", at)
         return cls(pose, table.middle(), pose.rotation @ square(table.turn(at.dimension)).T)
 
@@ -73,29 +73,32 @@ class Carrier:
         return self.turn[: len(self.begun), : len(self.begun)]
 
     def place(self, point: NDArray[Any]) -> NDArray[Any]:
-        """Return where a point (d,) of the scene as it begins has been carried [m]."""
+        """Return the place [m] to which the solid has carried an initial point (d,)."""
         return np.asarray(self.pose.position + self.flat @ (point - self.begun))
 
     def arms(self, points: NDArray[Any]) -> NDArray[Any]:
-        """Return ways (..., 3) from the middle of the solid to points (..., d) [m]."""
+        """Return vectors (..., 3) from the middle of the solid to points (..., d) [m]."""
         return in_space(points - self.pose.position)
 
     def bars(self, shift: NDArray[Any], twist: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return derivatives by fields of the state, from those by the place (d,) and by a further turn (3,)."""
+        """Return derivatives with respect to fields of the state, given those with respect to a shift (d,) and a small
+        rotation (3,)."""
         return {position_name(self.pose.name): shift[None]} | self.pose.turning_bars(twist)
 
     def lifted(self, bar: NDArray[Any], point: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return derivatives by fields of the state, from that (d,) by where a point (d,) has been carried."""
+        """Return derivatives with respect to fields of the state, given the derivative (d,) with respect to the carried
+        place of ``point`` (d,)."""
         return self.bars(bar, np.cross(self.arms(self.place(point)), in_space(bar)))
 
     def carried(self, bars: NDArray[Any], points: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return derivatives by fields of the state of a value that depends on how points (n, d) lie beside the solid,
-        from those (n, d) by the points."""
+        """Return derivatives with respect to fields of the state of a value that depends on points (n, d) relative to
+        the solid. ``bars`` (n, d) are its derivatives with respect to the points."""
         return self.bars(-bars.sum(axis=0), -np.cross(self.arms(points), in_space(bars)).sum(axis=0))
 
 
 def ride_of(on: str | None, turns: bool, at: SensedScene) -> Ride | None:
-    """Return how a sensor rides on a solid; raise `InputError` where it cannot. None without a solid."""
+    """Return the ride of a sensor on a solid, None without a solid; raise `InputError` if the solid cannot carry
+    sensors."""
     if on is None:
         return None
     ride = Ride(on, turns)
@@ -104,14 +107,14 @@ def ride_of(on: str | None, turns: bool, at: SensedScene) -> Ride | None:
 
 
 def square(matrix: NDArray[Any]) -> NDArray[Any]:
-    """Return a rotation (d, d) as one of space, (3, 3)."""
+    """Extend a rotation matrix (d, d) to three dimensions, (3, 3)."""
     found = np.eye(3)
     found[: len(matrix), : len(matrix)] = matrix
     return found
 
 
 def together(*each: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Add up derivatives by name."""
+    """Add tables of derivatives, name by name."""
     found = dict[str, NDArray[Any]]()
     for bars in each:
         for name, bar in bars.items():
@@ -120,14 +123,15 @@ def together(*each: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def named(on: Any) -> str | None:
-    """Check the name of a solid that carries a sensor, or None; raise `InputError`."""
+    """Check the name of a solid that carries a sensor, or None; raise `InputError` for anything else."""
     if on is not None and (not isinstance(on, str) or not on):
         raise InputError(f"on is {shown(on)}, but must be the name of a solid that moves.")
     return on
 
 
 def axes_of(axes: Any, is_carried: bool) -> Axes:
-    """Check which axes a sensor has; raise `InputError`, also for those of a body without one."""
+    """Check a sensor's axes, "world" or "body"; raise `InputError` for anything else, and for "body" without a
+    solid."""
     if not isinstance(axes, str) or axes not in ("world", "body"):
         raise InputError(f'axes is {shown(axes)}, but must be "world" or "body".')
     if axes == "body" and not is_carried:
@@ -136,16 +140,16 @@ def axes_of(axes: Any, is_carried: bool) -> Axes:
 
 
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}
-"""Factor of w, over the reach to the number of dimensions, with which it has the integral 1."""
+"""Normalisation of w by number of dimensions: this factor / reach^dimensions gives w the integral 1."""
 LEAST_REACH = 5.0
-"""In spacings: with it the weights of a lattice add up to 1 within 0.1 %, wherever a plane or a column lies in it."""
+"""Reach in spacings with which the weights of a lattice add up to 1 within 0.1 %, wherever the plane or column is."""
 MOST_PARTS = 40
-"""Most parts along an axis: enough for a reach of half a spacing, and less is warned of."""
+"""Greatest number of parts along an axis: enough for a reach of half a spacing; smaller reaches cause a warning."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights w(q) = (1 - q)^4 (1 + 4 q) of a distance q in units of a reach (Wendland 1995), 0 beyond."""
+    """Weights w(q) = (1 - q)^4 (1 + 4 q), 0 for q > 1, where q is distance / reach (Wendland 1995)."""
 
     values: NDArray[Any]
     """w"""
@@ -160,23 +164,23 @@ class Weights:
 
 
 Across = Callable[[NDArray[Any]], NDArray[Any]]
-"""A sensor's view of ways (n, d): a linear function to ways (n, k)."""
+"""A sensor's projection: a linear function from vectors (n, d) to vectors (n, k)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Around:
-    """A place, and how a sensor sees the particles around it."""
+    """A place, and the way a sensor measures distances of particles from it."""
 
     place: NDArray[Any]
     """(d,) [m]"""
     reach: float
-    """Distance [m] from which on particles weigh nothing."""
+    """Distance [m] beyond which the weight of particles is 0."""
     across: Across
     parts: NDArray[Any] | None = None
-    """(m, d) places of the parts of a particle from it [m], which weigh the same; None for one point."""
+    """(m, d) positions [m] of a particle's equal parts relative to the particle; None for one point."""
 
     def carried(self, carrier: Carrier, turns: bool) -> "Around":
-        """Return the view where a solid has carried its place to, and its axes and parts where it ``turns``."""
+        """Return this view moved with a solid: its place, and if it ``turns``, also its axes and parts."""
         place, turn = carrier.place(self.place), carrier.flat
         if not turns:
             return replace(self, place=place)
@@ -184,34 +188,34 @@ class Around:
         return replace(self, place=place, across=lambda way: self.across(way @ turn), parts=parts)
 
     def shifts(self) -> NDArray[Any]:
-        """Return the ways (m, k) from a particle to its parts, as they are seen."""
+        """Return the projected vectors (m, k) from a particle to its parts."""
         return self.across(np.zeros((1, len(self.place))) if self.parts is None else self.parts)
 
 
 @dataclass(frozen=True)
 class Image:
-    """One image of all particles, or of all their parts in one place of their cells, that weigh something."""
+    """The particles with a weight above 0, for one periodic image and one of the parts of each particle."""
 
     near: NDArray[np.int_]
-    """(m,) numbers of the particles"""
+    """(m,) indices of the particles"""
     ways: NDArray[Any]
-    """(m, k) ways from the place to them [m]"""
+    """(m, k) vectors from the place to the particles [m]"""
     weights: Weights
-    """(m,) their weights"""
+    """(m,) weights of the particles"""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The particles around a place, along periodic axes with all of their images that are near."""
+    """The particles around a place, including all periodic images close to it."""
 
     images: list[Image]
-    """Images of each of the parts of a particle, near the place."""
+    """Periodic images near the place, of each part of a particle."""
     particles: int
     """Number n of particles."""
     parts: int
     """Number of parts into which a particle is divided."""
     reach: float
-    """Distance [m] from which on particles weigh nothing."""
+    """Distance [m] beyond which the weight of particles is 0."""
 
     @classmethod
     def of(cls, at: Reading, around: Around) -> "Seen":
@@ -242,7 +246,7 @@ class Seen:
         return found / self.parts
 
     def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
-        """Return the derivative (n, k) with respect to the ways, from that with respect to the weights, (n,)."""
+        """Return the derivative (n, k) with respect to the vectors, given that with respect to the weights (n,)."""
         each, found = np.broadcast_to(factors, self.particles), np.zeros((self.particles, self.images[0].ways.shape[1]))
         for image in self.images:
             found[image.near] += (each[image.near] * image.weights.slopes / self.reach**2)[:, None] * image.ways
@@ -250,16 +254,17 @@ class Seen:
 
 
 def reach_of(given: float | None, at: Cut) -> float:
-    """Return the distance [m] from a plane or an axis at which particles count: the given one, or else two support
-    radii, or five spacings where these are more."""
+    """Return the distance [m] from a plane or an axis up to which particles count: the given one, else the larger of
+    two support radii and five spacings."""
     if given is not None:
         return given
     return max(2.0 * at.lattice.support, LEAST_REACH * at.lattice.cell ** (1.0 / at.dimension))
 
 
 def parts_of(reach: float, at: Cut, across: Across, axes: int) -> NDArray[Any]:
-    """Return the places (m, d) of parts of a particle from it [m]. They lie evenly in its cell, along the ``axes`` axes
-    that are seen best. There are `LEAST_REACH` of them to a reach, as then the weights of a lattice add up to 1."""
+    """Return the positions (m, d) of a particle's parts relative to the particle [m]. The parts are evenly spaced in
+    its cell, along the ``axes`` axes with the largest projections. `LEAST_REACH` parts per reach make the weights of a
+    lattice add up to 1."""
     spacing = at.lattice.cell ** (1.0 / at.dimension)
     count = min(int(np.ceil(LEAST_REACH * spacing / reach * (1.0 - 1e-9))), MOST_PARTS)
     best = np.argsort(-np.linalg.norm(across(np.eye(at.dimension)), axis=1), kind="stable")[:axes]
@@ -268,19 +273,18 @@ def parts_of(reach: float, at: Cut, across: Across, axes: int) -> NDArray[Any]:
 
 
 class ParticleSum(Protocol):
-    """A sum over the particles of a state that a sensor reads."""
+    """A sum over particles that a sensor reads from a state."""
 
     @property
     def quantity(self) -> str | None:
-        """Return the name of the quantity of particles, or of the load, that the sum is of; None where it is of the
-        fields of a state."""
+        """Return the name of the summed quantity or load; None if the sum uses only fields of a state."""
 
     def on_host(self, at: Reading) -> NDArray[Any]:
-        """Compute the sum (6,) of a state; numbers that a sum does not have are 0."""
+        """Compute the sum (6,) of a state; unused entries are 0."""
 
 
 class Summed(Sensor):
-    """A sensor whose reading is a function of one sum over particles, besides the poses of solids."""
+    """A sensor whose reading is a function of one sum over particles and of the poses of solids."""
 
     def __repr__(self) -> str:
         given = [value for name, value in vars(self).items() if not name.startswith("_")]
@@ -292,15 +296,15 @@ class Summed(Sensor):
 
     @abstractmethod
     def summed(self, at: SensedScene) -> ParticleSum:
-        """Return the sum that the sensor reads in a scene."""
+        """Return the sum that the sensor reads in the scene ``at``."""
 
     @abstractmethod
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
-        """Return the sensor's reading (k,) from the sum (6,). Of fields it looks at the poses of solids alone."""
+        """Return the sensor's reading (k,), given the sum (6,). The only fields used are the poses of solids."""
 
 
 class LoadSensor(Summed):
-    """A sensor of a force and its torque: in the plane, those of a metre across it."""
+    """A sensor of a force and its torque, in 2-D of a layer 1 m thick."""
 
     def columns(self, dimension: int) -> dict[str, str]:
         force, torque = ("N", "N m") if dimension == 3 else ("N/m", "N")
@@ -313,14 +317,14 @@ class LoadSensor(Summed):
 
 @dataclass(frozen=True, eq=False)
 class WeightedSum:
-    """The sums of w_i and of w_i q_i over the particles around a place, where q is a quantity, or else the velocity
-    ``along`` a direction (d,)."""
+    """The sums of w_i and of w_i q_i over the particles around a place. Here q is a quantity, or without one the
+    velocity component ``along`` a direction (d,)."""
 
     around: Around
     quantity: str | None = None
     along: NDArray[Any] | None = None
     ride: Ride | None = None
-    """Solid that carries the place, which is that of the scene as it begins."""
+    """Solid that carries the place; the place itself is given in the initial scene."""
 
     def on_host(self, at: Reading) -> NDArray[Any]:
         weights, found = self.seen(at).weights, np.zeros(6)
@@ -330,7 +334,7 @@ class WeightedSum:
         return found
 
     def seen(self, at: Reading) -> Seen:
-        """Find the particles around the place."""
+        """Return the particles around the place."""
         ride, around = self.ride, self.around
         return Seen.of(at, around if ride is None else around.carried(ride.carrier(at), ride.turns))
 
@@ -349,15 +353,15 @@ class RegionSum:
     about: NDArray[Any]
     quantity: str = "wall_force"
     ride: Ride | None = None
-    """Solid that carries the region and the point: arms and forces are then along the axes of the scene as it begins,
-    turned with the solid."""
+    """Solid that carries the region and the point: arms and forces then have components along the initial axes turned
+    with the solid."""
 
     def on_host(self, at: Reading) -> NDArray[Any]:
         arms, force = map(in_space, self.chosen(at))
         return np.concatenate([force.sum(axis=0), np.cross(arms, force).sum(axis=0)])
 
     def chosen(self, at: Reading) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the arms (n, d) of the particles, and their forces, 0 outside of the region."""
+        """Return the particles' lever arms (n, d), and their forces, which are 0 outside the region."""
         if self.ride is not None:
             carrier, force = self.ride.carrier(at), at["wall_force"]
             arms = (at["positions"] - carrier.place(self.about)) @ carrier.flat
@@ -370,7 +374,7 @@ class RegionSum:
 
 @dataclass(frozen=True)
 class LoadSum:
-    """The force and the torque on a solid, by the name of the load."""
+    """The sum of force and torque on a solid, read from the load with the given name."""
 
     quantity: str
 
@@ -381,7 +385,7 @@ class LoadSum:
 
 @dataclass(frozen=True)
 class NoSum:
-    """The sum of a sensor that reads the motion of solids alone: 0."""
+    """The sum 0, for a sensor that reads only the motion of solids."""
 
     quantity: None = None
 
@@ -390,7 +394,8 @@ class NoSum:
 
 
 def load_bars(bar: NDArray[Any], dimension: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return derivatives by the three components each of a force and a torque, from those by what a scene has."""
+    """Return derivatives with respect to force and torque (6,), given those with respect to the components that the
+    scene's dimension has."""
     if dimension == 3:
         return bar[:3], bar[3:]
     return in_space(bar[:2]), np.array([0.0, 0.0, bar[2]])
@@ -402,5 +407,6 @@ def turned(found: NDArray[Any], turn: NDArray[Any]) -> NDArray[Any]:
 
 
 def in_the_scene(found: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Return force and torque (..., 6) as a scene has them: in the plane two components and one."""
+    """Return the components of force and torque (..., 6) that a scene has: in 2-D two of the force and one of the
+    torque."""
     return found if dimension == 3 else found[..., [0, 1, 5]]

@@ -1,5 +1,5 @@
-"""Sensors of pressure at a point, of a flow through a plane, of loads on walls and solids; those that a scene names;
-and warnings of sensors that stand where no fluid can be."""
+"""Sensors of pressure at a point, of flow through a plane, and of loads on walls and solids; the sensors of a scene;
+and warnings about sensors that fluid cannot reach."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
@@ -41,17 +41,17 @@ from cortado.scene.scene import Scene
 
 @fixed
 class PressureProbe(Summed):
-    """A sensor of the mean pressure of the particles around a point, those nearby weighing most:
+    """A sensor of the weighted mean pressure of the particles around a point; near particles have the largest weights:
 
     p = sum_i p_i w_i / sum_i w_i,   w_i = w(r_i / radius).
 
-    Here r_i is a particle's distance from the point. Without fluid within the radius it is 0.
+    Here r_i is a particle's distance from the point. Where there is no fluid within the radius, the reading is 0.
     Example: ``run = simulation.run(100, sensors={"wall": cortado.sensors.PressureProbe([0.79, 0.05])})``
     """
 
     def __init__(self, position: Any, radius: float | None = None, on: str | None = None):
         """Place the probe at ``position`` (d,) [m]; ``radius`` [m] is the smoothing kernel's support radius if left
-        out. ``on`` names a solid that carries it from there."""
+        out. ``on`` names a solid that carries the probe from this initial position."""
         self.position = point("position", position)
         self.radius = None if radius is None else positive("radius", radius)
         self.on = named(on)
@@ -83,8 +83,7 @@ class PressureProbe(Summed):
 
 @fixed
 class FlowRate(Summed):
-    """A sensor of the volume of fluid that goes through a plane in a second, along its normal; the mean over a layer
-    around it:
+    """A sensor of the volume flow rate through a plane along its normal, averaged over a layer around the plane:
 
     Q = sum_i V (v_i . normal) w_i,   w_i = w(r_i / reach) with the integral 1,
 
@@ -93,8 +92,8 @@ class FlowRate(Summed):
     """
 
     def __init__(self, position: Any, normal: Any, reach: float | None = None):
-        """Place the plane by a point ``position`` (d,) [m] and a ``normal`` (d,); ``reach`` of the layer on both sides
-        [m] is two support radii of the scene's smoothing kernel, but at least five spacings, if left out."""
+        """Place the plane by a point ``position`` (d,) [m] and a ``normal`` (d,); ``reach`` [m] is half the layer's
+        thickness; if left out, the larger of two support radii of the smoothing kernel and five spacings."""
         self.position, self.normal = point("position", position), direction("normal", normal)
         if len(self.position) != len(self.normal):
             raise InputError(
@@ -133,18 +132,17 @@ class WallForce(LoadSensor):
 
     F = sum_i f_i,   T = sum_i (x_i - about) x f_i,
 
-    over the particles of a region, where f_i is the quantity "wall_force". Walls push the fluid with -F. The border of
-    a region is a jump: let it run where particles do not push in the direction that is looked at, as half-way between
-    two walls.
-    Example: ``run = simulation.run(100, sensors={"force": cortado.sensors.WallForce()})``
+    over the particles of a region, where f_i is the quantity "wall_force". The walls push the fluid with -F. The
+    reading jumps when a particle crosses the border, so put it where particles exert no force in the measured
+    direction. Example: ``run = simulation.run(100, sensors={"force": cortado.sensors.WallForce()})``
     """
 
     def __init__(
         self, lower: Any = None, upper: Any = None, about: Any = None, on: str | None = None, axes: Axes = "world"
     ):
-        """Take corners ``lower``, ``upper`` (d,) of the region [m], which has no end there if left out, and the point
-        ``about`` (d,) of the torque [m], the origin if left out. ``on`` names a solid that carries and turns both;
-        ``axes`` of the "world" or the "body", as it begins, are those of the force and the torque."""
+        """Take corners ``lower``, ``upper`` (d,) of the region [m], unbounded if left out, and the point ``about`` (d,)
+        of the torque [m], the origin if left out. ``on`` names a solid that carries and turns both. ``axes`` of force
+        and torque are those of the "world", or of the "body", which turn with the solid."""
         self.lower, self.upper, self.about = (
             None if values is None else read(what, values)
             for what, values, read in (("lower", lower, corner), ("upper", upper, corner), ("about", about, point))
@@ -201,16 +199,16 @@ class SolidLoad(LoadSensor):
 
     F = sum_i f_i,   T = sum_i (x_i - c) x f_i,
 
-    over all particles. Here -f_i is the mass of particle i times the acceleration that the walls of the solid give it,
-    by pressure and, without slip, by viscosity. This is in the step that begins at the state. The point c is the middle
-    of the solid at the end of that step, where its walls are too. So the solid gets the momentum that the fluid loses
-    to it. Contact, gravity and buoyancy in air are not in it, nor forces of one's own between fluid and walls.
-    Example: ``run = simulation.run(100, sensors={"load": cortado.sensors.SolidLoad("pillar")})``
+    over all particles. Here -f_i is the mass of particle i times its acceleration by the solid's walls, through
+    pressure and, for no-slip walls, viscosity. The acceleration is that of the step beginning at the state. The point c
+    is the middle of the solid at the end of that step. So the solid gains the momentum that the fluid loses to it. Not
+    included are contact, gravity, buoyancy in air, and user-defined forces between fluid and walls. Example: ``run =
+    simulation.run(100, sensors={"load": cortado.sensors.SolidLoad("pillar")})``
     """
 
     def __init__(self, solid: str, axes: Axes = "world"):
-        """Take the name of a ``solid`` in the scene, and whether the force and the torque are along ``axes`` of the
-        "world", or of the "body" of a solid that moves, as it begins."""
+        """Take the name of a ``solid`` in the scene. ``axes`` of force and torque are those of the "world", or of the
+        "body" of a moving solid, which turn with it."""
         if not isinstance(solid, str) or not solid:
             raise InputError(f"solid is {shown(solid)}, but must be the name of a solid.")
         self.solid, self.axes = solid, axes_of(axes, True)
@@ -243,11 +241,11 @@ SENSORS: dict[str, Callable[..., Sensor]] = {
     "spring_force": SpringForce,
     "body_motion": BodyMotion,
 }
-"""Classes of sensors by their kinds."""
+"""Sensor classes by the ``kind`` in a scene file."""
 
 
 def sensors_of(scene: Scene) -> dict[str, Sensor]:
-    """Make the sensors of a scene, by their names. Up is against gravity."""
+    """Make the sensors of a scene, by name. Their up direction is opposite to gravity."""
     gravity = np.asarray(scene.forces.gravity, dtype=np.float64)
     upwards: dict[str, Any] = {"wave_gauge": {"up": -gravity}} if gravity.any() else {}
     return {
@@ -257,14 +255,14 @@ def sensors_of(scene: Scene) -> dict[str, Sensor]:
 
 
 MOST_CELLS = 200_000
-"""Most cells of half a spacing that are looked at; a larger container is not judged."""
+"""Greatest number of cells, half a spacing wide, that are searched; larger containers are not checked."""
 DEEP = 0.01
-"""In spacings: a place that is less deep in a wall or a solid is on its surface."""
+"""Depth in spacings: a point less deep in a wall or solid counts as on its surface."""
 
 
 def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_]:
-    """Test (n,) which points (n, d) [m] no way leads to from particles (m, d) [m] through cells half a spacing wide, in
-    a container without periods and emitters. Solids at rest are in the way, moving ones are not."""
+    """Return booleans (n,): True for points (n, d) [m] that no path connects with particles (m, d) [m]. Only solids at
+    rest block paths, which lead through cells half a spacing wide. The container has no periodic axes or emitters."""
     from scipy.ndimage import label
 
     nowhere, ends = np.zeros(len(points), dtype=bool), scene.container.extent()
@@ -288,11 +286,11 @@ def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_
 
 
 MOST = 16
-"""Most points along an axis by which planes and columns are looked at."""
+"""Greatest number of points along an axis with which planes and columns are checked."""
 
 
 class Prepared(Cut, Protocol):
-    """A simulation as checks of sensors see it."""
+    """The parts of a simulation that checks of sensors use."""
 
     @property
     def scene(self) -> Scene:
@@ -308,14 +306,14 @@ class Prepared(Cut, Protocol):
 
 
 def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
-    """Warn of sensors, by their names, from which the scene, as it begins, keeps all fluid away."""
+    """Warn about sensors (by name) that fluid cannot reach in the initial scene."""
     for name, sensor in sensors.items():
         if (found := _doubt(simulation, sensor)) is not None:
             warn(f"the sensor {name!r} {found}.")
 
 
 def _doubt(simulation: Prepared, sensor: Any) -> str | None:
-    """Say why a sensor may never see fluid; None where it may, and for sensors that are not Cortado's own."""
+    """Return the reason why a sensor may never meet fluid; None if it can, and for user-defined sensors."""
     scene, spacing = simulation.scene, simulation.scene.discretisation.spacing
     if isinstance(sensor, WallForce):
         return _without_walls(simulation, sensor)
@@ -340,7 +338,8 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
 
 
 def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
-    """Say that a sensor without a container is further from fluid and solids than its reach and their own size."""
+    """Return a warning if, without a container, a sensor's distance from fluid and solids exceeds its reach plus their
+    size."""
     ends = _of_things(simulation)
     points = _looked_at(ends, sensor)
     gap = float(np.linalg.norm(points - np.clip(points, *ends), axis=1).min())
@@ -355,13 +354,14 @@ def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
 
 
 def _of_things(simulation: Prepared) -> tuple[Points, Points]:
-    """Return the box around fluid and walls as they begin, lower and upper (d,) [m]."""
+    """Return the box around the initial fluid and walls, lower and upper (d,) [m]."""
     points = np.concatenate([simulation.positions, simulation.walls])
     return points.min(axis=0), points.max(axis=0)
 
 
 def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
-    """Say that a gauge's column does not begin at the bottom of the container, or reaches far beyond it."""
+    """Return a warning if a gauge's column does not begin at the container's bottom, or extends far beyond the
+    container."""
     scene, ends = simulation.scene, simulation.scene.container.extent()
     assert ends is not None
     heights = corners(*ends) @ gauge.up
@@ -378,7 +378,7 @@ def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
 
 
 def _too_wide(scene: Scene, key: str, wide: float | None) -> str | None:
-    """Say that a reach is larger than a container without periods."""
+    """Return a warning if a sensor's reach is larger than a container without periodic axes."""
     ends = scene.container.extent()
     if wide is None or ends is None or any(scene.periods[1]):
         return None
@@ -389,7 +389,7 @@ def _too_wide(scene: Scene, key: str, wide: float | None) -> str | None:
 
 
 def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
-    """Return points (n, d) of a sensor within a box (2, d), of which fluid has to reach one [m]."""
+    """Return points (n, d) [m] of a sensor within a box (2, d) [m]; the sensor works if fluid can reach any of them."""
     place = sensor.position
     if isinstance(sensor, PressureProbe):
         return np.array([place])
@@ -405,7 +405,7 @@ def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
 
 
 def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
-    """Say what keeps fluid away from each of the points (n, d) [m]; None where nothing does."""
+    """Return for each of the points (n, d) [m] what keeps fluid away from it, or None."""
     scene = simulation.scene
     d, deep = scene.dimension, DEEP * scene.discretisation.spacing
     region, ends = scene.container.region(d).opened(scene.container.periods(d)[1]), scene.container.extent()
@@ -427,14 +427,14 @@ def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
 
 
 def _in_metres(scene: Scene, place: Points) -> str:
-    """Return a hint where a place is far outside, as it would be in millimetres."""
+    """Return a hint on units if a place is far outside, as a place given in millimetres would be."""
     ends = scene.container.extent()
     far = ends is not None and np.abs(place).max() > 10.0 * np.abs(ends).max()
     return " (positions are in metres)" if far else ""
 
 
 def _without_walls(simulation: Prepared, sensor: WallForce) -> str | None:
-    """Say that no particle is in a region which could push walls."""
+    """Return a warning if no particle in the region could push a wall."""
     walls, d = simulation.walls, simulation.scene.dimension
     lower = np.full(d, -np.inf) if sensor.lower is None else sensor.lower
     upper = np.full(d, np.inf) if sensor.upper is None else sensor.upper

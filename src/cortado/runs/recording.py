@@ -1,7 +1,6 @@
-"""Which states of a run become frames, every so many steps or so many in a second, and what is read of it on the way.
+"""Choose the states of a run that become frames (by steps or by time), and read quantities and sensors during the run.
 
-Sums over particles are read on the device by sensors, and whole states by copies off the device, with tables of what
-is recorded of them.
+Sensors' sums over particles are computed on the device. Whole states are copied to the host and stored in tables.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,35 +32,35 @@ from cortado.scene.scene import Scene
 
 
 class FrameChoice(Protocol):
-    """A choice of the states that are frames of a run, besides the first and the last."""
+    """A rule that chooses the states of a run that become frames, besides the first and the last state."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return the settings by which one run is told from another."""
+        """Return the settings that must be unchanged when a run is resumed."""
 
     @property
     def rate(self) -> float | None:
-        """Return the number of frames in a simulated second [1/s]; None where steps are chosen, not times."""
+        """Return the number of frames per simulated second [1/s]; None if frames are chosen by steps."""
 
     def is_due(self, step: int, before: float, now: float) -> bool:
-        """Test whether the state after a step is a frame, given the times [s] of the state before and of itself, after
-        the first state."""
+        """Test whether the state after ``step`` steps is a frame, given the times [s] since the start of the previous
+        state and of this state."""
 
     def announced(self, rollout: Rollout) -> NDArray[Any]:
-        """Return times (frames,) [s] for as many frames as there can be, exact if they are known before the run, else
-        about right."""
+        """Return times (frames,) [s] for the greatest possible number of frames: exact if known before the run, else
+        estimates."""
 
     def expected(self, rollout: Rollout) -> int:
-        """Return how many frames are likely to come."""
+        """Return the expected number of frames."""
 
     def count(self, steps: int, time: float | None) -> int | None:
-        """Return how many frames ``steps`` steps of one length have that simulate a time [s]; None where that depends
-        on an unknown time."""
+        """Return the number of frames of ``steps`` equal steps over a ``time`` [s]; None if it depends on an unknown
+        time."""
 
 
 @dataclass(frozen=True)
 class EverySteps:
-    """A choice of one frame for every ``record_every`` steps; a `FrameChoice`."""
+    """A `FrameChoice` of one frame for every ``record_every`` steps."""
 
     steps: int
 
@@ -90,8 +89,7 @@ class EverySteps:
 
 @dataclass(frozen=True)
 class FramesPerSecond:
-    """A choice of a number of frames in each simulated second, each the first state at its time or after it; a
-    `FrameChoice`.
+    """A `FrameChoice` of ``rate`` frames per simulated second; each frame is the first state at or after its due time.
 
     Raises:
         InputError: a rate that is not a number greater than 0.
@@ -130,14 +128,14 @@ class FramesPerSecond:
 @dataclass(frozen=True, eq=False)
 class TrajectoryBatch(Sequence[Trajectory]):
     """The trajectories of a batch of runs: ``batch[b]`` is the `Trajectory` of scene b, with the bits of its single
-    run; of a scene that lost a particle it has the frames before."""
+    run; if the scene lost a particle, it contains the frames before."""
 
     trajectories: tuple[Trajectory, ...]
     """One for each scene."""
     fields: Mapping[str, NDArray[Any]]
-    """(frames, batch, ...) every field that steps change, by its name; NaN behind the last frame of a lost scene."""
+    """(frames, batch, ...) every field that steps change, by name; NaN after the last frame of a lost scene."""
     lost: Mapping[int, DivergedError]
-    """Errors of the scenes that lost a particle, by their number."""
+    """Errors of the scenes that lost a particle, by the number of the scene."""
 
     def __repr__(self) -> str:
         lost = f", {len(self.lost)} lost" if self.lost else ""
@@ -183,9 +181,9 @@ def recorded(
     quantities: Arrays,
     readings: Callable[[int], Mapping[str, Readings]],
 ) -> Trajectory | TrajectoryBatch:
-    """Make the trajectory of a scene from fields (frames, ...) after numbers of steps (frames,), in a batch (frames,
-    batch, ...), and from the fields that no step changes. Beside them are ``quantities`` (frames, ...) of the same
-    frames, and ``readings`` of sensors by the number of the scene."""
+    """Make the trajectory of a scene from ``fields`` (frames, ...), of a batch (frames, batch, ...), recorded after
+    ``steps`` (frames,) steps. ``constants`` are fields that no step changes, ``quantities`` (frames, ...) those of the
+    same frames, ``readings`` those of sensors by scene number."""
 
     def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
         own = {name: array[kept][at] for name, array in fields.items()}
@@ -220,12 +218,12 @@ def recorded(
 
 
 MOST = 2**28
-"""Bytes of copies above which they are looked at before the next steps begin."""
+"""Size [bytes] of waiting copies above which they are read before the next steps begin."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A sensor's reading of a state."""
+    """A sensor's reading of one state."""
 
     sensor: str
     number: int
@@ -233,11 +231,11 @@ class Row:
     member: int
     """Number of the scene in a batch, else 0."""
     reading: Callable[[], NDArray[Any]]
-    """Makes the reading (k,) of the sensor."""
+    """Computes the reading (k,) of the sensor."""
 
 
 class _Poses(dict[str, NDArray[Any]]):
-    """A state as sensors see it of which the poses of solids alone are known: a `cortado.runs.sensor.Reading`."""
+    """A `cortado.runs.sensor.Reading` of a state that contains only the poses of solids."""
 
     def __init__(self, scene: QuantityEvaluator, fields: Mapping[str, NDArray[Any]]):
         super().__init__(fields)
@@ -246,7 +244,7 @@ class _Poses(dict[str, NDArray[Any]]):
 
 
 def kept_by_steps(scene: QuantityEvaluator, rollout: Rollout, names: tuple[str, ...]) -> StepQuantities:
-    """Return what keeps quantities of steps by their names, made once for a rollout."""
+    """Return the `StepQuantities` of these names for a rollout, created once and reused."""
     kept: dict[tuple[str, ...], Any] = rollout.beside
     if names not in kept:
         kept[names] = StepQuantities(scene.within(names), scene.solver, rollout.longest_chunk)
@@ -255,11 +253,11 @@ def kept_by_steps(scene: QuantityEvaluator, rollout: Rollout, names: tuple[str, 
 
 
 class QuantityReader:
-    """A `cortado.rollout.checkpoints.ChunkReader` of quantities that need the step after a state, which is the run's
-    own."""
+    """A `cortado.rollout.checkpoints.ChunkReader` of quantities computed within the step after a state; it uses the
+    run's own steps."""
 
     def __init__(self, scene: QuantityEvaluator, rollout: Rollout, wanted: Mapping[int, str]):
-        """Prepare to read of the states with these numbers a quantity each, by its name."""
+        """Prepare to read quantities: ``wanted`` gives their names and the numbers of the states."""
         self.found: dict[int, Arrays] = {}
         """Quantities by name, by the numbers of states."""
         self.beside = kept_by_steps(scene, rollout, tuple(sorted(set(wanted.values()))))
@@ -272,11 +270,11 @@ class QuantityReader:
 
 
 class StepReader:
-    """A `cortado.rollout.checkpoints.ChunkReader` of sensors. What it reads is copied to the host, where `rows` looks
-    at it while a GPU takes the next steps."""
+    """A `cortado.rollout.checkpoints.ChunkReader` of sensors. Sums are copied to the host, where `rows` converts them
+    to readings while a GPU takes the next steps."""
 
     def __init__(self, scene: QuantityEvaluator, rollout: Rollout, sensors: Mapping[str, Summed]):
-        """Prepare to read ``sensors`` by their names in the run of a rollout, whose solver the ``scene`` has too."""
+        """Prepare to read ``sensors`` (by name) in the run of a rollout; ``scene`` has the rollout's solver."""
         self.sensors, self._scene, self._rollout = dict(sensors), scene, rollout
         length, layout, first = rollout.longest_chunk, rollout.solver.layout, rollout.initial
         summed = {name: one.summed(scene) for name, one in sensors.items()}
@@ -290,14 +288,14 @@ class StepReader:
         self._poses = [f for f in first.fields if f.axis is Axis.SCALAR and not f.is_constant] if moved else []
         options = {"device": "cpu", "pinned": first.positions.device.is_cuda}
         self._found = {name: wp.empty(length * layout.members, dtype=SIX, **options) for name in summed}
-        """Sums, state by state, on the host."""
+        """Sums on the host, state by state."""
         sizes = {f.name: (first[f.name].dtype, layout.members) for f in self._poses}
         self._first = {name: wp.empty(size, dtype=kind, **options) for name, (kind, size) in sizes.items()}
         self._later = {name: wp.empty(length * size, dtype=kind, **options) for name, (kind, size) in sizes.items()}
-        """Poses of solids in the first state of a chunk, and in those behind it, on the host."""
+        """Poses of solids on the host: in the first state of a chunk, and in its later states."""
         self._is_ready = wp.Event(first.positions.device) if first.positions.device.is_cuda else None
         self._step = self._count = 0
-        """The first state of the last chunk, and how many of its states wait to be looked at."""
+        """The number of the last chunk's first state, and how many of the chunk's states are not yet read."""
         self._rows = list[Row]()
 
     @property
@@ -317,13 +315,13 @@ class StepReader:
             first.positions.device.stream.record_event(self._is_ready)
 
     def rows(self) -> list[Row]:
-        """Return the readings of all states that were read since the last call, state by state."""
+        """Return the readings of all states since the last call, state by state."""
         self._look()
         found, self._rows = self._rows, []
         return found
 
     def _look(self) -> None:
-        """Make rows of the sums of the last chunk."""
+        """Convert the sums of the last chunk to rows."""
         if self._is_ready is not None and self._count:
             wp.synchronize_event(self._is_ready)
         count, self._count = self._count, 0
@@ -353,12 +351,12 @@ class StepReader:
 
 
 class Waiting:
-    """Copies of states in pinned memory of the host, in their order. It is filled as an observer of a forward run,
-    and emptied by `look`, which the run calls while a GPU takes the next steps."""
+    """A queue of state copies in pinned host memory. An observer of a forward run fills it. The run calls `look`, which
+    empties it, while a GPU takes the next steps."""
 
     def __init__(self, look: Callable[[int, State], None], first: State, copies: list[State]):
-        """Take the function that is to look at the number of a state and at its copy, which is overwritten later.
-        ``first`` is a state of the run, and ``copies`` are those of earlier runs, which are used again."""
+        """Take the function ``look`` to call with a state's number and its copy, which is overwritten later. ``first``
+        is a state of the run; ``copies`` of earlier runs are reused."""
         self._look, self._device = look, first.positions.device
         names = [field.name for field in first.fields if field.is_constant]
         self._constant = {name: copies[0][name] if copies else _empty(first[name]) for name in names}
@@ -369,7 +367,7 @@ class Waiting:
         self._most = max(MOST // sum(array.capacity for array in first.arrays()), 1)
 
     def keep(self, number: int, state: State) -> None:
-        """Copy a state; on a GPU after the work that was launched, without waiting for it."""
+        """Copy a state; on a GPU the copy is queued after all launched kernels, without waiting for them."""
         if len(self._numbers) == len(self._copies):
             own = {n: self._constant[n] if n in self._constant else _empty(state[n]) for n in state.names}
             self._copies.append(State(state.fields, own, state.batch))
@@ -384,7 +382,7 @@ class Waiting:
             self.look()
 
     def look(self) -> None:
-        """Look at all copies; on a GPU work that was launched after them goes on meanwhile."""
+        """Call the function for all copies; kernels launched on a GPU after the copies keep running."""
         if self._is_ready is not None and self._numbers:
             wp.synchronize_event(self._is_ready)
         numbers, self._numbers = self._numbers, []
@@ -393,8 +391,8 @@ class Waiting:
 
 
 class Table:
-    """Arrays by name, one row for each record. They are allocated at once, as to allocate each row by itself costs more
-    than to copy it."""
+    """Arrays by name, with one row for each record. Many rows are allocated at a time: allocating each row separately
+    costs more than copying it."""
 
     def __init__(self, expected: int):
         self._rows, self._count, self._arrays = expected, 0, dict[str, NDArray]()
@@ -411,11 +409,11 @@ class Table:
         self._count += 1
 
     def arrays(self) -> dict[str, NDArray]:
-        """Return the arrays (records, ...) by name. They hold memory for one further record at most."""
+        """Return the arrays (records, ...) by name, without unused memory for more than one further record."""
         own = {name: array[: self._count] for name, array in self._arrays.items()}
         return own if self._count >= self._rows - 1 else {name: array.copy() for name, array in own.items()}
 
 
 def _empty(array: wp.array) -> wp.array:
-    """Allocate an array of the host, which a GPU can write to while the host goes on."""
+    """Allocate a host array that a GPU can write to while the host continues."""
     return wp.empty(array.shape, dtype=array.dtype, device="cpu", pinned=array.device.is_cuda)

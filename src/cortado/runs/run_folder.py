@@ -1,6 +1,6 @@
 """The folder of one run: its scene, where and how it ran, its metrics, its trajectory and its pictures.
 
-Its files are read again where they are damaged, of an earlier Cortado, or made of a file that has changed since.
+Files are checked on reading: they may be damaged, from an earlier Cortado, or depend on a file that has changed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from cortado.scene.scene import Scene, files_named
 from cortado.version import __version__
 
 LARGEST = 2**31
-"""Most bytes of a file that is read again when a run goes on."""
+"""Greatest size [bytes] of a file that is read when a run is resumed."""
 _PACKAGES = ("warp-lang", "numpy", "scipy", "pydantic", "h5py", "matplotlib")
 
 
@@ -35,7 +35,7 @@ _RESUMABLE = ("run", "optimise")
 """The commands that have --resume."""
 _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json", "sensors.csv")
 REPLAY_LOG = "replay.log"
-"""The file in which a search notes its evaluations."""
+"""The file in which a search logs its evaluations."""
 _FOLDERS = ("checkpoint", "figures")
 _PICTURES = (
     "particles",
@@ -55,13 +55,13 @@ FIGURES = (
     *(f"{name}.png" for name in (*_PICTURES, *_SHADED, *(f"measured_{k}" for k in range(100)))),
     *(f"{name}.mp4" for name in _FILMS),
 )
-"""Every file that a run may have in its figures; other files there are the user's."""
+"""Every file that a run may write into its figures folder; other files there belong to the user."""
 TO_RESUME = "; choose another --out, or begin one without --resume"
-"""End of a sentence about a missing run to go on with."""
+"""End of the error message about a missing run to resume."""
 
 
 class _Entry:
-    """A descriptor of the path of a file or a folder in the folder of a run."""
+    """A descriptor that returns the path of a file or folder inside a run folder."""
 
     def __init__(self, name: str):
         self._name = name
@@ -72,17 +72,18 @@ class _Entry:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """Paths and files of one run: `create` makes one, `open` finds one, `resume` goes on with one.
+    """Paths and files of one run: `create` makes a new folder, `open` opens an existing one, `resume` continues its
+    run.
 
-    Its mark, environment.json, comes first and is removed last, so that a process that is killed in between leaves
-    a folder which can be overwritten or resumed.
+    The file environment.json marks a run folder. It is written first and removed last: a process killed in between
+    leaves a folder that can be overwritten or resumed.
     """
 
     path: Path
     scene = _Entry("scene.json")
     """The resolved scene."""
     environment = _Entry("environment.json")
-    """Versions, device, command line and start of the run."""
+    """Versions, device, command line and starting time of the run."""
     metrics = _Entry("metrics.jsonl")
     """One JSON object a line."""
     trajectory = _Entry("trajectory.vtkhdf")
@@ -90,13 +91,13 @@ class RunFolder:
     sensors = _Entry("sensors.csv")
     """sensors.csv: readings of sensors in every step; only where the scene has some."""
     checkpoint = _Entry("checkpoint")
-    """The optimiser's own folder, from which it resumes."""
+    """The folder with the optimiser's state, from which a search is resumed."""
     figures = _Entry("figures")
     """The folder of the pictures."""
     report = _Entry("report.html")
-    """The page that shows it all."""
+    """report.html, a page with the run's results and pictures."""
     result = _Entry("result.json")
-    """The results, for machines; it is there when the run has ended."""
+    """result.json with the results; it is written when the run ends."""
 
     @classmethod
     def create(
@@ -116,8 +117,8 @@ class RunFolder:
             path: the folder, made with its parents when missing.
             scene_json: the resolved scene.
             command: the command line, word by word.
-            kind: the command that writes it; only this one resumes it.
-            settings: tables of what else must be the same when it is resumed.
+            kind: the command that writes the run; only this command can resume it.
+            settings: tables of further settings that must be unchanged when the run is resumed.
             device: where the run computes, in words.
             overwrite: removes an earlier run in this folder (its files only).
 
@@ -136,7 +137,7 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | Path, otherwise: str = ", but RUN must be the folder of one") -> Self:
-        """Open the folder of an existing run; ``otherwise``: how the sentence ends if there is none.
+        """Open the folder of an existing run; ``otherwise``: end of the error message if there is no run.
 
         Raises:
             InputError: there is no run in it.
@@ -157,10 +158,10 @@ class RunFolder:
         settings: Mapping[str, Any] | None = None,
         device: str = "",
     ) -> Self:
-        """Open the folder of an existing run that goes on, noted in environment.json with versions and command.
+        """Open the folder of a run to resume it, and add versions and command of this process to environment.json.
 
         Raises:
-            InputError: there is no run in it, or one of another kind, scene or settings; the sentence says which.
+            InputError: the folder contains no run, or one of another kind, scene or settings; the message says which.
             ComputationError: the disk is full.
         """
         folder = cls.open(path, TO_RESUME)
@@ -175,7 +176,7 @@ class RunFolder:
         return folder
 
     def require(self, scene_json: str, kind: str, settings: Mapping[str, Any] | None = None) -> None:
-        """Raise `InputError` unless the run in the folder is of this kind, scene and settings; the sentence says what
+        """Raise `InputError` unless the run in the folder is of this kind, scene and settings; the message says what
         differs."""
         noted = read_json(self.environment)
         former = noted.get("kind", kind)
@@ -196,20 +197,20 @@ class RunFolder:
         require_files(read_json(self.environment).get("files", {}), self.path)
 
     def write_sensors(self, readings: Mapping[str, Readings]) -> None:
-        """Write sensors.csv, whole or not at all; nothing without sensors."""
+        """Write sensors.csv, whole or not at all; without sensors write no file."""
         if readings:
             write_atomically(self.sensors, as_csv(readings))
 
     def read_sensors(self) -> dict[str, Readings]:
-        """Read the file of `write_sensors`, bit for bit; nothing where it wrote nothing. Raise `InputError` for a
+        """Read sensors.csv with exactly the numbers written; empty if there is no file. Raise `InputError` for a
         damaged file."""
         return from_csv(self.sensors) if self.sensors.exists() else {}
 
     def read_scene(self, overrides: Sequence[str] = ()) -> Scene:
-        """Read the scene, with replacements as for `load_scene`; without its warnings, which came when it ran.
+        """Read the scene, with overrides as in `load_scene`. Its warnings are left out, as the run has printed them.
 
         Raises:
-            InputError: the file is damaged; `SceneError` where what it says, or a replacement, does not fit.
+            InputError: the file is damaged; `SceneError`: a value in the file or an override is wrong.
         """
         text = bytes_of(self.scene).decode(errors="replace")
         with unwarned():
@@ -219,8 +220,8 @@ class RunFolder:
                 raise error.in_file(str(self.scene)) from None
 
     def write_result(self, **values: Any) -> None:
-        """Write result.json, by which a run is known to have ended; takes NumPy values too. A number that is not finite
-        is null."""
+        """Write result.json, which marks a run as ended. Values may be NumPy's; numbers that are not finite become
+        null."""
         write_atomically(self.result, json.dumps(finite(as_json(values)), indent=2) + "\n")
 
     def read_result(self) -> dict[str, Any] | None:
@@ -228,19 +229,19 @@ class RunFolder:
         return read_json(self.result) if self.result.exists() else None
 
     def append_metrics(self, **values: Any) -> None:
-        """Add one line to metrics.jsonl, kept even if the process is killed next; takes NumPy values too."""
+        """Append one line to metrics.jsonl; it survives if the process is killed right after. Values may be NumPy's."""
         line = json.dumps(values, default=plain) + "\n"
         with sentences(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
             file.write(line)
 
     def write_metrics(self, columns: Mapping[str, Any]) -> None:
-        """Write metrics.jsonl with a line for each step, from (steps,) of each name; whole or not at all."""
+        """Write metrics.jsonl, whole or not at all: one line per step, from columns (steps,) by name."""
         rows = (dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True))
         lines = [json.dumps({"step": step, **row}, default=plain) + "\n" for step, row in enumerate(rows, 1)]
         write_atomically(self.metrics, "".join(lines))
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """Read all lines of metrics.jsonl; a last line that a killed run left unfinished is left out.
+        """Read all lines of metrics.jsonl; an unfinished last line of a killed run is ignored.
 
         Raises:
             InputError: an earlier line is damaged.
@@ -259,7 +260,7 @@ class RunFolder:
             return False
 
     def _complete(self, noted: Mapping[str, Any], scene_json: str) -> None:
-        """Write the files that a run folder has from the start, first environment.json, which marks it as one."""
+        """Write the initial files of a run folder; the first is environment.json, which marks it."""
         write_atomically(self.environment, json.dumps(noted, indent=2) + "\n")
         write_atomically(self.scene, scene_json)
         self.figures.mkdir(exist_ok=True)
@@ -281,7 +282,7 @@ class RunFolder:
             self._remove_run()
 
     def _require_own(self) -> None:
-        """Raise `InputError` for a folder that is not meant for one run."""
+        """Raise `InputError` for a folder that belongs to something else than one run."""
         if Path.cwd().is_relative_to(self.path.resolve()):
             raise InputError(f"{self.path} is the current folder, or one that it is in; choose another --out.")
         runs = sorted(one.parent.name for one in self.path.glob(f"*/{self.environment.name}"))
@@ -289,7 +290,7 @@ class RunFolder:
             raise InputError(f"{self.path} holds other runs, such as {runs[0]}; choose another --out.")
 
     def _remove_run(self) -> None:
-        """Remove the files of a run, its mark last, and leave those that others put beside it."""
+        """Remove the run's files, environment.json last; files that the run did not write are kept."""
         written = (*map(self.figures.joinpath, FIGURES), *map(self.path.joinpath, _FILES))
         for path in (*(folder / REPLAY_LOG for folder in self._checkpoints()), *written):
             path.unlink(missing_ok=True)
@@ -299,25 +300,24 @@ class RunFolder:
         self.environment.unlink()
 
     def _remove_unfinished(self) -> None:
-        """Remove unfinished files that killed processes were writing."""
+        """Remove unfinished files of killed processes."""
         for folder in (self.path, self.figures, *self._checkpoints()):
             for path in folder.glob(UNFINISHED):
                 path.unlink(missing_ok=True)
 
     def _checkpoints(self) -> list[Path]:
-        """Return the folders with the logs of one search after the other, that of the first one last, as it holds the
-        rest."""
+        """Return the log folders of all searches. The first search's comes last, because it contains the others."""
         return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
 
 
 def computed(scene: Any) -> Any:
-    """Return a scene without tables that change only how it is shown, and what is read of it."""
+    """Return a scene without the tables that affect only pictures and readings, not the computation."""
     shown = ("picture", "sensor")
     return {name: table for name, table in scene.items() if name not in shown} if isinstance(scene, dict) else scene
 
 
 def finite(value: Any) -> Any:
-    """Return a value without numbers that JSON does not have."""
+    """Return a value in which numbers that JSON lacks (NaN, infinities) are null."""
     if isinstance(value, dict):
         return {name: finite(entry) for name, entry in value.items()}
     if isinstance(value, list):
@@ -326,7 +326,7 @@ def finite(value: Any) -> Any:
 
 
 def bytes_of(path: Path) -> bytes:
-    """Read all of a file; raise `InputError` if it is no regular one, or very large."""
+    """Read all of a file; raise `InputError` if it is no regular file or too large."""
     try:
         return content(path, LARGEST)
     except OSError as problem:
@@ -341,14 +341,13 @@ def read_json(path: Path) -> Any:
 
 
 def cut_torn_line(path: Path) -> None:
-    """Remove an unfinished last line that a killed run left, so that the next line begins a line."""
+    """Remove an unfinished last line of a killed run, so that text appended next starts a new line."""
     if path.exists():
         os.truncate(path, bytes_of(path).rfind(b"\n") + 1)
 
 
 def session(command: Sequence[str], device: str) -> dict[str, Any]:
-    """Return where and when a part of a run happens: operating system, Python, the versions that matter, the
-    command."""
+    """Return a record of the present process: time, operating system, Python, versions of packages, and the command."""
     return {
         "cortado": __version__,
         "python": platform.python_version(),
@@ -369,13 +368,12 @@ def plain(value: Any) -> Any:
 
 
 def as_json(value: Any) -> Any:
-    """Return a value as it comes back from a file: arrays and tuples are lists."""
+    """Return a value as JSON stores it: arrays and tuples become lists."""
     return json.loads(json.dumps(value, default=plain))
 
 
 def require_same(former: Any, given: Any, folder: Path) -> None:
-    """Raise `InputError`, with the field, where given settings differ from those that the run in a folder was begun
-    with."""
+    """Raise `InputError`, naming the field, if settings differ from those with which the run in a folder began."""
     for name, (before, now) in sorted(differences(former, given).items()):
         field = ".".join(part if not part.isdigit() else f"[{part}]" for part in name.split(".")).replace(".[", "[")
         raise InputError(
@@ -385,8 +383,8 @@ def require_same(former: Any, given: Any, folder: Path) -> None:
 
 
 def differences(one: Any, other: Any, missing: Any = None, name: str = "") -> dict[str, list[Any]]:
-    """Return both values of whatever differs in two objects, by dotted names; of entries that one of them has not the
-    value ``missing``."""
+    """Return pairs of values that differ in two objects, by dotted names. An entry absent from one object has the value
+    ``missing``."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         pairs = {key: (one.get(key, missing), other.get(key, missing)) for key in {**one, **other}}
     elif _are_tables(one) and _are_tables(other) and len(one) == len(other):
@@ -399,7 +397,7 @@ def differences(one: Any, other: Any, missing: Any = None, name: str = "") -> di
 
 
 def _written(value: Any) -> str:
-    """Return a value as a run's file shows it, in a few words; "nothing" for None."""
+    """Return a value as a short text, as in a run's files; "nothing" for None."""
     if value is None:
         return "nothing"
     return json.dumps(value)[: 2 * LONGEST] if isinstance(value, dict) else shown(value)
@@ -417,12 +415,12 @@ def _version(package: str) -> str | None:
 
 
 def file_marks(scene_json: str) -> dict[str, str]:
-    """Return the mark of each file that a resolved scene names, such as a mesh, by its path."""
+    """Return, by path, a mark of the content of each file that a resolved scene names, such as a mesh."""
     return {table[key]: _mark(Path(table[key])) for table, key in files_named(json.loads(scene_json))}
 
 
 def require_files(marks: Mapping[str, str], run: Path) -> None:
-    """Raise `InputError` for a file that is no longer the one a run was made with."""
+    """Raise `InputError` if a file is not the same as when the run was made."""
     for name, mark in marks.items():
         if not Path(name).is_file():
             raise InputError(f"{name} is missing, but the run in {run} was made with it: put it back.")

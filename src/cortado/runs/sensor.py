@@ -1,4 +1,5 @@
-"""What a sensor is and sees, and what it read in every step of a run, in arrays, in a file and beside measured data."""
+"""The interface of sensors, and their readings in every step of a run: as arrays, as a file, and compared with measured
+data."""
 
 import csv
 import io
@@ -20,7 +21,7 @@ from cortado.scene.solids import SolidTable
 
 
 class Cut(Protocol):
-    """A scene cut into particles, as sensors need to know it."""
+    """The discretisation of a scene, as sensors need it."""
 
     @property
     def dimension(self) -> int:
@@ -28,15 +29,15 @@ class Cut(Protocol):
 
     @property
     def lattice(self) -> Lattice:
-        """Return the constants of the particles at rest, such as their volume and the axes along which they repeat."""
+        """Return the constants of the rest lattice, such as the particles' volume and the periodic axes."""
 
 
 class SensedScene(Cut, Protocol):
-    """A scene cut into particles, and what stands in it, as sensors prepare for it."""
+    """A discretised scene with its solids and container; sensors use it before a run."""
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
-        """Return the solids of the scene, as they begin."""
+        """Return the solids of the scene in their initial poses."""
 
     @property
     def container(self) -> Container:
@@ -44,14 +45,14 @@ class SensedScene(Cut, Protocol):
 
 
 class Reading(SensedScene, Protocol):
-    """A state as sensors see it: a `cortado.losses.Snapshot`."""
+    """A state from which sensors read fields and quantities: a `cortado.losses.Snapshot`."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return a field of the state or a quantity of its particles, float64."""
 
 
 class Sensor(Protocol):
-    """A sensor that reads a few numbers of a state, and their derivatives."""
+    """A sensor that computes a few numbers from a state, with their derivatives."""
 
     def columns(self, dimension: int) -> dict[str, str]:
         """Return the names of the sensor's numbers, with their units."""
@@ -60,7 +61,7 @@ class Sensor(Protocol):
         """Return the sensor's reading (k,) of a state, one number for each column."""
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Turn the adjoint (k,) of the sensor's reading into those of fields and quantities, by name."""
+        """Convert the adjoint (k,) of the reading to adjoints of fields and quantities, by name."""
 
 
 TIME = "time [s]"
@@ -68,7 +69,7 @@ TIME = "time [s]"
 
 
 def point(what: str, values: Any) -> NDArray[Any]:
-    """Check a place or a direction, (d,), finite; raise `InputError`."""
+    """Check that a place or direction (d,) is finite; raise `InputError` if not."""
     array = corner(what, values)
     if not np.isfinite(array).all():
         raise InputError(f"{what} is {array.tolist()}, but must be finite.")
@@ -76,7 +77,7 @@ def point(what: str, values: Any) -> NDArray[Any]:
 
 
 def corner(what: str, values: Any) -> NDArray[Any]:
-    """Check a corner (d,) of a region, infinite where it has no end; raise `InputError`."""
+    """Check a corner (d,) of a region, whose unbounded sides are infinite; raise `InputError` if it is wrong."""
     array = read_only(what, values)
     if array.shape not in ((2,), (3,)):
         raise InputError(f"{what} has shape {array.shape}, but must have 2 or 3 components.")
@@ -86,7 +87,7 @@ def corner(what: str, values: Any) -> NDArray[Any]:
 
 
 def direction(what: str, values: Any) -> NDArray[Any]:
-    """Check a direction (d,) and scale it to length 1; raise `InputError`."""
+    """Check a direction (d,) and scale it to length 1; raise `InputError` if it is wrong."""
     array = point(what, values)
     if not array.any():
         raise InputError(f"{what} is {array.tolist()}, but must not be 0.")
@@ -94,7 +95,7 @@ def direction(what: str, values: Any) -> NDArray[Any]:
 
 
 def positive(what: str, value: Any) -> float:
-    """Check a finite number above 0; raise `InputError`."""
+    """Check that a number is finite and above 0; raise `InputError` if not."""
     number = as_one_number(what, value)
     if not 0.0 < number < np.inf:
         raise InputError(f"{what} is {number:g}, but must be greater than 0 and finite.")
@@ -102,13 +103,13 @@ def positive(what: str, value: Any) -> float:
 
 
 def checked_sensor(sensor: Any) -> Sensor:
-    """Return what a user gives as a sensor if it is one; else raise `InputError`."""
+    """Return the user's object if it is a sensor; else raise `InputError`."""
     require_methods("sensor", sensor, ("columns", "value", "adjoint"), "a sensor, such as one of cortado.sensors")
     return sensor
 
 
 def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict[str, Sensor]:
-    """Return sensors by name; raises `InputError` for names that are ``taken`` and for anything but sensors."""
+    """Return sensors by name; raise `InputError` for names in ``taken`` and for objects that are no sensors."""
     if given is None:
         return {}
     if not isinstance(given, Mapping):
@@ -131,7 +132,7 @@ def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
 
 
 def in_dimension(what: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Check that a place has one component for each dimension of the scene; raise `InputError`."""
+    """Check that a place has one component for each dimension of the scene; raise `InputError` if not."""
     if len(values) != dimension:
         raise InputError(f"{what} has {len(values)} components, but must have {dimension}, as the scene has.")
     return values
@@ -146,20 +147,20 @@ class Readings:
     values: NDArray[Any]
     """(readings, k)"""
     units: Mapping[str, str]
-    """Units of its numbers, by their names, in their order."""
+    """Units of the sensor's numbers by name, in column order."""
 
     def __repr__(self) -> str:
         return f"Readings({len(self.times)} of {', '.join(self.units)})"
 
     def __getitem__(self, column: str) -> NDArray[Any]:
-        """Return one of its numbers over time, (readings,), by name; raise `InputError` for an unknown name."""
+        """Return one number of the sensor over time, (readings,), by name; raise `InputError` for an unknown name."""
         if column not in self.units:
             raise InputError(f"a column is {shown(column)}, but must be one of {', '.join(self.units)}.")
         return self.values[:, list(self.units).index(column)]
 
 
 class SensorLog:
-    """A log of the numbers of several sensors, state by state."""
+    """A log of the readings of several sensors, state by state."""
 
     def __init__(self, sensors: Mapping[str, Sensor], dimension: int):
         """Take ``sensors`` by the names that tell them apart; raise `InputError` for an object that is no sensor."""
@@ -174,8 +175,8 @@ class SensorLog:
         """Readings (k,) of each sensor, state by state."""
 
     def read(self, name: str, number: int, reading: Callable[[], NDArray[Any]]) -> None:
-        """Note the reading (k,) of a sensor of a state by its number, unless it is known: NaN where the next step loses
-        a particle, for which the run raises the error itself."""
+        """Store the reading (k,) of a sensor for state ``number``, unless it is known. It is NaN if the next step loses
+        a particle; the run itself raises that error."""
         if number == len(self._rows[name]):
             try:
                 self._rows[name].append(reading())
@@ -183,17 +184,18 @@ class SensorLog:
                 self._rows[name].append(np.full(len(self._units[name]), np.nan))
 
     def known(self, readings: Mapping[str, Readings]) -> float:
-        """Return the last step of which there are all readings of these sensors; infinite without sensors."""
+        """Return the last step for which all of these sensors have readings; infinite without sensors."""
         if any(name not in readings or readings[name].units != self._units[name] for name in self.sensors):
             return -1
         return min((len(readings[name].times) - 1 for name in self.sensors), default=inf)
 
     def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
-        """Take over the readings of the first state and after ``steps`` steps."""
+        """Take over an earlier log's readings, from the first state up to ``steps`` steps."""
         self._rows = {name: list(readings[name].values[: steps + 1]) for name in self.sensors}
 
     def readings(self, times: NDArray[Any]) -> dict[str, Readings]:
-        """Return the readings of all states that every sensor has read, at the first of these times [s]."""
+        """Return the readings of all states that every sensor has read; ``times`` [s] begin with those of these
+        states."""
         count = min(map(len, self._rows.values()), default=0)
         found = {}
         for name, units in self._units.items():
@@ -203,7 +205,7 @@ class SensorLog:
 
 
 def as_csv(readings: Mapping[str, Readings]) -> str:
-    """Write a table with a column for the time and one for each number of each sensor, the unit in its head."""
+    """Return a CSV table with a column for time and one for each number of each sensor, with units in the heads."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     heads = [f"{name}.{column} [{unit}]" for name, own in readings.items() for column, unit in own.units.items()]
@@ -213,7 +215,7 @@ def as_csv(readings: Mapping[str, Readings]) -> str:
 
 
 def from_csv(path: Path) -> dict[str, Readings]:
-    """Read a file of `as_csv`; raise `InputError` for anything else."""
+    """Read a file written with `as_csv`; raise `InputError` for any other file."""
     columns = read_columns(path)
     times, found = columns.pop(TIME, np.zeros(0)), dict[str, dict[str, str]]()
     if not len(times):
@@ -235,12 +237,12 @@ def _rows(readings: list[Readings]) -> Iterable[list[str]]:
 
 
 Summary = dict[str, dict[str, dict[str, float]]]
-"""By the sensor and its number: ``last``, ``mean`` and ``greatest``."""
+"""``last``, ``mean`` and ``greatest``, by sensor and by the number's name."""
 
 
 def summary(readings: Mapping[str, Readings]) -> Summary:
-    """Return for each number of each sensor the last reading, the mean over time, and the greatest: the reading
-    farthest from 0, with its sign."""
+    """Return for each number of each sensor the last reading, the mean over time, and the reading with the greatest
+    absolute value, with its sign."""
     return {name: {column: _of(own, column) for column in own.units} for name, own in readings.items()}
 
 
@@ -255,23 +257,23 @@ def _of(read: Readings, column: str) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredColumn:
-    """Measured values of one number of a sensor, at times within the run, beside its readings."""
+    """Measured values for one number of a sensor, at times within the run, and the simulated values at these times."""
 
     name: str
-    """"gauge.height" of the sensor gauge."""
+    """Name of the number, such as "gauge.height" of the sensor "gauge"."""
     unit: str
     times: NDArray[Any]
     """(k,) [s], times within the run."""
     values: NDArray[Any]
     """(k,)"""
     simulated: NDArray[Any]
-    """(k,) readings of the sensor then: between two steps interpolated linearly."""
+    """(k,) readings of the sensor at these times, linearly interpolated between steps."""
     left_out: int
-    """Number of measured points that are before or after the run."""
+    """Number of measured points before the start or after the end of the run."""
 
     @property
     def errors(self) -> dict[str, float]:
-        """Return errors of the simulated less the measured values, in the sensor's unit."""
+        """Return errors of simulated minus measured values, in the sensor's unit."""
         off = self.simulated - self.values
         worst = int(np.abs(off).argmax())
         return {
@@ -283,13 +285,14 @@ class MeasuredColumn:
 
 
 def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[MeasuredColumn]:
-    """Read the columns of a table of measured data, each beside the readings of a run's sensor.
+    """Read a table of measured data, and pair each column with the readings of a run's sensor.
 
-    The table has a column "time" [s] and columns such as "gauge.height", named as in sensors.csv; units in brackets may
-    be left out, and so may entries.
+    The table has a column "time" [s] and columns such as "gauge.height", named as in sensors.csv. Units in brackets may
+    be left out, and entries may be empty.
 
     Raises:
-        InputError: a file that is no such table, columns of no sensor or in another unit, or no point within the run.
+        InputError: the file is no such table, a column belongs to no sensor or has another unit, or no point is within
+        the run.
     """
     columns = read_columns(path)
     named = {name_and_unit(head): values for head, values in columns.items()}
@@ -323,9 +326,9 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
 def measured_columns(
     path: Path, units: Mapping[str, str], own: str = "", sensors: Collection[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """Return the columns of a table, (lines,) by name. As in sensors.csv, a name may have the ``own`` sensor before it
-    and its unit in brackets behind it; columns of other ``sensors`` are left out. Raises `InputError` for a column in
-    another unit, or twice."""
+    """Return the columns of a table, (lines,) by name. As in sensors.csv, the ``own`` sensor's name may precede a
+    column's name, and its unit may follow in brackets. Columns of other ``sensors`` are left out. Raises `InputError`
+    for a column in another unit, or twice."""
     found: dict[str, NDArray[Any]] = {}
     for head, values in read_columns(path).items():
         name, unit = name_and_unit(head)

@@ -1,5 +1,5 @@
-"""The values that sensors read of a run on its device. Captured steps keep quantities of each step. Sums over particles
-(`cortado.runs.particle_sums`) are launched after a chunk of steps, for all of its states, in float64 and a fixed
+"""The values that sensors read on the device during a run. Captured steps store quantities of each step. Sums over
+particles (`cortado.runs.particle_sums`) are launched after a chunk of steps, for all its states, in float64 and fixed
 order."""
 
 from collections.abc import Callable, Mapping
@@ -30,7 +30,7 @@ from cortado.sph.parts import unsort
 
 @wp.struct
 class _Around:
-    """A place and the view of a sensor, padded to three dimensions, as `Domain.ways` and `Weights` have them."""
+    """A sensor's place and projection padded to three dimensions; see `Domain.ways` and `Weights`."""
 
     place: wp.vec3d
     lower: wp.vec3d
@@ -47,7 +47,7 @@ class _Around:
 
 @wp.struct
 class _Region:
-    """A region, padded to three dimensions, as `Domain.within` has it."""
+    """A region padded to three dimensions; see `Domain.within`."""
 
     start: wp.vec3d
     lengths: wp.vec3d
@@ -58,7 +58,7 @@ class _Region:
 
 @wp.struct
 class _Ride:
-    """A point that a solid carries, and R_0^T of that: see `cortado.runs.particle_sums`."""
+    """A point that a solid carries, and the solid's R_0^T; see `cortado.runs.particle_sums`."""
 
     arm: wp.vec3d
     own: wp.mat33d
@@ -67,7 +67,8 @@ class _Ride:
 
 @cache
 def _rides(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make kernels of the places to which a solid carries a point, and of how it turns a view back; a thread a row."""
+    """Make kernels that compute the place to which a solid carries a point, and the matrix that turns vectors back to
+    the solid's initial axes. Each thread computes one row."""
     angle, of = rotations(precision, dimension).angle, rotations(FLOAT64, dimension)
     module = kernel_module(f"sensors_on_solids_{precision.name}_{dimension}")
     wide = wp.float64 if dimension == 2 else wp.vec3d
@@ -100,13 +101,14 @@ def _rides(precision: Precision, dimension: int) -> SimpleNamespace:
 
 @cache
 def _kernels(precision: Precision) -> SimpleNamespace:
-    """Make kernels of partial sums over every so many particles of a scene in one state, and of the sum of these."""
+    """Make kernels that compute partial sums over a scene's particles with a fixed stride in one state, and the sum of
+    the partial sums."""
     real, vector = precision.real, precision.vector
     module = kernel_module(f"particle_sums_{precision.name}")
 
     @wp.func(module=module)
     def of_state(first: wp.array(dtype=vector), later: wp.array(dtype=vector), i: int, before: int) -> vector:
-        """Return entry i of the states of a chunk, the first of which is in an array of its own."""
+        """Return entry i of the states of a chunk; the chunk's first state is in a separate array."""
         if i < before:
             return first[i]
         return later[i - before]
@@ -117,7 +119,7 @@ def _kernels(precision: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def placed(x: vector, start: wp.vec3d, lengths: wp.vec3d) -> wp.vec3d:
-        """Return the image of a particle that is within the period from a start on."""
+        """Return the periodic image of a particle that lies in the period beginning at ``start``."""
         y = doubled(x)
         for k in range(3):
             if lengths[k] > wp.float64(0.0):
@@ -130,14 +132,14 @@ def _kernels(precision: Precision) -> SimpleNamespace:
     def from_a_solid(
         row: int, y: wp.vec3d, places: wp.array(dtype=wp.vec3d), views: wp.array(dtype=wp.mat33d)
     ) -> wp.vec3d:
-        """Return the way from the place of a row to a point, as a solid sees it that has carried the place."""
+        """Return the vector from a row's place to a point, in the axes of the solid that carried the place."""
         return views[row] * (y - places[row])
 
     @wp.func(module=module)
     def weight(
         a: _Around, x: vector, row: int, places: wp.array(dtype=wp.vec3d), views: wp.array(dtype=wp.mat33d)
     ) -> wp.float64:
-        """Return the weight of a particle, the mean over its parts, summed over their images."""
+        """Return the weight of a particle: the mean over its parts, summed over their periodic images."""
         y = placed(x, a.lower, a.lengths)
         way = y - a.place
         if places.shape[0] > 0:
@@ -220,15 +222,15 @@ def _kernels(precision: Precision) -> SimpleNamespace:
 
 
 class StepQuantities:
-    """The quantities of particles and the loads on solids that every step of a chunk computes for the state at which it
-    begins; they are kept until the next chunk."""
+    """Quantities of particles and loads on solids that each step of a chunk computes for its initial state. They are
+    stored until the next chunk."""
 
     def __init__(self, formulas: Mapping[str, QuantityFormula], solver: ParticleSolver, length: int):
-        """Make room for ``formulas`` by the names of their quantities in chunks of ``length`` steps."""
+        """Allocate arrays for ``formulas`` (by quantity name) in chunks of ``length`` steps."""
         self._formulas, self._solver, self._length, self.kept = formulas, solver, length, dict[str, wp.array]()
 
     def launch(self, step: int, parameters: Parameters) -> None:
-        """Launch the kernels for a step of the chunk that the solver has just taken, counted from 0."""
+        """Launch the kernels for the step that the solver has just taken; ``step`` counts from 0 within the chunk."""
         solver, context = self._solver, self._solver.context(parameters)
         pressures = solver.pressures()
         if pressures is None:
@@ -244,16 +246,16 @@ class StepQuantities:
                 unsort(context, found, own)
 
     def of_step(self, name: str, step: int) -> wp.array:
-        """Return a quantity in the scene's order, or a load, of a step of the chunk, counted from 0."""
+        """Return a load, or a quantity in the scene's order, of step number ``step`` (from 0) of the chunk."""
         size = len(self.kept[name]) // self._length
         return self.kept[name][step * size : (step + 1) * size]
 
 
 class CarriedRows:
-    """Where a solid has carried the place of a sensor in each state of a chunk of a run."""
+    """The places to which a solid has carried a sensor, in each state of a chunk of a run."""
 
     def __init__(self, ride: Ride, point: NDArray[Any], scene: SensedScene, solver: ParticleSolver, rows: int):
-        """Make room for ``rows`` states; ``point`` (d,) is the place in the ``scene`` as it begins [m]."""
+        """Allocate arrays for ``rows`` states; ``point`` (d,) is the sensor's initial place in the ``scene`` [m]."""
         table, layout = ride.table(scene), solver.layout
         self._device, self._members, self._ride = solver.device, layout.members, _Ride()
         self._ride.arm = wp.vec3d(*_wide(point - table.middle()))
@@ -273,7 +275,7 @@ class CarriedRows:
         self.views = wp.empty(rows, dtype=wp.mat33d, device=solver.device)
 
     def recorded(self, rows: int, first: State, later: StateSeries) -> list[Callable[[], None]]:
-        """Return functions that find the places in ``rows`` states, the first of which is in arrays of its own."""
+        """Return functions that compute the places in ``rows`` states; the first state is in separate arrays."""
         members, behind = self._members, rows - self._members
         copies = [partial(wp.copy, own, first[name], count=members) for name, own in self._fields.items()]
         if behind:
@@ -287,7 +289,7 @@ class ChunkSums:
     """The sums of one sensor over the particles of each state of a chunk of a run."""
 
     def __init__(self, summed: ParticleSum, scene: SensedScene, solver: ParticleSolver, length: int):
-        """Prepare the sum over particles of a scene in chunks of up to ``length`` steps."""
+        """Prepare the sum ``summed`` over a scene's particles, for chunks of up to ``length`` steps."""
         layout, self._summed, domain = solver.layout, summed, scene.lattice.domain
         self._scenes, self._particles, self._device = layout.members, layout.particles, solver.device
         self._stride, self._kernels = isqrt(layout.particles - 1) + 1, _kernels(layout.precision)
@@ -295,7 +297,7 @@ class ChunkSums:
         self._partial = wp.empty(rows * self._stride, dtype=SIX, device=solver.device)
         self._total = wp.zeros(rows, dtype=SIX, device=solver.device)
         self._launches: dict[tuple[int, int], list[Callable[[], None]]] = {}
-        """By the number of steps and the address of the first state, as in most chunks neither is another."""
+        """Cached launches by number of steps and address of the first state, which are the same in most chunks."""
         self._setting: Any = None
         point: NDArray[Any] | None = None
         if isinstance(summed, WeightedSum):
@@ -306,8 +308,8 @@ class ChunkSums:
         self._carried = None if ride is None or point is None else CarriedRows(ride, point, scene, solver, rows)
 
     def launch(self, count: int, first: State, later: StateSeries, kept: Mapping[str, wp.array]) -> wp.array:
-        """Launch the sums over the states at which ``count`` steps began, the ``first`` and those ``later``, with the
-        quantities that were ``kept``. Return them (at least count scenes,), which the next launch overwrites."""
+        """Launch the sums over the initial states of ``count`` steps (``first`` and ``later``), with the ``kept``
+        quantities. Return the sums (at least count * scenes,); the next launch overwrites them."""
         if isinstance(self._summed, LoadSum):
             return kept[self._summed.quantity]
         if isinstance(self._summed, NoSum):
@@ -327,7 +329,7 @@ class ChunkSums:
         later: StateSeries,
         kept: Mapping[str, wp.array],
     ) -> list[Callable[[], None]]:
-        """Return functions that launch the sums, with arguments that are packed once."""
+        """Return functions that launch the sums; their arguments are packed only once."""
         rows = count * self._scenes
         sizes = {"particles": self._particles, "before": self._scenes * self._particles, "stride": self._stride}
         fields = {"x_first": first.positions, "x": later.whole("positions"), "a": self._setting}
@@ -348,7 +350,7 @@ class ChunkSums:
 
 
 def _around(summed: WeightedSum, domain: Domain, device: Any) -> Any:
-    """Return a place and the view of a sensor as kernels take them."""
+    """Return a sensor's place and projection as a struct for kernels."""
     around, found = summed.around, _Around()
     d, shifts = len(around.place), around.shifts()
     widest = around.reach + float(np.linalg.norm(shifts, axis=1).max())
@@ -365,7 +367,7 @@ def _around(summed: WeightedSum, domain: Domain, device: Any) -> Any:
 
 
 def _region(summed: RegionSum, domain: Domain) -> Any:
-    """Return a region as kernels take it; along a third axis that is not there it has no end."""
+    """Return a region as a struct for kernels; in 2-D it is unbounded along the third axis."""
     found, (start, lower, upper) = _Region(), domain.ends(summed.lower, summed.upper)
     found.start, found.about = wp.vec3d(*_wide(start)), wp.vec3d(*_wide(summed.about))
     found.lower, found.upper = wp.vec3d(*_wide(lower, -np.inf)), wp.vec3d(*_wide(upper, np.inf))
@@ -380,7 +382,7 @@ def _wide(values: NDArray[Any], rest: float = 0.0) -> NDArray[Any]:
 
 
 def _square(matrix: NDArray[Any]) -> NDArray[Any]:
-    """Return a matrix with zeros up to (3, 3), row by row."""
+    """Return a matrix padded with zeros to (3, 3), row by row."""
     found = np.zeros((3, 3))
     found[: matrix.shape[0], : matrix.shape[1]] = matrix
     return found.ravel()

@@ -47,12 +47,12 @@ class Frame:
     time: float
     """[s]"""
     quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """(n,) or (n, k) by name: those that were recorded, such as ``density``"""
+    """(n,) or (n, k) recorded quantities by name, such as ``density``"""
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """further fields of the state by name, such as those that parts keep; see `Trajectory`"""
+    """further fields of the state by name, such as fields of parts; see `Trajectory`"""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Return a quantity of the particles by its name, one that was recorded or the speed, or a field of the state.
+        """Return a recorded quantity of the particles, the speed, or a field of the state, by name.
 
         Raises:
             InputError: it was not recorded, or there is no such quantity.
@@ -60,7 +60,8 @@ class Frame:
         return chosen(self.quantities, name, fields_of(self))
 
     def moved(self, duration: float) -> Frame:
-        """Return about the state a short time [s] later, or earlier: every particle goes on along its velocity."""
+        """Return the frame extrapolated by ``duration`` [s], which may be negative, with constant velocities of
+        particles."""
         if duration == 0.0:
             return self
         return replace(self, positions=self.positions + duration * self.velocities, time=self.time + duration)
@@ -70,13 +71,13 @@ class Frame:
 
 
 def fields_of(of: Frame | Trajectory) -> dict[str, NDArray[Any]]:
-    """Return every field that steps change, of a frame or over frames, by its name."""
+    """Return by name every field that steps change, of a frame or of a trajectory."""
     fractions = {} if of.mass_fractions is None else {"mass_fractions": of.mass_fractions}
     return {"positions": of.positions, "velocities": of.velocities, **fractions, **of.others}
 
 
 def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return a quantity that was recorded, the speed, or one of ``fields``; raise `InputError` for any other name."""
+    """Return a recorded quantity, the speed, or one of ``fields``, by name; raise `InputError` for any other name."""
     check_quantity(name, others=tuple(fields))
     if name in fields:
         return fields[name]
@@ -90,7 +91,7 @@ def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[st
 
 
 SUFFIXES = (".vtkhdf", ".hdf")
-"""Endings by which ParaView knows a trajectory."""
+"""File suffixes that ParaView accepts for a trajectory."""
 
 
 @public
@@ -98,8 +99,8 @@ SUFFIXES = (".vtkhdf", ".hdf")
 class Trajectory:
     """The recorded frames of a run, and the solver's notes on every step.
 
-    ``trajectory[k]`` is the `Frame` k, counted from the end where k is negative; ``trajectory[2:5]`` and
-    ``trajectory[::10]`` are trajectories of these frames alone; ``len``, ``for`` and ``reversed`` go over the frames.
+    ``trajectory[k]`` is the `Frame` k; a negative k counts from the end. ``trajectory[2:5]`` and ``trajectory[::10]``
+    are trajectories of only these frames. ``len``, ``for`` and ``reversed`` work on the frames.
 
     Raises:
         InputError: arrays whose shapes do not belong together.
@@ -121,11 +122,11 @@ class Trajectory:
     velocities: NDArray[Any]
     """(frames, n, d) [m/s]"""
     diagnostics: Mapping[str, NDArray[Any]]
-    """(steps,) by name: ``converged``, and what else the solver notes; see `StepLog`"""
+    """(steps,) by name: ``converged`` and the solver's other notes; see `StepLog`"""
     mass_fractions: NDArray[Any] | None = None
     """(frames, n, phases) [-]; None with one phase"""
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """(frames, ...) further fields of the states by name, with an emitter ``outlet`` [m] and ``emitted`` [m]: see
+    """(frames, ...) further fields of the states by name; with an emitter also ``outlet`` [m] and ``emitted`` [m], see
     `RestartState`"""
     constants: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """fields that no step changes: ``reference_density`` (n,), a particle's mass over its volume on the rest lattice
@@ -133,19 +134,19 @@ class Trajectory:
     substeps: int = 0
     """[-] explicit steps of diffusion within each step"""
     origin: Origin | None = None
-    """of which particles it is; None where nothing is known of it"""
+    """description of the particles' scene; None if unknown"""
     quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """(frames, n) or (frames, n, k) by name: those that were recorded, such as ``density``"""
+    """(frames, n) or (frames, n, k) recorded quantities by name, such as ``density``"""
     sensors: Mapping[str, Readings] = field(default_factory=dict)
-    """what sensors have read in every step, by their names; it is not in files"""
+    """readings of sensors in every step, by sensor name; files do not contain them"""
     solids: SolidMotions = field(default_factory=SolidMotions)
-    """where solids that move are, by their names"""
+    """motions of the moving solids, by name"""
     begun: int | None = None
-    """[-] steps taken before the first one of the ``diagnostics``; those of the first frame if left out"""
+    """[-] number of steps before the first entry of ``diagnostics``; if left out, that of the first frame"""
     marks: Marks | None = None
-    """when frames are due of a run with ``--fps``; None where they come after so many steps"""
+    """times at which frames of a run with ``--fps`` are due; None if frames are chosen by steps"""
     scene: Scene | None = field(default=None, repr=False)
-    """of which it is a run; None of a trajectory from a file, which does not hold it"""
+    """scene of the run; None if the trajectory was read from a file, which does not contain the scene"""
 
     def __post_init__(self) -> None:
         if self.begun is None and len(self.steps):
@@ -176,7 +177,7 @@ class Trajectory:
     def __getitem__(self, k: slice) -> Trajectory: ...
 
     def __getitem__(self, k: int | slice) -> Frame | Trajectory:
-        """Return a frame, or a trajectory of some; the solver's notes stay those of the whole run.
+        """Return a frame, or a trajectory of some frames, which keeps the solver's notes on the whole run.
 
         Raises:
             IndexError: there is no such frame.
@@ -195,9 +196,8 @@ class Trajectory:
         return Frame(self.positions[place], self.velocities[place], fractions, float(self.times[place]), own, others)
 
     def quantity(self, name: str) -> NDArray[Any]:
-        """Return by ``name`` a quantity (frames, n) or (frames, n, k) of the particles, one that was recorded or the
-        speed, or a field of the states, which may have other axes behind the first. For any other use
-        `Simulation.quantity`.
+        """Return by ``name`` a recorded quantity of the particles or the speed, (frames, n) or (frames, n, k), or a
+        field (frames, ...) of the states. `Simulation.quantity` computes others.
 
         Raises:
             InputError: it was not recorded, or there is no such quantity.
@@ -220,8 +220,8 @@ class Trajectory:
 
     @property
     def due(self) -> NDArray[Any]:
-        """Return the times (frames,) [s] at which pictures and films show each frame: at its whole mark in a run with
-        ``--fps``, to which it is moved along its velocities, and else at its time."""
+        """Return the times (frames,) [s] at which pictures and films show the frames. In a run with ``--fps`` a frame
+        is extrapolated to its due time; else this is the frame's own time."""
         return self.times if self.marks is None else self.marks.due(self.times)
 
     @property
@@ -236,10 +236,10 @@ class Trajectory:
 
     @property
     def iterations(self) -> NDArray[Any]:
-        """Return the pressure iterations (steps,) [-] of each step, of a solver with one loop.
+        """Return the pressure iterations (steps,) [-] of each step, for a solver with one pressure loop.
 
         Raises:
-            InputError: the solver notes something else.
+            InputError: the solver does not record iterations.
         """
         return noted(self.diagnostics, "iterations")
 
@@ -248,7 +248,7 @@ class Trajectory:
         """Return the average (rho - rho_0) / rho_0 (steps,) [-] at the end of each step.
 
         Raises:
-            InputError: the solver notes something else.
+            InputError: the solver does not record density errors.
         """
         return noted(self.diagnostics, "density_errors")
 
@@ -264,7 +264,8 @@ class Trajectory:
 
     @property
     def last_state(self) -> RestartState:
-        """Return the state of the last frame, from which `Simulation.run` goes on bit for bit, in arrays of its own.
+        """Return a copy of the state of the last frame. `Simulation.run` continues from it bit for bit as without a
+        stop.
 
         Raises:
             InputError: there is no frame.
@@ -297,19 +298,19 @@ class Trajectory:
             self.write_frames(writer)
 
     def write_frames(self, writer: vtkhdf.TrajectoryWriter) -> None:
-        """Write all frames by a ``writer`` whose file has room for them."""
+        """Write all frames with a ``writer`` whose file has room for them."""
         for k, step in enumerate(self.steps):
             recorded = {name: array[k] for name, array in self.quantities.items()}
             frame = {name: array[k] for name, array in fields_of(self).items()}
             append_frame(writer, frame, int(step), recorded, float(self.times[k]))
 
     def export(self, folder: str | PathLike[str], to: str, scene: Scene | str | PathLike[str] | None = None) -> Path:
-        """Write the surface of the fluid and its particles, in the colours of pictures, and solids for other programs:
-        see `docs/into_blender.md`. Returns the file to open, or the folder of a series.
+        """Export the fluid's surface and particles, coloured as in pictures, and the solids to other programs: see
+        `docs/into_blender.md`. Return the file to open, or the folder of a series.
 
         ``to``: "usd", one file with time samples; "ply", "obj", "glb" or "vtp", files for each frame, the last with
-        ``run.pvd`` for ParaView. ``scene``: of a trajectory from a file the scene, or the path of its file. The folder
-        must be empty or missing. In the plane there is no surface, and z is 0.
+        ``run.pvd`` for ParaView. ``scene``: the scene or its file's path; needed for a trajectory from a file. The
+        folder must be empty or missing. In 2-D no surface is exported, and z is 0.
 
         Raises:
             InputError: another format, a folder with files, no scene or another one, a library that is missing, or a
@@ -325,8 +326,8 @@ class Trajectory:
         return path
 
     def to_xarray(self) -> Any:
-        """Return an ``xarray.Dataset`` of the dimensions time, particle and space, with units: position, velocity, with
-        several phases mass_fraction, recorded quantities, and where solids that move are, along a dimension solid.
+        """Return an ``xarray.Dataset`` with units and the dimensions time, particle, space and solid. It contains
+        position, velocity, recorded quantities, motions of solids and, with several phases, mass_fraction.
 
         Raises:
             InputError: xarray is missing.
@@ -336,9 +337,9 @@ class Trajectory:
     def picture(
         self, k: int = -1, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
     ) -> ShadedPicture:
-        """Draw a shaded picture of frame k, (rows, columns, 3), linear from 0 to 1, which a notebook shows. The camera
-        is where it sees the fluid in every frame. The arguments ``scene``, ``device`` and ``settings`` and the errors
-        are those of `film`.
+        """Draw a shaded picture of frame k, (rows, columns, 3), linear from 0 to 1; a notebook displays it. The camera
+        is placed so that the fluid is visible in every frame. Arguments ``scene``, ``device``, ``settings`` and errors
+        are as in `film`.
 
         Example: ``cortado.pictures.write_picture("last.png", trajectory.picture(width=640, height=360))``
         """
@@ -348,32 +349,32 @@ class Trajectory:
     def film(
         self, path: str | Path, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
     ) -> Film:
-        """Write a film of the run, an mp4, and return it; a notebook plays it. One that is stopped (Ctrl-C) keeps its
-        frames, and the same call goes on after them. See `docs/pictures.md`.
+        """Write a film of the run and return it; a notebook plays it. A film stopped by Ctrl-C keeps its frames, and
+        the same call continues it. See `docs/pictures.md`.
 
         Args:
-            path: ends in .mp4, or in .webp, an animation that pages of text show, and which does not go on.
-            scene: that of the run, or the path of its file; needed of a trajectory that was loaded from a file.
-            device: of the rays, "cpu" or "cuda:0".
+            path: ends in .mp4, or in .webp: an animation for web pages; the call cannot continue a stopped one.
+            scene: the run's scene or its file's path; needed if the trajectory was loaded from a file.
+            device: device that traces the rays, "cpu" or "cuda:0".
             settings: keys of the scene's table [picture], such as ``colour="speed"``, ``film_speed=0.25`` or
                 ``film_frames=100``; ``lines=1080`` sets width and height; ``camera=pictures.Orbit()`` moves the camera.
 
         Raises:
             SceneError: settings that do not fit.
-            InputError: a package is missing, or what ``colour`` names was not recorded and cannot be computed.
+            InputError: a package is missing, or the quantity of ``colour`` was not recorded and cannot be computed.
         """
         film: Film = on_top("trajectory_film")(self, path, scene, device, settings)
         return film
 
     def _repr_html_(self) -> str:
-        """Show the run in motion, with y up, and its first, middle and last frame, coloured by speed, in a notebook."""
+        """Show in a notebook an animation of the run, with y up, and its first, middle and last frame, coloured by
+        speed."""
         page: str = on_top("trajectory_page")(self)
         return page
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read the file at a ``path``, written by `save` or by `TrajectoryWriter`, whose writer may be dead or still at
-        work.
+        """Read a file that `save` or `TrajectoryWriter` wrote; its writer may still be writing or may have been killed.
 
         Raises:
             InputError: the file is missing, damaged, or none of Cortado's trajectories.
@@ -397,7 +398,7 @@ class Trajectory:
 
 
 def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
-    """Return the diagnostic (steps,) of a name; raise `InputError` where a solver has other diagnostics."""
+    """Return the diagnostic (steps,) with this name; raise `InputError` if the solver does not record it."""
     if name not in diagnostics:
         raise InputError(f"{name} is no diagnostic of this solver, whose diagnostics are {', '.join(diagnostics)}.")
     return diagnostics[name]

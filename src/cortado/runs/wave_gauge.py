@@ -1,15 +1,14 @@
-"""The height of the surface of the fluid at a place: up to which level fluid fills a column from its floor on.
+"""The height of the fluid's surface at a place: the level up to which the fluid fills a column above a floor.
 
-Solids take a part of the column. It is a grid of points: so many levels, and in each of them places with weights w_c
-that add up to 1. Of the point x_c a solid takes
+Solids occupy part of the column. The column is a grid of levels; the points x_c of a level have weights w_c that add up
+to 1. Of the point x_c a solid occupies the fraction
 
     s_c = min(max(1/2 - phi(x_c) / step, 0), 1)
 
-with the signed distance phi from the solid: a flat one takes its own height of every place, wherever it is between the
-levels. Several take what each of them takes, together at most all. Level k has the room 1 - sum_c w_c s_c, and a depth
-of fluid fills level after level. A solid that leaves no room above fluid, as a boat or a ceiling does, is a step in
-that height. Fluid that is pressed together a little is not on the deck: the step is a slope over the next `FILM` of
-depth.
+with the signed distance phi from the solid. A flat solid thus occupies exactly its own height, wherever it lies between
+levels. Fractions of several solids add up, to at most 1. Level k has the room 1 - sum_c w_c s_c, and the fluid fills
+level after level. A solid that leaves no room above fluid, such as a boat or a ceiling, is a step in the height. So
+that slightly compressed fluid does not appear on a deck, the step is a slope over the next `FILM` of depth.
 """
 
 from dataclasses import dataclass, replace
@@ -46,22 +45,23 @@ from cortado.scene.shape_tables import Container, NoContainer
 from cortado.scene.solids import SolidTable
 
 FINE = 0.5
-"""In spacings: greatest distance between the points of a column."""
+"""Greatest distance between the points of a column, in spacings."""
 ACROSS_REACH = 20.0
 """Least number of points from the axis of a column to its side."""
 LEAST = 1e-3
-"""The part of a level that counts as no room at all."""
+"""Room of a level, as a fraction, below which the level counts as full of solid."""
 MOST = 4_000_000
-"""Most points: where solids go higher they are further apart."""
+"""Greatest number of points: for higher solids the points are further apart."""
 NARROW = 0.01
-"""The part of a column that has to be within a container that cuts it."""
+"""Least fraction of a column's cross-section that must lie within the container."""
 FILM = 1.0
-"""In spacings: so deep a film is above a solid that has fluid below it too, before the height is exactly that of it."""
+"""Depth in spacings of the film above a solid with fluid below, from which on the height is exactly the film's
+surface."""
 
 
 @dataclass(frozen=True)
 class Standing:
-    """A solid in its place beside a gauge: x is at ``middle + scale turn r``, with the place r in its own frame."""
+    """A solid at its pose near a gauge: a point r in the solid's frame is at ``middle + scale turn r``."""
 
     own: Solid
     middle: NDArray[Any]
@@ -70,7 +70,7 @@ class Standing:
     """(d, d)"""
     scale: float
     pose: Pose | None
-    """Pose of a solid that moves; else None."""
+    """Pose of a moving solid; None for a solid at rest."""
 
     @classmethod
     def of(cls, table: SolidTable, d: int, at: Reading | None = None) -> "Standing":
@@ -81,13 +81,13 @@ class Standing:
         return cls(table.own_solid(), pose.position, pose.rotation[:d, :d], pose.scale, pose)
 
     def local(self, points: NDArray[Any], domain: Domain) -> NDArray[Any]:
-        """Return the places (n, d) in the solid's frame of points (n, d) [m], taking of each point the periodic image
-        nearest to the solid's middle."""
+        """Return points (n, d) [m] in the solid's frame, using each point's periodic image nearest to the solid's
+        middle."""
         return np.asarray(domain.shortest(points - self.middle) @ self.turn / self.scale)
 
     def reach(self, up: NDArray[Any], foot: NDArray[Any]) -> tuple[float, float]:
-        """Return how high the solid goes above a foot (d,) along ``up`` (d,), and how far from its middle [m], infinite
-        if it has no end."""
+        """Return the solid's greatest height above ``foot`` (d,) along ``up`` (d,), and its radius about its middle
+        [m]; infinite if unbounded."""
         ends = self.scale * corners(*self.own.extent())
         high = float(((self.middle - foot) @ up) + (ends @ self.turn.T @ up).max())
         return high, float(np.linalg.norm(ends, axis=1).max()) if self.own.is_bounded else np.inf
@@ -95,30 +95,30 @@ class Standing:
 
 @dataclass(frozen=True)
 class Axis:
-    """The axis of a gauge: the line at which it stands, upwards from its floor."""
+    """The axis of a gauge: a line upwards from the gauge's floor."""
 
     foot: tuple[float, ...]
-    """(d,) where its axis meets its floor [m]"""
+    """(d,) point where the axis meets the floor [m]"""
     up: tuple[float, ...]
     """(d,) unit vector"""
     reach: float
-    """Reach of its weights [m]."""
+    """Reach of the gauge's weights [m]."""
     step: float
     """Distance from point to point [m]."""
     film: float
     """`FILM` [m]"""
     beside: tuple[tuple[float, ...], ...]
-    """(d - 1, d) unit vectors across it"""
+    """(d - 1, d) unit vectors perpendicular to the axis"""
 
     @classmethod
     def of(cls, at: Cut, position: NDArray[Any], floor: float, up: NDArray[Any], reach: float) -> "Axis":
-        """Make the axis of a gauge at a position, from its floor upwards."""
+        """Make the axis of a gauge at ``position``, from ``floor`` upwards."""
         in_dimension("position", position, at.dimension)
         spacing = at.lattice.cell ** (1.0 / at.dimension)
         return _axis_of(spacing, tuple(position.tolist()), floor, tuple(up.tolist()), reach)
 
     def places(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the points (c, d) of the floor from its foot [m], and their weights (c,)."""
+        """Return the column's points (c, d) on the floor relative to the foot [m], and their weights (c,)."""
         d, count = len(self.foot), int(np.ceil(self.reach / self.step))
         along = np.asarray(self.step * np.arange(-count, count + 1), dtype=np.float64)
         places = grid([along] * (d - 1))
@@ -126,7 +126,7 @@ class Axis:
         return places[weights > 0.0] @ np.array(self.beside), weights[weights > 0.0] / weights.sum()
 
     def carried(self, carrier: Carrier, turns: bool) -> "Axis":
-        """Return the axis where a solid has carried its foot to, turned with it if it ``turns``."""
+        """Return the axis with its foot carried by a solid, and turned with the solid if it ``turns``."""
         foot = tuple(carrier.place(np.array(self.foot)).tolist())
         if not turns:
             return replace(self, foot=foot)
@@ -136,7 +136,7 @@ class Axis:
 
 @lru_cache(maxsize=64)
 def _axis_of(spacing: float, position: tuple[float, ...], floor: float, up: tuple[float, ...], reach: float) -> Axis:
-    """Return the axis of a gauge, which is asked for in every step."""
+    """Return the axis of a gauge; results are cached, as every step calls this."""
     foot = np.array(position) + (floor - np.dot(position, up)) * np.array(up)
     beside = tuple(map(tuple, np.linalg.svd(np.array([up]))[2][1:].tolist()))
     return Axis(tuple(foot.tolist()), up, reach, min(FINE * spacing, reach / ACROSS_REACH), FILM * spacing, beside)
@@ -144,21 +144,22 @@ def _axis_of(spacing: float, position: tuple[float, ...], floor: float, up: tupl
 
 @dataclass(frozen=True)
 class Column:
-    """The points of a gauge's column, with the parts that solids take of them."""
+    """The points of a gauge's column, with the fractions that solids occupy."""
 
     axis: Axis
     points: NDArray[Any]
     """(levels, c, d) [m]"""
     weights: NDArray[Any]
-    """(c,), over those that are within the container"""
+    """(c,) weights, normalised over the points within the container"""
     outside: NDArray[Any]
-    """(c,) the part of each place that is behind the sides of the container"""
+    """(c,) fraction of each point's cell that is behind the sides of the container"""
     solids: list[tuple[Standing, NDArray[Any]]]
-    """Solids in it, and the distance of its points from them (levels, c) [m], where that is less than a step."""
+    """Solids in the column, each with the distances (levels, c) of the points from it [m], if some are less than a
+    step."""
 
     @classmethod
     def of(cls, axis: Axis, solids: list[Standing], domain: Domain, container: Container) -> "Column | None":
-        """Make a column with solids in it; None where no solid is in it."""
+        """Make a column that contains solids; None if no solid is in the column."""
         foot, up = np.array(axis.foot), np.array(axis.up)
         tops, sizes = np.array([one.reach(up, foot) for one in solids]).T
         ways = domain.shortest(foot - np.array([one.middle for one in solids], dtype=np.float64))
@@ -185,19 +186,18 @@ class Column:
 
     @cached_property
     def _taken(self) -> NDArray[Any]:
-        """Return the part (levels, c) of each point that solids and the container take, 1 or more where that is all of
-        it."""
+        """Return the fraction (levels, c) of each point that solids and the container occupy; 1 or more means all."""
         return self.outside + sum(np.clip(0.5 - far / self.axis.step, 0.0, 1.0) for _, far in self.solids)
 
     @cached_property
     def room(self) -> NDArray[Any]:
-        """Return the part (levels,) of each level that no solid takes."""
+        """Return the fraction (levels,) of each level that is free of solids."""
         return np.asarray((1.0 - np.minimum(self._taken, 1.0)) @ self.weights)
 
     @cached_property
     def _ends(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the ends of levels between which the height is linear, and the depths that fill the room below them
-        [m]."""
+        """Return the heights between which the level is a linear function of depth, and the depths of fluid that fill
+        the room below them [m]."""
         filled = self.axis.step * np.concatenate([[0.0], np.cumsum(self.room)])
         kept, blocked = np.ones(len(filled), dtype=bool), np.append(self.room < LEAST, False)
         kept[: int(np.argmin(blocked))] = False  # what stands on the floor
@@ -207,8 +207,9 @@ class Column:
         return ends, filled[ends]
 
     def level(self, depth: float) -> tuple[float, NDArray[Any], float]:
-        """Return the height above the column's floor of fluid that has ``depth`` [m] where no solids are. Also return
-        the part (levels,) of each level's solids that adds to it, and its derivative with respect to the depth."""
+        """Return the height above the column's floor of fluid that would have ``depth`` [m] without solids. Also return
+        the fraction (levels,) of each level's solids that adds to the height, and the height's derivative with respect
+        to ``depth``."""
         (ends, filled), step, levels = self._ends, self.axis.step, np.arange(len(self.room))
         low = max(int(np.searchsorted(filled, depth, side="right")) - 1, 0)
         if low == len(ends) - 1:  # above all solids
@@ -219,7 +220,8 @@ class Column:
         return step * (ends[low] + part * (ends[low + 1] - ends[low])), below, float(slope)
 
     def pushes(self, depth: float, bar: float, domain: Domain) -> "list[Push]":
-        """Turn the derivative with respect to the level at a depth [m] into those with respect to motions of solids."""
+        """Convert the derivative with respect to the height at a depth [m] to derivatives with respect to motions of
+        solids."""
         _, below, slope = self.level(depth)
         shares, found = bar * slope * below, list[Push]()
         for one, far in self.solids:
@@ -235,19 +237,19 @@ class Column:
 
 @dataclass(frozen=True, eq=False)
 class Push:
-    """The derivative of a gauge's level with respect to the motion of a solid in its column."""
+    """The derivative of a gauge's height with respect to the motion of a solid in its column."""
 
     solid: Standing
     shift: NDArray[Any]
-    """(d,) by its place"""
+    """(d,) with respect to a shift of the solid"""
     twist: NDArray[Any]
-    """(3,) by a further turn about its middle"""
+    """(3,) with respect to a small rotation about the solid's middle"""
     grown: float
-    """By its scale."""
+    """With respect to the solid's scale."""
 
     @property
     def bars(self) -> dict[str, NDArray[Any]]:
-        """Return derivatives by fields of the state, of which a solid at rest has none."""
+        """Return derivatives with respect to fields of the state; a solid at rest has no fields."""
         pose = self.solid.pose
         if pose is None:
             return {}
@@ -256,7 +258,7 @@ class Push:
 
 
 def column_of(axis: Axis, at: Reading) -> Column | None:
-    """Return a column as solids stand in it in a state; None where none does."""
+    """Return the gauge's column with the solids in it in a state; None if no solid is in the column."""
     tables, domain = at.solids, at.lattice.domain
     if any(table.moves for table in tables):
         return Column.of(axis, [Standing.of(table, at.dimension, at) for table in tables], domain, at.container)
@@ -265,8 +267,8 @@ def column_of(axis: Axis, at: Reading) -> Column | None:
 
 @lru_cache(maxsize=64)
 def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
-    """Return the part (c,) of the cell around each point of a gauge's column that is within a container. None where all
-    of it is, or where the container's sides are not along the column."""
+    """Return the fraction (c,) of the cell around each point of a column that is within the container. None if all
+    cells are inside, or if the container's sides are not parallel to the column."""
     up, foot = np.array(axis.up), np.array(axis.foot)
     region, periods = container.region(len(up)), container.periods(len(up))[1]
     along = np.abs(up) > 1.0 - 1e-12
@@ -282,34 +284,34 @@ def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
 
 @lru_cache(maxsize=64)
 def _at_rest(axis: Axis, tables: tuple[SolidTable, ...], domain: Domain, container: Container) -> Column | None:
-    """Return a column with solids that stay, computed once; None where none is in it."""
+    """Return the column with the solids at rest, computed once and cached; None if no such solid is in the column."""
     if not tables:
         return None
     return Column.of(axis, [Standing.of(table, len(axis.foot)) for table in tables], domain, container)
 
 
 def _on_a_solid(axis: Axis, at: Reading) -> Column | None:
-    """Return the column of a gauge on a solid, as solids stand in it in a state; None where none does."""
+    """Return the column of a gauge that rides on a solid, with the solids in it in a state; None if no solid is in the
+    column."""
     solids = [Standing.of(table, at.dimension, at) for table in at.solids]
     return Column.of(axis, solids, at.lattice.domain, NoContainer())
 
 
 FINER = 4.0
-"""Factor of a particle's number of parts along an axis where solids are in the column of a gauge."""
+"""Factor for the number of a particle's parts along an axis if solids are in the gauge's column."""
 
 
 @fixed
 class WaveGauge(Summed):
-    """A sensor of the height of the fluid's surface at a place: its volume in a column around it fills the room of the
-    column from the floor on. Without solids that is its volume over the column's cross-section,
+    """A sensor of the height of the fluid's surface at a place: the level up to which the fluid in a column around the
+    place would fill that column from its floor. Without solids,
 
     h = floor + sum_i V w_i,   w_i = w(r_i / radius) with the integral 1,
 
-    where r_i is the horizontal distance and V the volume of a particle, spacing^d. Solids take their part of the room,
-    where they are in each step. Above one that stands on the floor, hangs in the fluid or reaches through its surface h
-    is the level of the surface. Fluid that is in the air counts too, as if it lay on
-    the rest, also on a solid with air below. What is behind the sides of a container that stand along ``up`` is none of
-    the column.
+    where r_i is the horizontal distance and V the volume of a particle, spacing^d. Solids occupy part of the column, at
+    their pose in each step. h is the surface level also above a solid on the floor, within the fluid or piercing its
+    surface. Fluid in the air counts as if it lay on the rest, also on a solid with air below. The column ends at
+    container sides parallel to ``up``.
 
     Example::
 
@@ -326,12 +328,11 @@ class WaveGauge(Summed):
         on: str | None = None,
         axes: Axes = "world",
     ):
-        """Place a gauge at ``position`` (d,) [m], of which the component along ``up`` does not matter. ``floor``: from
-        where on the column is filled, along ``up`` [m]. ``radius`` [m], two support radii of the scene's smoothing
-        kernel, but at least five spacings, if left out; ``up`` (d,), +y if left out. ``on`` names a solid that carries
-        the foot of the column. With ``axes`` of the "body" the column turns with it, and the height is that in the
-        solid as it begins; else it stands along ``up``, and the height is that of the "world". Sides of the container
-        do not bound a column on a solid."""
+        """Place a gauge at ``position`` (d,) [m]; its component along ``up`` has no effect. ``floor``: coordinate of
+        the column's bottom along ``up`` [m]. ``radius`` [m]: if left out, the larger of two support radii of the
+        smoothing kernel and five spacings. ``up`` (d,): +y if left out. ``on`` names a solid that carries the foot of
+        the column. With ``axes`` "body" the column turns with the solid, and the height is measured along the solid's
+        axes; with "world" along ``up``. Sides of the container do not bound a column on a solid."""
         self.position, self.floor = point("position", position), float(floor)
         self.radius = None if radius is None else positive("radius", radius)
         self.up = direction("up", np.eye(len(self.position))[1] if up is None else up)
@@ -341,8 +342,8 @@ class WaveGauge(Summed):
         return {"height": "m"}
 
     def summed(self, at: SensedScene) -> WeightedSum:
-        """Return the sum of weights of the horizontal distances of particles, as vectors (n, d). Where the column has
-        sides, or solids may come into it, particles have more parts."""
+        """Return the weighted sum over horizontal distances of particles. Particles have more parts if the container
+        cuts the column, or if solids can enter it."""
         axis, across, ride = self._axis(at), at.dimension - 1, ride_of(self.on, self.axes == "body", at)
         if ride is not None:
             parts = parts_of(axis.reach / FINER, at, self._across, across)
