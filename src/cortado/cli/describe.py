@@ -51,13 +51,12 @@ SAME = 1e-6
 MOST_FRAMES = 1_000_000
 """Greatest number of frames of a film."""
 HEADS, PER_PARTICLE, PER_STEP = 28e3, 24.0, 50.0
-"""Measured bytes of a trajectory file besides its frames: headers, constant fields (per particle), diagnostics (per
-step)."""
+"""Measured bytes of a trajectory file without frames: headers, constants per particle, diagnostics per step."""
 
 
 def measured_speed(simulation: Simulation) -> tuple[int, float]:
-    """Return how many first steps of a scene were timed (after twice as many untimed ones), and the time of one step
-    [s], including sensors. Raise `DivergedError` if the scene diverges within these steps."""
+    """Return the number of timed first steps (after twice as many untimed ones), and the time of one step [s] with
+    sensors. Raise `DivergedError` if the scene diverges."""
     steps = FIRST_STEPS
     while True:
         rollout = simulation.rollout(steps)
@@ -77,8 +76,7 @@ class RunLength:
     """The length of a run, given as a number of steps or as a time, with its frames and its film."""
 
     def __init__(self, simulation: Simulation, steps: int | None, time: float | None, choice: FrameChoice):
-        """Compute the length of a run of ``steps`` steps or of a ``time`` [s]; raise `InputError` for invalid
-        values."""
+        """Compute the length of a run of ``steps`` or of a ``time`` [s]; raise `InputError` for invalid values."""
         solver, picture = simulation.scene.solver, simulation.scene.picture or Picture()
         self.is_about = solver.chooses and time is not None
         """Whether the number of steps is an estimate."""
@@ -189,7 +187,7 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
 
 
 def _fluid_size(simulation: Simulation) -> list[float]:
-    """Return the size (d,) [m] of the fluid, including particles queued in emitters but not the emitters' reserves."""
+    """Return the fluid's size (d,) [m], with particles queued in emitters but without the emitters' reserves."""
     scene, spacing = simulation.scene, simulation.scene.discretisation.spacing
     columns = [emitter.particles(spacing) for emitter in scene.emitter]
     shown = np.concatenate([simulation.positions[: simulation.free_particles], *columns])
@@ -197,8 +195,8 @@ def _fluid_size(simulation: Simulation) -> list[float]:
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
-    """Return the time step [s], its limits [s] by name, and the name of the limit that determines the first step; None
-    for a fixed step."""
+    """Return the time step [s], its limits [s] by name, and the name of the limit that sets the first step (None if
+    fixed)."""
     scene = simulation.scene
     if scene.solver.time_step != "auto":
         return scene.solver.time_step, stability_limits(scene), None
@@ -248,8 +246,8 @@ def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
 
 
 def of_emitter(emitter: EmitterTable, spacing: float) -> dict[str, Any]:
-    """Return when an emitter is empty (None if never), the drains that feed it, its greatest speed, and the areas of
-    its particles' cells and of its opening."""
+    """Return when an emitter is empty (None if never), the drains that feed it, its speed, and two areas: of its
+    particles' cells and of its opening."""
     dry, areas = emitter.dry_after(spacing), {"area": emitter.area(spacing), "area_asked": emitter.asked_area()}
     known = {"name": emitter.name, "fed_by": list(emitter.fed_by), "speed_m_s": emitter.speed(spacing), **areas}
     return {**known, "runs_dry_at_s": dry if math.isfinite(dry) else None}
@@ -374,8 +372,7 @@ def _trajectory(length: RunLength) -> str:
 
 
 def _film(length: RunLength, traced: float | None, quick: float | None) -> str:
-    """Return a text on the film's frames and length, with its drawing times estimated from the times of single pictures
-    [s]."""
+    """Return a text on the film's frames and length, and its drawing times by those of single pictures [s]."""
     if length.film is None:
         return "of unknown length; --time says it" if length.time is None else "none"
     if traced is None:

@@ -1,4 +1,5 @@
-"""Files that are read and written whole, locks, films, and what a terminal is told. Knows nothing of fluids."""
+"""Reading and writing of whole files, locks, encoding of films, and messages on terminals. Nothing here depends on
+fluids."""
 
 from typing import TYPE_CHECKING
 

@@ -1,6 +1,6 @@
-"""Files on the disk. Of those that are read, users' are only regular ones of a modest size, as a pipe may wait and a
-device may go on for ever; others come with Cortado. Those that are written appear whole or not at all, in folders that
-one process at a time writes; one sentence says so where a disk refuses.
+"""Files on the disk. User files must be regular files of limited size: reading a pipe may block, and a device may have
+no end. Written files appear whole or not at all; only one process at a time writes a folder. Errors of the disk become
+one sentence.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ OTHERS = (
 
 
 def as_path(what: str, value: Any) -> str:
-    """Return a path as text; raises `InputError` for anything else, also for a number, which Python would take as an
-    open file."""
+    """Return a path as text; raises `InputError` for anything else, including numbers, which Python would take for open
+    files."""
     if isinstance(value, (str, os.PathLike)):
         path = os.fspath(value)
         if isinstance(path, str) and path:
@@ -44,7 +44,7 @@ def as_path(what: str, value: Any) -> str:
 
 
 def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
-    """Return size and times of a file that may be read, with links followed.
+    """Check that a file may be read, following links, and return its size and times.
 
     Raises `OSError`, whose ``strerror`` says why in words, if it is no regular file, or has more bytes than ``most``.
     """
@@ -109,7 +109,7 @@ def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def name_and_unit(head: str) -> tuple[str, str | None]:
-    """Split the head of a column into name and unit; None where it has no unit in brackets."""
+    """Split a column's head into name and unit; None without a unit in brackets."""
     name, bracket, unit = head.partition("[")
     return name.strip(), unit.rstrip().removesuffix("]").strip() if bracket else None
 
@@ -145,11 +145,11 @@ def unfinished(path: Path) -> Path:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a whole file under a temporary name and then rename it, so that no reader meets half of it.
+    """Write a whole file under a temporary name and then rename it, so that no reader sees an incomplete file.
 
     Raises:
         ComputationError: the disk is full.
-        InputError: there can be no such file, or something of that name is no file, such as a device.
+        InputError: the file cannot be created, or the path is no regular file, such as a device.
     """
     temporary = unfinished(path)
     with sentences(path):
@@ -166,8 +166,8 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def is_taken(path: Path) -> bool:
-    """Test if anything exists at a path, also a link that leads nowhere. Raises `InputError` where the test is
-    impossible, as with a name that is too long."""
+    """Test if anything exists at a path, also a link that leads nowhere. Raises `InputError` if the test fails, for
+    example because the name is too long."""
     with sentences(path):
         try:
             path.lstat()
@@ -177,7 +177,7 @@ def is_taken(path: Path) -> bool:
 
 
 def write_fully(file: Any, content: bytes) -> None:
-    """Write all bytes to an unbuffered file, which may accept a part at a time."""
+    """Write all bytes to an unbuffered file, which may accept only some bytes per call."""
     rest = memoryview(content)
     while rest:
         rest = rest[file.write(rest) :]
@@ -217,12 +217,12 @@ def make_folder(path: Path) -> None:
 
 
 BEYOND = 2**30
-"""Offset of the byte that Windows locks, far behind the file's content, which others may thus read."""
+"""Offset of the byte that Windows locks: far behind the file's content, so that others can read the content."""
 
 
 def lock(file: int) -> None:
     """Lock a file by its descriptor, until it is closed or its process dies; raises `BlockingIOError` if another
-    process has it. The package filelock does not tell who has a lock, which `locked` reads in the file."""
+    process holds the lock. `locked` reads the holder from the file, which the package filelock cannot tell."""
     if sys.platform != "win32":
         import fcntl
 
@@ -247,11 +247,11 @@ _NOT_SUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 def locked(folder: Path) -> Iterator[None]:
     """Make a folder, and lock it against every other process until the block ends.
 
-    The system takes the lock from a process that dies, so that none is left behind. On file systems without
-    locks, as some networks have them, folders are not protected.
+    The operating system releases the lock of a process that dies. On file systems without locks, such as some network
+    drives, folders are not protected.
 
     Raises:
-        InputError: another process has it, or it cannot be written.
+        InputError: another process holds the lock, or the folder cannot be written.
         ComputationError: the disk is full.
     """
     path = folder / LOCK

@@ -1,5 +1,5 @@
-"""Linear images as files and screens hold them: eight bits of sRGB (IEC 61966-2-1), videos that every browser plays
-(H.264 in an mp4), and animated WebPs, which pages of text show moving without a player."""
+"""Encoding of linear images: as 8-bit sRGB (IEC 61966-2-1), as videos that every browser plays (H.264 in an mp4), and
+as animated WebPs, which pages show without a player."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from cortado.files.terminal import held
 ROWS = 32
 """Number of rows of a picture converted at a time, few enough for the processor's cache."""
 MOST_LIGHT = 2.0
-"""Greatest value of a user's picture, as noise may leave 0 to 1; above it, values are taken for bytes to 255."""
+"""Greatest value accepted in a user's picture: noise may exceed 1 a little; larger values are taken for bytes up to
+255."""
 STEPS = 1 << 14
-"""Number of equal parts of the light from 0 to 1, each much shorter than any of the 256 values."""
+"""Number of equal intervals of light from 0 to 1, each much shorter than the interval of any byte value."""
 LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
 
 
@@ -73,7 +74,8 @@ def _values(light: NDArray[Any]) -> NDArray[np.uint8]:
 
 @cache
 def _steps(dtype: np.dtype[Any]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-    """Return the least light of each byte but 0, (256,), and the byte at the start of each step, (STEPS + 1,)."""
+    """Return the lower limit of light of each byte (256,), except byte 0, and the byte at the start of each interval
+    (STEPS + 1,)."""
     middles = (np.arange(1, 257) - 0.5) / 255.0
     exact = np.where(middles <= 0.04045, middles / 12.92, ((middles + 0.055) / 1.055) ** 2.4)
     rounded = exact.astype(dtype)
@@ -113,19 +115,19 @@ class ShadedPicture(np.ndarray):
 
 
 VIDEO_QUALITY = "18"
-"""Constant rate factor of x264: 0 loses nothing, 51 nearly everything; at 18 the eye sees no difference."""
+"""Constant rate factor of x264: 0 is lossless, 51 the worst; at 18 the eye sees no difference."""
 BITS = 1.2e6
 """Greatest bit rate [1/s] for 1920 x 1080 pixels, averaged over seconds: 9.6 MB in the first minute."""
 THREADS = 8
-"""Number of encoder threads, each at its own frame; it is fixed, as the file's bytes depend on it."""
+"""Number of encoder threads, each working on its own frame; fixed, because the file's bytes depend on it."""
 HELPERS = 4
 """Number of threads that convert the parts of a frame."""
 TICKS = 90_000
-"""Parts of a second that are the unit of frame times."""
+"""Number of units of frame time in a second."""
 
 
 class Video:
-    """A video that grows by a frame at a time; see `writing`."""
+    """A video file to which frames are added; see `writing`."""
 
     def __init__(self, container: Any, frames_per_second: float):
         from av.video.reformatter import VideoReformatter
@@ -171,13 +173,14 @@ class Video:
         self.frames = source.frames
 
     def finish(self) -> None:
-        """Write the frames that the encoder still holds."""
+        """Write the frames that are still in the encoder."""
         self._helpers.shutdown()
         if self._stream is not None:
             self._container.mux(self._stream.encode())
 
     def _stream_of(self, width: int, height: int) -> Any:
-        """Return the stream, made for the first frame. No frame depends on a later one, so others can follow a copy."""
+        """Return the stream, created for the first frame. No frame depends on a later one, so new frames can follow
+        copied ones."""
         if self._stream is None:
             most = BITS * (width * height / (1920 * 1080)) ** 0.75
             options = {"crf": VIDEO_QUALITY, "bf": "0", "maxrate": f"{most:.0f}", "bufsize": f"{4.0 * most:.0f}"}
@@ -194,13 +197,13 @@ class Video:
 
 @contextmanager
 def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", count: int = 0) -> Iterator[Video]:
-    """Open a video for writing; it appears under its path when the block ends. Where it is interrupted, the frames so
-    far appear, and the next call with the same ``note`` and ``count`` begins with them.
+    """Open a video for writing; it appears under its path when the block ends. After an interruption the file contains
+    the frames so far, and the next call with the same ``note`` and ``count`` begins with these.
 
     Args:
         path: ends in .mp4.
-        frames_per_second: about; each frame has a time of its own.
-        note: what the video is made of, which is written into it.
+        frames_per_second: approximate rate; each frame has its own time.
+        note: text that identifies the content; it is stored in the file.
         count: how many frames it will have.
 
     Raises:
@@ -313,7 +316,7 @@ class Animation:
 @contextmanager
 def moving_picture(path: Path, frames_per_second: float, note: str = "", count: int = 0) -> Iterator[Video | Animation]:
     """Open a film for writing: an animated WebP for a path that ends in .webp, else a video as by `writing`. An
-    animation appears when the block ends; where it is interrupted, with the frames so far."""
+    animation is written when the block ends; after an interruption it contains the frames so far."""
     if path.suffix.lower() != ".webp":
         with writing(path, frames_per_second, note, count) as video:
             yield video

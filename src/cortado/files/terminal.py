@@ -1,10 +1,10 @@
-"""Messages to the user, whatever stands at the other end of stdout and stderr; how far a long computation is; and how a
-signal ends it.
+"""Messages on stdout and stderr, whatever these are connected to; progress of long computations; and handling of
+signals.
 
 Ctrl-C and SIGTERM end a command with a sentence and the exit code that shells expect, at any moment.
 
-As long as there is nothing to keep, the process ends on the spot: an exception would come out of the import of some
-library, or get lost in it. Within `keeping` it is a `KeyboardInterrupt`, so that files are closed on the way out.
+Outside `keeping` a signal ends the process at once: an exception could surface in, or get lost in, some library's
+import. Within `keeping` it raises a `KeyboardInterrupt`, so that files are closed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from cortado.errors import ComputationError
 
 
 def printable(text: str) -> str:
-    """Return a text on one line, with characters that would steer a terminal as escapes, such as ``\\x1b``.
+    """Return a text on one line, with control characters written as escapes, such as ``\\x1b``.
 
     A byte of a file name that is not UTF-8, which Python keeps as a lone surrogate, becomes that byte's escape.
     """
@@ -45,7 +45,7 @@ def note(sentence: str, end: str = "\n") -> None:
 
 @contextmanager
 def timed_note(what: str) -> Iterator[None]:
-    """Print a line on stderr with the block's work, and the time that it took, unless `quietly`."""
+    """Print a line on stderr that says what the block does, and then its computing time, unless `quietly`."""
     begun = time.monotonic()
     note(what, end="")
     try:
@@ -63,7 +63,7 @@ def is_quiet() -> bool:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Suppress all output of the block, in all threads, but results, warnings and errors."""
+    """Suppress all output of the block, in all threads, except results, warnings and errors."""
     _Quiet.depth += 1
     try:
         yield
@@ -85,7 +85,7 @@ def tell(result: str) -> None:
 
 @contextmanager
 def to_stdout() -> Iterator[None]:
-    """Raise `ComputationError` for prints in the block that fail, or `BrokenPipeError` if nobody reads them."""
+    """If a print in the block fails, raise `ComputationError`, or `BrokenPipeError` if the reader has gone."""
     try:
         try:
             yield
@@ -142,7 +142,7 @@ LINE_INTERVAL = 10.0
 
 
 def announce(result: str) -> None:
-    """Print a result on stdout before the work has ended, unless progress is hidden."""
+    """Print a result on stdout before the command has ended, unless progress is hidden."""
     if not _hidden.get() and not is_quiet():
         tell(result)
 
@@ -158,7 +158,7 @@ _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 
 @contextmanager
 def untracked() -> Iterator[None]:
-    """Hide the progress of all computations of this thread in the block, as each is a part of a larger one."""
+    """Hide the progress of this thread's computations in the block, because they are parts of a larger computation."""
     token = _hidden.set(True)
     try:
         yield
@@ -211,8 +211,8 @@ def _bar(total: int, description: str, stream: TextIO) -> Iterator[Advance]:
 
 
 class _Lines:
-    """A progress report of at most one line every `interval` seconds, and one for the last step. The time left follows
-    from the steps after the first report, before which kernels are compiled, or earlier work is skipped."""
+    """A progress report of at most one line every `interval` seconds, and one for the last step. The time left is
+    estimated from steps after the first report: before it, kernels are compiled or earlier work is skipped."""
 
     def __init__(self, total: int, description: str, stream: TextIO, interval: float) -> None:
         self._total, self._description, self._stream, self._interval = total, description, stream, interval
@@ -239,21 +239,21 @@ class _Lines:
 
 
 def _text(fields: dict[str, Any]) -> str:
-    """Return fields as words: loss 0.1235, step 7."""
+    """Return fields as text: loss 0.1235, step 7."""
     words = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in fields.items()}
     return ", ".join(f"{name} {word}" for name, word in words.items())
 
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN = 0.01
-"""Delay [s] before an interruption is retried that came where Python drops exceptions, as in a finaliser."""
+"""Delay [s] before an interruption is raised again, if Python dropped its exception, as in a finaliser."""
 
 _stderr = 2
 """Descriptor of a copy of stderr, as stderr is silenced for a while when Warp starts."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """An exception for a signal that interrupts a command; takes its number and words on what is kept."""
+    """The exception for a signal that interrupts a command; takes the signal's number and a text on what is kept."""
 
     def __init__(self, number: int, kept: str = ""):
         super().__init__(number, kept)
@@ -284,8 +284,8 @@ def finish() -> None:
 
 @contextmanager
 def keeping(kept: Callable[[], str]) -> Iterator[None]:
-    """Turn signals in the block into exceptions; ``kept`` returns the end of their sentence, on what is kept and where,
-    or nothing. Of nested blocks, the innermost with a text counts."""
+    """Turn signals in the block into exceptions. ``kept`` returns the end of their message, which says what is kept and
+    where, or an empty text. In nested blocks the innermost non-empty text counts."""
     ours = [number for number in SIGNALS if signal.getsignal(number) is _leave]
     for number in ours:
         signal.signal(number, _raise)
@@ -301,7 +301,7 @@ def keeping(kept: Callable[[], str]) -> Iterator[None]:
 
 
 class Hold:
-    """A delay of signals for a while. Threads and processes that begin meanwhile never get Ctrl-C, which a terminal
+    """A temporary delay of signals. Threads and processes started meanwhile never receive Ctrl-C, which a terminal
     sends to all of them."""
 
     def __init__(self) -> None:
@@ -317,7 +317,7 @@ class Hold:
             self._handler = signal.signal(signal.SIGTERM, lambda number, _: self._late.append(number))
 
     def end(self) -> None:
-        """Deliver the signals that came; repeated calls do nothing."""
+        """Deliver the delayed signals; repeated calls do nothing."""
         if self._handler is not None:
             signal.signal(signal.SIGTERM, self._handler)
             self._handler = None
@@ -330,7 +330,7 @@ class Hold:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Delay signals in the block, to leave written files whole; threads other than the first never get them."""
+    """Delay signals in the block, so that files are written completely. Only the main thread receives signals."""
     late, before = list[int](), dict[int, Any]()
     if threading.current_thread() is threading.main_thread():
         heard = [number for number in SIGNALS if callable(signal.getsignal(number))]
@@ -345,7 +345,7 @@ def held() -> Iterator[None]:
 
 
 def _first_said(stop: BaseException | None) -> str:
-    """Return the end of an interruption's sentence, or of one that was being handled as it came."""
+    """Return the end of an interruption's message, or that of an earlier interruption that was being handled."""
     if not isinstance(stop, Interrupted):
         return ""
     return stop.kept or _first_said(None if stop.__suppress_context__ else stop.__context__)

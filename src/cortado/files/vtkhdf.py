@@ -1,9 +1,9 @@
 """Frames of particles in one temporal VTKHDF file, which ParaView opens and a killed run leaves readable.
 
-A frame is written at the places of its datasets (`FileLayout`) without HDF5, which a full disk can kill.
-Then one number of eight bytes counts it, and carries the CRC-32 of all frames so far: a SIGKILL comes before or
-after it. The checksums are not those of HDF5, which need datasets in chunks, whose index a killed process
-leaves half written.
+A frame's bytes are written at the offsets of its datasets (`FileLayout`) without HDF5, as a full disk can crash HDF5.
+Then a single write of eight bytes stores the number of frames and their CRC-32; a SIGKILL comes before or after this
+write. HDF5's own checksums are not used: they need datasets in chunks, and a killed process leaves the index of the
+chunks half written.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from cortado.files.vtkhdf_layout import FORMAT, WRITTEN, FileLayout, frame_check
 
 
 class TrajectoryWriter:
-    """A writer of a trajectory's frames to one VTKHDF file; a context manager.
+    """Writes a trajectory's frames to one VTKHDF file; a context manager.
 
-    The file appears at `path` with its first frame, or with those that are `kept`, and can be opened, by ParaView too,
-    while it grows. Frames that are not written yet, or never were as the run ended early, have no particles there.
+    The file appears at `path` once its first frame, or the first `kept` frames, are written. It can be opened while it
+    grows, by ParaView too. Frames not yet written, or never written as the run ended early, contain no particles.
 
     Raises:
-        InputError: a size that makes no sense, or a path that cannot be written.
+        InputError: an impossible size, or a path that cannot be written.
         ComputationError: the disk has not enough room for all frames.
     """
 
     def __init__(self, path: str | Path, *, expected: int | None = None, kept: int = 1, **fields: Any) -> None:
-        """Make the file with ``fields`` of a `FileLayout`. The disk must have room for all frames, or for ``expected``
-        ones. A file of that name is replaced when the first ``kept`` frames are written."""
+        """Create the file; ``fields`` are arguments of `FileLayout`. The disk must have room for all frames, or for
+        ``expected`` ones. A file of that name is replaced when the first ``kept`` frames are written."""
         self.path, self._layout = Path(path), FileLayout(**fields)
         self.frames_written, self.steps_written, self._kept = 0, 0, kept
         self._unfinished = unfinished(self.path)
@@ -70,7 +70,7 @@ class TrajectoryWriter:
             positions: (n, d) [m]
             velocities: (n, d) [m/s]
             step: number of steps taken so far; the number of this frame when left out.
-            time: [s] of this frame, where it is another than was announced.
+            time: time of this frame [s], if it differs from the announced one.
             others: exactly those given at construction.
             scalars: (n,) each, and vectors (n, d), exactly those named at construction.
 
@@ -116,7 +116,7 @@ class TrajectoryWriter:
         self.frames_written, self._frames_checksum = frame + 1, checksum
 
     def append_steps(self, **diagnostics: ArrayLike) -> None:
-        """Write what the solver noted of one step (scalars) or of several ((k,) each), by name.
+        """Write the solver's diagnostics by name, of one step (scalars) or of k steps (arrays (k,)).
 
         Raises:
             InputError: names other than announced, or more steps than announced.
@@ -137,7 +137,7 @@ class TrajectoryWriter:
         self.steps_written, self._steps_checksum = last, checksum
 
     def close(self) -> None:
-        """End the file; without any frame, or without all that are kept, none is left behind."""
+        """Finish the file; if it has no frame, or not all ``kept`` frames, remove it."""
         self._file.close()
         if self.frames_written < self._kept:
             self._unfinished.unlink(missing_ok=True)
@@ -178,12 +178,12 @@ class TrajectoryWriter:
 
 
 def read(path: str | Path) -> dict[str, Any]:
-    """Read the frames and steps that were completed, while the writer is at work or after its death.
+    """Read the completed frames and steps, even while the writer is running or after it was killed.
 
     Returns:
-        times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s],
-        under its own name every scalar field (frames, n). By name others, further arrays of every frame, constants,
-        what holds for the whole run, and diagnostics, (steps,) each; origin, a text; and marks, None or two numbers.
+        times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s], and every
+        scalar field (frames, n) under its own name. Tables by name: others (arrays of every frame), constants (arrays
+        for the whole run) and diagnostics (steps,). Also origin, a text, and marks, None or two numbers.
 
     Raises:
         InputError: the file is missing, damaged, or none of Cortado's trajectories.
@@ -245,7 +245,7 @@ def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
 
 
 def _records(columns: Mapping[str, ArrayLike], record: np.dtype[Any]) -> NDArray[Any]:
-    """Return structured records (steps,) from one array for each field name."""
+    """Return structured records (steps,), made from one array for each field name."""
     arrays = {name: np.atleast_1d(column) for name, column in columns.items()}
     records = np.zeros(max((len(array) for array in arrays.values()), default=0), record)
     for name, array in arrays.items():

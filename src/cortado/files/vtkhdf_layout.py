@@ -1,13 +1,13 @@
 """The layout of a trajectory file: room for every frame from the start, so that nothing changes its place or size.
 
-Every dataset is contiguous, sparse on disk and has its place; `PointOffsets` leads from a frame to its rows. The
-datasets that count points and cells have two parts: one with all particles, and an empty one. A frame that is
-not there yet is the empty part. One number in `PartOffsets` makes it appear, so that a program that reads the
-file, such as ParaView, finds every size as it was when it looked first.
+Every dataset is contiguous, sparse on disk and at a fixed offset; `PointOffsets` maps a frame to its rows. The datasets
+that count points and cells have two parts: one with all particles, and an empty one. A frame not yet written refers to
+the empty part. Changing one number in `PartOffsets` makes the frame appear, so that readers such as ParaView never see
+sizes change.
 
-HDF5 lays the file out in memory, and plain writes take it to the disk. With writes of HDF5 a file would be as readable
-after a kill. But a full disk then ends the process with a segmentation fault, always while the file is laid out and
-often later (HDF5 2.0). Its mode for one writer and many readers leaves files of killed writers that VTK does not open.
+HDF5 creates the file in memory, and plain writes copy it to disk. Files written by HDF5 itself would also be readable
+after a kill, but a full disk causes a segmentation fault: always while the file is created, and often later (HDF5 2.0).
+After a kill in HDF5's mode for one writer and many readers, VTK cannot open the file.
 
 Format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/vtkhdf_specifications.html
 """
@@ -27,9 +27,9 @@ from cortado.errors import InputError
 from cortado.files.disk import write_fully
 
 FORMAT = 3
-"""Version of the group "cortado"; the first had no checksums, the second no states to go on from."""
+"""Version of the group "cortado"; version 1 had no checksums, version 2 no states to continue from."""
 WRITTEN, MISSING = 0, 1
-"""The parts of a frame that is there, and of one that is not."""
+"""The numbers of the part for a written frame and of the part for a missing frame."""
 _TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")
 _PAGE = 4096
 
@@ -39,28 +39,28 @@ class FileLayout:
     """The fields, types and sizes of a trajectory file, with room for every frame."""
 
     times: NDArray[np.float64]
-    """(frames,) [s] of the frames that will come, as far as it is known"""
+    """(frames,) [s] expected times of the frames, as far as known"""
     particles: int
     dimension: int
     """2 or 3; in 2-D the stored points have z = 0."""
     precision: str = "float32"
     """Type of the stored positions, velocities and scalars, "float32" or "float64"."""
     steps: int = 0
-    """Most steps of which numbers are kept."""
+    """Greatest number of steps whose diagnostics are stored."""
     scalars: Sequence[str] = ()
     """Names of further scalar fields of every frame, such as "density" and "pressure", which ParaView shows."""
     vectors: Sequence[str] = ()
-    """Names of further fields of vectors, besides the velocity."""
+    """Names of further vector fields, besides the velocity."""
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Further arrays of every frame by name, with the types and shapes of the first."""
     constants: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Arrays of any shape that hold for the whole run, by name."""
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
-    """Types of the numbers kept of every step, by name."""
+    """Types of the diagnostics of every step, by name."""
     origin: str = ""
-    """JSON text on the particles' origin; empty where nothing is known."""
+    """JSON text on the particles' origin; empty if unknown."""
     marks: tuple[float, ...] = ()
-    """Time [s] of the first due frame, and frames per second; empty where steps choose the frames."""
+    """Time [s] of the first due frame, and frames per second; empty if frames are chosen by steps."""
 
     def __post_init__(self) -> None:
         own: dict[str, Any] = {"times": np.array(self.times, dtype=np.float64, ndmin=1)}
@@ -97,7 +97,7 @@ class FileLayout:
 
     @property
     def records(self) -> np.dtype[Any]:
-        """Structured type of the record kept of a step."""
+        """Structured type of the record of a step's diagnostics."""
         return np.dtype(sorted(self.diagnostics.items()))
 
     @property
@@ -119,7 +119,7 @@ class FileLayout:
         return len(self.times) * frame + self.steps * self.records.itemsize + 8 * 2 * self.shape[0] + constants
 
     def create(self) -> tuple[Pages, dict[str, int]]:
-        """Return the empty file, and the byte at which each dataset begins."""
+        """Return the empty file, and the byte offset of each dataset."""
         import h5py
 
         pages = Pages()
@@ -182,27 +182,28 @@ def frames_seed(
     origin: str,
     marks: tuple[float, ...],
 ) -> int:
-    """Return the checksum from which those of frames start: it depends on the frames' format, ``kinds`` (type and shape
-    of each field), and on all constants."""
+    """Return the initial value of the frames' checksum. It depends on the frames' format, ``kinds`` (type and shape of
+    each field), and on all constants."""
     fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
     varying = [(name, dtype.str, sizes) for name, (dtype, sizes) in kinds.items()]
     return zlib.crc32(origin.encode(), zlib.crc32(repr((shape, varying, fixed, *marks)).encode()))
 
 
 def frame_checksum(checksum: int, time: Any, number: Any, rows: Iterable[bytes]) -> int:
-    """Return the CRC-32 of the frames so far and one more: its time [s], its number of steps, and its fields."""
+    """Return the CRC-32 of the frames so far and one more frame, given its time [s], its number of steps, and its
+    fields."""
     for content in (time.tobytes(), number.tobytes(), *rows):
         checksum = zlib.crc32(content, checksum)
     return checksum
 
 
 def steps_seed(records: np.dtype[Any]) -> int:
-    """Return the checksum of no steps, with records of this type."""
+    """Return the initial value of the steps' checksum, for records of this type."""
     return zlib.crc32(repr(records.descr).encode())
 
 
 def _reserve(group: Any, name: str, shape: tuple[int, ...], dtype: Any) -> int:
-    """Create a contiguous, unwritten dataset at its place in the file, and return its first byte."""
+    """Create a contiguous, unwritten dataset in the file, and return its byte offset."""
     from h5py import h5d, h5p, h5s, h5t
 
     options = h5p.create(h5p.DATASET_CREATE)
@@ -213,7 +214,7 @@ def _reserve(group: Any, name: str, shape: tuple[int, ...], dtype: Any) -> int:
 
 
 def _write_cells(group: Any, cells: int) -> None:
-    """Write one cell per point for all frames (their offsets into it are zero), and none for the empty part."""
+    """Write one cell per point, shared by all frames (their offsets are zero), and no cells for the empty part."""
     group["NumberOfConnectivityIds"] = np.array([cells, 0])
     group["NumberOfCells"] = np.array([cells, 0])
     group["Connectivity"] = np.arange(cells)
@@ -221,7 +222,7 @@ def _write_cells(group: Any, cells: int) -> None:
 
 
 class Pages(io.RawIOBase):
-    """A file in memory that stores only pages that were written to."""
+    """A file in memory that stores only written pages."""
 
     def __init__(self) -> None:
         self._pages: dict[int, bytearray] = {}
@@ -262,7 +263,7 @@ class Pages(io.RawIOBase):
         return len(buffer)
 
     def _parts(self, content: Any) -> Iterator[tuple[bytearray, int, memoryview]]:
-        """Yield page by page: the page, the place in it, and the part of the content; moves on."""
+        """Yield for each page: the page, the offset in it, and the part of the content; advance the position."""
         rest = memoryview(content)
         while rest:
             number, place = divmod(self._place, _PAGE)

@@ -1,5 +1,5 @@
-"""Pictures to aim at, in files; shaded pictures, films, plots and exports of runs. `cortado.render` has pictures with
-derivatives."""
+"""Target pictures; and shaded pictures, films, plots and exports of runs. Differentiable pictures are in
+`cortado.render`."""
 
 from cortado.lazy import getter
 

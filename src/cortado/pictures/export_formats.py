@@ -1,4 +1,4 @@
-"""A trajectory as files of other programs, in one of several formats, and as a dataset of xarray."""
+"""Export of trajectories to files for other programs, in several formats, and to an xarray dataset."""
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
@@ -27,8 +27,7 @@ Advance = Callable[[], None]
 
 
 def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
-    """Write a glTF file for each frame, with all of it by name, y up as glTF wants it, and linear colours; return the
-    folder."""
+    """Write a glTF file for each frame, with named parts, y up as in glTF, and linear colours; return the folder."""
     import trimesh
 
     upright = Pose(run.up, np.zeros(3)).matrix
@@ -47,7 +46,7 @@ def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
 def _write_series(
     run: Exported, folder: Path, advance: Advance, ending: str, content: Callable[[Any], str | bytes]
 ) -> list[str]:
-    """Write the files of each frame, each with its ``content``, and return entries of ParaView's collections."""
+    """Write the files of each frame, whose bytes ``content`` returns, and return entries for a ParaView collection."""
     entries = []
     for number, frame in enumerate(run.frames(run.series)):
         for part, (of, (name, what)) in enumerate(_files(run, number, frame, ending).items()):
@@ -60,14 +59,14 @@ def _write_series(
 
 
 def _write_meshes(run: Exported, folder: Path, advance: Advance, ending: str) -> Path:
-    """Write a series by trimesh, with sRGB colours as programs expect, and return the folder."""
+    """Write a series of files with trimesh, in sRGB colours, which programs expect; return the folder."""
     _write_series(run, folder, advance, ending, lambda what: _trimesh(what, _srgb).export(file_type=ending))
     return folder
 
 
 def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
-    """Write a series by VTK, with all fields of the particles; return ``run.pvd``, which has them all at their
-    times."""
+    """Write a series of files with VTK, with all fields of the particles; return ``run.pvd``, which lists the files and
+    their times."""
     entries = _write_series(run, folder, advance, "vtp", _vtp)
     lines = ['<VTKFile type="Collection" version="0.1">', "  <Collection>", *entries, "  </Collection>", "</VTKFile>"]
     write_atomically(folder / "run.pvd", "\n".join([*lines, ""]))
@@ -77,8 +76,8 @@ def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
 def _files(
     run: Exported, number: int, frame: ExportedFrame, ending: str
 ) -> dict[str, tuple[str, ExportedFrame | Mesh]]:
-    """Return name and contents of each file of a frame, by its part of the frame: the particles, the surface, and each
-    solid. A solid at rest has one file for all frames."""
+    """Return names and contents of a frame's files, by part: the particles, the surface, and each solid. A solid at
+    rest has one file for all frames."""
     found: dict[str, ExportedFrame | Mesh] = {"particles": frame}
     if frame.surface is not None:
         found["surface"] = frame.surface
@@ -91,12 +90,12 @@ def _files(
 
 
 def _numbered(name: str, number: int, ending: str) -> str:
-    """Return the file name of a frame's number."""
+    """Return the file name for a frame's number."""
     return f"{name}_{number:05d}.{ending}"
 
 
 def _trimesh(what: Mesh | ExportedFrame, colours: Callable[[Any], Any]) -> Any:
-    """Return a mesh, or the particles of a frame, as an object of trimesh with opaque colours."""
+    """Return a mesh, or the particles of a frame, as a trimesh object with opaque colours."""
     import trimesh
 
     own = np.pad(colours(np.clip(what.colours, 0.0, 1.0)), ((0, 0), (0, 1)), constant_values=255)
@@ -119,8 +118,8 @@ def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
     """Write ``run.usdc`` with the mesh ``/run/surface``, the points ``/run/particles``, and for each solid a transform
     ``/run/solid_NAME`` with a mesh; return its path.
 
-    Frame k is at time code k, and the file says how many time codes a second has: `WholeFrames` says which states
-    these are. Lengths are metres, colours linear.
+    Frame k is at time code k, and the file stores the number of time codes per second. `WholeFrames` chooses the
+    states. Lengths are metres, colours linear.
     """
     pxr = _pxr()
     path = folder / "run.usdc"
@@ -145,7 +144,7 @@ def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
 
 
 class _Writer:
-    """A writer that adds frames to the stage of a USD file."""
+    """Adds frames to the stage of a USD file."""
 
     def __init__(self, pxr: Any, stage: Any, run: Exported, frames: int, rate: float):
         self._pxr, self._run, geometry = pxr, run, pxr.UsdGeom
@@ -242,8 +241,8 @@ def _pxr() -> Any:
 
 
 def _vtp(what: ExportedFrame | Mesh) -> str:
-    """Return the text of a VTP file, with numbers in base64. It has a vertex for each particle of a frame, with its
-    velocity [m/s] and all fields, or a mesh's triangles with normals, and a surface's velocities [m/s]."""
+    """Return the text of a VTP file, with numbers in base64. For a frame it contains a vertex per particle with
+    velocity [m/s] and all fields; for a mesh triangles, normals and, of a surface, velocities [m/s]."""
     colours = {"colour": _srgb(np.clip(what.colours, 0.0, 1.0))}
     velocities = {} if what.velocities is None else {"velocity": what.velocities}
     if isinstance(what, ExportedFrame):
@@ -262,7 +261,7 @@ def _vtp(what: ExportedFrame | Mesh) -> str:
 
 
 def _polydata(points: np.ndarray, corners: np.ndarray, cells: str, fields: Mapping[str, np.ndarray]) -> Any:
-    """Make VTK's data of points (p, 3) [m] and cells with k corners each, (c, k), with fields (p, ...) by name."""
+    """Make a VTK data set of points (p, 3) [m], cells (c, k) with k corners each, and fields (p, ...) by name."""
     vtk = _vtk()
     data, places, topology = vtk.vtkPolyData(), vtk.vtkPoints(), vtk.vtkCellArray()
     places.SetData(_array("points", points))
@@ -286,7 +285,7 @@ def _array(name: str, values: np.ndarray) -> Any:
 
 @cache
 def _vtk() -> Any:
-    """Import the used parts of VTK, which takes seconds to import as a whole."""
+    """Import only the parts of VTK in use: importing all of it takes seconds."""
     try:
         from vtkmodules import vtkCommonCore, vtkCommonDataModel, vtkIOXML
         from vtkmodules.util import numpy_support
@@ -381,7 +380,8 @@ def labelled(trajectory: Trajectory) -> Any:
 
 
 def _of_solids(solids: Mapping[str, SolidMotion], turned: tuple[str, ...]) -> Variables:
-    """Return xarray variables of moving solids, one behind the other; given paths have no velocities."""
+    """Return xarray variables of moving solids, stacked along one dimension; solids with prescribed paths have no
+    velocities."""
 
     def over_time(
         name: str, like: str, axes: tuple[str, ...], unit: str

@@ -1,7 +1,7 @@
-"""What is written of a run for other programs: in every frame the particles, the surface of the fluid, and solids.
+"""The data of a run that exporters write in every frame: the particles, the surface of the fluid, and the solids.
 
-Surfaces end at the walls of the container, where pictures are cut, and enclose the volume of their particles. Around
-each body of fluid that is apart from others, all points are moved in or out by the same distance.
+Surfaces end at container walls, as in pictures, and enclose the volume of their particles. To reach this volume, all
+points around a connected body of fluid are moved in or out by the same distance.
 """
 
 import re
@@ -33,47 +33,49 @@ from cortado.scene.shape_tables import CylinderContainer
 from cortado.simulation import Simulation
 
 EVEN = 1e-6
-"""Recorded frames whose distances in time differ by less than this part are evenly spaced."""
+"""Relative difference of time intervals below which recorded frames count as evenly spaced."""
 DIGITS = (0, 1, 2, 3)
-"""Places behind the point that a number of frames in a second may have where recorded frames are not evenly spaced."""
+"""Greatest number of decimals of a frame rate if recorded frames are not evenly spaced."""
 UNLIKE = 0.05
-"""Relative difference of a surface's volume from the fluid's above which a message tells it."""
+"""Relative difference between the surface's and the fluid's volume above which a message reports it."""
 ROUND = 0.05
-"""Width of faces of round solids, in sizes of the solid."""
+"""Width of the faces of round solids, relative to the solid's size."""
 LINKED = 1.25
-"""In spacings: particles that are nearer to each other are of one body."""
+"""Distance in spacings below which two particles belong to one body of fluid."""
 NEAR_SURFACE = 2.0
-"""In spacings: particles that link to no surface are of the body of the nearest one, unless it is farther away."""
+"""Greatest distance in spacings at which a particle without link to a surface is assigned to the body of the nearest
+surface."""
 MOST_SHIFT = 1.0
-"""Greatest move of a point in a pass, in spacings."""
+"""Greatest displacement of a point in one pass, in spacings."""
 PASSES = 2
-"""Number of passes that move points out, some beyond a wall, and back to it."""
+"""Number of passes; each moves points outwards, and back to a wall if they have crossed it."""
 ROUNDS = 20
-"""Most rounds of Newton's method, each by a fifth of a spacing at most."""
+"""Greatest number of iterations of Newton's method; each moves points by at most a fifth of a spacing."""
 IN_PLACE = 1e-6
-"""In spacings: points that a turn into the axes of the container and back moves by less are where they were."""
+"""Round-off in spacings: points that a rotation to the container's axes and back moves by less count as unmoved."""
 
 
 @dataclass(frozen=True)
 class WholeFrames:
-    """Evenly spaced frames of an animation: frame k, at the time start + k / rate, is a recorded state moved there."""
+    """Evenly spaced frames of an animation: frame k, at time start + k / rate, is a recorded state extrapolated to that
+    time."""
 
     rate: float
-    """[1/s] frames in a second"""
+    """[1/s] frame rate"""
     times: NDArray[np.float64]
     """(frames,) [s]"""
     recorded: NDArray[np.intp]
-    """(frames,) the number of the recorded state that a frame is made of: the nearest in time, or of a run with marks
-    the first from then on. A step back along velocities is the way between the states of a step"""
+    """(frames,) number of the recorded state for each frame: the nearest in time or, in a run with marks, the first
+    state at or after the frame's time"""
     shifts: NDArray[np.float64]
-    """(frames,) [s] from the time of that state to that of the frame; 0 where recorded states are evenly spaced"""
+    """(frames,) [s] time of the frame minus time of its recorded state; 0 if recorded states are evenly spaced"""
     left_out: float
-    """[s] how much later than the last frame the run ends"""
+    """[s] time from the last frame to the end of the run"""
 
     @classmethod
     def of(cls, times: NDArray[np.float64], marks: Marks | None = None) -> "WholeFrames":
-        """Choose frames for states recorded at ``times`` (m,) [s]: at their ``marks``, if they have some. Without
-        marks, evenly spaced states are the frames; of others the rate is a round number near that of the states."""
+        """Choose frames for states recorded at ``times`` (m,) [s]: at their ``marks``, if given. Without marks, evenly
+        spaced states are the frames; else the frame rate is a round number near the states' rate."""
         if marks is not None:
             whole = marks.at(np.arange(int(marks.passed(times[-1:])[0]) + 1))
             recorded = np.searchsorted(times, whole - SAME / marks.rate)
@@ -95,7 +97,7 @@ class WholeFrames:
 
     @property
     def in_words(self) -> str:
-        """Say how the frames differ from recorded states; empty where they do not."""
+        """Return a text on how the frames differ from recorded states; empty if they are equal."""
         found = []
         if self.shifts.any():
             most = 1e3 * float(np.abs(self.shifts).max())
@@ -106,8 +108,8 @@ class WholeFrames:
 
 
 def _round_rate(times: NDArray[np.float64]) -> float:
-    """Return the roundest frame rate [1/s] of which each frame is nearest to one of the states, recorded at ``times``
-    (m,) [s] from 0 on, the last apart; the mean rate where there is none."""
+    """Return the frame rate [1/s] with the fewest digits that assigns each state its own frame. States are recorded at
+    ``times`` (m,) [s] from 0; the last is ignored. Without such a rate return the mean rate."""
     usual = times[:-1]
     mean = (len(usual) - 1) / float(usual[-1])
     for digits in DIGITS:
@@ -119,7 +121,7 @@ def _round_rate(times: NDArray[np.float64]) -> float:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh of triangles in space; outside is the side from which corners run counterclockwise."""
+    """A triangle mesh in 3-D; seen from outside, the corners of triangles run counterclockwise."""
 
     points: Points
     """(p, 3) [m]"""
@@ -130,10 +132,10 @@ class Mesh:
     colours: Points
     """(p, 3) linear, from 0 to 1"""
     velocities: Points | None = None
-    """(p, 3) [m/s]; None of a solid, whose motion its poses tell."""
+    """(p, 3) [m/s]; None for a solid, whose poses give its motion."""
 
     def moved(self, pose: "Pose") -> "Mesh":
-        """Return the mesh turned and moved to a pose."""
+        """Return the mesh rotated and shifted to a pose."""
         return Mesh(self.points @ pose.turn.T + pose.position, self.triangles, self.normals @ pose.turn.T, self.colours)
 
 
@@ -148,7 +150,7 @@ class Pose:
 
     @property
     def matrix(self) -> Points:
-        """Return the pose as a matrix (4, 4) for columns: turned, then moved."""
+        """Return the pose as a matrix (4, 4) for column vectors: rotation, then translation."""
         return np.block([[self.turn, self.position[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 
@@ -158,35 +160,35 @@ class ExportedSolid:
 
     name: str
     part: str
-    """Name in files and their parts: "solid_" and the solid's name, of letters, digits and underscores alone."""
+    """Name in files: "solid_" and the solid's name, with only letters, digits and underscores."""
     mesh: Mesh
-    """About its middle, not turned."""
+    """Mesh about the solid's middle, not rotated."""
     moves: bool
 
 
 @dataclass(frozen=True)
 class ExportedFrame:
-    """One exported frame of a run, in three dimensions: z is 0 in the plane."""
+    """One exported frame of a run, in three dimensions; for a 2-D run z is 0."""
 
     time: float
     """[s]"""
     positions: Points
-    """(n, 3) of the particles [m] that do not wait in an emitter, along a periodic axis within the period"""
+    """(n, 3) [m] of the particles not waiting in emitters; along periodic axes within one period"""
     velocities: Points
     """(n, 3) [m/s]"""
     colours: Points
-    """(n, 3) of the particles, linear, from 0 to 1: those of the pictures"""
+    """(n, 3) colours of the particles as in pictures, linear, from 0 to 1"""
     fields: Mapping[str, np.ndarray]
     """(n,) or (n, k) by name: the mass fractions of several phases, and recorded quantities"""
     surface: Mesh | None
-    """Surface of the fluid; None in the plane, and where the particles are too far from each other to have one."""
+    """Surface of the fluid; None in 2-D, and if the particles are too far apart for a surface."""
     poses: Mapping[str, Pose]
-    """Poses of all solids, by their names."""
+    """Poses of all solids, by name."""
 
 
 class Exported:
-    """A run and its scene in the form that exporters write; ``simulation`` computes a ``picture.colour`` that was not
-    recorded. Raises `InputError` where nothing does."""
+    """A run and its scene in the form that exporters write. ``simulation`` computes a ``picture.colour`` that was not
+    recorded; if that is impossible, `InputError` is raised."""
 
     def __init__(self, trajectory: Trajectory, scene: Scene, simulation: Callable[[], Simulation] | None = None):
         self.times, self.scene = trajectory.times, scene
@@ -197,7 +199,8 @@ class Exported:
         self.solids = [_solid(one, parts[one.name], one.name in trajectory.solids) for one in shown.values()]
         self._trajectory = trajectory
         self._held = (0.0, 1.0, 1.0)
-        """Of the frame where they differ most: its time [s], what the surface encloses, and the fluid's volume [m³]."""
+        """Time [s], volume within the surface and fluid's volume [m³], of the frame in which the two volumes differ
+        most."""
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -210,7 +213,8 @@ class Exported:
 
     @property
     def series(self) -> WholeFrames | None:
-        """Return the frames of a series of files: at the marks of a run that has some, else None for all states."""
+        """Return the frames of a series of files: those at the run's marks, or None (all states) for a run without
+        marks."""
         return None if self._trajectory.marks is None else self.whole
 
     @property
@@ -220,11 +224,11 @@ class Exported:
 
     @property
     def up(self) -> Points:
-        """Return the rotation (3, 3) that makes y the axis against gravity; in the plane there is nothing to turn."""
+        """Return the rotation (3, 3) that turns the direction opposite to gravity to y; the identity in 2-D."""
         return upright(np.asarray(self.scene.forces.gravity)) if self.scene.dimension == 3 else np.eye(3)
 
     def frames(self, whole: WholeFrames | None = None) -> Iterator[ExportedFrame]:
-        """Yield all recorded states, or whole frames, one after the other, as surfaces take memory."""
+        """Yield all recorded states or the ``whole`` frames, one at a time because surfaces need much memory."""
         if whole is None:
             return (self._frame(frame, k, self._trajectory.solids, k) for k, frame in enumerate(self._trajectory))
         solids = self._trajectory.solids.at(self.scene, self.times, whole.recorded, whole.times)
@@ -233,14 +237,16 @@ class Exported:
 
     @property
     def in_words(self) -> str:
-        """Say how far the volumes within the exported surfaces are from the fluid's; empty where they are close."""
+        """Return a text on the difference between the volumes within exported surfaces and the fluid's; empty if it is
+        small."""
         if _unlike(self._held) <= UNLIKE:
             return ""
         time, held, whole = self._held
         return f"at {time:.4g} s the surface encloses {held:.4g} m³, where there are {whole:.4g} m³ of fluid"
 
     def _frame(self, frame: Frame, recorded: int, solids: SolidMotions, number: int) -> ExportedFrame:
-        """Make a frame of a state near a recorded one, with the solids where they are in a frame of their motion."""
+        """Make an exported frame from a state near a recorded one, with the solids' poses from frame ``number`` of
+        their motions."""
         shown = those(is_out(self.scene, frame.others, len(frame.positions)))
         within = self.scene.domain.wrapped(frame.positions[shown])
         positions, velocities = in_space(np.float64(within)), in_space(np.float64(frame.velocities[shown]))
@@ -260,7 +266,7 @@ class Exported:
 
     @cached_property
     def _stage(self) -> Stage:
-        """Return the stage of a run in 3-D, which tells whether its fluid ends at the walls of its container."""
+        """Return the stage of a 3-D run, which knows if the container's walls cut the fluid."""
         return Stage.of(self.scene, shown_places(self.scene, self._trajectory))
 
     def _surface(self, positions: Points, velocities: Points, colours: Points) -> Mesh | None:
@@ -276,17 +282,18 @@ class Exported:
 
 
 def _unlike(held: tuple[float, float, float]) -> float:
-    """Return the relative difference between a surface's volume and the fluid's, given a frame's time and both."""
+    """Return the relative difference between a surface's volume and the fluid's, given the tuple (time, both
+    volumes)."""
     return abs(held[1] / held[2] - 1.0)
 
 
 def _first_of_each(scene: Scene) -> dict[str, ShownSolid]:
-    """Return the solids by name, without their images a period away, which come behind."""
+    """Return the solids by name, without their periodic images, which follow them in the list."""
     return {one.name: one for one in reversed(shown_solids(scene))}
 
 
 def _part_names(solids: Iterable[str]) -> dict[str, str]:
-    """Return the names that files have for solids, by the solids' names: no two alike."""
+    """Return a unique name for files for each solid, by the solid's name."""
     found: dict[str, str] = {}
     for number, name in enumerate(solids):
         plain = f"solid_{re.sub(r'[^A-Za-z0-9_]', '_', name)}"
@@ -308,7 +315,8 @@ def _solid(shown: ShownSolid, part: str, moves: bool) -> ExportedSolid:
 
 
 def _ribbon(vertices: Points, edges: np.ndarray, size: float) -> tuple[Points, np.ndarray, Points]:
-    """Make points, triangles and normals of an outline in the plane, a tenth of its size wide across the plane."""
+    """Make points, triangles and normals of a 2-D outline, extruded perpendicular to the plane by a tenth of its
+    size."""
     start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
     along = (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
     outwards = np.stack([along[:, 1], -along[:, 0], np.zeros(len(along))], axis=1)
@@ -334,8 +342,8 @@ def with_volume(
     kept: Callable[[Points], Points],
 ) -> Points:
     """Move the points (p, 3) [m] of a surface with triangles (t, 3) along ``ways`` (p, 3), unit vectors outwards or 0.
-    Each body of fluid gets ``spacing``³ for each of its particles at ``places`` (n, 3) [m]. ``kept`` brings points back
-    to a wall that were moved beyond it."""
+    Each body of fluid then encloses ``spacing``³ for each of its particles at ``places`` (n, 3) [m]. ``kept`` returns
+    points beyond a wall to the wall."""
     of_points, of_particles = _bodies(points, triangles, places, spacing)
     count = max(of_points.max(), of_particles.max(initial=-1)) + 1
     wanted = np.bincount(of_particles[of_particles >= 0], minlength=count) * spacing**3
@@ -378,8 +386,8 @@ def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: floa
 def _volumes(
     points: Points, ways: Points, triangles: np.ndarray, bodies: np.ndarray, count: int
 ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Make the function that returns the volumes (bodies,) [m³] and their slopes [m²] for points of bodies (p,) moved
-    along their ways by distances (bodies,) [m]. A volume is a cubic polynomial of its distance."""
+    """Return a function from distances (bodies,) [m] to volumes (bodies,) [m³] and their derivatives [m²]. The points
+    of each body are moved by its distance along their ``ways``. A volume is a cubic polynomial of the distance."""
     (a, b, c), (x, y, z) = ([each[corner] for corner in triangles.T] for each in (points, ways))
     own = bodies[triangles[:, 0]]
     terms = (
@@ -398,9 +406,9 @@ def _sixth(a: Points, b: Points, c: Points) -> np.ndarray:
 
 
 def contained_liquid(stage: Stage, positions: Points, colours: Points, device: Any = "cpu") -> Surface:
-    """Make the surface of the fluid of particles at positions (n, 3) [m] with colours (n, 3), see `liquid_surface`, in
-    the axes of the scene. Where fluid touches walls it is extended behind them, and its points there are then moved to
-    the wall. The others are moved until the surface encloses the volume of the particles; see `with_volume`.
+    """Make the fluid's surface in the scene's axes, for particles at positions (n, 3) [m] with colours (n, 3); see
+    `liquid_surface`. At walls the fluid is extended behind the wall, and surface points there are moved back to the
+    wall. All other points are moved until the surface encloses the particles' volume; see `with_volume`.
 
     Raises:
         ComputationError: there is no surface.
@@ -423,8 +431,8 @@ def contained_liquid(stage: Stage, positions: Points, colours: Points, device: A
 
 
 def _in_room(stage: Stage, points: Points) -> Points:
-    """Return the points (p, 3) of the container, where it cuts fluid, nearest to points (p, 3) [m], in the frame of the
-    picture."""
+    """Return the points (p, 3) [m] inside the container nearest to given points (p, 3), in picture axes, along the axes
+    where walls cut the fluid."""
     if not stage.cuts:
         return points
     lower, upper = stage.room

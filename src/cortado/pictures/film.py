@@ -1,6 +1,6 @@
-"""Pictures that change over a run, of one or of several side by side, and films of them.
+"""Pictures of the frames of one run or of several runs side by side, and films of them.
 
-One run as pictures show it is what is in the picture, and each of its frames as a state that is drawn.
+A `ShownRun` provides a run's stage, and for each frame the state to draw.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ from cortado.version import __version__
 
 Ahead = Callable[[Iterator[Points]], Iterator[Points]]
 Around = tuple[tuple[int, ...], tuple[int, ...]]
-"""Numbers of the frames that a film shows before and after one, nearest first."""
+"""Numbers of the frames that a film shows before and after a frame, nearest first."""
 ALONE: Around = (), ()
 Panel = Callable[[int, Around], Points]
-"""From a frame, a number, and those around it to a picture (rows, columns, 3), linear from 0 to 1."""
+"""A function from a frame's number and the frames around it to a picture (rows, columns, 3), linear from 0 to 1."""
 
 
 MOST_PICTURES = 9
-"""Most pictures side by side; in more of them one sees nothing."""
+"""Greatest number of pictures side by side; more would be too small."""
 LEAST_PIXELS = 64
-"""Fewest pixels of each picture, along either side."""
+"""Least number of pixels along each side of each picture."""
 AIR = 1.25
-"""Least height of a picture over the height of its contents at the picture's width."""
+"""Least ratio of a picture's height to the height of its contents at the picture's width."""
 SLOW = 0.1
-"""Seconds of the run in a second of a film below which fluid at rest is not averaged: it swims slowly enough to be
-seen."""
+"""Film speed (simulated seconds per second) below which fluid at rest is not averaged over frames, because its motion
+is slow enough to follow."""
 TELLING_FRAMES = 100
-"""Number of frames that tell where solids come to."""
+"""Number of frames from which the range of the solids' motion is found."""
 
 
 def alone(images: list[Points]) -> Points:
@@ -68,15 +68,15 @@ def alone(images: list[Points]) -> Points:
 
 @dataclass(frozen=True)
 class Page:
-    """The contents of each frame of a film: the picture of one panel, or those of several put together."""
+    """The contents of each frame of a film: the picture of one panel, or several panels' pictures combined."""
 
     panels: Sequence[Panel]
     composed: Callable[[list[Points]], Points] = alone
-    """Puts the pictures of the panels together to the page."""
+    """Combines the panels' pictures to one picture."""
     fingerprint: str = ""
-    """A checksum of all that its pictures are made of; empty where that is not known."""
+    """A checksum of all data shown in the pictures; empty if unknown."""
     notes: str = ""
-    """A sentence for those who see it; empty if there is nothing to say."""
+    """A sentence for viewers of the film, or an empty text."""
 
     def image(self, frame: int) -> Points:
         """Return the picture (rows, columns, 3) of a frame, linear from 0 to 1."""
@@ -97,7 +97,7 @@ def _around(frames: Sequence[int], n: int, window: int) -> Around:
 
 
 class FilmedRun:
-    """A `Panel` that draws the states of one run, in which fluid at rest does not flicker in 3-D."""
+    """A `Panel` that draws the states of one run; in 3-D it keeps fluid at rest from flickering."""
 
     def __init__(self, artist: PlanePainter | SpacePainter, state: Callable[[int], State]):
         """Take a painter, and a function from the number of a frame to its ``state``."""
@@ -118,9 +118,9 @@ class FilmedRun:
 
 
 def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tuple[list[PlaneStage | Stage], int]:
-    """Frame stages of one dimension in parts of a page as wide as the first one's picture but for some ``spare``
-    columns and no higher, in one scale. Each camera sees all that any of them shows; the number in a row is returned
-    too. Raises `InputError` where parts are too small."""
+    """Fit several stages of one dimension, at one scale, into a page of the first stage's picture size minus ``spare``
+    columns. Every camera sees all that any stage shows. Return the stages and the number of pictures in a row; raise
+    `InputError` if pictures are too small."""
     whole, count = stages[0].picture, len(stages)
     page = whole.model_copy(update={"width": max(whole.width - spare, 1)})
     lower, upper = (np.array(ends) for ends in zip(*(stage.ends for stage in stages), strict=True))
@@ -137,8 +137,8 @@ def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tup
 
 
 def in_a_row(count: int, size: Points, page: Picture) -> int:
-    """Return how many of ``count`` pictures go into a row of a page, for contents as wide and high as ``size`` (2,) to
-    be large, and few places empty."""
+    """Return how many of ``count`` pictures to place in a row of a page, so that contents of width and height ``size``
+    (2,) are large and few places stay empty."""
 
     def gain(across: int) -> float:
         down = -(-count // across)
@@ -149,8 +149,7 @@ def in_a_row(count: int, size: Points, page: Picture) -> int:
 
 
 def lacking(scene: Scene) -> str | None:
-    """Return a sentence about the missing package that shaded pictures of a scene need; None where nothing is
-    missing."""
+    """Return a sentence on a missing package that shaded pictures of the scene need; None if all are installed."""
     picture = scene.picture or Picture()
     needed = {"av": "PyAV"} if picture.film_frames != 0 else {}
     missing = [name for module, name in needed.items() if find_spec(module) is None]
@@ -161,8 +160,8 @@ def lacking(scene: Scene) -> str | None:
 
 
 def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
-    """Write a film of the frames that a pace chooses. Where it is interrupted, what is drawn is kept, and the next call
-    of the same film goes on after it."""
+    """Write a film of the frames that ``pace`` chooses. After an interruption the drawn frames are kept, and the next
+    call for the same film continues after them."""
     shown = [frames[k] for k in pace.frames]
     note = page.fingerprint and f"{page.fingerprint} {len(shown)} {pace.speed}"
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
@@ -177,7 +176,7 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
 
 
 def _ahead(count: int, images: Iterator[Points]) -> Iterator[Points]:
-    """Yield images in order, of which ``count`` are drawn while those before are used."""
+    """Yield images in order; up to ``count`` images are drawn ahead while earlier ones are used."""
     painter = ThreadPoolExecutor(1, thread_name_prefix="cortado-film")
     try:
         coming = deque(painter.submit(next, images, None) for _ in range(count))
@@ -195,18 +194,18 @@ def _ahead(count: int, images: Iterator[Points]) -> Iterator[Points]:
 
 @dataclass(frozen=True)
 class ShownRun:
-    """A run with its scene and the values by which its particles are coloured, as pictures and films show it."""
+    """A run prepared for pictures and films: its scene, and the values that colour its particles."""
 
     scene: Scene
     trajectory: Trajectory
     values: NDArray | None = None
-    """(frames, n) values by which a scale colours particles; None for the colours of phases."""
+    """(frames, n) values that a colour scale converts to colours; None for the colours of phases."""
     unit: str | None = None
-    """Unit of values that not all scenes have."""
+    """Unit of the values, if the quantity exists only in some scenes."""
 
     @cached_property
     def stage(self) -> PlaneStage | Stage:
-        """Return the stage around its fluid, with a camera that sees all of it in every frame."""
+        """Return the stage of the run, with a camera that sees all of the fluid in every frame."""
         stride = max(len(self.trajectory) // TELLING_FRAMES, 1)
         poses = [self._pose(k) for k in range(0, len(self.trajectory), stride)] if self._motions else []
         return stage_of(
@@ -216,7 +215,8 @@ class ShownRun:
         )
 
     def panel(self, stage: PlaneStage | Stage, device: object, scale: Scale | None) -> Panel:
-        """Return the run's pictures by the number of the frame, on a stage that is its own but for the camera."""
+        """Return the panel that draws the run's frames, on ``stage``: the run's own stage with perhaps another
+        camera."""
         return FilmedRun(painter_on(stage, device), lambda k: self._state(k, stage, scale))
 
     @cached_property
@@ -226,7 +226,7 @@ class ShownRun:
 
     @property
     def fingerprint(self) -> str:
-        """Return a checksum of all that its pictures are made of."""
+        """Return a checksum of all data shown in the pictures."""
         trajectory, found = self.trajectory, sha256(f"{__version__} {self.scene.to_json()}".encode())
         for array in (trajectory.due, trajectory.positions[:1], trajectory.positions[-1:]):
             found.update(np.ascontiguousarray(array).tobytes())
@@ -250,14 +250,14 @@ class ShownRun:
 
     @cached_property
     def _out(self) -> list[NDArray[np.bool_]]:
-        """Return masks (frames, n) of the particles in the fluid."""
+        """Return masks (frames, n), True for particles in the fluid."""
         return [is_out(self.scene, frame.others, self.trajectory.particles) for frame in self.trajectory]
 
     def _pose(self, k: int) -> Scene | None:
         return posed(self.scene, self._motions, k) if self._motions else None
 
     def _view(self, k: int, stage: PlaneStage | Stage) -> View | None:
-        """Return the view of a moving camera in a frame; None for a camera at rest."""
+        """Return the view of a moving camera in frame k; None for a camera at rest."""
         path = (self.scene.picture or Picture()).camera_path
         if path is None or isinstance(stage, PlaneStage):
             return None
@@ -273,8 +273,8 @@ class ShownRun:
 
 
 def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles that have left emitters and are in no drain, given `Frame.others`. Where
-    there is no fluid yet, the layers that come first are out from the start."""
+    """Return a mask (n,) of the particles that have left emitters and are in no drain, given `Frame.others`. If there
+    is no fluid yet, the first layers of emitters count as out from the start."""
     found = ~waits(scene, others, particles)
     for _, first, sample in () if found.any() else samples(scene, particles):
         found[first : first + sample.layer] = True
@@ -282,8 +282,8 @@ def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[n
 
 
 def drawn_for_each(scene: Scene, positions: NDArray) -> NDArray[np.int64]:
-    """Return which particle (n,) a viewer draws for each at positions (n, d) [m]: itself, or the first of the others
-    if it rests far away, in reserve of an emitter or taken by a drain."""
+    """Return for each particle at positions (n, d) [m] the number (n,) of the particle drawn in its place: its own
+    number, or the first visible particle's if it is stored far away, in an emitter's reserve or taken by a drain."""
     count = len(positions)
     if not (scene.drain or scene.emitter):
         return np.arange(count)
@@ -293,8 +293,8 @@ def drawn_for_each(scene: Scene, positions: NDArray) -> NDArray[np.int64]:
 
 
 def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """Return places (frames, n, d) [m] of particles in pictures; those that wait in an emitter are at its opening, and
-    those that a drain took in its middle."""
+    """Return the places (frames, n, d) [m] of particles in pictures. Particles waiting in an emitter are placed at its
+    opening, and particles taken by a drain in the drain's middle."""
     places, others, count = trajectory.positions, trajectory.others, trajectory.particles
     out = np.array([is_out(scene, frame.others, count) for frame in (trajectory if scene.emitter else ())])
     for name, first, sample in samples(scene, count):
@@ -307,13 +307,14 @@ def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
 
 
 def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
-    """Return an index that takes the particles that are out (n,) from arrays (n, ...); without a copy where all are."""
+    """Return an index that selects the particles with ``out`` (n,) from arrays (n, ...), without a copy if all are
+    out."""
     return slice(None) if out.all() else out
 
 
 def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """Return the times (frames, n) [s] since particles left an emitter, between frames as if its speed were even; of
-    others the time since the run began, and 0 of those that wait."""
+    """Return the times (frames, n) [s] since particles left an emitter, assuming constant emission between frames.
+    Other particles have the time since the start of the run; waiting particles have 0."""
     since, count = np.full(trajectory.positions.shape[:2], float(trajectory.times[0])), trajectory.particles
     for name, first, sample in samples(scene, count):
         if emitted_name(name) in trajectory.others:
@@ -326,11 +327,11 @@ def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
 def coloured_by(
     scene: Scene, trajectory: Trajectory, simulation: Callable[[], Simulation] | None = None
 ) -> NDArray | None:
-    """Return the values (frames, n) by which pictures of a scene colour particles: recorded, computed from records, or
-    else by a simulation. None for the colours of phases.
+    """Return the values (frames, n) that colour particles in pictures: recorded, computed from records, or else
+    computed with a simulation. None for the colours of phases.
 
     Raises:
-        InputError: it was not recorded and cannot be computed.
+        InputError: the quantity was not recorded and cannot be computed.
     """
     name = (scene.picture or Picture()).colour
     if name == "phase":

@@ -1,6 +1,7 @@
-"""Pictures to aim at: latte art drawn at any resolution, picture files read and written, and frames of videos.
+"""Target pictures: latte art drawn at any resolution; reading and writing of picture files; and reading of video
+frames.
 
-A picture is (rows, columns, 3) red, green and blue, linear light from 0 to 1, float64, its first row at the top. A
+A picture is a float64 array (rows, columns, 3) of linear red, green and blue from 0 to 1; its first row is the top. A
 resolution is (columns, rows), as in a scene, or one number for a square.
 """
 
@@ -25,28 +26,28 @@ Picture = NDArray[np.float64]
 Resolution = int | tuple[int, int]
 Colour = tuple[float, float, float]
 Shape = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]
-"""Whether the points x, y are inside; a shape fills -1 to 1 from its bottom to its top."""
+"""Tests whether points x, y are inside; from bottom to top a shape extends from -1 to 1."""
 
 MILK: Colour = (0.96, 0.93, 0.86)
 COFFEE: Colour = (0.30, 0.16, 0.08)
 WHITE: Colour = (1.0, 1.0, 1.0)
 DRAWN = 100.0
-"""About how many bytes a drawn picture takes for each pixel."""
+"""Approximate memory of a drawn picture, in bytes per pixel."""
 SAMPLES = 6
-"""Points along either side of a pixel that tell how much of it a shape covers."""
+"""Number of sample points along each side of a pixel, for computing how much of the pixel a shape covers."""
 FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
 """Formats of the files that are read."""
 MOST_BYTES = 2**28
-"""Most bytes of a picture's file."""
+"""Greatest size of a picture file [bytes]."""
 MOST_PIXELS = 2**26
-"""Most pixels of a picture that is resampled."""
+"""Greatest number of pixels of a picture that is resampled."""
 MOST_PIXELS_KEPT = 2**24
-"""Most pixels of a picture that is not resampled."""
+"""Greatest number of pixels of a picture that is not resampled."""
 PIXELS_AT_ONCE = 2**20
 ROUNDING = 0.01
-"""Part of a picture: where more is left out than by rounding its sides, a warning says so."""
+"""Fraction of a picture above which cropping causes a warning; rounding the sides crops less."""
 LIGHT = from_srgb(np.arange(256, dtype=np.uint8))
-"""Linear light of every value in a file."""
+"""Linear light for every byte value in a file."""
 
 
 @public
@@ -65,8 +66,8 @@ def heart(
         resolution: columns and rows of pixels, or one number for both.
         cup: radius of a round cup in the middle, relative to half of the shorter side of the picture; outside it
             is the background. None: coffee everywhere.
-        size: of the shape, relative to the cup or, without one, to the shorter side of the picture.
-        milk, coffee, background: red, green and blue, linear, from 0 to 1.
+        size: size of the shape, relative to the cup or, without a cup, to the shorter side of the picture. milk,
+        coffee, background: red, green and blue, linear, from 0 to 1.
 
     Example: ``target = cortado.pictures.heart((128, 128), cup=0.9)  # (128, 128, 3)``
     """
@@ -83,11 +84,9 @@ def rosetta(
     coffee: Colour = COFFEE,
     background: Colour = WHITE,
 ) -> Picture:
-    """Draw a rosetta: layers of milk like the leaves of a fern, drawn together by a stem, a small heart on top.
+    """Draw a rosetta: layers of milk like fern leaves, pulled together along a stem, with a small heart on top.
 
-    The arguments are those of `heart`.
-
-    ``resolution``, ``cup``, ``size``, ``coffee`` and ``background`` too.
+    The arguments ``resolution``, ``cup``, ``size``, ``milk``, ``coffee`` and ``background`` are those of `heart`.
 
     Example: ``target = cortado.pictures.rosetta((128, 128), cup=0.9)  # (128, 128, 3)``
     """
@@ -96,14 +95,14 @@ def rosetta(
 
 @public
 def read_picture(path: str | Path, resolution: Resolution | None = None) -> Picture:
-    """Read the picture at a ``path``, a file of one of `FORMATS`, transparent parts on white.
+    """Read the picture at ``path``, in one of the `FORMATS`; transparent parts are shown on white.
 
     Args:
-        resolution: columns and rows wanted: the largest part in the middle with their proportions is resampled,
-            in linear light. None keeps the pixels as they are.
+        resolution: wanted columns and rows: the largest central part with this aspect ratio is resampled, in linear
+        light. None keeps the original pixels.
 
     Raises:
-        InputError: there is no such file, no picture in it, or one of too many pixels.
+        InputError: the file is missing, is no picture, or has too many pixels.
 
     Example: ``target = cortado.pictures.read_picture("target.png", (64, 48))  # (48, 64, 3)``
     """
@@ -116,12 +115,12 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
 
 
 def resized(picture: Any, resolution: tuple[int, int]) -> Picture:
-    """Return the largest middle part of a Pillow picture that has these proportions, resampled in linear light."""
+    """Return the largest central part of a Pillow picture with this aspect ratio, resampled in linear light."""
     return _whole(picture) if resolution == picture.size else _resampled(picture, *resolution)
 
 
 def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
-    """Open a picture's file with Pillow, of ``most`` pixels; raise `InputError` as `read_picture` does."""
+    """Open a picture file with Pillow, of at most ``most`` pixels; raise `InputError` as `read_picture` does."""
     from PIL import Image, ImageOps, UnidentifiedImageError
 
     try:
@@ -144,7 +143,7 @@ def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
 
 
 def warn_of_cropping(found: str, size: tuple[int, int], shape: tuple[int, int]) -> None:
-    """Warn where a picture of a ``size`` in pixels loses parts to get the proportions of ``shape``; the sentence begins
+    """Warn if cropping a picture of ``size`` pixels to the aspect ratio of ``shape`` removes a part; the message begins
     with ``found``."""
     left, top, right, bottom = _middle(size, shape)
     share = (right - left) * (bottom - top) / (size[0] * size[1])
@@ -154,7 +153,7 @@ def warn_of_cropping(found: str, size: tuple[int, int], shape: tuple[int, int]) 
 
 
 def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float, float, float]:
-    """Return left, top, right and bottom of the largest middle part of a picture that has these proportions."""
+    """Return left, top, right and bottom of the largest central part of a picture with this aspect ratio."""
     (width, height), (columns, rows) = size, shape
     scale = min(width / columns, height / rows)
     left, top = 0.5 * (width - scale * columns), 0.5 * (height - scale * rows)
@@ -162,7 +161,7 @@ def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float
 
 
 def _check_header(path: str | Path, file: Any, most: int) -> None:
-    """Raise `InputError` for a picture of too many pixels or bits, before anything is decoded."""
+    """Raise `InputError` for a picture with too many pixels or bits per channel, before decoding it."""
     if file.width * file.height > most:
         raise _too_many(path, f"{file.width} x {file.height} pixels", most)
     if file.mode.startswith(("I", "F")):
@@ -209,7 +208,7 @@ def _mixed(share: Picture, inside: Picture, outside: Picture) -> Picture:
 
 
 def _coverage(shape: Shape, columns: int, rows: int) -> Picture:
-    """Return the share (rows, columns, 1) of pixels inside of a shape; the shorter side goes from -1 to 1, y
+    """Return the fraction (rows, columns, 1) of each pixel inside a shape; the shorter side extends from -1 to 1, y
     upwards."""
     half = 0.5 * min(columns, rows)
     covered = np.zeros((rows, columns, 1))
@@ -223,13 +222,14 @@ def _coverage(shape: Shape, columns: int, rows: int) -> Picture:
 
 
 def _in_heart(x: Any, y: Any) -> Any:
-    """Test points against the sextic (x^2 + y^2 - 1)^3 = x^2 y^3, from y = -1 to 1.2367, moved and shrunk."""
+    """Test if points are inside the sextic (x^2 + y^2 - 1)^3 = x^2 y^3 (y from -1 to 1.2367), shifted and scaled."""
     x, y = 1.1183 * x, 1.1183 * y + 0.1183
     return (x**2 + y**2 - 1.0) ** 3 < x**2 * y**3
 
 
 def _in_rosetta(x: Any, y: Any) -> Any:
-    """Test points against six layers, bent alike so that coffee of one width stays between them, a stem and a heart."""
+    """Test if points are inside six layers, a stem or a heart. Equal curvature keeps a constant width of coffee between
+    layers."""
     x = np.abs(x)
     inside = _in_heart(x / 0.31, (y - 0.69) / 0.31) | ((x < 0.02) & (np.abs(y + 0.2) < 0.8))
     height = y - (x**0.75 - 0.55 * x**2)  # of the point of the stem where the layer through x, y leaves it
@@ -247,8 +247,8 @@ def _columns_and_rows(resolution: Resolution) -> tuple[int, int]:
 
 
 def _bands(picture: Any) -> Iterator[tuple[int, Any]]:
-    """Yield a few opaque rows after the other, each with the number of its first row: arrays of all rows at once would
-    take many times the room of the picture."""
+    """Yield blocks of a few opaque rows, each with the number of its first row. Arrays of all rows at once would need
+    many times the picture's memory."""
     from PIL import Image
 
     height = max(PIXELS_AT_ONCE // picture.width, 1)
@@ -268,7 +268,7 @@ def _whole(picture: Any) -> Picture:
 
 
 def _resampled(picture: Any, columns: int, rows: int) -> Picture:
-    """Return the largest middle part with the proportions of columns and rows, resampled to (rows, columns, 3)."""
+    """Return the largest central part with the aspect ratio of columns and rows, resampled to (rows, columns, 3)."""
     from PIL import Image
 
     box = _middle(picture.size, (columns, rows))
@@ -282,9 +282,9 @@ def _resampled(picture: Any, columns: int, rows: int) -> Picture:
 
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
-"""Endings of the pictures in a folder that are read."""
+"""Suffixes of the picture files that are read from a folder."""
 MOST_BYTES_OF_VIDEO = 2**33
-"""Most bytes of a video's file."""
+"""Greatest size of a video file [bytes]."""
 
 
 def read_frames(
@@ -294,18 +294,18 @@ def read_frames(
     frame_rate: float | None = None,
     every: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Read times (frames,) [s] after the first frame, and frames (frames, rows, columns, 3), linear, from 0 to 1.
+    """Read times (frames,) [s] since the first frame, and frames (frames, rows, columns, 3), linear, from 0 to 1.
 
     Args:
-        path: a video, or a folder of pictures, which are taken in the order of their names.
-        resolution: columns and rows wanted: the largest part in the middle with their proportions is resampled.
-        crop: left, top, right and bottom of the part of each frame that counts, in the pixels of the frame as players
-            show it; all of it if left out.
-        frame_rate: frames in a second, needed for a folder; what the video itself says if left out.
-        every: take only every so many frames.
+        path: a video, or a folder of pictures, which are read in the order of their names.
+        resolution: wanted columns and rows: the largest central part with this aspect ratio is resampled.
+        crop: left, top, right and bottom of the part of each frame to use, in pixels of the frame as players show it;
+        the whole frame if left out.
+        frame_rate: frames per second, needed for a folder; the video's own rate if left out.
+        every: read only every ``every``-th frame.
 
     Raises:
-        InputError: there is no such file, or no frames in it, or PyAV is missing.
+        InputError: the file is missing or has no frames, or PyAV is missing.
     """
     is_folder = Path(path).is_dir()
     if is_folder and frame_rate is None:
@@ -342,8 +342,8 @@ def _decoded(path: str | Path) -> Iterator[tuple[float, Any]]:
 
 
 def _upright(frame: Any) -> Any:
-    """Return the picture of a frame as players show it: telephones note how they were held as a matrix (ISO/IEC
-    14496-12, 8.3.2), which turns or mirrors what is stored; the nearest right angle counts."""
+    """Return the picture of a frame as players show it. Telephones store their orientation as a matrix (ISO/IEC
+    14496-12, 8.3.2) that rotates or mirrors the stored picture; here it is rounded to the nearest right angle."""
     from PIL.Image import Transpose
 
     picture = frame.to_image()

@@ -1,6 +1,5 @@
-"""HTML for notebooks and run folders. Notebooks show an object as its repr with a picture, a film, a view in motion or
-a table below it. The report.html of a run folder holds its pictures and films inside and opens from disk, without a
-network.
+"""HTML for notebooks and run folders. Notebooks show an object as its repr with a picture, a film, an animation or a
+table below. The report.html of a run folder embeds pictures and films, and opens from disk without a network.
 """
 
 from __future__ import annotations
@@ -43,12 +42,12 @@ _KINDS = {
 WIDE = ' style="width: 100%"'
 AGAIN, LATER = "<h2>How to run it again</h2>", "<h2>Drawn later</h2>"
 MOST_WRITTEN_OUT = 12
-"""Most numbers that are written out one by one."""
+"""Greatest number of values that are written out one by one."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report with words, figures and a table; empty ones are left out."""
+    """A section of a report, with text, figures and a table; empty parts are left out."""
 
     title: str
     words: Sequence[object] = ()
@@ -60,18 +59,18 @@ class Section:
     view: str = ""
     """HTML of `particle_view`."""
     head: Sequence[str] = ()
-    """Heads of the columns of the table."""
+    """Column heads of the table."""
     rows: Sequence[Sequence[object]] = ()
-    """Rows of the table; the first entry of each names the others."""
+    """Rows of the table; the first entry of each row is its name."""
 
 
 def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> Path:
     """Write the report of a run and return its path.
 
     Args:
-        folder: the run; the command that made it, its scene and its environment end the page.
+        folder: the run folder; the page ends with the run's command, scene and environment.
         title: heading of the page.
-        sections: in their order.
+        sections: sections in their order on the page.
 
     Raises:
         InputError: a picture that cannot be read or has an unknown ending, or a page that cannot be written.
@@ -104,7 +103,7 @@ def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> 
 
 
 def add_to_report(folder: RunFolder, caption: str, path: Path) -> None:
-    """Show a picture or a film of a run, drawn later, in its report, where it has one; a file is shown once."""
+    """Add a picture or film that was drawn later to the run's report, if there is a report; each file is shown once."""
     page = folder.report.read_text(encoding="utf-8") if folder.report.exists() else ""
     before, again, after = page.partition(AGAIN)
     if again:
@@ -115,7 +114,7 @@ def add_to_report(folder: RunFolder, caption: str, path: Path) -> None:
 
 
 def written(value: Any) -> str:
-    """Write out a number, or a few of them; of more, their count and range."""
+    """Return a number or a few numbers as text; for many numbers, their count and range."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
         return str(value)
@@ -159,7 +158,7 @@ def _figure(caption: str, path: Path) -> str:
 
 
 def _shown(path: Path, words: str, look: str = "") -> str:
-    """Return HTML of a picture or a video that a file holds, as a part of the page, with ``words`` about it."""
+    """Return HTML that embeds a picture or video file in the page, with the caption ``words``."""
     kind = _KINDS.get(path.suffix.lower())
     if kind is None:
         raise InputError(f"{path} cannot be shown; a report takes {', '.join(_KINDS)}.")
@@ -174,7 +173,7 @@ def _shown(path: Path, words: str, look: str = "") -> str:
 
 
 def _again(folder: RunFolder) -> str:
-    """Return HTML of the command of the run, and of those that went on with it."""
+    """Return HTML of the command of the run, and of the commands that resumed it."""
     try:
         noted = json.loads(folder.environment.read_text(encoding="utf-8"))
         commands = [noted["command"], *(session["command"] for session in noted["resumed"])]
@@ -188,7 +187,7 @@ def _again(folder: RunFolder) -> str:
 
 
 def _details(label: str, path: Path) -> str:
-    """Return HTML of a JSON file of the run, folded away."""
+    """Return HTML of a JSON file of the run, collapsed."""
     if not path.exists():
         return ""
     text = path.read_text(encoding="utf-8")
@@ -198,11 +197,11 @@ def _details(label: str, path: Path) -> str:
 
 
 IN_MOTION = 1_000_000
-"""Most bytes of the view of a trajectory."""
+"""Greatest size of the animation of a trajectory [bytes]."""
 MANY = 2000
-"""Number of particles whose nearest others are looked for."""
+"""Number of particles whose nearest neighbours are searched."""
 MOST_NUMBERS = 6
-"""Most numbers of a parameter that the table shows; of more the smallest and the greatest."""
+"""Greatest number of a parameter's values that the table shows; for more it shows the smallest and the greatest."""
 HEAD = ("parameter", "unit", "first guess", "found")
 
 
@@ -215,8 +214,8 @@ def simulation_page(simulation: Simulation) -> str:
 
 
 def trajectory_page(run: Trajectory) -> str:
-    """Return HTML of a trajectory: its repr, and a `particle_view` in a frame of its own, where scripts run, with y up.
-    Below are pictures of the first, the middle and the last frame, coloured by speed."""
+    """Return HTML of a trajectory: its repr, and a `particle_view` with y up, in an iframe, where scripts may run.
+    Below are pictures of the first, middle and last frame, coloured by speed."""
     if not len(run):
         return f"<pre>{escape(repr(run))}</pre>"
     domain = WITHOUT_PERIODS if run.scene is None else run.scene.container.domain(run.dimension)
@@ -235,16 +234,16 @@ def trajectory_page(run: Trajectory) -> str:
 
 
 def film_page(film: Film) -> str:
-    """Return HTML of a film: its repr, and the video, or the animation, which is part of the page."""
+    """Return HTML of a film: its repr, and the embedded video or animation."""
     return as_words(film) + _shown(film.path, repr(film), WIDE)
 
 
 def result_page(
     found: object, message: str, problem: Any, start: Mapping[str, Any], best: Mapping[str, Any], losses: Any
 ) -> str:
-    """Return HTML of the result of a search from a start to the best parameters, with its end and all its losses. For a
-    `Problem`, also in other coordinates, it shows pictures of two runs, with the first and with the best parameters,
-    unless they diverge."""
+    """Return HTML of the result of a search: start, best parameters, the reason why it ended, and all losses. For a
+    `Problem`, in any coordinates, it shows pictures of the runs with the first and with the best parameters, unless
+    they diverge."""
     if hasattr(problem, "coordinates"):
         problem, (start, best) = problem.problem, [problem.parameters(u) for u in (start, best)]
     is_ours = isinstance(problem, Problem) and problem.simulation.batch is None
@@ -257,7 +256,8 @@ def result_page(
 
 
 def _draw_ends(problem: Problem, points: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the ends of runs with the first guess and the found parameters, or their pictures, and a known target."""
+    """Draw the last states (or pictures) of the runs with the first guess and with the found parameters, and a known
+    target."""
     own = Problem(
         problem.simulation, problem.steps, problem.loss, state=problem.state
     )  # the user's keeps its last evaluation
@@ -279,7 +279,7 @@ def _row(name: str, unit: str, first: Any, found: Any) -> tuple[str, ...]:
 
 
 def _written(value: Any) -> str:
-    """Write a number, a few numbers, or the count and the range of many."""
+    """Return as text a number, a few numbers, or the count and range of many."""
     numbers = np.ravel(value)
     if len(numbers) > MOST_NUMBERS:
         return f"{np.shape(value)} numbers, {numbers.min():.4g} to {numbers.max():.4g}"
@@ -287,12 +287,12 @@ def _written(value: Any) -> str:
 
 
 def as_words(found: object) -> str:
-    """Return HTML of the repr of an object."""
+    """Return an object's repr as HTML."""
     return f"<p>{escape(repr(found))}</p>"
 
 
 def picture(found: object, draw: Callable[[Path], Any]) -> str:
-    """Return HTML of the PNG that ``draw`` writes to a path; empty where a package is missing that draws."""
+    """Return HTML of the PNG that ``draw`` writes to a path; empty if a package for drawing is missing."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
         try:
@@ -313,7 +313,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _spacing(positions: NDArray[Any]) -> float:
-    """Return the usual distance [m] from particles (n, d) to the nearest other; 1 for a single one."""
+    """Return the typical distance [m] between nearest neighbours among particles (n, d); 1 for a single particle."""
     from scipy.spatial import KDTree
 
     if len(positions) < 2:

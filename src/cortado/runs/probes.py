@@ -133,8 +133,8 @@ class WallForce(LoadSensor):
     F = sum_i f_i,   T = sum_i (x_i - about) x f_i,
 
     over the particles of a region, where f_i is the quantity "wall_force". The walls push the fluid with -F. The
-    reading jumps when a particle crosses the border, so put it where particles exert no force in the measured
-    direction. Example: ``run = simulation.run(100, sensors={"force": cortado.sensors.WallForce()})``
+    reading jumps when a particle crosses the border: put it where particles exert no force in that direction.
+    Example: ``run = simulation.run(100, sensors={"force": cortado.sensors.WallForce()})``
     """
 
     def __init__(
@@ -202,8 +202,8 @@ class SolidLoad(LoadSensor):
     over all particles. Here -f_i is the mass of particle i times its acceleration by the solid's walls, through
     pressure and, for no-slip walls, viscosity. The acceleration is that of the step beginning at the state. The point c
     is the middle of the solid at the end of that step. So the solid gains the momentum that the fluid loses to it. Not
-    included are contact, gravity, buoyancy in air, and user-defined forces between fluid and walls. Example: ``run =
-    simulation.run(100, sensors={"load": cortado.sensors.SolidLoad("pillar")})``
+    included are contact, gravity, buoyancy in air, and user-defined forces between fluid and walls.
+    Example: ``run = simulation.run(100, sensors={"load": cortado.sensors.SolidLoad("pillar")})``
     """
 
     def __init__(self, solid: str, axes: Axes = "world"):

@@ -1,21 +1,21 @@
-"""Quantities of the sorted particles of a step, on the device, with their tangents and adjoints.
+"""Formulas on the device for quantities of a step's sorted particles, with tangents and adjoints.
 
-n is the number density, m a particle's mass over its volume V on the rest lattice. Vorticity is by summation over the
-fluid around a particle (Monaghan 1992):
+Here n is the number density, and m a particle's mass divided by its volume V on the rest lattice. The vorticity is an
+SPH sum over fluid neighbours (Monaghan 1992):
 
     c_i = V sum_j (v_i - v_j) x G_ij,   omega_i = c_i / (mu n_i).
 
-mu = -(V / d) sum_j x_j . G_j is that of the rest lattice, on which a fluid that turns as a whole has twice its rate of
-turning. Walls have no part in it.
+The factor mu = -(V / d) sum_j x_j . G_j is computed on the rest lattice. There a rigidly rotating fluid has a vorticity
+of twice its angular velocity. Walls do not contribute.
 
-Particle i pushes walls, those of one solid or all, with
+Particle i exerts on all walls, or on those of one solid, the force
 
     f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i + B_i),
 
 where A_i is the sum over wall particles along which its pressure acts (``wall_push`` of
-`cortado.solvers.particles.ParticleSolver`). They give it the acceleration a_i by a force such as viscosity. The vector
-B_i is the part of images (`cortado.solvers.projection.mean_stress`), if walls mirror. So the walls get the momentum
-that the fluid loses to them: the mass of a particle is m_i s^d, with the spacing s.
+`cortado.solvers.particles.ParticleSolver`). The a are accelerations of the particle by wall forces such as viscosity.
+B_i is the contribution of mirror images (`cortado.solvers.projection.mean_stress`), if walls mirror. Walls gain the
+momentum that the fluid loses: a particle's mass is m_i s^d, with the spacing s.
 """
 
 from collections.abc import Callable
@@ -46,30 +46,30 @@ SIX = wp.types.vector(6, wp.float64)
 
 @dataclass(frozen=True)
 class Bars:
-    """Adjoints within a step, to which those of quantities are added; see `cortado.solvers.solver.WithinBar`."""
+    """Adjoints within a step, to which adjoints of quantities are added; see `cortado.solvers.solver.WithinBar`."""
 
     of: Adjoints
     """Adjoints of sorted particles at the start of the step, and of parameters and solids."""
     p: wp.array
-    """(n,) of the pressures with which particles push walls."""
+    """(n,) adjoint of the pressures that particles exert on walls."""
     stress: wp.array
-    """(n,) of the pressures that a gauge would read."""
+    """(n,) adjoint of the pressures that a gauge would read."""
     v_star: wp.array
-    """(n,) of the predicted velocities."""
+    """(n,) adjoint of the predicted velocities."""
 
 
 class QuantityFormula(Protocol):
     """A formula of a quantity of the sorted particles of a step, with its derivatives: numbers or vectors (n,), or six
-    numbers for each scene. ``p`` (n,) are the pressures by which particles push walls, where the step was taken."""
+    numbers for each scene. ``p`` (n,) are the pressures that particles exert on walls, if the step was taken."""
 
     def value(self, step: StepContext, p: Any) -> wp.array:
         """Return the quantity; the next call overwrites it."""
 
     def tangent(self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any) -> wp.array:
-        """Return the tangent of the quantity, given those of p and of the pressures that a gauge would read."""
+        """Return the tangent of the quantity, given the tangents of p and of the pressures that a gauge would read."""
 
     def adjoint(self, step: StepContext, p: Any, own: wp.array, bar: Bars) -> None:
-        """Add to the adjoints ``bar`` by the quantity's own one."""
+        """Add the contribution of the quantity's adjoint ``own`` to the adjoints ``bar``."""
 
 
 def turns(discretisation: Discretisation) -> Callable[..., Any]:
@@ -97,8 +97,8 @@ def circulation_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def number_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
-    """Make the kernels of densities, of speeds, whose derivative at rest, where they have a kink, is taken as 0, and of
-    the vorticity, given the circulation c; ``factor`` is mu."""
+    """Make the kernels of density, of speed, and of vorticity given the circulation c; ``factor`` is mu. At rest, where
+    the speed has a kink, its derivative is set to 0."""
     real, vector = precision.real, precision.vector
     modules = [kernel_module(f"quantities_{kind}_{precision.name}") for kind in ("forward", "tangent", "derivative")]
 
@@ -138,8 +138,8 @@ def wall_force_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def load_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of each particle's share in the force and the torque on a solid with a ``middle``, along a
-    periodic axis by the shorter arm; ``twist`` are its `WallLoads.twists`."""
+    """Make the kernels of each particle's contribution to force and torque on a solid with a ``middle``. Along periodic
+    axes the shorter arm counts; ``twist`` are the particle's `WallLoads.twists`."""
     real, vector = precision.real, precision.vector
     module, derivative = (kernel_module(f"{name}_{precision.name}") for name in ("load", "load_derivative"))
     numbers = ["cell", "period"]
@@ -203,7 +203,8 @@ class OfParticles:
     one."""
 
     def __init__(self, solver: ParticleSolver, kernels: Kernels, kind: Any, total: Kernels | None = None, **given: Any):
-        """Take kernels that write ``q``, of a ``kind``, and those of the sum ``circulation``; ``given`` are numbers."""
+        """Take kernels that compute ``q`` of type ``kind``, and the kernels of the sum ``circulation``; ``given`` are
+        constants."""
         self._kernels, self._total, self._given = kernels, total, given
         self._q = solver.layout.arrays(q=kind, q_dot=kind)
         names = () if total is None else ("circulation", "circulation_dot", "circulation_bar")
@@ -246,7 +247,7 @@ class Pressure:
 
 
 class WallLoads:
-    """The forces of a solver's particles on walls [N], vectors (n,) on the device, which the next call overwrites.
+    """The forces of a solver's particles on walls [N], vectors (n,) on the device; the next call overwrites them.
     ``solid`` is the number of a solid's wall particles, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def __init__(self, solver: ParticleSolver):
@@ -280,7 +281,7 @@ class WallLoads:
         return found
 
     def adjoint(self, step: StepContext, p: wp.array, f_bar: wp.array, bar: Bars, solid: int) -> None:
-        """Add to the adjoints of the particles by that of the forces f."""
+        """Add the contribution of the adjoint of the forces f to the particles' adjoints."""
         known, bars = self._sums(step, p, solid), {**self._bars, "p_bar": bar.p}
         step.launch(self._kernels.adjoint, known, bars, *bar.of.named, self._numbers, f_bar=f_bar)
         self._push.adjoint(step, bar.of, solid, self._bars["push_bar"], bar.v_star)
@@ -290,8 +291,8 @@ class WallLoads:
             action.adjoint(step, bar.of, solid, self._bars["rub_bar"], bar.v_star)
 
     def twists(self, step: StepContext, solid: int) -> wp.array:
-        """Return the sums of y x a over forces that act at x_i - y, by the walls of a solid; times m_i s^d they twist
-        it [N m]."""
+        """Return the sums of y x a over a solid's wall forces, which act at x_i - y; times m_i s^d they are torques on
+        the solid [N m]."""
         return self._total("twist", [action.total(step, solid) for action in self._twists])
 
     def twists_tangent(self, step: StepContext, along: Tangents, solid: int) -> wp.array:
@@ -299,7 +300,7 @@ class WallLoads:
         return self._total("twist_dot", [action.tangent(step, along, solid) for action in self._twists])
 
     def twists_adjoint(self, step: StepContext, total_bar: wp.array, bar: Bars, solid: int) -> None:
-        """Add to the adjoints of the particles by that of `twists`."""
+        """Add the contribution of the adjoint of `twists` to the particles' adjoints."""
         for action in self._twists:
             action.adjoint(step, bar.of, solid, total_bar, bar.v_star)
 
@@ -311,7 +312,7 @@ class WallLoads:
         return found
 
     def _total(self, name: str, arrays: list[wp.array]) -> wp.array:
-        """Add up arrays; the sum of one is itself."""
+        """Return the sum of arrays; a single array is returned as it is."""
         if len(arrays) == 1:
             return arrays[0]
         total = self._vectors[name]
@@ -339,9 +340,9 @@ class WallForces:
 
 
 class SolidLoads:
-    """The quantity of force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i. The vector r_i leads to
-    particle i from the middle of the solid at the end of the step, where its walls are. For viscosity as a stress r_i
-    leads to the surface beneath the particle."""
+    """The quantity of force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i. The vector r_i points from
+    the solid's middle at the end of the step, where its walls are, to particle i. For viscosity as a stress it points
+    to the surface beneath the particle."""
 
     def __init__(self, loads: WallLoads, solver: ParticleSolver, solid: NamedSolid):
         vector, layout, number = solver.layout.precision.vector, solver.layout, solid.number
@@ -354,7 +355,7 @@ class SolidLoads:
 
     @cached_property
     def _each(self) -> dict[str, wp.array]:
-        """Make the arrays of particles' shares, as most runs do without."""
+        """Allocate the arrays of particles' contributions on first use: most runs do not need them."""
         return self._layout.arrays(load=SIX, load_dot=SIX)
 
     @cached_property

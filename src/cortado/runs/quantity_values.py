@@ -1,6 +1,6 @@
-"""Quantities of particles by name, of a state together with what the step after it depends on, with their derivatives.
+"""Quantities of particles by name, with derivatives, computed from a state and the parameters of the step after it.
 
-What a state decides of each particle is computed here from formulas, and recorded in the states of a run.
+The module computes them from formulas, and records them in the frames of a run.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -34,14 +34,13 @@ from cortado.sph.parts import Adjoints, StepContext, sort
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A state, and the parameters of the step that begins at it. Quantities are computed when they are asked for, and
-    kept."""
+    """A state, and the parameters of the step that begins at it. Quantities are computed on first use and cached."""
 
     state: State
     """The state on the device."""
     parameters: Mapping[str, NDArray]
-    """Parameters by name, with one row of those over time, and a first axis for the scenes of a batch or one for all of
-    them."""
+    """Parameters by name; of time-dependent ones the step's row. The first axis is over the scenes of a batch, or has
+    length 1."""
     substeps: int
     """Explicit steps of diffusion within the step."""
     row: int
@@ -49,10 +48,10 @@ class Moment:
     evaluator: Callable[[], "QuantityEvaluator"]
     """Makes the object that computes quantities."""
     wanted: set[str] = field(default_factory=set)
-    """Quantities that were asked for, also of other moments of a run that share this set: those that need a step are
-    computed by one."""
+    """Quantities asked for so far, also at other moments of a run, which share this set: one step computes all that
+    need a step."""
     counts: list[Counts] = field(default_factory=list)
-    """Rounds of the loops of the step, one entry once the run that took it has told them."""
+    """Iteration counts of the step's loops: one entry, once the run has taken the step."""
     _values: Arrays = field(default_factory=dict)
 
     @classmethod
@@ -64,8 +63,8 @@ class Moment:
         evaluator: Callable[[], "QuantityEvaluator"],
         wanted: set[str] | None = None,
     ) -> "Moment":
-        """Take a state of a rollout's present evaluation, after ``step`` steps. After the last one the parameters are
-        as `row_of` says."""
+        """Take a state of a rollout's present evaluation, after ``step`` steps. For the parameters after the last step
+        see `row_of`."""
         parameters = row_of(rollout, rollout.parameters.written, step)
         size = rollout.step_sizes.of_step(min(step, max(rollout.steps - 1, 0)))
         if size is not None:
@@ -83,11 +82,11 @@ class Moment:
         return self._values[name]
 
     def know(self, values: Arrays) -> None:
-        """Take quantities, by name, that the run itself has computed."""
+        """Store quantities (by name) that the run itself has computed."""
         self._values.update(values)
 
     def adjoint(self, bars: Mapping[str, NDArray]) -> tuple[Arrays, Arrays]:
-        """Turn adjoints of quantities into those of the state's fields and of the step's parameters."""
+        """Convert adjoints of quantities to adjoints of the state's fields and of the step's parameters."""
         return self.evaluator().adjoint(bars, self)
 
     def tangents(self, names: list[str], dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]) -> Arrays:
@@ -96,9 +95,9 @@ class Moment:
 
 
 STRESS = "pressure"
-"""The quantity that is the mean stress, which others do not need."""
+"""The quantity that is computed from the mean stress; no other quantity needs it."""
 OF_PRESSURE = {STRESS, "wall_force"}
-"""Quantities of particles that need the step after the state to be solved; others need its neighbours alone."""
+"""Quantities of particles that require solving the step after the state; others only need the state's neighbours."""
 
 
 class StepWithin(PressureAdjoint, Protocol):
@@ -108,13 +107,13 @@ class StepWithin(PressureAdjoint, Protocol):
 
 
 def _needs_the_step(name: str) -> bool:
-    """Test whether a quantity needs the step after the state to be solved, and not its neighbours alone."""
+    """Test whether a quantity requires solving the step after the state, rather than only the state's neighbours."""
     return name in OF_PRESSURE or is_load(name)
 
 
 class QuantityEvaluator:
-    """A computation of quantities of states, with tangents and adjoints, in the arrays of one solver, which no run may
-    use meanwhile. Its arguments and results are in the scene's order, of a batch with a first axis for the scenes."""
+    """Computes quantities of states, with tangents and adjoints, in the arrays of one solver; no run may use the solver
+    meanwhile. Arguments and results are in the scene's order; for a batch the first axis is over the scenes."""
 
     def __init__(self, solver: Solver, scene: Scene, circulation_factor: float):
         """Take a solver; ``circulation_factor`` is that of `cortado.discretise.smoothing`. Raises `InputError` for a
@@ -125,15 +124,15 @@ class QuantityEvaluator:
         self.lattice = solver.lattice
         """Constants of the lattice of particles at rest."""
         self.solids: tuple[SolidTable, ...] = scene.solid
-        """As they begin."""
+        """The solids in their initial poses."""
         self.container: Container = scene.container
         self._formulas = {**formulas(solver, circulation_factor), **spring_loads(solver)}
         self._counts: Counts = ()
-        """Of the step that was solved last."""
+        """Iteration counts of the step solved last."""
         self._graphs: dict[tuple[int, Counts], CapturedGraph] = {}
-        """The way back from pressures, by the solver's generation and the counts of the step."""
+        """Captured adjoints of pressures, by the solver's generation and the step's iteration counts."""
         self._rounds: list[int] = []
-        """(members,) the same of each scene."""
+        """(members,) iteration counts of each scene."""
 
     @property
     def turn(self) -> Turn:
@@ -141,7 +140,7 @@ class QuantityEvaluator:
         return self.solver.turn
 
     def within(self, names: Iterable[str]) -> dict[str, QuantityFormula]:
-        """Return by name the formulas of quantities that need a step, for steps of the solver that others take."""
+        """Return by name the formulas of quantities that need a step, for use within steps taken by a run."""
         return {name: self._formulas[name] for name in self._checked(names)}
 
     @in_turn
@@ -170,8 +169,8 @@ class QuantityEvaluator:
 
     @in_turn
     def adjoint(self, bars: Mapping[str, NDArray], moment: Moment) -> tuple[Arrays, Arrays]:
-        """Turn adjoints of quantities, by name, into those of the state, by fields, and of the parameters of the step,
-        as `Moment` has them but with an axis for the scenes."""
+        """Convert adjoints of quantities (by name) to adjoints of the state's fields and of the step's parameters.
+        Parameters are as in `Moment`, with an axis for the scenes."""
         wanted, solver = self._checked(bars), self.solver
         if wanted == [STRESS]:
             return self._from_stress(bars[STRESS], moment)
@@ -192,7 +191,7 @@ class QuantityEvaluator:
         return self._found(adjoint, state_bar)
 
     def _from_stress(self, stress_bar: NDArray, moment: Moment) -> tuple[Arrays, Arrays]:
-        """Return what `adjoint` does for pressures that a gauge would read, by a captured graph."""
+        """Return the result of `adjoint` for pressures that a gauge would read, using a captured graph."""
         solver, (given, _, state_bar), adjoint = self.solver, self._of_stress, self._pressure_adjoint
         self._set(moment)
         if not moment.counts:
@@ -207,7 +206,7 @@ class QuantityEvaluator:
         return self._found(adjoint, state_bar)
 
     def _go_back(self, counts: Counts) -> None:
-        """Replay the step, and go back through it from the adjoint of pressures."""
+        """Replay the step, and run its adjoint, starting from the adjoint of pressures."""
         solver, parameters, (given, own, state_bar) = self.solver, self._rollout.parameters, self._of_stress
         solver.reserve(counts)
         solver.replay(self._rollout.initial, parameters, counts)
@@ -216,7 +215,7 @@ class QuantityEvaluator:
 
     @cached_property
     def _of_stress(self) -> tuple[wp.array, WithinBar, State]:
-        """Make the adjoint of pressures in the scene's order, that within the step, and that of the state."""
+        """Allocate three adjoints: of pressures in the scene's order, within the step, and of the state."""
         solver, numbers = self.solver, self.solver.numbers
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
         return numbers(), WithinBar(fields, numbers(), numbers(), solver.vectors()), solver.new_state()
@@ -241,7 +240,7 @@ class QuantityEvaluator:
     # ---- the step ------------------------------------------------------------------------------------------------
 
     def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[StepContext, wp.array | None]:
-        """Find the particles' neighbours and, where a pressure is wanted, take the step; ``replay`` it for
+        """Find the particles' neighbours and, if a pressure is wanted, take the step; with ``replay`` prepare
         derivatives."""
         self._set(moment)
         solved = any(map(_needs_the_step, names))
@@ -264,7 +263,7 @@ class QuantityEvaluator:
         return context
 
     def _solve(self, replay: bool) -> tuple[StepContext, wp.array]:
-        """Take the step, and return it with the pressures by which particles push walls."""
+        """Take the step, and return it with the pressures that particles exert on walls."""
         solver, rollout = self.solver, self._rollout
         rollout.forward(keep=False)
         found = solver.pressures()
@@ -284,7 +283,7 @@ class QuantityEvaluator:
     def _tangent(
         self, names: Iterable[str], state_dot: State, along: Parameters
     ) -> tuple[ParticleTangent | PressureTangent, wp.array | None, wp.array | None]:
-        """Return the tangent of the sorted particles, and of their two pressures, as far as they are wanted."""
+        """Return the tangents of the sorted particles and, if wanted, of their two pressures."""
         solver, parameters = self.solver, self._rollout.parameters
         if not any(map(_needs_the_step, names)):
             own = ParticleTangent(solver, along)
@@ -325,7 +324,7 @@ class QuantityEvaluator:
         return self.solver.search.order.numpy()[: self.solver.layout.all_particles]
 
     def _shown(self, name: str, values: wp.array) -> NDArray:
-        """Return a quantity in the scene's order; loads on solids have none."""
+        """Return a quantity in the scene's order, or the components of a load on a solid."""
         own = values.numpy().astype(np.float64)
         if is_load(name):
             return self._load(own)
@@ -334,7 +333,8 @@ class QuantityEvaluator:
         return self._by_scene(found[:, 2] if name == "vorticity" and self.dimension == 2 else found)
 
     def of_scene(self, name: str, values: NDArray) -> NDArray:
-        """Return as `values` does a quantity that a step has left in the scene's order, or six numbers of a load."""
+        """Return, in the form of `values`, a quantity stored by a step in the scene's order, or the six numbers of a
+        load."""
         found = values.astype(np.float64)
         found.flags.writeable = False
         return self._load(found) if is_load(name) else self._by_scene(found)
@@ -348,7 +348,7 @@ class QuantityEvaluator:
         return own if batch is None else own.reshape(batch, -1, *own.shape[1:])
 
     def _sorted(self, name: str, values: NDArray) -> wp.array:
-        """Return the adjoint of a quantity on the device, as its formula has the quantity there."""
+        """Return the adjoint of a quantity on the device, in the order of sorted particles that its formula uses."""
         given, layout = np.asarray(values, dtype=np.float64), self.solver.layout
         if is_load(name):
             six = np.zeros((layout.members, 6))
@@ -364,7 +364,8 @@ class QuantityEvaluator:
 
 def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
     """Return the values of parameters for all steps of a rollout, and one row of those over time, in arrays of their
-    own. After the last step its values hold on; paths of solids are continued, as solids would stop otherwise."""
+    own. After the last step, values stay constant, except that paths of solids are extrapolated, as solids would
+    otherwise stop."""
     found = {}
     for name, value in values.items():
         shares = _shares_of_rows(rollout, name, row, value) or {}
@@ -384,7 +385,7 @@ def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArr
 
 
 def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> dict[int, float] | None:
-    """Return the rows of which a row is the sum, with their factors; None for parameters that are not over time."""
+    """Return the rows, with factors, whose weighted sum is a given row; None for time-independent parameters."""
     known = rollout.solver.layout.known
     if name not in known.over_time:
         return None
@@ -395,14 +396,14 @@ def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> d
 
 
 class Recorder:
-    """A computation of quantities of a rollout's states. It has a solver of its own for the same scene, as the arrays
-    of the rollout's solver are in use."""
+    """Computes quantities of a rollout's states. It has its own solver for the same scene, as the arrays of the
+    rollout's solver are in use."""
 
     def __init__(
         self, rollout: Rollout, names: Iterable[str], evaluator: Callable[[], QuantityEvaluator], dimension: int
     ):
-        """Take ``names`` of quantities; ``evaluator`` makes their evaluator, and is called where there are some. Raises
-        `InputError` for an unknown name."""
+        """Take ``names`` of quantities; ``evaluator`` creates their evaluator and is called only if there are names.
+        Raises `InputError` for an unknown name."""
         self.names = tuple(dict.fromkeys(check_quantity(name, "record") for name in require_names("record", names)))
         self._rollout, self._evaluator = rollout, evaluator() if self.names else None
         self._dimension = dimension
@@ -417,7 +418,7 @@ class Recorder:
         return {name: self._value(name, moment).astype(real) for name in self.names}
 
     def _value(self, name: str, moment: Moment) -> NDArray:
-        """Return a quantity; NaN where the next step loses a particle, for which the run raises the error itself."""
+        """Return a quantity; NaN if the next step loses a particle: the run itself raises that error."""
         try:
             return moment.value(name)
         except DivergedError:

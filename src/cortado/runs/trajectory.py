@@ -374,7 +374,7 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file that `save` or `TrajectoryWriter` wrote; its writer may still be writing or may have been killed.
+        """Read the file at ``path`` that `save` or `TrajectoryWriter` wrote; its writer may be running or killed.
 
         Raises:
             InputError: the file is missing, damaged, or none of Cortado's trajectories.
