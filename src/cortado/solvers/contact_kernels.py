@@ -1,28 +1,30 @@
 """Bodies that touch the container, solids and each other: a smooth penalty with restitution and friction.
 
-Points of a body's surface are in the other solid, where they would go, by d_j > 0, along the normals n_j of the faces
-above them. With the weights w_j = d_j^3 / sum d_j^3 the contact is D = sum_j w_j d_j deep, near the greatest depth
-whatever the number of points. The body gets the momentum
+At the predicted pose, points of a body's surface are inside the other solid by depths d_j > 0 along the normals n_j of
+the faces above them. With the weights w_j = d_j^3 / sum d_j^3 the contact has the depth D = sum_j w_j d_j, which is
+near the greatest depth for any number of points. The body gets the momentum
 
     P = (q / dt) m D sum_j w_j n_j,   1 / m = 1 / M + r^2 / I,
 
-and the other solid -P. Here r is the arm of P, I the least moment of inertia, and 1 / m has the same of another body
-that is free. So each contact swings with sqrt(q) / dt. Of two free bodies each has points in the other, and both
-contacts count half.
+and the other solid -P. Here r is the arm of P and I the least moment of inertia; if the other solid is free, 1 / m also
+has the same terms of that body. So each contact oscillates with the angular frequency sqrt(q) / dt. Two free bodies
+have points in each other, and both contacts have the weight one half.
 
-*Restitution*: D has also beta - 1 of its growth in the step. beta(e), by which a body leaves with e of its
-speed, is a fit to steps of one that hits a wall, within 0.004 for e from 0.03 to 0.95, and 0.98 for 1.
+*Restitution*: beta - 1 times the growth of D in the step is added to D. beta(e), with which a body rebounds at e times
+its speed, is fitted to steps of a body that hits a wall: within 0.004 for e from 0.03 to 0.95; for e = 1 it rebounds at
+0.98.
 
-*Friction* (Coulomb's): to stop what slips takes Q = sum_j w_j (m_j u_j + M g dt). Point j slips by u_j, m_j is the mass
-that a push there sees, and gravity counts along the face where the other solid is not free. The body gets
+*Friction* (Coulomb's): the momentum that would stop all slip is Q = sum_j w_j (m_j u_j + M g dt). Point j slips with
+the velocity u_j and m_j is its effective mass. The term with gravity along the face is only there if the other solid is
+not free. The body gets
 
     -Q / (1 + t^8)^(1/8),   t = sum_j w_j |m_j u_j + M g dt| / (mu (q / dt) m D):
 
-what stops it where that is little, and mu times the push where it is much. So what lies on a slope creeps with up to
-t^8 / 8 times M g dt / m_j.
+which stops the slip if Q is small, and is mu times the push if Q is large. So a body at rest on a slope creeps with up
+to t^8 / 8 times M g dt / m_j.
 
-All is smooth but for corners where a contact begins, or the face above a point changes. At mu = 0 the derivative by mu
-is that of one side.
+All is smooth except that derivatives jump when a contact begins or the face above a point changes. At mu = 0 the
+derivative with respect to mu is one-sided.
 """
 
 from dataclasses import dataclass
@@ -41,10 +43,10 @@ from cortado.sph.moving_solids import free_module, hold_type
 STIFFNESS = 0.04
 """The stiffness q of contacts [-]."""
 FAR = 1e6
-"""[m] beyond which no face is looked for."""
+"""[m] the greatest distance at which faces are searched."""
 SHARES = ("pushes", "drags", "scales")
-"""What a point adds: d^3 n and its moments about the middles of both solids, as columns; the same of d^3 times what
-stops the point; and d^3, d^4, both also with d before the step, and the length of that."""
+"""Names of a point's terms: d^3 n and its moments about the middles of both solids, as columns; the same for d^3 times
+the momentum that stops the point; d^3 and d^4, both also with d before the step; and the length of that momentum."""
 OWN = ("before", "turned_before", "after", "turned")
 POSES = ("before", "turns_before", "after", "turns")
 NUMBERS = ("time_step", "density", "other_density")
@@ -56,15 +58,15 @@ class ContactKernels:
     scene."""
 
     look: Any
-    """This finds the face that a point is deepest behind, and goes on from the deepest so far: the normal in the frame
-    of the other solid, how far the plane is from the middle of that along it, for a scale of 1, and the shift to the
-    image that is near."""
+    """Finds the face behind which a point is deepest, starting from the deepest found so far. It writes the normal in
+    the other solid's frame, the distance of the face's plane from that solid's middle at a scale of 1, and the shift to
+    the nearest periodic image."""
     push: Kernels
-    """These compute `SHARES` from both poses, the scale of the other solid, the lift of `lift_kernels` and `NUMBERS`;
-    adjoints of these are written, point by point."""
+    """Compute `SHARES` from both poses, the scale of the other solid, the lift of `lift_kernels` and `NUMBERS`. The
+    adjoint kernel writes adjoints of these inputs, point by point."""
     give: Kernels
-    """These turn the sums of shares into the momenta of both, with a thread for each scene; a solid that is not free
-    gets none."""
+    """Turn the sums of shares into momenta of both solids, with a thread for each scene; a solid that is not free gets
+    none."""
 
 
 @cache
@@ -97,7 +99,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
 
     @wp.func
     def ease(density: real, other: real, volumes: pair, greatest: pair, is_free: bool, arms: pair) -> real:
-        """Return 1 / m of a push with arms of these squares about the middles of both solids."""
+        """Return 1 / m of a push, given the squared arms about the middles of both solids."""
         found = (one / volumes[0] + greatest[0] * arms[0]) / density
         if is_free:
             found += (one / volumes[1] + greatest[1] * arms[1]) / other

@@ -24,7 +24,7 @@ Arrays = dict[str, wp.array]
 
 @dataclass(frozen=True)
 class Touching:
-    """A free body and what it may touch: all solids at rest, or one solid that moves."""
+    """A free body and solids that it may touch: all solids at rest, or one moving solid."""
 
     body: int
     """Number of the body among the free bodies."""
@@ -34,9 +34,9 @@ class Touching:
     """Number of the other solid among the free bodies; -1 for a solid that is not free."""
     obstacles: Sequence[Obstacle]
     points: NDArray[np.float64]
-    """(n, d) of the surface of the body, in its frame [m]"""
+    """(n, d) points of the body's surface in the body's frame [m]"""
     slides: Sequence[float] = ()
-    """(d,) How fast the surface of the other solid slides, in its frame [m/s]; 0 where it does not."""
+    """(d,) velocity with which the other solid's surface slides, in this solid's frame [m/s]; 0 without sliding"""
 
 
 class Contact:
@@ -57,14 +57,14 @@ class Contact:
         self.own = wp.array(np.tile(points, (layout.members, 1)), dtype=vector, device=device)
         self.all = layout.members * self.count
         self.found = self.arrays({"face": vector, "plane": real, "shift": vector, "depth": real})
-        """The faces that points are behind, as the kernel ``look`` writes them."""
+        """The faces above points of the body, as the kernel ``look`` writes them."""
 
     def arrays(self, kinds: Mapping[str, Any]) -> Arrays:
-        """Make arrays (members points,) of zeros, by name, each of its own type."""
+        """Make arrays (members points,) of zeros by name, with the types in ``kinds``."""
         return {name: wp.zeros(self.all, dtype=kind, device=self.layout.device) for name, kind in kinds.items()}
 
     def poses(self, each: Sequence[Named]) -> Named:
-        """Return pose, scale and tangents of the other solid under the names of kernel arguments, out of those of all
+        """Return pose, scale and tangents of the other solid by the names of kernel arguments, given those of all
         moving solids, ``each``."""
         against = self.touching.against
         other = resting_pose(self.layout) if against < 0 else each[against]
@@ -119,18 +119,20 @@ class Contacts:
             for label, value in unsaid.items()
             for suffix in ("", "_dot", "_bar")
         }
-        """Numbers of bodies that say none, which are no parameters, with tangents and adjoints that nobody reads."""
+        """Default values for bodies without such keys; they are not parameters, and their tangents and adjoints are
+        never read."""
         self.lifts = lift_kernels(layout.precision)
         self.lift = {"lift": wp.zeros(layout.members, dtype=layout.precision.vector, device=layout.device)}
 
     def bodies(self, number: int) -> tuple[FreeBody, FreeBody]:
-        """Return the body of a contact and the other free body; the first one twice where the other is not free."""
+        """Return the body of a contact and the other free body. If the other solid is not free, return the first body
+        twice."""
         touching, bodies = self.contacts[number].touching, self.part.bodies
         own = bodies[touching.body]
         return own, own if touching.other < 0 else bodies[touching.other]
 
     def known(self, step: StepContext, number: int) -> tuple[Named, ...]:
-        """Return the arrays and constants of a contact by the names that kernels have for them."""
+        """Return the arrays and constants of a contact by the names of kernel arguments."""
         contact, (own, other), pair = self.contacts[number], self.bodies(number), self.layout.precision.pair
         constants: dict[str, Any] = {
             "particles": contact.count,
@@ -145,7 +147,7 @@ class Contacts:
         return *known, self._poses[number], own.constants, self.lift
 
     def numbers(self, parameters: Parameters, number: int, suffix: str = "") -> Arrays:
-        """Return what both solids are by their parameters, or tangents or adjoints, by the kernels' names."""
+        """Return the parameters of both solids, or tangents or adjoints of these, by the names of kernel arguments."""
         found = {f"time_step{suffix}": parameters["time_step"]}
         for way, body in zip(("", "other_"), self.bodies(number), strict=True):
             name, weight = body.table.name, body.table.weight
@@ -156,7 +158,7 @@ class Contacts:
         return found
 
     def given(self, number: int, each: Sequence[FreeBody | Changes]) -> Arrays:
-        """Return the momenta that both solids get, or their changes."""
+        """Return the momenta that both solids get, or tangents or adjoints of these."""
         touching = self.contacts[number].touching
         return given_to(each, touching.body, touching.other)
 
@@ -173,12 +175,13 @@ class Contacts:
             step.launch(self.kernels.give.forward, given, *self.known(step, number), threads=self.layout.members)
 
     def tangent(self, changes: Sequence[Changes]) -> "ContactsTangent":
-        """Return forward mode of `look`: from ``changes`` of the bodies' poses to those of what contacts push with."""
+        """Return the tangent of `look`: it computes tangents of the contacts' pushes from ``changes`` of the bodies'
+        poses."""
         return ContactsTangent(self, changes)
 
     def adjoint(self, changes: Sequence[Changes]) -> "ContactsAdjoint":
-        """Return reverse mode of `look`: from the adjoints in ``changes`` of what contacts push with to those of poses,
-        densities and the time step."""
+        """Return the adjoint of `look`: it turns adjoints, in ``changes``, of the contacts' pushes into adjoints of
+        poses, densities and the time step."""
         return ContactsAdjoint(self, changes)
 
 
@@ -203,7 +206,7 @@ class ContactsTangent:
 
 
 def lift_sizes(of: Tangents | Adjoints, suffix: str) -> Arrays:
-    """Return tangents or adjoints of what the lift is made of."""
+    """Return tangents or adjoints of the values from which the lift is computed."""
     return {f"{name}{suffix}": of.parameters[name] for name in ("time_step", "gravity")}
 
 
@@ -220,7 +223,7 @@ class ContactsAdjoint:
         self._sums = zeros(sums, layout.device)
 
     def look(self, step: StepContext, bar: Adjoints) -> None:
-        """Apply the adjoint of `Contacts.look`: from adjoints of the bodies' momenta to adjoints of their poses."""
+        """Apply the adjoint of `Contacts.look`: turn adjoints of the bodies' momenta into adjoints of their poses."""
         contacts, members = self._contacts, self._contacts.layout.members
         for number, (contact, moved) in enumerate(zip(contacts.contacts, self._moved, strict=True)):
             numbers = contacts.numbers(bar.parameters, number, "_bar")

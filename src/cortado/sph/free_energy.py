@@ -1,7 +1,7 @@
 """Helmholtz free energies F(c) = alpha f(c) of a mixture, and how mobile its phases are (Yang et al. 2015).
 
-    double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: the mixture separates into pure phases (Lee and Kim 2015) miscible
-    f = sum_k c_k^2 / 2: phases mix, by Fick's law
+    double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: the mixture separates into pure phases (Lee and Kim 2015)
+    miscible     f = sum_k c_k^2 / 2: phases mix, by Fick's law
 
     constant     m = 1
     degenerate   m = (z + sqrt(z^2 + delta^2)) / 2,   z = sum_(k<l) c_k c_l: where phases touch

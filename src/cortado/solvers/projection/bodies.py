@@ -22,7 +22,7 @@ class Start:
     """The velocities of a body before pressures push it in a step, or tangents or adjoints of these velocities."""
 
     motion: Arrays
-    """V_0, W_0 and L_0 by the names that kernels have for them; they precede all other arrays of a step."""
+    """V_0, W_0 and L_0 by the names of kernel arguments; they take precedence over other arrays of a step."""
     given: Arrays
     """The parts of both momenta that contact gives."""
 
@@ -33,14 +33,15 @@ class Start:
 
     @classmethod
     def at_rest(cls, layout: Layout, suffix: str) -> "Start":
-        """Return zero velocities, for a step of no length without gravity; its adjoints are never read."""
+        """Return zero velocities, for a step of length 0 without gravity; adjoints of these are never read."""
         kinds = {**dict.fromkeys(("V_0", "W_0", "L_0"), layout.precision.vector), "time_step": layout.precision.real}
         sizes = {f"{name}{suffix}": (layout.members, kind) for name, kind in kinds.items()}
         return cls(zeros(sizes, layout.device), {})
 
 
 class Held:
-    """The arrays by which particles know a body in a step, or their tangents or adjoints with a ``suffix`` of names."""
+    """Arrays of particles about one body in a step, or tangents or adjoints of these with names that end in
+    ``suffix``."""
 
     def __init__(self, body: FreeBody, layout: Layout, start: Start, suffix: str = ""):
         self.body, self.start, self._layout = body, start, layout
@@ -48,14 +49,14 @@ class Held:
         self.known = layout.arrays(suffix, gamma_of=vector, arm=vector, sizes=precision.pair)
         self.shares = layout.arrays(suffix, pulled=vector, twisted=vector)
         self.moved = {f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=device) for name in "VWL"}
-        """V, W and L of an iteration."""
+        """V, W and L of the body in an iteration."""
         names = ("faster", "turned_faster")
         self.faster = {f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=device) for name in names}
         """V - V_0 and W - W_0."""
         self._sums = [layout.sum_of(vector) for _ in range(2)]
         self._suffix, self._whole = suffix, layout.sum_of(precision.pair)
         self.whole: Arrays = {}
-        """The sums of the sizes of gamma and of its torque."""
+        """The sums, over particles, of the sizes of gamma and of its torque."""
 
     def at_rest(self) -> "Held":
         """Return a copy that shares the arrays of this body but begins at rest."""
@@ -89,21 +90,21 @@ class Bodies:
         return [{**held.moved, **held.faster} for held in self.held]
 
     def at_rest(self) -> "Bodies":
-        """Return these bodies beginning at rest, pushed by pressures alone, and without hinges between them: `drifted`
-        is linear in the pressures."""
+        """Return a copy of these bodies that begin at rest, are pushed by pressures alone, and have no hinges; so
+        `drifted` is linear in the pressures."""
         other = copy(self)
         other.joints = Joints(self.part, (), self.layout)
         other.held, other.drift = [held.at_rest() for held in self.held], wp.zeros_like(self.drift)
         return other
 
     def known(self, context: StepContext, held: Held) -> tuple[Named, ...]:
-        """Arguments of kernels that are about a body, by name."""
+        """Return the kernel arguments about one body, by name."""
         own = held.known, held.shares, held.faster, held.whole, held.start.motion
         return *own, *held.body.known(context)
 
     def begin(self, context: StepContext, around: Arrays, k: wp.array) -> None:
-        """Find which particles bodies push in a step, and add the bodies' part to the pressure matrix' diagonal; find
-        what the pressures ``k`` of the step before would give to bodies without slip."""
+        """Find which particles bodies push in a step, and add the bodies' part to the pressure matrix' diagonal;
+        compute the momenta that the pressures ``k`` of the previous step would give to bodies without slip."""
         self.joints.begin(context)
         for held in self.held:
             context.launch(self.kernels.hold.forward, *self.known(context, held), edge=around["edge"])
@@ -126,7 +127,7 @@ class Bodies:
         return sums
 
     def drifted(self, context: StepContext, drift: wp.array, y: wp.array) -> wp.array:
-        """Return the drift of walls where bodies have the velocities that pressures y give them."""
+        """Return the drift of walls for the velocities that pressures y give to bodies."""
         self.join(context, y)
         for held in self.held:
             known = self.known(context, held)
@@ -135,17 +136,17 @@ class Bodies:
         return drift
 
     def loosen(self, context: StepContext, y: wp.array) -> list[Arrays]:
-        """Write the velocities that pressures y give to bodies without the hinges between them, and return the sums of
-        `move` of each."""
+        """Write the velocities that pressures y give to bodies without hinges, and return the sums by `move` for each
+        body."""
         return [self.move(context, held, y, held.moved) for held in self.held]
 
     def join(self, context: StepContext, y: wp.array) -> None:
-        """Write the velocities that pressures y give to bodies on their hinges."""
+        """Write the velocities that pressures y give to bodies with their hinges."""
         self.loosen(context, y)
         self.joints.join(context, self.velocities)
 
     def settle(self, context: StepContext, y: wp.array) -> None:
-        """Write the velocities that pressures y give to bodies as those at the end of the step."""
+        """Write the velocities that pressures y give to bodies, as the bodies' velocities at the end of the step."""
         self.join(context, y)
         for held in self.held:
             for name, array in held.body.moved.items():
@@ -196,7 +197,8 @@ class BodiesTangent:
                     wp.copy(pressed, total)
 
     def _join(self, context: StepContext, dot: Tangents, y: wp.array, y_dot: wp.array) -> None:
-        """Write the velocities that pressures y give to bodies on their hinges, and the tangents of these."""
+        """Write the velocities that pressures y give to bodies with their hinges, and the tangents of these
+        velocities."""
         bodies = self._bodies
         for k in range(len(self._held)):
             self._move(context, dot, k, (y, y_dot))
@@ -274,7 +276,7 @@ class BodiesAdjoint:
                 array.zero_()
 
     def _loosen(self, context: StepContext, bar: Adjoints, y: wp.array, y_bar: wp.array) -> None:
-        """Turn the adjoints of V, W and L of bodies, and of V - V_0 and W - W_0, into that of the pressures y."""
+        """Turn the adjoints of bodies' V, W, L, V - V_0 and W - W_0 into the adjoint of the pressures y."""
         bodies, bars = self._bodies, [{**own.moved, **own.faster} for own in self._held]
         sums = bodies.loosen(context, y)
         self._joints.join(context, bar, bodies.velocities, bars, self._turned)
@@ -323,8 +325,8 @@ class BodiesAdjoint:
         around_bar: Arrays,
         pressures: tuple[wp.array, wp.array],
     ) -> None:
-        """Apply the adjoint of what `Bodies.begin` finds of bodies without slip, given the pressures of the step before
-        and their adjoints, after `finish`."""
+        """Apply, after `finish`, the adjoint of the momenta that `Bodies.begin` computes for bodies without slip, given
+        the pressures of the previous step and their adjoints."""
         for k, held in enumerate(self._bodies.held):
             if held.body.table.sticks:
                 for array in self._held[k].known.values():

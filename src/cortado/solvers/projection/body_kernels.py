@@ -1,19 +1,18 @@
-"""A rigid body in the projection: it takes part by its velocities, which pressures change as they change those of
-fluid.
+"""A rigid body in the projection: pressures change the body's velocities as they change velocities of fluid.
 
-Walls of a body push particle i by gamma_i = sum w_b (N_b g_ib + e_i (g_ib - N_b g_ib)), N_b = n_b n_b^T, over its own
-wall particles, with e_i of all walls (`cortado.solvers.projection.wall_sums`). With r_i = x_i - c', the pressure
-impulses y, the body's density rho and its volume K in those of a particle,
+Walls of a body push particle i by gamma_i = sum w_b (N_b g_ib + e_i (g_ib - N_b g_ib)), N_b = n_b n_b^T, summed over
+its own wall particles, with e_i computed from all walls (`cortado.solvers.projection.wall_sums`). With r_i = x_i - c',
+the pressure impulses y, the body's density rho and its volume K in units of a particle's volume,
 
     V = V_0 + dt g + sum y_i gamma_i / (rho K),   L = L_0 + sum y_i r_i x gamma_i,   W = R' I^-1 R'^T L / rho
 
-is the transpose of what its velocity adds to the divergence, - gamma_i . (V + W x r_i), of which that with the velocity
-(V_0, W_0) of its walls is counted with those of all walls. Linear momentum is kept to round-off. A body that is held
-has less than 1 / (rho K) and R' I^-1 R'^T in their place (`cortado.sph.moving_solids`).
+is the transpose of the body's term in the divergence, - gamma_i . (V + W x r_i). The part of this term by the wall
+velocity (V_0, W_0) is contained in the sum over all walls. Linear momentum is conserved to round-off. For a held body
+smaller matrices replace 1 / (rho K) and R' I^-1 R'^T (`cortado.sph.moving_solids`).
 
-The particles around a light body all move it. The diagonal a_i of the iteration gets |gamma_i| sum_j |gamma_j| / (rho
-K) + lambda |r_i x gamma_i| sum_j |r_j x gamma_j| / rho, with lambda the largest eigenvalue of I^-1. Divided by it the
-body's part of the matrix has no eigenvalue beyond 2.
+All particles around a light body move it. So the diagonal a_i of the iteration gets the term |gamma_i| sum_j |gamma_j|
+/ (rho K) + lambda |r_i x gamma_i| sum_j |r_j x gamma_j| / rho, with lambda the largest eigenvalue of I^-1. With this
+diagonal the body's part of the matrix has no eigenvalue above 2.
 """
 
 from dataclasses import dataclass, replace
@@ -40,13 +39,13 @@ class BodyKernels:
     measure: Kernels
     """The sizes of gamma and r x gamma."""
     weigh: Kernels
-    """The part of bodies in the diagonal a, by these sizes and by ``whole``, their sums; particles' shares of the
-    adjoints of the sums and of the density are written."""
+    """The bodies' term in the diagonal a, from these sizes and their sums ``whole``. The adjoint writes particles'
+    shares of the adjoints of the sums and of the density."""
     share: Any
-    """This adds the adjoint of the sums to those of the sizes."""
+    """Adds the adjoint of the sums to the adjoints of the sizes."""
     pull: Kernels
-    """The momenta y gamma and y r x gamma that the pressure impulse y of each particle gives; the adjoint goes on from
-    those of their sums."""
+    """The momenta y gamma and y r x gamma that the pressure impulse y of each particle gives; the adjoint starts from
+    the adjoints of the sums of these momenta."""
 
 
 @cache
@@ -61,7 +60,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
 
     @wp.func
     def between(a: vector, foot: vector, edge: real) -> vector:
-        """Return the part of a vector along the normal of a wall plus the part across it times the edge factor e."""
+        """Return a vector's part along a wall's normal, plus the edge factor e times its part across the normal."""
         part = normal(a, foot)
         return part + edge * (a - part)
 
@@ -117,7 +116,8 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
     @particle_kernel(tangent_module, "pulled_dot twisted_dot")
     @typed
     def pull_tangent(y_i, y_dot_i, gamma_of_i, gamma_of_dot_i, arm_i, arm_dot_i) -> tuple[vector, vector]:
-        """Write the tangents of `pull`, by hand: each iteration computes them, and a made kernel is slower."""
+        """Write the tangents of `pull`; the kernel is handwritten because each iteration runs it and a generated one is
+        slower."""
         turn = wp.cross(arm_dot_i, gamma_of_i) + wp.cross(arm_i, gamma_of_dot_i)
         return y_dot_i * gamma_of_i + y_i * gamma_of_dot_i, y_dot_i * wp.cross(arm_i, gamma_of_i) + y_i * turn
 
@@ -139,9 +139,9 @@ class MotionKernels:
     """Kernels that move rigid bodies by pressures and gravity, with their tangents and adjoints."""
 
     move: Kernels
-    """The kernels of `cortado.sph.moving_solids.move_kernels`, by the sums of y gamma and y r x gamma."""
+    """The kernels of `cortado.sph.moving_solids.move_kernels`, given the sums of y gamma and y r x gamma."""
     carry: Kernels
-    """The drift of walls by the velocity changes, particles' shares of whose adjoints are written."""
+    """The drift of walls by the velocity changes; the adjoint writes particles' shares of the changes' adjoints."""
 
 
 @cache

@@ -1,38 +1,39 @@
-"""What a particle's neighbourhood lets the projection do, from the moments of its neighbours, and the images of the
-fluid in flat walls that mirror it (`cortado.particles.neighbourhood`), in place of wall particles.
+"""Weights and gradient corrections of a particle in the projection, computed from the moments of its neighbours; and
+images of the fluid in flat mirroring walls, in place of wall particles (`cortado.particles.neighbourhood`).
 
 M, Q and g are the moments of `cortado.solvers.projection.sums`, gamma and nu those of
 `cortado.solvers.projection.wall_sums`, and H is the fullness of `cortado.sph.moment_functions`. S(a, b) is a smoothstep
-of H from a to b. B = 1 / (1 + ((nu + 9 q nu_m) / 0.05)^4) is 0 beside walls, with nu_m of those that mirror and q,
-which is 0 beside others. The projection takes:
+of H from a to b. B = 1 / (1 + ((nu + 9 q nu_m) / 0.05)^4) is near 0 beside walls; nu_m is the part of nu by mirroring
+walls, and q is near 0 beside other walls. The projection uses:
 
-    sigma = S(0.1, 0.5) B    how much tension is let through, 1 where a scene is shut (see `pressure`),
-    f = S(0.1, 0.5) of H + nu   how full it is: how much of the last step's pressure is taken on,
-    u = S(0.5, 0.8)          how much it is shifted,
-    r = S(0.8, 0.95) B       how much of a low density is repaired,
-    c = S(0.7, 0.95) of H + 2 nu   its share of a coarse pressure: 1 inside and beside walls, 0 at free surfaces,
+    sigma = S(0.1, 0.5) B    the part of tension that is admitted; 1 in a shut scene (see `pressure`),
+    f = S(0.1, 0.5) of H + nu   the part of the previous step's pressure with which a step begins,
+    u = S(0.5, 0.8)          the part of the shift that is applied,
+    r = S(0.8, 0.95) B       the part of a low density that is repaired,
+    c = S(0.7, 0.95) of H + 2 nu   the share of a coarse pressure: 1 inside and beside walls, 0 at free surfaces,
     L = I + c (B (K - I) + (1 - B_o) (t P - (1 + t) C)), c = S(0.2, 0.5),   which corrects gradients,
     K = J + 0.033 S(0.8, 0.95) J (J - I), J = 1.05 (M + 0.05 I)^-1,
-    B_o = 1 / (1 + ((nu - q nu_m) / 0.05)^4), beside walls that do not mirror, whose gamma C is made of,
+    B_o = 1 / (1 + ((nu - q nu_m) / 0.05)^4), 0 beside walls without mirror; C uses their gamma,
     C = 1.05 (P M N + N M P) / (M : N + 0.05), N = gamma gamma^T / (gamma^2 + 0.01 a_0 / 20), P = I - N,
     t = 0.2 (1.05 / (M : P / (d - 1) + 0.05) - 1), in d dimensions,
-    a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m         the diagonal of the projection's matrix.
+    a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m,   the diagonal of the projection's matrix.
 
-Wall particles hold what is alone, but rows that a wave draws out beside a wall are out of their order: D takes them for
-compressed, which damps waves, and still water is stirred. A mirror is right wherever rows stand. So images count h
-times, and the particles of walls that mirror 1 - h times, with
+Wall particles stop even single fluid particles. But if a wave stretches rows of fluid beside a wall, these rows no
+longer match the rows of wall particles: the divergence D takes them for compressed, which damps waves and stirs still
+water. A mirror is right for any rows. So images have the weight h, and particles of mirroring walls the weight 1 - h,
+with
 
     h = S(0.7, 0.9) of sum V W_i' / (nu_m + 1e-6) q,   q = 1 / (1 + ((nu - nu_m) / 0.005)^4),
 
-the part of the images in the number density over nu_m, the part of the walls. It is 1 where as much fluid is beside a
-wall as the wall expects, and 0 in spray and beside solids, which walls do not mirror. With g_i' = V grad W of the
-separation from an image x_j' = R x_j + o, images add
+a smoothstep of the ratio of the images' part of the number density to nu_m, the walls' part. h is 1 if the fluid beside
+a wall is as dense as the wall expects, and 0 in spray and beside solids, which walls do not mirror. With g_i' = V grad
+W of the separation from an image x_j' = R x_j + o, images add
 
     h_i sum (v_i - R v_j) . g_i'                   to the divergence,
     sum (h_i k_i + h_j k_j) g_i'                   to its transpose, the force,
     h_i sum V W_i'                                 to the number density.
 
-Gradients of images are not corrected: L is 1 beside walls that mirror.
+Gradients of images are not corrected: L is the unit matrix beside mirroring walls.
 """
 
 from dataclasses import dataclass
@@ -49,29 +50,29 @@ from cortado.solvers.projection.wall_sums import DIRECTION, normal_part, types_b
 from cortado.sph.moment_functions import matrix_type, moment_functions
 
 TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95)
-"""The fullness below which nothing, and above which all is done."""
+"""For each weight, the fullness below which it is 0 and the fullness above which it is 1."""
 SHARED = (0.7, 0.95)
 """Fullness H + 2 nu below which the share of a coarse pressure is 0, and above which it is 1."""
 WALLED = 0.05
-"""nu at which a wall halves tension, correction and the repair of low densities."""
+"""nu of walls at which the weights of tension, correction and repair of low densities are halved."""
 APART = 0.005
-"""nu of walls that do not mirror at which a particle is half as much beside a mirror, so that it is next to none of
-them where it is. Mirrors do not mirror them: with images up to its foot water at rest beside a solid that stands on
-the floor moves 1.4 to 2 times as fast."""
+"""nu of walls without mirror at which q is 1/2, so that a particle beside a mirror with q near 1 is far from such
+walls. Mirrors do not mirror these walls: with images up to the foot of a solid on the floor, water at rest beside it
+moves 1.4 to 2 times as fast."""
 MIRRORED = 9.0
-"""How many times more walls that mirror count in B. Images make up for what is missing beside them, which K would make
-up for too, and a block that falls from a lid has no tension to an image of its own."""
+"""Additional weight of mirroring walls in B. Images fill the missing neighbourhood beside them, for which K would
+correct a second time; and a block that falls from a lid must not be held by tension to its own image."""
 REGULAR = 0.05
-"""The number that is added to the diagonal of M before it is inverted."""
+"""The number added to the diagonal of M before M is inverted."""
 NEWTON = 0.033
 """Two thirds of a step of Newton's method towards the inverse of M, J + J (I - M J) = J + 0.05 J (J - I). Inside of the
-fluid, where M is nearly I, J follows its changes for 95 % only: rows that pass one another seem to be squeezed, which
-holds back films on a gentle slope. With a whole step they flow 1 to 2 % too fast, and water at rest moves faster. At
-surfaces, where M is far from I, it would widen jets."""
+fluid M is nearly I, and J follows only 95 % of M's changes: rows that pass one another seem to be squeezed, which slows
+films on a gentle slope. With a full step films flow 1 to 2 % too fast, and water at rest moves faster. At surfaces,
+where M is far from I, the step would widen jets."""
 ALONG = 0.2
-"""The part of what gradients along a wall lack beside it that is made up. On the lattice, with Wendland C2, the first
-row lacks 25 % of a pressure's gradient along the wall. With 0 water at rest sinks along upright walls, in a lasting
-vortex, and with 1, where divergences are right, the second row has 6 % too much and rises."""
+"""The part of the missing gradient along a wall that is corrected. On the lattice, with Wendland C2, the first row
+lacks 25 % of a pressure's gradient along the wall. With 0, water at rest sinks along upright walls in a lasting vortex.
+With 1, divergences are right, but the gradient of the second row is 6 % too great and it rises."""
 
 
 @cache
@@ -92,17 +93,18 @@ class EffectFunctions:
     """Warp functions of the weights, the gradient correction and the diagonal of one particle in the projection."""
 
     weights: Any
-    """(sigma, f, u, r) of M, nu and that of walls that mirror."""
+    """(sigma, f, u, r) from M, nu, and nu of mirroring walls."""
     correction: Any
-    """L of M, gamma, nu, the parts of both that are of walls that mirror, and 0.05 a_0."""
+    """L from M, gamma, nu, the parts of gamma and nu by mirroring walls, and 0.05 a_0."""
     inverse: Any
     """1.05 (M + 0.05 I)^-1"""
     diagonal: Any
-    """a of L, Q, g, gamma, m and 0.05 a_0."""
+    """a from L, Q, g, gamma, m and 0.05 a_0."""
     share: Any
-    """c of M and nu."""
+    """The share c of a coarse pressure from M and nu."""
     back: Any
-    """From adjoints of L, a, weights and c to those of M, Q, g, gamma, nu, of walls that mirror, and m."""
+    """Turns adjoints of L, a, weights and c into adjoints of M, Q, g, gamma, nu, gamma and nu of mirroring walls, and
+    m."""
 
 
 @cache
@@ -138,7 +140,7 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
 
     @wp.func
     def walled_correction(M: matrix, gamma: vector, least: real) -> matrix:
-        """Return the correction t P - (1 + t) C along a wall; M_zz = 1 of the plane does not count."""
+        """Return the correction t P - (1 + t) C along a wall; M_zz = 1 in the plane has no effect."""
         N = wp.outer(gamma, gamma) / (wp.dot(gamma, gamma) + direction * least)
         across = M * N - N * M * N
         P, whole = unit() - N, real(1.0) + regular
@@ -184,10 +186,10 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
 
 
 EVEN = (0.7, 0.9)
-"""The images' part in the density over that of wall particles, below which images do not count, and above which they
-count wholly. From 0.5 to 0.8 waves are the same, but spray that is thrown at a wall in long steps passes it."""
+"""Ratio of the images' part of the density to the wall particles' part: below the first number h is 0, above the second
+h is 1. With 0.5 and 0.8 waves are the same, but spray thrown at a wall in long steps passes through it."""
 LEAST = 1e-6
-"""Wall coverage nu below which a wall is out of reach."""
+"""Wall coverage nu below which no wall is within reach."""
 
 
 @dataclass(frozen=True)
@@ -197,8 +199,8 @@ class ImageSums:
     weights: Kernels
     """sum V W_i', without an adjoint"""
     lift: Kernels
-    """sum (h_i y_i + h_j y_j) g_i', for arrays y and h. From adjoints f of it: sum g_i' . (f_i - R f_j), and what x is
-    given."""
+    """sum (h_i y_i + h_j y_j) g_i', for arrays y and h. From this sum's adjoints f: sum g_i' . (f_i - R f_j), and the
+    adjoint of x."""
     echo: Any
     """sum (c_i + c_j) g_i'"""
     spread: Kernels
@@ -289,7 +291,7 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
     @mirror_sum(discretisation)
     @typed
     def mirror_walls_back(x_ij, v_j, mirror_bar_i, behind_bar_i, sweep_bar_i, foot, mirrors: int, s) -> vector:
-        """Return the adjoint of x by those of the sums; that of the drift is -``sweep_bar``."""
+        """Return the adjoint of x, given the adjoints of the sums; the adjoint of the drift is -``sweep_bar``."""
         bent = hessian_product(x_ij, normal(mirror_bar_i - sweep_bar_i * v_j, foot), s)
         return s.volume * (bent + behind_bar_i * gradient(x_ij, s))
 

@@ -1,26 +1,26 @@
-"""What is read of a step of the projection: the pressure that a gauge reads, and what walls that mirror get.
+"""Values read from a step of the projection: the pressure that a gauge reads, and the forces on walls that mirror.
 
-The first is the mean normal stress of the projection's pressures about a particle.
+A gauge reads the mean normal stress at a particle by the projection's pressures.
 
 Particle j pushes i with the force -V (T_i + T_j) g_ij / dt, where T = k L, and wall particle b with -V k_i b_ib / dt,
-where b_ib is what b adds to gamma_i. The momentum that these forces carry is spread evenly from particle to particle,
-and to the point s_b of the wall's surface (the virial of Irving and Kirkwood 1950):
+where b_ib is the term of b in gamma_i. The momentum flux of these forces is spread evenly along the lines from particle
+to particle, and to the point s_b of the wall's surface (the virial of Irving and Kirkwood 1950):
 
     dt p_i = (-1/2 sum_j x_ij . (T_i + T_j) g_ij - k_i r_i) / d,   r_i = sum_b b_ib . (x_i - s_b),
 
-in d dimensions, where images and walls that mirror (`cortado.solvers.projection.effects`) count h and 1 - h times.
-The multiplier k / dt is no stress beside a wall, where neighbours are missing, and scatters where they
-are uneven, so that the forces do not.
+in d dimensions, where images have the weight h and mirroring walls the weight 1 - h
+(`cortado.solvers.projection.effects`). The multiplier k / dt itself is not a stress beside a wall, where neighbours are
+missing. It scatters among uneven particles, exactly so that the forces do not scatter.
 
 Kernels divide impulses, k or dt p, by the time step.
 
-Beside what `cortado.solvers.projection.wall_sums` gives them, walls that mirror get the forces of images, in place of
-the share h of those of their own wall particles,
+In addition to the forces of `cortado.solvers.projection.wall_sums`, mirroring walls get the forces of images, in place
+of the part h of the forces on their own wall particles,
 
     sum (h_i p_i + h_j p_j) g_i' - h_i p_i gamma_m,
 
-over the images by one solid, or by all walls, with gamma_m of its wall particles that mirror. With it walls get what
-momentum the fluid loses to them. Loads are read now and then, so that h is differentiated on its own here.
+summed over the images by one solid, or by all walls, with gamma_m of its mirroring wall particles. So walls receive
+exactly the momentum that the fluid loses to them. Loads are read rarely, so h is differentiated separately here.
 """
 
 from dataclasses import replace
@@ -48,12 +48,13 @@ from cortado.sph.moment_functions import matrix_type, moment_functions, symmetri
 from cortado.sph.parts import Adjoints, StepContext, Tangents, integration_module
 
 TOPIC = "mean_stress"
-"""Topic of its Warp modules, to which the dimension is appended where it counts."""
+"""Topic of the Warp modules here; the dimension is appended if kernels depend on it."""
 
 
 class MeanStress:
-    """The mean normal stress dt p of the sorted particles of a step, with its derivatives. ``around`` is what surrounds
-    them (`cortado.solvers.projection.surroundings`), and ``at`` has k and T of the last iteration."""
+    """The mean normal stress dt p of the sorted particles of a step, with its derivatives. ``around`` has the
+    particles' surroundings (`cortado.solvers.projection.surroundings`), and ``at`` has k and T of the last
+    iteration."""
 
     def __init__(self, discretisation: Discretisation, layout: Layout, dimension: int, faces: int):
         self._faces = FaceShares(discretisation, layout, faces)
@@ -74,14 +75,14 @@ class MeanStress:
         return found
 
     def tangent(self, context: StepContext, dot: Tangents, around: tuple[Named, ...], at: Named) -> NDArray:
-        """Return the tangent (n,) of the stress impulses dt p; ``around`` and ``at`` come with their tangents."""
+        """Return the tangent (n,) of the stress impulses dt p; ``around`` and ``at`` include tangents."""
         found, walls = self._arrays["q"], self._totals(context, *around)
         dots = {f"{name}_dot": one.tangent(context, dot, ALL_WALLS, *around) for name, one in self._walls.items()}
         context.launch(self._kernels.tangent, *dot.named, *around, at, walls, dots, q_dot=found)
         return np.array(found.numpy())
 
     def adjoint(self, context: StepContext, bar: Adjoints, around: tuple[Named, ...], at: Named) -> None:
-        """Take the adjoint of the stress, ``q_bar`` in ``at``, and add what follows to the adjoints of k, particles and
+        """Apply the adjoint of the stress: from ``q_bar`` in ``at`` add to the adjoints of k, particles and
         ``around``."""
         (own, pairs), reach_bar = self._kernels.adjoint, self._arrays["reach_bar"]
         context.launch(own, *bar.named, at, self._totals(context, *around), reach_bar=reach_bar)
@@ -152,7 +153,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
     @particle_kernel(adjoint_module, "q_bar +k_bar reach_bar")
     def own_adjoint(k_i: real, reach_i: vector, mirrors_i: vector, q_bar_i: real) -> tuple[real, real, vector]:
-        """Replace the adjoint of q by that of the sum over neighbours, and add to those of k and r."""
+        """Replace the adjoint of q by the adjoint of the sum over neighbours, and add to the adjoints of k and r."""
         bar = per * q_bar_i
         return bar, -bar * (reach_i[0] + mirrors_i[0]), vector(-bar * k_i, real(0.0), real(0.0))
 
@@ -171,7 +172,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 
 def _reach_work(d: Discretisation) -> Any:
-    """Make the work of the wall term (r, 0, 0) of the mean stress by a solid's walls."""
+    """Make the work function of the wall term (r, 0, 0) of the mean stress by a solid's walls."""
     real, gradient, normal = d.precision.real, pair_functions(d).gradient, normal_part(d)
 
     @types_by_name(d.precision, {d.precision.vector: "reach"})
@@ -184,7 +185,7 @@ def _reach_work(d: Discretisation) -> Any:
 
 
 def _mirror_work(d: Discretisation) -> Any:
-    """Make the work of the wall term (-h r, 0, 0) by which mirroring walls count 1 - h times."""
+    """Make the work function of the wall term (-h r, 0, 0), which gives mirroring walls the weight 1 - h."""
     real, gradient, normal = d.precision.real, pair_functions(d).gradient, normal_part(d)
 
     @types_by_name(d.precision, {d.precision.vector: "reach"})
@@ -208,7 +209,7 @@ def pressed_kernels(precision: Precision) -> Kernels:
 
 @cache
 def image_load_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the sum over images by the walls ``solid``, with ``y`` for p."""
+    """Make the kernels of the sum over images by the walls of ``solid``; the argument ``y`` is p."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     gradient, hessian_product = pair.gradient, pair.hessian_product
@@ -283,8 +284,8 @@ def _mirrored_work(d: Discretisation) -> Any:
 
 
 class ImageLoads:
-    """The forces of images over the volume of a particle, vectors (n,) [N / m^d], of the sorted particles of a step on
-    the device, which the next call overwrites."""
+    """The forces of images divided by a particle's volume, vectors (n,) [N / m^d], of the sorted particles of a step.
+    The next call overwrites these device arrays."""
 
     def __init__(self, density: Surroundings):
         self._density, self._layout = density, density.layout
@@ -293,7 +294,7 @@ class ImageLoads:
         self._faces = FaceShares(density.discretisation, density.layout, density.faces)
 
     def total(self, step: StepContext, solid: int, p: wp.array) -> wp.array:
-        """Return the forces by pressures p (n,) [Pa] on the walls of a solid, or on all."""
+        """Return the forces by pressures p (n,) [Pa] on the walls of one solid, or on all walls."""
         found, known = self._vectors["total"], {"y": p, "image": self._density.around["image"]}
         step.launch(self._kernels.forward, known, solid=solid, total=found)
         add(self._walls.total(step, solid, known), found)
@@ -312,7 +313,7 @@ class ImageLoads:
     def adjoint(
         self, step: StepContext, bar: Adjoints, solid: int, p: wp.array, total_bar: wp.array, p_bar: wp.array
     ) -> None:
-        """Add to the adjoints of particles, solids and pressures by that of the forces."""
+        """Add to the adjoints of particles, solids and pressures, given the adjoint of the forces."""
         around = self._adjoint
         around.begin()
         known = {"y": p, "image": self._density.around["image"]}

@@ -1,15 +1,16 @@
-"""How walls push a particle of the projection, with derivatives.
+"""The sums by which walls push a particle of the projection, with derivatives.
 
-With g_ib = V grad W_ib, of which n_b n_b^T g_ib is the part along the normal of a wall, sums over wall particles are
+With g_ib = V grad W_ib, of which n_b n_b^T g_ib is the part along the normal of a wall, the sums over wall particles b
+are
 
     normal = sum w_b n_b n_b^T g_ib,   whole = sum w_b g_ib,   nu = V sum w_b W_ib,
 
-and, as walls may move, their drifts sum w_b (n_b n_b^T g_ib) . v_b and sum w_b g_ib . v_b. The walls push along
+and for moving walls the drifts sum w_b (n_b n_b^T g_ib) . v_b and sum w_b g_ib . v_b. The walls push along
 
     gamma = normal + e (whole - normal),   e = S(0.1, 0.4) of (whole^2 - normal^2) / (whole^2 + 0.01 a_0 / 20).
 
-Along a flat wall and in a corner that walls close, e is 0, so that the order of wall particles holds nothing back.
-About an edge that sticks out into the fluid, parts along normals add up to a third of what is missing, and e is 1.
+Along a flat wall and in a concave corner e is 0, so that the arrangement of wall particles causes no friction. At an
+edge that protrudes into the fluid the parts along normals add up to only a third of the missing sum, and e is 1.
 
 The pressure of a particle pushes the walls of one solid along gamma_s / V,
 
@@ -17,16 +18,17 @@ The pressure of a particle pushes the walls of one solid along gamma_s / V,
 
 with the sums above over the wall particles of the solid, and e from those over all walls.
 
-Flat faces of moving solids have images of the fluid in place of wall particles. In reverse mode a sum over images is a
-work that is linear in adjoints,
+Flat faces of moving solids act by images of the fluid instead of wall particles. In reverse mode a sum over images is a
+work W that is linear in adjoints,
 
     W = sum V ((b_i + h_i c_i) W_i' + h_i d_i (u_i - R (u_j + B_j x_ij)) . g_i' + e_i swept . g_i' / dt
                - 1/2 h_i k_i (q_i + q_j) x_i' . g_i'),
 
-as the lift is the transpose of the spread. The slope B is that of the push by a coarse pressure. Warp makes gradients
-of W by the poses of the solid before and after the step. Those by positions stand elsewhere, but for what e gives.
+because the lift is the transpose of the spread. B is the slope of the push by a coarse pressure. Warp differentiates W
+with respect to the poses of the solid before and after the step. Gradients with respect to particle positions are in
+other modules, except the part through the edge factor e.
 
-`types_by_name` has the types of the projection's quantities by their names, for these sums and all others.
+`types_by_name` returns the types of the projection's quantities by name, for these and all other sums.
 """
 
 from collections.abc import Iterator, Mapping
@@ -52,20 +54,21 @@ from cortado.sph.moment_functions import matrix_type, moment_functions, symmetri
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 EDGED = (0.1, 0.4)
-"""The part of a wall's push, squared, off normals, up to which e is 0, and from which it is 1. It is below 0.02 along
-flat walls and in the corners of a box, 0.3 a spacing and a half from an edge, and 0.75 diagonally before it."""
+"""The squared part of a wall's push that is not along normals: e is 0 below the first number and 1 above the second.
+This part is below 0.02 along flat walls and in corners of a box, 0.3 at 1.5 spacings from an edge, and 0.75 diagonally
+in front of it."""
 DIRECTION = 0.01
-"""In parts of 0.05 a_0: gamma^2 below which the direction of a wall is not known."""
+"""In parts of 0.05 a_0: gamma^2 below which the direction of a wall is unknown."""
 
 
 @dataclass(frozen=True)
 class EdgeFunctions:
-    """Warp functions of one particle that tell how much it is beside the edge of a wall."""
+    """Warp functions of one particle for the edge factor e, with derivatives."""
 
     edge: Any
     """e of normal, whole and 0.05 a_0."""
     back: Any
-    """From the adjoint of e to those of normal and whole."""
+    """Turns the adjoint of e into the adjoints of normal and whole."""
 
 
 @cache
@@ -116,8 +119,8 @@ def beside_sums(discretisation: Discretisation) -> Kernels:
     @wall_sum(discretisation, grows=beside)
     @typed
     def beside_tangent(x_ij, x_dot_ij, v_j, v_dot_j, foot, turn_dot, s) -> tuple[vector, vector, real, real, real]:
-        """Return the tangent of a wall particle's terms. A wall that turns turns its push; the rest of its way changes
-        the push as beside a wall that does not turn."""
+        """Return the tangent of a wall particle's terms. A turning wall turns its push; the rest of its motion changes
+        the push as if the wall did not turn."""
         rest = x_dot_ij - wp.cross(turn_dot, x_ij)
         whole, bent = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, rest, s)
         part = normal(whole, foot)
@@ -143,7 +146,7 @@ def beside_solid_kernel(discretisation: Discretisation) -> Any:
 
 
 def _normal_work(d: Discretisation) -> Any:
-    """Make the work of the wall term normal / V of a solid."""
+    """Make the work function of the wall term normal / V of a solid."""
     real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
 
     def normal_work(x_ij: vector, push_bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)) -> real:
@@ -171,7 +174,8 @@ def _work(d: Discretisation) -> Any:
         foot: vector,
         s: neighbourhood_type(d.precision),
     ) -> real:
-        """Also of the sums over walls that mirror, whose drift has the adjoint -``sweep_bar``."""
+        """Return the work of these sums, also over walls that mirror; the adjoint of the drift of these is
+        -``sweep_bar``."""
         whole, by_mirror = gradient(x_ij, s), mirrored * (mirror_bar_i - sweep_bar_i * v_j)
         part = wp.dot(normal(whole, foot), normal_bar_i + normal_drift_bar_i * v_j + by_mirror)
         part += wp.dot(whole, whole_bar_i + whole_drift_bar_i * v_j)
@@ -231,7 +235,8 @@ class ProjectionPush:
         return found
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
-        """Add to the adjoints of positions and solids by that of the total; the adjoint of v* gets nothing."""
+        """Add to the adjoints of positions and solids, given the adjoint of the total; the adjoint of v* is not
+        changed."""
         bars = self._arrays
         step.launch(self._kernels.adjoint, self._totals(step, solid), self._least, bars, push_bar=total_bar)
         for name, sums, over in self._each(solid):
@@ -256,12 +261,13 @@ class ProjectionPush:
 
 
 NUMBERS = ("image", "density", "weighted", "spread", "swept", "k", "q")
-"""h, b, c, d, e, k and q; B is the ``slope``."""
+"""Names of the adjoints h, b, c, d, e, k and q in W; B is the ``slope``."""
 
 
 @cache
 def face_share_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel that adds the adjoints of images to those of one solid, and of x by what faces have swept."""
+    """Make the kernel that adds adjoints of images to those of one solid, and adds to the adjoint of x through
+    ``swept``."""
     d = replace(discretisation, lanes=1, taped=True)
     precision = d.precision
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
@@ -370,8 +376,8 @@ class FaceShares:
     def add(
         self, context: StepContext, bar: Adjoints, *groups: Named, over: int = ALL_WALLS, **arrays: wp.array
     ) -> None:
-        """Add the shares of images, or of those ``over`` one solid, by the adjoints that are given as ``arrays``;
-        others are 0. ``groups`` have h as ``image``."""
+        """Add the shares of all images, or of the images by one solid, ``over``, from adjoints given as ``arrays``;
+        missing ones are 0. ``groups`` contain h as ``image``."""
         if self._faces:
             known = {**self._nothing, **{name: array for group in groups for name, array in group.items()}, **arrays}
             bar.solids.add(context.launch, self._kernel, *bar.named, known, over=over)
@@ -384,8 +390,8 @@ def weights_type(precision: Precision) -> Any:
 
 
 def types_by_name(precision: Precision, more: Mapping[Any, str] | None = None) -> TypesByName:
-    """Return the types of names in sums and kernels: vectors, matrices, symmetric ones as six numbers, and numbers for
-    all others. ``more`` are names of some kernels, and count before these."""
+    """Return the types of names in sums and kernels: vectors, matrices, symmetric matrices as six numbers, and numbers
+    for all other names. ``more`` are additional names, which take precedence."""
     common = {
         neighbourhood_type(precision): "s",
         precision.vector: "x v u g f h gamma beside mirror normal whole crowd apart arm kick thrust delta foot turn "
