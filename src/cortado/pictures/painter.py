@@ -1,6 +1,7 @@
-"""Who draws a scene, in 2-D or in 3-D; words, lines and scales of colours on pictures; a scene before it is run.
+"""Choose the painter of a scene, in 2-D or 3-D; draw texts, lines and colour scales on pictures; and draw a scene
+before a run.
 
-Before it is run a scene is drawn with the paths and sizes of what is in it.
+A scene before a run is drawn with the paths of its solids and emitters and with its dimensions.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,41 +29,41 @@ from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
 
 FINER = 3
-"""How many times finer than pixels lines are drawn, for smooth edges."""
+"""Supersampling factor with which lines are drawn, for smooth edges."""
 Text = tuple[tuple[int, int], str, str]
-"""A text on a picture: its place (column, row), its words, and by Pillow's two letters the point of them there."""
+"""A text on a picture: its place (column, row), the text, and Pillow's two-letter anchor."""
 SMALL, SMALLEST = 11, 7
-"""Pixels of the letters of a word on a small picture, and of one that is too long for it."""
+"""Letter size in pixels on a small picture, and least size for a text that is too long."""
 INK = from_srgb(np.array([43, 42, 40], dtype=np.uint8))
 PALETTE = "viridis"
 OUTERMOST = (0.5, 99.5)
-"""Percentiles at the ends of the scale, so that a few particles do not darken all the others."""
+"""Percentiles at the ends of the scale, so that a few extreme particles do not darken all others."""
 UNITS = {"age": "s", **{name: quantity.unit for name, quantity in QUANTITIES.items()}}
-"""Units of the quantities that all scenes have, by name."""
+"""Units, by name, of the quantities that exist in all scenes."""
 MOVING = np.array([0.75, 0.20, 0.02])
-"""Linear colour of paths and of an emitter's jet."""
+"""Linear colour of paths and of the arrows at emitters."""
 POSES = 60
-"""About how many places of a path are shown, at most twice as many."""
+"""Approximate number of places shown along a path; at most twice as many."""
 ARROW = 0.18
-"""Length of an arrow, in sizes of the contents, and of its head, in lengths of the arrow."""
+"""Length of an arrow relative to the size of the contents, and of its head relative to the arrow."""
 HEAD = 0.22
 
 
 def painter(
     scene: Scene, positions: Points | Sequence[Points], device: Any = "cpu", poses: Iterable[Scene] = ()
 ) -> PlanePainter | SpacePainter:
-    """Return the painter of a scene; arguments as of `stage_of`, and the ``device`` of the rays."""
+    """Return the painter of a scene; arguments are as in `stage_of`, and ``device`` traces the rays."""
     return painter_on(stage_of(scene, positions, poses), device)
 
 
 def painter_on(stage: PlaneStage | Stage, device: Any = "cpu") -> PlanePainter | SpacePainter:
-    """Return the painter of a stage, in the plane or in space; ``device`` is that of the rays."""
+    """Return the painter of a stage, in 2-D or 3-D; ``device`` traces the rays."""
     return PlanePainter(stage) if isinstance(stage, PlaneStage) else SpacePainter(stage, device)
 
 
 def stage_of(scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
-    """Return the stage around the fluid of a scene, which will be at positions (n, d) or (frames, n, d) [m]. ``poses``
-    are scenes with the solids where they will be, so that the picture has these, too."""
+    """Return the stage of a scene for fluid at positions (n, d) or (frames, n, d) [m]. ``poses`` are scenes with the
+    solids at later poses, which the picture must include too."""
     return (PlaneStage if scene.dimension == 2 else Stage).of(scene, positions, poses)
 
 
@@ -74,9 +75,9 @@ def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colo
 
 
 def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") -> Points:
-    """Draw a picture (rows, columns, 3), linear, of a scene before it is run. It has particles at positions (n, d) [m]
-    as spheres with colours (n, 3), and paths of solids and of emitters' openings, with arrows. Along each axis a
-    line is as long as the whole, and says how long."""
+    """Draw a picture (rows, columns, 3), linear, of a scene before it is run. It shows particles at positions (n, d)
+    [m] as spheres with colours (n, 3), and paths of solids and emitters, with arrows. Along each axis a line shows the
+    total length."""
     look = (scene.picture or Picture()).model_copy(update={"surface": "spheres", "colour": "phase"})
     scene = scene.model_copy(update={"picture": look})
     spacing, paths = scene.discretisation.spacing, _paths(scene)
@@ -98,7 +99,7 @@ def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") 
 
 
 def _paths(scene: Scene) -> list[Points]:
-    """Return the paths (k, d) [m] of solids' middles, and those of emitters' openings."""
+    """Return the paths (k, d) [m] of the middles of solids, and those of emitters' openings."""
     found = [places for table in scene.solid if (places := _places(table)) is not None]
     return found + [emitter.path.knots.seen for emitter in scene.emitter if emitter.path is not None]
 
@@ -110,7 +111,7 @@ def _places(table: SolidTable) -> Points | None:
 
 
 def _poses(scene: Scene) -> list[Scene]:
-    """Return scenes with one of the solids at each place of its path."""
+    """Return scenes in which one solid is at one place of its path, for all solids and places."""
     found = []
     for k, table in enumerate(scene.solid):
         places = _places(table)
@@ -122,8 +123,8 @@ def _poses(scene: Scene) -> list[Scene]:
 
 
 def _arrow(scene: Scene, emitter: EmitterTable, positions: Points) -> Points:
-    """Return an arrow (5, d) [m], line and head in one stroke, out of the opening of an emitter and at least as long as
-    the opening is wide. Without a container its size comes from positions (n, d) [m]."""
+    """Return an arrow (5, d) [m], one stroke for shaft and head, out of an emitter's opening. It is at least as long as
+    the opening is wide; without a container its length depends on positions (n, d) [m]."""
     start, direction = np.array(emitter.outlet), np.array(emitter.direction)
     size = np.ptp(scene.container.extent() or positions, axis=0).max()
     length = max(ARROW * float(size), emitter.width)
@@ -135,7 +136,7 @@ def _arrow(scene: Scene, emitter: EmitterTable, positions: Points) -> Points:
 
 
 def _edges(stage: Any, lower: Points, upper: Points) -> list[Points]:
-    """Return the ends (2, 2) on the screen, along each axis, of the box's outermost edge on the screen."""
+    """Return for each axis the ends (2, 2) on the screen of the box's edge that is outermost on the screen."""
     box, found = corners(lower, upper), list[Points]()
     for axis in range(len(lower)):
         pairs = [np.array([a, b]) for a in box for b in box if a[axis] < b[axis] and np.delete(a == b, axis).all()]
@@ -146,7 +147,7 @@ def _edges(stage: Any, lower: Points, upper: Points) -> list[Points]:
 
 
 def _sizes(stage: Any, edges: list[Points], lower: Points, upper: Points) -> list[Text]:
-    """Return texts that tell the length of the box along each axis, beside its edges."""
+    """Return texts with the box's length along each axis, placed beside its edges."""
     found, middle = list[Text](), stage.on_screen(0.5 * (lower + upper)[None])[0]
     for axis, edge in enumerate(edges):
         away = edge.mean(axis=0) - middle
@@ -158,8 +159,8 @@ def _sizes(stage: Any, edges: list[Points], lower: Points, upper: Points) -> lis
 
 
 def labelled(image: Points, text: str, below: str = "") -> Points:
-    """Write a word on a picture (rows, columns, 3), linear, on the left, at its top, and another one at its bottom, in
-    smaller letters where the first would be too long."""
+    """Write one text at the upper left of a linear picture (rows, columns, 3) and another at the lower left. If the
+    first text is too long, its letters are smaller."""
     rows, columns = image.shape[:2]
     size = max(round(0.042 * rows), SMALL)
     left, top = round(0.9 * size), round(0.7 * size)
@@ -168,22 +169,22 @@ def labelled(image: Points, text: str, below: str = "") -> Points:
 
 
 def written(image: Points, texts: Sequence[Text], size: int) -> Points:
-    """Write texts on a picture (rows, columns, 3), linear, in letters of a ``size`` in pixels; it is not copied, which
-    takes longer than to write."""
+    """Write texts on a picture (rows, columns, 3), linear, in letters of ``size`` pixels. The picture is changed in
+    place: copying it takes longer than writing."""
     where, cover = _covered(image.shape[:2], tuple(texts), size)
     image[where] = image[where] * (1.0 - cover) + INK * cover
     return image
 
 
 def length_of(text: str, size: int) -> float:
-    """Return the width of a text in pixels, in letters of a ``size`` in pixels."""
+    """Return the width of a text in pixels, for letters of ``size`` pixels."""
     return float(_font(size).getlength(text))
 
 
 @lru_cache(maxsize=32)
 def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tuple[tuple[slice, slice], Points]:
-    """Return the part of a picture of a shape that texts are on, and how much of each of its pixels they cover, which
-    is kept for all frames of a film."""
+    """Return the part of a picture of this shape that contains texts, and how much of each pixel they cover. The result
+    is cached for all frames of a film."""
     from PIL import Image, ImageDraw
 
     mask = Image.new("L", shape[::-1])
@@ -195,8 +196,8 @@ def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tupl
 
 
 def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) -> Points:
-    """Draw lines of a linear colour (3,) on a picture (rows, columns, 3), linear, through points (k, 2), columns and
-    rows; ``width`` in pixels."""
+    """Draw lines of a linear colour (3,) on a linear picture (rows, columns, 3), through points (k, 2) given as column
+    and row; ``width`` in pixels."""
     from PIL import Image, ImageDraw
 
     rows, columns = image.shape[:2]
@@ -209,8 +210,8 @@ def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) ->
 
 
 def side_by_side(images: Sequence[Points], across: int, names: Sequence[str] = ()) -> Points:
-    """Put pictures of one size together in rows of ``across``, a thin light line between them, each with its name on it
-    if it has one; the end of the last row may be empty."""
+    """Arrange pictures of one size in rows of ``across``, separated by thin light lines, each labelled with its name,
+    if any. The last row may be incomplete."""
     rows, columns = images[0].shape[:2]
     down = -(-len(images) // across)
     page = np.ones((down * rows, across * columns, 3), images[0].dtype)
@@ -235,7 +236,7 @@ def _font(size: int) -> Any:
 
 @dataclass(frozen=True)
 class Scale:
-    """A colour scale: the numbers of a quantity from one end of the colours to the other."""
+    """A colour scale: maps values of a quantity to colours."""
 
     name: str
     unit: str
@@ -244,8 +245,8 @@ class Scale:
 
     @classmethod
     def of(cls, name: str, values: NDArray, unit: str | None = None) -> "Scale":
-        """Make the scale of numbers, such as those of all frames of a film; ``unit`` is for a quantity that not all
-        scenes have."""
+        """Make the scale for values, such as those of all frames of a film; ``unit`` is needed for quantities that
+        exist only in some scenes."""
         least, greatest = np.percentile(values, OUTERMOST)
         return cls(name, UNITS.get(name, "") if unit is None else unit, float(least), float(greatest))
 
@@ -254,20 +255,20 @@ class Scale:
         return _colours(np.clip((values - self.least) / (self.greatest - self.least or 1.0), 0.0, 1.0))
 
     def columns(self, rows: int) -> int:
-        """Return how many pixels of the width of a picture with ``rows`` rows the scale takes."""
+        """Return the width of the scale in pixels, on a picture with ``rows`` rows."""
         size = _size_of_letters(rows)
         return ceil(max(self._wide(size), *(length_of(text, size) for text in self._heads))) + size
 
     def beside(self, image: Points) -> Points:
-        """Return a picture (rows, columns, 3) with the scale in columns of its own at its right edge."""
+        """Return the picture (rows, columns, 3), widened on the right by columns with the scale."""
         rows = image.shape[0]
         edge = np.pad(image[:, -1], ((reach := rows // 16, reach), (0, 0)), mode="edge")
         smooth = np.lib.stride_tricks.sliding_window_view(edge, 2 * reach + 1, axis=0).mean(axis=-1)
         return self.on(np.concatenate([image, np.repeat(smooth[:, None], self.columns(rows), axis=1)], axis=1))
 
     def on(self, image: Points) -> Points:
-        """Return a picture (rows, columns, 3) with the scale on its right edge: its colours with numbers beside them,
-        the greatest on top, and its name and unit above."""
+        """Return the picture (rows, columns, 3) with the scale drawn over its right edge: colours with numbers, the
+        greatest on top, and above them name and unit."""
         rows, columns = image.shape[:2]
         size = _size_of_letters(rows)
         top, bottom, right = round(0.34 * rows), round(0.70 * rows), columns - size // 2
@@ -287,11 +288,11 @@ class Scale:
         return self.name.replace("_", " "), f"[{self.unit}]"
 
     def _wide(self, size: int) -> float:
-        """Return the width in pixels of its colours with the numbers beside them."""
+        """Return the width in pixels of the scale's colours and numbers."""
         return size + max((length_of(f"{number:.4g}", size) for number in self._ticks()), default=0.0)
 
     def _ticks(self) -> list[float]:
-        """Return round numbers that the scale shows."""
+        """Return the round numbers that label the scale."""
         from matplotlib.ticker import MaxNLocator
 
         if not self.greatest > self.least:

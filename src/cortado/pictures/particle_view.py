@@ -1,4 +1,4 @@
-"""Particles of runs in motion as a piece of a page: it plays from a file, without a server and without a network."""
+"""Animation of the particles of runs as a part of an HTML page; it plays from a file, without server or network."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import INDEX_OF_AXIS, CylinderContainer
 
 MOST_BYTES = 2_200_000
-"""Most bytes of the positions, speeds and colours in one view; base64 makes them a third larger."""
+"""Greatest size [bytes] of positions, speeds and colours in one view; base64 makes them a third larger."""
 LEAST_FRAMES, MOST_FRAMES = 24, 120
-"""A view of many particles leaves out particles rather than show fewer frames than the least, if there are as many."""
+"""Least and greatest number of frames; a view of many particles leaves out particles to show at least the least
+number."""
 SHORTEST, LONGEST = 3.0, 12.0
-"""[s] that playing takes."""
+"""Least and greatest playing time [s]."""
 LARGEST = 32767
 """Largest position as a 16-bit number; the smallest is its negative."""
 _PLAIN = (0.1, 0.3, 0.8)
-"""The linear colour of particles that have none."""
+"""The linear colour of particles without a colour."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """The particles of a run in motion: positions, speeds and colours over frames."""
+    """The particles of a run: positions, speeds and colours over frames."""
 
     name: str
     positions: NDArray[Any]
@@ -52,16 +53,17 @@ def style() -> str:
 
 
 def script() -> str:
-    """Return the script that brings all the views of a page to life; it stands once in the page, after them."""
+    """Return the script that animates all views of a page; it must appear once in the page, after the views."""
     source = Path(__file__).with_suffix(".js").read_text(encoding="utf-8")
     return f"<script>\n{source}</script>"
 
 
 def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BYTES) -> tuple[NDArray[np.intp], int]:
-    """Choose the frames to show, and the stride that leaves out particles, for a view of at most ``most_bytes`` bytes.
+    """Choose the frames to show, and the stride with which particles are selected, for a view of at most ``most_bytes``
+    bytes.
 
-    ``numbers``: bytes of one particle in one frame, two for each component of a position, one for the speed, three for
-    a colour that changes, of all clouds together.
+    ``numbers``: bytes per particle and frame, summed over all clouds: two for each component of the position, one for
+    the speed, three for a changing colour.
     """
     count = min(frames, MOST_FRAMES, max(most_bytes // (numbers * particles), LEAST_FRAMES))
     stride = max(-(-count * numbers * particles // most_bytes), 1)
@@ -71,15 +73,15 @@ def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BY
 def particle_view(
     clouds: Sequence[Cloud], times: ArrayLike, spacing: float, *, lines: ArrayLike = (), stride: int = 1
 ) -> str:
-    """Return HTML that shows the clouds side by side, turned together; y is up. `script` must follow, and `style` be
-    there.
+    """Return HTML that shows the clouds side by side, rotated together; y is up. The page must contain `style`, and
+    `script` after the views.
 
     Args:
-        clouds: of the same frames and as many particles each.
+        clouds: clouds with the same frames and the same number of particles.
         times: (frames,) [s].
-        spacing: between particles at rest [m].
+        spacing: distance between particles at rest [m].
         lines: (k, 2, d) ends of lines [m], such as the edges of a container.
-        stride: the clouds have one of so many particles (`thinned`).
+        stride: the clouds contain every ``stride``-th particle (`thinned`).
     """
     times, dimension = np.asarray(times, dtype=float), clouds[0].positions.shape[2]
     ends = np.asarray(lines, dtype=float).reshape(-1, 2, dimension)
@@ -162,12 +164,12 @@ def _base64(array: NDArray[Any]) -> str:
 
 
 ROUND = 48
-"""Number of sides of the polygon that stands for a circle."""
+"""Number of sides of the polygon drawn for a circle."""
 
 
 def scene_view(scene: Scene, runs: Mapping[str, Iterable[Any]], times: ArrayLike) -> str:
-    """Return HTML that shows runs of a scene side by side, each by its name with a state for each of the times
-    (frames,) [s], such as a `Frame`; see `particle_view`. Solids that move are not shown."""
+    """Return HTML that shows runs of a scene side by side; see `particle_view`. ``runs`` gives, by name, a state (such
+    as a `Frame`) for each of the times (frames,) [s]. Moving solids are not shown."""
     turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
     states, times = {name: list(of_run) for name, of_run in runs.items()}, np.asarray(times)
     particles = len(next(iter(states.values()))[0].positions)
@@ -180,12 +182,12 @@ def scene_view(scene: Scene, runs: Mapping[str, Iterable[Any]], times: ArrayLike
 
 
 def outline(scene: Scene) -> Points:
-    """Return ends (k, 2, d) [m] of the lines that draw the container and the solids of a scene; none without both."""
+    """Return ends (k, 2, d) [m] of the outlines of a scene's container and solids; k is 0 if the scene has neither."""
     return np.concatenate([container_outline(scene), solid_outline(scene)])
 
 
 def container_outline(scene: Scene) -> Points:
-    """Return ends (k, 2, d) [m] of the lines that draw the container of a scene; none without a container."""
+    """Return ends (k, 2, d) [m] of the outline of a scene's container; k is 0 without a container."""
     container, ends = scene.container, scene.container.extent()
     if ends is None:
         return np.zeros((0, 2, scene.dimension))

@@ -1,4 +1,4 @@
-"""Pictures of fluid in 2-D: a body with a smooth edge and a little gloss, in its container, on paper."""
+"""Pictures of 2-D fluid: drawn as a body with a smooth edge and a little gloss, in its container, on paper."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -22,15 +22,15 @@ LIGHT = (-0.45, 0.70, 0.55)
 
 
 def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) -> Points:
-    """Return the light (rows, columns, 3) of a body that covers a part of each pixel (rows, columns).
+    """Return the shaded colours (rows, columns, 3) of a body that covers a fraction of each pixel (rows, columns).
 
-    The body looks as if it were thicker in the middle than at its edge.
+    The shading makes the body look thicker in the middle than at its edge.
 
     Args:
         cover: (rows, columns), from 0 to 1.
         colour: linear, (rows, columns, 3) or (3,).
-        width: of the edge, in pixels.
-        gleaming: how bright the image of the lamp is in it.
+        width: width of the edge, in pixels.
+        gleaming: brightness of the lamp's reflection in the body.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -50,22 +50,23 @@ def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) 
 
 
 FILLED = 0.80
-"""The part of the picture's width or height that the container takes."""
+"""Fraction of the picture's width or height that the container fills."""
 GLASS = (0.40, 0.50, 0.55)
 """Linear colour of the walls of a container."""
 GLEAM, GLEAM_OF_MIRRORS = 0.12, 0.7
-"""Of the lamp in solids, in those that are dull and in mirrors."""
+"""Brightness of the lamp's reflection in dull solids, and in mirrors."""
 SOLID_SHADOW = 0.25
-"""Part by which paper is darker behind a solid."""
+"""Fraction by which the paper is darker behind a solid."""
 BLUR, DROPPED, AROUND = 0.022, 0.020, 0.12
-"""Of shadows: how soft and how far down they are, and beyond which distance from a body there is none; in sizes."""
+"""Shadows, relative to the size of the contents: softness, downward offset, and distance from a body beyond which there
+is no shadow."""
 Layer = tuple[Points, Points]
-"""A layer of a picture: how much it hides of the layers behind (rows, columns, 1), and its light (rows, columns, 3)."""
+"""A layer of a picture: its opacity (rows, columns, 1) and its colours (rows, columns, 3)."""
 
 
 @dataclass(frozen=True)
 class PlaneStage:
-    """The surroundings of fluid in the plane, on the pixels of a picture; what is at rest is drawn once."""
+    """The surroundings of 2-D fluid, on the pixels of a picture; parts at rest are drawn once."""
 
     picture: Picture
     container: BoxContainer | None
@@ -77,12 +78,12 @@ class PlaneStage:
     """[m]"""
     solids: tuple[ShownSolid, ...] = ()
     seen: tuple[Points, Points] | None = None
-    """Lower and upper ends (2,) [m] of the picture's middle; those of the contents if left out."""
+    """Lower and upper ends (2,) [m] of the region in the picture's middle; if left out, those of the contents."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "PlaneStage":
-        """Make the stage of a scene in 2-D, whose fluid is at positions (n, 2) or (frames, n, 2) [m]; ``poses`` as of
-        `painter`."""
+        """Make the stage of a scene in 2-D, whose fluid is at positions (n, 2) or (frames, n, 2) [m]; ``poses`` are as
+        in `painter`."""
         container = scene.container if isinstance(scene.container, BoxContainer) else None
         spacing, solids = scene.discretisation.spacing, shown_solids(scene)
         if container is not None:
@@ -100,12 +101,12 @@ class PlaneStage:
 
     @property
     def seen_size(self) -> Points:
-        """Return width and height (2,) [m] of the part that the picture has in its middle."""
+        """Return width and height (2,) [m] of the region in the picture's middle."""
         lower, upper = self.seen or self.ends
         return upper - lower
 
     def framed(self, ends: tuple[Points, Points], picture: Picture) -> "PlaneStage":
-        """Return the stage in a picture of another size, with all that is between ``ends`` in its middle."""
+        """Return the stage for a picture of another size, with the region between ``ends`` in its middle."""
         return replace(self, picture=picture, seen=ends)
 
     @cached_property
@@ -129,7 +130,7 @@ class PlaneStage:
         return np.meshgrid(x, y)
 
     def is_near(self, points: Points, margin: float) -> NDArray[np.bool_]:
-        """Return a mask (n,) of the points (n, 2) [m] in the picture, or no further from it than a margin [m]."""
+        """Return a mask (n,) of the points (n, 2) [m] that are in the picture or within a ``margin`` [m] of it."""
         half = 0.5 * self.pixel * np.array([self.picture.width, self.picture.height])
         return np.asarray((np.abs(points - self._middle) <= half + margin).all(axis=1))
 
@@ -140,7 +141,7 @@ class PlaneStage:
 
     @property
     def up_axis(self) -> int:
-        """Return the axis of the scene that is upright in the picture."""
+        """Return the scene's axis that points upwards in the picture."""
         return 1
 
     @property
@@ -150,7 +151,7 @@ class PlaneStage:
 
     @cached_property
     def behind(self) -> Points:
-        """Draw the background (rows, columns, 3) of the fluid: paper, its shadows, and the inside of a container."""
+        """Draw the background (rows, columns, 3) of the fluid: paper with shadows, and the inside of a container."""
         paper = self._paper()
         if self.container is not None or self._tanks:
             outside = paper * (1.0 - self._shadow() * (1.0 - self._room))[..., None]
@@ -170,7 +171,7 @@ class PlaneStage:
 
     @cached_property
     def free(self) -> Points:
-        """Return the part (rows, columns) of each pixel that is within the container and in no solid."""
+        """Return the fraction (rows, columns) of each pixel that is inside the container and outside all solids."""
         free = self._room
         for _, distance in self._bodies:
             free = free * (1.0 - self._covered(distance))
@@ -178,23 +179,23 @@ class PlaneStage:
 
     @cached_property
     def shown(self) -> Points:
-        """Return the part (rows, columns) of each pixel where fluid is drawn. Opaque solids count too, as they are
+        """Return the fraction (rows, columns) of each pixel where fluid is drawn. It includes opaque solids, which are
         drawn over the fluid later."""
         return self.free if any(shown.transparency > 0.0 for shown, _ in self._bodies) else self._room
 
     @cached_property
     def _bodies(self) -> list[tuple[ShownSolid, Points]]:
-        """Return the solids that fluid flows around, and the distance of pixels from each."""
+        """Return the solids around which fluid flows, and the distance of pixels from each solid."""
         return [(one, self._distance(one)) for one in self.solids if not one.is_tank]
 
     @cached_property
     def _tanks(self) -> list[tuple[ShownSolid, Points]]:
-        """Return the solids that fluid is inside of, and the distance of pixels from the cavity of each."""
+        """Return the solids that contain fluid (tanks), and the distance of pixels from each tank's cavity."""
         return [(one, self._distance(one)) for one in self.solids if one.is_tank]
 
     def _distance(self, shown: ShownSolid, drop: float = 0.0) -> Points:
-        """Return the distance (rows, columns) [m] from a body of a place ``drop`` [m] above each pixel, negative
-        inside; infinite where it is far."""
+        """Return the signed distance (rows, columns) [m] from a body, measured ``drop`` [m] above each pixel; negative
+        inside, infinite far away."""
         (x, y), (lower, upper), margin = self.pixels, shown.body.extent(), AROUND * self._size
         columns = np.flatnonzero((x[0] > lower[0] - margin) & (x[0] < upper[0] + margin))
         rows = np.flatnonzero((y[:, 0] + drop > lower[1] - margin) & (y[:, 0] + drop < upper[1] + margin))
@@ -204,7 +205,7 @@ class PlaneStage:
         return found
 
     def _covered(self, distance: Points) -> Points:
-        """Return the part (rows, columns) of each pixel that a body covers."""
+        """Return the fraction (rows, columns) of each pixel that a body covers."""
         return np.clip(0.5 - distance / self.pixel, 0.0, 1.0)
 
     def _paper(self) -> Points:
@@ -216,7 +217,7 @@ class PlaneStage:
 
     @cached_property
     def _room(self) -> Points:
-        """Return the part (rows, columns) of each pixel that is within the container and tanks."""
+        """Return the fraction (rows, columns) of each pixel that is inside the container and the tanks."""
         room = np.ones(self.pixels[0].shape)
         if self.container is not None:
             x, y = self.pixels
@@ -232,7 +233,7 @@ class PlaneStage:
         return float((self.upper - self.lower).max())
 
     def _shadow(self) -> Points:
-        """Return how much darker (rows, columns) the paper is behind the container and tanks."""
+        """Return the darkening (rows, columns) of the paper behind the container and tanks."""
         tanks = [0.28 * self._below(shown) for shown, _ in self._tanks]
         if self.container is None:
             return np.max(tanks, axis=0)
@@ -246,12 +247,12 @@ class PlaneStage:
         return np.max([0.28 * across * edge(y + drop - self.lower[1]) * edge(self.upper[1] - y - drop), *tanks], axis=0)
 
     def _below(self, shown: ShownSolid) -> Points:
-        """Return the part (rows, columns) of the light that a body keeps off the paper."""
+        """Return the fraction (rows, columns) of light that a body's shadow takes from the paper."""
         distance = self._distance(shown, DROPPED * self._size)
         return 0.5 * (1.0 - np.tanh(distance / (BLUR * self._size)))
 
     def _body(self, shown: ShownSolid, distance: Points) -> Layer:
-        """Return the layer of a solid that fluid flows around, where it is within the container."""
+        """Return the layer of a solid around which fluid flows, drawn only inside the container."""
         cover = self._covered(distance)
         gleaming = GLEAM + (GLEAM_OF_MIRRORS - GLEAM) * shown.finish.reflectivity
         light = glossy(np.where(self._room > 0.5, cover, 1.0), shown.colour, self.gloss_width, gleaming)
@@ -281,18 +282,18 @@ class PlaneStage:
 
 
 SUPPORT = 1.3
-"""In spacings: the support of a particle's field."""
+"""Support of a particle's field, in spacings."""
 DROP = 0.8
-"""Strength of the field of a particle that is alone: a drop about as large as a spacing."""
+"""Strength of the field of an isolated particle, which makes a drop about as large as a spacing."""
 GRID = 4
-"""Nodes of the field for each spacing, along an axis."""
+"""Number of field nodes per spacing along an axis."""
 TOUCHING = 0.9
-"""In spacings: fluid that is nearer to a wall touches it."""
+"""Distance in spacings below which fluid counts as touching a wall."""
 
 
 @dataclass(frozen=True)
 class PlanePainter:
-    """A painter that draws states of one scene in the plane."""
+    """A painter that draws states of one 2-D scene."""
 
     stage: PlaneStage
 
@@ -303,7 +304,7 @@ class PlanePainter:
         return own._drawn(np.asarray(positions, dtype=np.float64), np.asarray(colours, dtype=np.float64))
 
     def _drawn(self, positions: Points, colours: Points) -> Points:
-        """Draw particles of fluid, in these colours, with the solids where the stage has them."""
+        """Draw particles of fluid in the given colours, and the solids at their poses on the stage."""
         stage, (cover, colour) = self.stage, self._fluid(positions, colours)
         body, width = np.where(stage.free > 0.5, cover, 1.0), stage.gloss_width
         fluid = glossy(body, colour, width) if stage.picture.shaded else colour
@@ -314,7 +315,8 @@ class PlanePainter:
         return np.clip(image, 0.0, 1.0)
 
     def _fluid(self, positions: Points, colours: Points) -> tuple[Points, Points]:
-        """Return the part (rows, columns) of each pixel that fluid covers, and its colour (rows, columns, 3)."""
+        """Return the fraction (rows, columns) of each pixel that fluid covers, and the fluid's colour (rows, columns,
+        3)."""
         from scipy.ndimage import map_coordinates
         from scipy.spatial import cKDTree
 
@@ -344,8 +346,8 @@ class PlanePainter:
         return cover, np.clip(colour, 0.0, 1.0)
 
     def _wetting(self, positions: Points) -> tuple[Points, np.ndarray]:
-        """Return positions (n, 2) with mirror images behind walls that they touch and images a period away, and the
-        particle of each."""
+        """Return positions (n, 2) with mirror images behind touched walls and with periodic images, and the number of
+        each one's particle."""
         stage, of, reach = self.stage, np.arange(len(positions)), TOUCHING * self.stage.spacing
         lengths = np.zeros(2) if stage.container is None else stage.container.periods(2)[1]
         positions = stage.lower + wrapped(positions - stage.lower, lengths)
@@ -362,13 +364,13 @@ class PlanePainter:
 
 
 def _distances(tree: object, points: Points, reach: float) -> Points:
-    """Return distances (p, k) [m] to the nearest particles; infinite where there are fewer within reach."""
+    """Return distances (p, k) [m] to the nearest particles; infinite if fewer particles are within reach."""
     distances, _ = tree.query(points, k=24, distance_upper_bound=reach, workers=usable_cores())  # type: ignore[attr-defined]
     return distances
 
 
 def _weight(distances: Points, reach: float) -> Points:
-    """Return Wendland's C2 function of distances over the reach, 1 at 0."""
+    """Return Wendland's C2 function of distances / reach, 1 at distance 0."""
     q = np.minimum(distances / reach, 1.0)
     return (1.0 - q) ** 4 * (1.0 + 4.0 * q)
 
@@ -376,8 +378,8 @@ def _weight(distances: Points, reach: float) -> Points:
 def _splat(
     positions: Points, strength: Points, colours: Points, corner: Points, cell: float, counts: np.ndarray, reach: float
 ) -> tuple[Points, Points]:
-    """Return at nodes (nx, ny) the sum of the particles' fields, and the mean of their colours (3, nx, ny), weighted by
-    nearness."""
+    """Return at nodes (nx, ny) the sum of the particles' fields, and their mean colour (3, nx, ny) with weights that
+    fall with distance."""
     patch = np.arange(-int(reach / cell) - 1, int(reach / cell) + 2)
     nearest = np.rint((positions - corner) / cell).astype(int)
     size = int(np.prod(counts))

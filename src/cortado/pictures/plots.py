@@ -1,4 +1,4 @@
-"""Plots by matplotlib: one look for all of them, and a PNG of each that appears whole or not at all."""
+"""Plots with matplotlib in a common style; each PNG is written whole or not at all."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cortado.files.disk import write_atomically
 from cortado.files.image_encoding import to_srgb
 
 PALETTE = ("#3d6b8e", "#c0763b", "#5b8a5a", "#8c5f7d", "#a89a4b", "#6b7a80", "#a8504f", "#4f8f8b")
-"""Muted colours that stay apart in print and for most eyes."""
+"""Muted colours that remain distinguishable in print and for most colour-blind readers."""
 INK, FAINT = "#2b2a28", "#8a857c"
 DASHED: dict[str, Any] = {"linestyle": (0, (5, 4)), "linewidth": 1.2}
 STYLE = {
@@ -42,7 +42,7 @@ STYLE = {
 
 @contextmanager
 def drawing(path: str | Path, width: float = 9.0, height: float = 5.2) -> Iterator[Any]:
-    """Yield a figure of a width and height in inches, saved under `path` in one go when the block ends well."""
+    """Yield a figure of a width and height in inches; it is saved under `path` if the block ends without an error."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -66,8 +66,8 @@ def whole_numbers(axis: Any) -> None:
 
 
 def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", label: str = "loss") -> Path:
-    """Plot losses (evaluations,) over the evaluations, on a logarithmic scale where any is positive. Losses that are
-    not finite, and on that scale not positive, are left out."""
+    """Plot losses (evaluations,) over the evaluations, on a logarithmic scale if any loss is positive. Losses that are
+    not finite are left out; on a logarithmic scale also those that are not positive."""
     values = np.asarray(losses, dtype=float)
     shown = np.isfinite(values)
     logarithmic = bool(np.any(values[shown] > 0.0))
@@ -101,14 +101,14 @@ def panels(
     true: ArrayLike | None = None,
     start: ArrayLike | None = None,
 ) -> Path:
-    """Plot each component of found numbers in a panel of its own, over whole numbers.
+    """Plot each component of ``found`` in its own panel, over whole numbers.
 
     Args:
         x: (k,) evaluations or steps.
         found: (k, c).
-        names: c of them.
-        true: (c,) or (k, c), dashed; None where it is not known.
-        start: (c,) or (k, c), the first guess, faint.
+        names: names of the c components.
+        true: (c,) or (k, c), true values, dashed; None if unknown.
+        start: (c,) or (k, c), the first guess, drawn faintly.
     """
     x, found = np.asarray(x), np.asarray(found, dtype=float)
     count = found.shape[1]
@@ -134,12 +134,11 @@ _MOST_IN_A_ROW = 4
 
 
 def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path, title: str = "") -> Path:
-    """Plot images in a row, such as start, target and result; more than 4 in a grid, such as moments on the way.
+    """Plot images in a row, such as start, target and result; more than 4 images are plotted in a grid.
 
     Args:
         images: one (rows, columns, 3) linear image for each panel, from 0 to 1; the first row is at the top.
-        titles: one for each panel.
-        title: of the whole.
+        titles: one for each panel. title: title of the whole figure.
     """
     shown = [to_srgb(image) for image in images]
     if not shown or len(shown) != len(titles):
@@ -164,7 +163,7 @@ def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path,
 _FAR, _NEAR = "#c9d9e4", "#27506f"
 _MOST_DRAWN = 150_000
 _SHOWN_RANGE = (0.0, 99.5)
-"""Percentiles at the ends of a colour scale, so that a few fast drops do not darken all the others."""
+"""Percentiles at the ends of a colour scale, so that a few fast drops do not darken all others."""
 
 
 def particles(
@@ -180,15 +179,15 @@ def particles(
 ) -> Path:
     """Plot particle sets side by side, such as before, after and target.
 
-    In 3-D one looks along the third axis: x to the right, y upwards, larger z nearer, nearer particles over
-    farther ones. All panels share their scale. Above 150 000 particles, only every k-th is drawn.
+    In 3-D the view is along the third axis: x to the right, y upwards, larger z nearer; nearer particles cover farther
+    ones. All panels have the same scale. Above 150 000 particles, only every k-th is drawn.
 
     Args:
         positions: one (n, d) [m] for each panel.
         titles: one for each panel.
         colours: for each panel (n,) numbers, drawn with one scale (speed, density), or (n, 3) red, green,
             blue, linear light in [0, 1]; None shades by depth.
-        colour_label: beside the scale, with its unit.
+        colour_label: label of the colour scale, with its unit.
         container: lower and upper corner (d,) [m], outlined.
         lines: for each panel (k, 2, d) ends of lines [m] that are drawn over the particles, such as those of solids.
         dimension: 2 or 3; that of the first set when left out. In 2-D a third component is ignored.
@@ -237,7 +236,7 @@ def _bounds(
 
 
 class _ColourScale:
-    """A map from the caller's colours to red, green, blue, with one scale for all panels."""
+    """A map from the caller's ``colours`` to red, green and blue, with one scale for all panels."""
 
     def __init__(self, sets: list[NDArray[Any]], colours: Sequence[NDArray[Any] | None]) -> None:
         from matplotlib.cm import ScalarMappable
@@ -255,7 +254,7 @@ class _ColourScale:
         self.mappable = self._map if numbers else None
 
     def rgb(self, points: NDArray[Any], colours: NDArray[Any] | None) -> NDArray[Any]:
-        """Return colours (n, 3) in [0, 1] of points, by given colours or by depth."""
+        """Return colours (n, 3) in [0, 1] of points, from the given colours or from the points' depth."""
         if colours is not None and colours.ndim == 2:
             return to_srgb(colours[None])[0] / 255.0
         return self._map.to_rgba(_depth(points) if colours is None else colours)[:, :3]
@@ -267,7 +266,7 @@ def _depth(points: NDArray[Any]) -> NDArray[Any]:
 
 
 def _draw_set(axes: Any, points: NDArray[Any], colours: NDArray[Any], title: str) -> None:
-    """Draw discs as large as the particles are apart, the nearer over the farther."""
+    """Draw discs of one particle spacing in diameter; nearer discs cover farther ones."""
     from matplotlib.collections import EllipseCollection
 
     kept = np.flatnonzero(np.isfinite(points).all(axis=1))

@@ -1,7 +1,7 @@
 """Pictures, films and plots of a run.
 
-Pictures and films are as the table [picture] of its scene and settings of a call ask for them; plots show how steps
-converged, what sensors have read, and whether gradients are right.
+Pictures and films follow the table [picture] of the scene and the settings of a call. Plots show the convergence of
+steps, sensor readings, and checks of gradients.
 """
 
 from __future__ import annotations
@@ -42,15 +42,14 @@ from cortado.scene.tables import field_name
 from cortado.simulation import Simulation
 
 SHEET = 3
-"""Pictures in a row of a contact sheet, and rows of it."""
+"""Number of pictures in a row of a contact sheet, and number of rows."""
 
 
 def run_pictures(
     scene: Scene, trajectory: Trajectory, folder: Path, device: Any, values: NDArray | None = None
 ) -> Figures:
-    """Draw the first and the last state of a run, a contact sheet and a film of it, into a folder; (caption, path) of
-    each. Sheet and film are quick if the scene does not say which quality they have. ``values`` as those of
-    `run_page`."""
+    """Draw a run's first and last state, a contact sheet and a film into a folder; return (caption, path) of each.
+    Sheet and film have quality "quick" unless the scene sets the quality. ``values`` colour the particles."""
     run, last, picture = ShownRun(scene, trajectory, values), len(trajectory) - 1, scene.picture or Picture()
     page, is_quick = run_page(run, device), picture.quality is None and scene.dimension == 3
     stills: Figures = []
@@ -77,7 +76,7 @@ def run_pictures(
 
 
 def run_page(run: ShownRun, device: Any) -> Page:
-    """Return the frames of a run as pictures, by their number."""
+    """Return the page that draws a run's frames by number."""
     if run.values is None:
         return Page([run.panel(run.stage, device, None)], fingerprint=run.fingerprint)
     scale = Scale.of((run.scene.picture or Picture()).colour, run.values, run.unit)
@@ -86,8 +85,8 @@ def run_page(run: ShownRun, device: Any) -> Page:
 
 
 def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | Stage, Callable[[Points], Points]]:
-    """Return the stage and the place of a scale at its right edge: on the picture, or beside a narrower one if the
-    scale would cover contents."""
+    """Return the stage and the method that draws the scale at the right edge: over the picture, or beside a narrower
+    picture if the scale would cover contents."""
     free = stage.picture.width - scale.columns(stage.picture.height)
     is_covered = stage.on_screen(corners(*stage.ends))[:, 0].max() > free
     if not is_covered or free < LEAST_PIXELS:
@@ -96,12 +95,12 @@ def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | S
 
 
 def trajectory_view(scene: Scene, trajectory: Trajectory) -> str:
-    """Return HTML that shows a run in motion; see `scene_view`."""
+    """Return HTML with an animation of a run; see `scene_view`."""
     return scene_view(scene, {scene.name: list(trajectory)}, trajectory.times)
 
 
 Units = Mapping[str, str]
-"""Units of fields that not all scenes have, by their names."""
+"""Units, by name, of fields that exist only in some scenes."""
 
 
 def shown_run(
@@ -111,7 +110,8 @@ def shown_run(
     units: Units | None = None,
     simulation: Callable[[], Simulation] | None = None,
 ) -> ShownRun:
-    """Return a run as pictures with keys of [picture] replaced show it; ``simulation`` computes unrecorded colours."""
+    """Return a run prepared for pictures, with keys of [picture] replaced; ``simulation`` computes unrecorded
+    colours."""
     if not len(trajectory):
         raise InputError("The trajectory has no frames, but must have one to be filmed.")
     known = dict.fromkeys(trajectory.others, "") if units is None else units
@@ -169,7 +169,7 @@ def trajectory_film(
 
 
 def device_of(name: str) -> Any:
-    """Return Warp's device of a name; raise `InputError` where there is none."""
+    """Return the Warp device with this name; raise `InputError` if there is none."""
     start_warp()
     return device_named(name)
 
@@ -182,7 +182,7 @@ def _scene_of(trajectory: Trajectory, given: Scene | str | Path | None) -> Scene
 
 
 def _units_of_fields(simulation: Simulation) -> dict[str, str]:
-    """Return the units of the particles' fields that a user's own part keeps, by their names."""
+    """Return, by name, the units of the particle fields that user-defined parts keep."""
     drawn = (Entry.NUMBER, Entry.VECTOR)
     known = (field for field in simulation.initial.fields if field.entry in drawn and field.axis is Axis.PARTICLE)
     return {field.name: field.unit for field in known if field.name not in NAMES}
@@ -202,12 +202,12 @@ def _alone(frame: Frame) -> Trajectory:
 
 
 WIDE = 16.0 / 9.0
-"""Ratio of columns to rows of pictures of which only the number of lines is given."""
+"""Ratio of columns to rows for pictures given only by their number of lines."""
 
 
 def shown_as(scene: Scene, settings: Mapping[str, Any], fields: Collection[str] = ()) -> Scene:
-    """Return the scene with keys of [picture] replaced. ``lines`` sets width and height, and ``camera`` takes a path
-    too, such as `pictures.Orbit`; ``colour`` may name one of ``fields``, which not all scenes have.
+    """Return the scene with keys of [picture] replaced. ``lines`` sets width and height; ``camera`` may be a path such
+    as `pictures.Orbit`; ``colour`` may also name one of ``fields``, which exist only in some scenes.
 
     Raises:
         SceneError: settings that do not fit.
@@ -233,11 +233,10 @@ def shown_as(scene: Scene, settings: Mapping[str, Any], fields: Collection[str] 
 
 
 def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
-    """Plot density error [%] and iterations, of each loop of the solver, of every step; steps that did not converge are
-    marked.
+    """Plot density error [%] and iterations of each solver loop over the steps; steps that did not converge are marked.
 
     Args:
-        tolerance: the solver's, drawn as a line [-].
+        tolerance: the solver's tolerance [-], drawn as a line.
     """
     steps = np.arange(1, len(trajectory.converged) + 1)
     loops = {name: column for name, column in trajectory.diagnostics.items() if column.dtype.kind == "i"}
@@ -267,7 +266,7 @@ def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float
 
 
 def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
-    """Plot a curve for each number of each sensor, those of one unit in one panel."""
+    """Plot a curve for each number of each sensor; numbers with the same unit share a panel."""
     lines = dict[str, list[tuple[str, Readings, str]]]()
     for name, own in found.items():
         for column, unit in own.units.items():
@@ -281,7 +280,7 @@ def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
 
 @contextmanager
 def _over_time(path: str | Path, units: Sequence[str]) -> Iterator[Any]:
-    """Yield panels of a plot over time, one below the other, with these units; each gets a legend."""
+    """Yield panels of a plot over time, stacked vertically, one for each unit; each panel gets a legend."""
     with drawing(path, height=1.5 + 2.5 * len(units)) as figure:
         panels = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
         yield panels
@@ -292,7 +291,7 @@ def _over_time(path: str | Path, units: Sequence[str]) -> Iterator[Any]:
 
 
 def beside_measured(found: Mapping[str, Readings], measured: Sequence[MeasuredColumn], path: str | Path) -> Path:
-    """Plot a panel for each measured number: its points, the curve of the sensor, and the error in the title."""
+    """Plot a panel for each measured number: measured points, the sensor's curve, and the error in the title."""
     with _over_time(path, [one.unit for one in measured]) as panels:
         for panel, one in zip(panels, measured, strict=True):
             name, _, column = one.name.rpartition(".")
@@ -309,10 +308,9 @@ if TYPE_CHECKING:
 
 
 def gradient_check(certificate: Certificate, path: str | Path) -> Path:
-    """Plot four panels: central differences against forward mode, the adjoint's growth, the horizon, and the
-    estimators.
+    """Plot four panels: central differences compared with forward mode, growth of the adjoint, horizon, and estimators.
 
-    The horizon is that of the parameter with the shortest one. Where the adjoint is wrong, the last two panels are
+    The horizon is shown for the parameter with the shortest horizon. If the adjoint is wrong, the last two panels are
     empty.
     """
     with drawing(path, 12.0, 8.4) as figure:

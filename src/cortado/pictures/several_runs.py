@@ -1,4 +1,4 @@
-"""Several runs side by side in a picture or a film: with one clock, one camera and one scale of colours."""
+"""Several runs side by side in a picture or a film, with a common clock, camera and colour scale."""
 
 from __future__ import annotations
 
@@ -47,22 +47,22 @@ def film_side_by_side(
     device: str = "cpu",
     **settings: Any,
 ) -> Film:
-    """Write a film of up to nine runs side by side, an mp4 or a webp as of `Trajectory.film`, and return it.
+    """Write a film of up to nine runs side by side, an mp4 or webp as in `Trajectory.film`, and return it.
 
-    All have one clock, one camera and one scale of colours, and the table [picture] of the first one's scene. At each
-    time a run is shown by its recorded frame nearest to it; one that has ended stands still.
+    All runs share clock, camera, colour scale and the first scene's table [picture]. At each time of the film, a run's
+    recorded frame nearest in time is shown; a run that has ended shows its last frame.
 
     Args:
-        runs: by the labels that they have; without labels they have the values in which their scenes differ.
+        runs: trajectories by label; in a list without labels, labels are made of the values in which the scenes differ.
         path: ends in .mp4 or in .webp.
-        scenes: those of the runs, or the paths of their files; needed of trajectories that were loaded from files.
-        device: of the rays, "cpu" or "cuda:0".
-        settings: as of `Trajectory.film`, of which ``lines``, ``width`` and ``height`` are those of the whole film.
+        scenes: the runs' scenes or the paths of their files; needed for trajectories loaded from files.
+        device: device that traces the rays, "cpu" or "cuda:0".
+        settings: as in `Trajectory.film`; ``lines``, ``width`` and ``height`` are those of the whole film.
 
     Raises:
         SceneError: settings that do not fit.
-        InputError: no runs or more than nine, some in 2-D and some in 3-D, a run without frames or a scene, a package
-            that is missing, or what ``colour`` names was not recorded and cannot be computed.
+        InputError: no runs or more than nine, 2-D and 3-D runs mixed, a run without frames or scene, a missing package,
+        or a ``colour`` that was not recorded and cannot be computed.
 
     Example: ``cortado.film_side_by_side({"thin": first, "thick": second}, "both.mp4")``
     """
@@ -86,7 +86,7 @@ def film_side_by_side(
 
 
 def _trajectories(runs: Any) -> list[Trajectory]:
-    """Return the given trajectories, with labels or without; raise `InputError` for anything else."""
+    """Return the given trajectories, with or without labels; raise `InputError` for other objects."""
     each = runs.values() if isinstance(runs, Mapping) else runs
     if not isinstance(each, Iterable) or isinstance(runs, Trajectory):
         raise InputError(f"runs is {shown(runs)}, but must be several trajectories, with labels or without.")
@@ -100,8 +100,8 @@ def _trajectories(runs: Any) -> list[Trajectory]:
 def shown_alike(
     scenes: Sequence[Scene], trajectories: Sequence[Trajectory], settings: Mapping[str, Any]
 ) -> list[Scene]:
-    """Return the scenes of runs with the table [picture] of the first one, whose keys `shown_as` replaces. Raises
-    `InputError` for runs that cannot be side by side, and where a package is missing."""
+    """Return the runs' scenes, all with the first scene's table [picture], after `shown_as` has replaced keys. Raise
+    `InputError` if runs cannot be shown together, or if a package is missing."""
     if not 0 < len(scenes) <= MOST_PICTURES:
         raise InputError(f"There are {len(scenes)} runs, but from 1 to {MOST_PICTURES} can be side by side.")
     if len({scene.dimension for scene in scenes}) > 1:
@@ -143,7 +143,7 @@ def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tu
 
 
 def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
-    """Return the pictures of a panel for shown frames, with a name and a time on them."""
+    """Return the pictures of a panel for the shown frames, labelled with name and time."""
 
     def drawn(k: int, around: Around) -> Points:
         before, after = (tuple(int(shown.nearest[n]) for n in side) for side in around)
@@ -153,18 +153,18 @@ def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
 
 
 def _composed(across: int, scale: Scale | None, images: list[Points]) -> Points:
-    """Put pictures together to the page, with the scale beside it."""
+    """Combine pictures to the page, with the colour scale beside them."""
     page = side_by_side(images, across)
     return page if scale is None else scale.beside(page)
 
 
 SAME = 0.01
-"""Part of the time between two frames below which they count as simultaneous."""
+"""Fraction of the frame interval below which two frames count as simultaneous."""
 
 
 def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return the times (frames,) [s] of a film of runs with frames at times (own frames,): those of the run with most
-    frames in a second, and before and after it those of others."""
+    """Return the times (frames,) [s] of a film of several runs, given each run's times. They are the times of the run
+    with the highest frame rate, extended at both ends by those of other runs."""
     found = np.zeros(0)
     for times in sorted(each, key=lambda own: (interval_of(own), -len(own))):
         if not len(found):
@@ -177,18 +177,18 @@ def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def interval_of(times: NDArray[Any]) -> float:
-    """Return the usual time between two frames [s]; infinite with a single one."""
+    """Return the typical time between two frames [s]; infinite for a single frame."""
     return float(np.median(np.diff(times))) if len(times) > 1 else np.inf
 
 
 @dataclass(frozen=True, eq=False)
 class ShownFrames:
-    """The frames of one run that a film shows: at each of its times the nearest one that was recorded."""
+    """The frames of one run that a film shows: the nearest recorded frame for each time of the film."""
 
     own: NDArray[Any]
-    """(own frames,) when they were recorded [s]"""
+    """(own frames,) recording times [s]"""
     times: NDArray[Any]
-    """(frames,) of the film, in the time of the run [s]"""
+    """(frames,) times of the film, in simulated time [s]"""
 
     @cached_property
     def nearest(self) -> NDArray[np.int64]:
@@ -197,37 +197,37 @@ class ShownFrames:
 
     @cached_property
     def during(self) -> NDArray[np.bool_]:
-        """Return a mask (frames,) of the times when the run has begun, and has not ended yet."""
+        """Return a mask (frames,) of the times between the start and the end of the run."""
         near = SAME * interval_of(self.times)
         return (self.times > self.own[0] - near) & (self.times < self.own[-1] + near)
 
     @property
     def off(self) -> float:
-        """Return the greatest time [s] between a frame and its showing, while the run goes on."""
+        """Return the greatest difference [s] between a frame's time and the film's time, between start and end of the
+        run."""
         return float(np.abs(self.own[self.nearest] - self.times)[self.during].max(initial=0.0))
 
     def time_in_words(self, k: int) -> str:
-        """Write the recording time of the frame that is shown as frame k, with enough digits to tell frames apart."""
+        """Return as text the recording time of the frame shown as frame k, with enough digits to distinguish frames."""
         interval = interval_of(self.times)
         digits = max(ceil(-log10(interval)), 0) if 0.0 < interval < np.inf else 3
         time = f"{self.own[self.nearest[k]]:.{digits}f} s"
         return time if self.during[k] else f"stands still at {time}"
 
     def notes(self, name: str) -> list[str]:
-        """Return notes for the viewer about a run of that name: a late begin, an early end."""
+        """Return notes for viewers about the run ``name``, such as a late start or an early end."""
         ends = f'"{name}" ends at {self.own[-1]:.4g} s and stands still from then on'
         begins = f'"{name}" begins at {self.own[0]:.4g} s'
         return [note for note, is_on in ((begins, self.during[0]), (ends, self.during[-1])) if not is_on]
 
 
 MOST_KEYS, LONGEST = 3, 64
-"""Values and characters of a label; where it has more, it is another one."""
+"""Greatest numbers of values and of characters of a label; beyond these a different label is used."""
 
 
 def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
-    """Return a label for each of several scenes: its name if all names differ, or else the values in which the scenes
-    differ, such as ``viscosity = 0.1 Pa s``. ``otherwise``: what they are called where no values differ, or too
-    many."""
+    """Return a label for each scene: its name if all names differ, else the values in which the scenes differ, such as
+    ``viscosity = 0.1 Pa s``. ``otherwise``: labels to use if no values or too many differ."""
     tables = [computed(json.loads(scene.to_json())) for scene in scenes]
     keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table, "missing")))
     short = [key.rpartition(".")[2] for key in keys]
@@ -244,7 +244,7 @@ def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
 
 
 def _value(table: Any, key: str) -> str:
-    """Write the value of a table of a scene under a dotted name."""
+    """Return as text the value with a dotted name in a scene's table."""
     for part in key.split("."):
         try:
             table = table[int(part)] if isinstance(table, list) else table[part]
