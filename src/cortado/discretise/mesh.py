@@ -13,32 +13,32 @@ from cortado.discretise.shapes import Numbers, Points, Which, grid, launch_on_cp
 from cortado.discretise.solid import Faces, Moments, Solid, enclosed_moments
 
 LEAF = 8
-"""Most triangles in a leaf."""
+"""Most triangles in a leaf of the tree."""
 BITS = 10
-"""Bits of each coordinate by which points are sorted: points near in space are near in memory."""
+"""Bits of each coordinate by which points are sorted, so that points near in space are near in memory."""
 SPREAD = ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249))
-"""Shifts and masks that bring the bits three places apart."""
+"""Shifts and masks that spread the bits of a number to every third place."""
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleTree:
-    """A tree of triangles, halved again and again across the longest side of their middles' box.
+    """A tree of triangles, split recursively across the longest side of the box around their centres.
 
-    `cortado.discretise.tree_kernels` says how nodes are numbered.
+    `cortado.discretise.tree_kernels` defines the numbers of the nodes.
     """
 
     corners: Points
-    """(k, 3, 3) corners of the triangles, those of a leaf one after the other [m]"""
+    """(k, 3, 3) corners of the triangles, leaf after leaf [m]"""
     order: Numbers
-    """(k,) number of each triangle among the given ones"""
+    """(k,) index of each triangle in the original order"""
     starts: NDArray[np.int32]
-    """(leaves + 1,) the first triangle of each leaf, and one behind the last"""
+    """(leaves + 1,) first triangle of each leaf, and the number of triangles"""
     boxes: Points
-    """(2 leaves, 6) lower and upper corner of each node's box [m]; there is no node 0"""
+    """(2 leaves, 6) lower and upper corner of each node's box [m]; row 0 is unused"""
 
     @classmethod
     def of(cls, corners: Points) -> "TriangleTree":
-        """Build the tree of one triangle or more, by their corners (k, 3, 3) [m]."""
+        """Build the tree of at least one triangle, from their corners (k, 3, 3) [m]."""
         count, middles = len(corners), corners.mean(axis=1)
         levels = max(int(np.ceil(np.log2(count / LEAF))), 0)
         order = np.arange(count)
@@ -57,13 +57,13 @@ class TriangleTree:
         return cls(ordered, order, starts.astype(np.int32), np.concatenate([np.zeros((1, 6)), *boxes[::-1]]))
 
     def moved(self, scale: float, shift: Points) -> "TriangleTree":
-        """Return the tree with coordinates multiplied by a scale greater than 0 and then moved (3,) [m]."""
+        """Return the tree with coordinates multiplied by a positive scale and then shifted by (3,) [m]."""
         corners, boxes = scale * self.corners + shift, scale * self.boxes + np.tile(shift, 2)
         return TriangleTree(corners, self.order, self.starts, boxes)
 
     def nearest(self, points: Points, reach: float = np.inf) -> tuple[Points, Points]:
-        """Return the nearest points (n, 3) of the triangles [m], and their distances (n,) [m], for points (n, 3) [m];
-        the points themselves and ``reach`` [m] where nothing is nearer than that."""
+        """Return the points (n, 3) of the triangles nearest to points (n, 3) [m], and their distances (n,) [m]. Without
+        a triangle within ``reach`` [m], return the point itself and ``reach``."""
         order = np.arange(len(points)) if np.isfinite(reach) else _along_a_curve(points)  # these take long enough
         nearest, squares = np.empty((len(points), 3)), np.empty(len(points))
         self.ask("find_nearest", points[order], reach=reach, nearest=nearest, squares=squares)
@@ -72,15 +72,14 @@ class TriangleTree:
         return found, away
 
     def windings(self, points: Points) -> NDArray[np.int32]:
-        """Return how often (n,) the triangles go around points (n, 3) [m]; they must be closed."""
+        """Return the winding numbers (n,) of the triangles, which must be closed, around points (n, 3) [m]."""
         found = np.empty(len(points), dtype=np.int32)
         self.ask("find_windings", points, windings=found)
         return found
 
     def crossings(self, names: Numbers, tolerance: float) -> Numbers:
-        """Return the pairs (m, 2) of triangles that cross: an edge of one goes through the other, further than a
-        tolerance [m] to both sides. Triangles do not cross at vertices that they have in common, by the ``names`` (k,
-        3) of these."""
+        """Return the pairs (m, 2) of triangles that cross: an edge of one passes through the other by more than a
+        tolerance [m] on both sides. Triangles do not cross at common vertices, which have equal ``names`` (k, 3)."""
         count, ordered = len(self.corners), np.ascontiguousarray(names[self.order], dtype=np.int32)
         counts, places, others = (np.zeros(size, dtype=np.int32) for size in (count, count + 1, 1))
         given = {"names": ordered, "tolerance": tolerance, "counts": counts}
@@ -94,8 +93,8 @@ class TriangleTree:
         return np.sort(self.order[pairs], axis=1)
 
     def beside(self, other: "TriangleTree", reach: float) -> Numbers:
-        """Return the pairs (m, 2) of a triangle of this tree and one of another whose boxes are no further apart than a
-        reach [m] along any axis."""
+        """Return pairs (m, 2) of a triangle of this tree and one of another tree, if their boxes are at most a reach
+        [m] apart along every axis."""
         pairs = np.ones((1, 2), dtype=np.int64)
         leaves = np.array([len(self.starts) - 1, len(other.starts) - 1])
         while (pairs < leaves).any():
@@ -115,8 +114,8 @@ class TriangleTree:
         return np.column_stack([self.order[pairs[:, 0]], other.order[pairs[:, 1]]])
 
     def ask(self, kernel: str, points: Points, **arguments: Any) -> None:
-        """Launch one of the `tree_kernels` for points (n, 3) [m], with its further arguments, which include arrays that
-        it writes to."""
+        """Launch one of the `tree_kernels` for points (n, 3) [m], with its other arguments, including its output
+        arrays."""
         from cortado.device.modules import start_warp
 
         start_warp()
@@ -135,12 +134,12 @@ class TriangleTree:
 
 
 def _starts(count: int, level: int) -> Numbers:
-    """Return the first triangle of each node of a level, and the number of all, (2^level + 1,)."""
+    """Return the first triangle of each node of a level, followed by the number of triangles, (2^level + 1,)."""
     return (np.arange(2**level + 1) * count) >> level
 
 
 def _near(first: Points, second: Points, reach: float) -> Which:
-    """Test (n,) which boxes (n, 6) are no further apart than a reach along any axis."""
+    """Test (n,) which boxes (n, 6) are at most a reach apart along every axis."""
     apart = np.maximum(first[:, :3] - second[:, 3:], second[:, :3] - first[:, 3:])
     return np.asarray((apart <= reach).all(axis=1))
 
@@ -157,23 +156,23 @@ def _along_a_curve(points: Points) -> Numbers:
 
 
 LYING = 10.0
-"""In distances at which one looks beside a triangle: nearer triangles lie on it."""
+"""In units of the distance at which the sides of a triangle are examined: nearer triangles count as lying on it."""
 THIN = 1e-15
-"""Part of the width of a triangle below which a piece is left out."""
+"""Relative to the width of a triangle: smaller pieces are left out."""
 
 
 def outer_surface(
     corners: Points, pairs: Numbers, holds: Callable[[Points], Which], reach: float
 ) -> tuple[Points, Points]:
-    """Return the surface of a union of closed parts, in pieces (n, 3, 3) [m] of their triangles, cut where parts meet,
-    and their weights (n,) in integrals over the surface. The weight is 0 where both sides of a piece are inside or
-    outside, less than 1 where several triangles lie on each other.
+    """Return the surface of a union of closed parts, as pieces (n, 3, 3) [m] of their triangles, cut where parts meet.
+    Also return the pieces' weights (n,) in surface integrals. A weight is 0 if both sides of a piece are inside or both
+    outside, and less than 1 if several triangles lie on each other.
 
     Args:
         corners: (k, 3, 3) of all triangles, counterclockwise as seen from outside [m].
-        pairs: (m, 2) numbers of all triangles that may meet beside their own edges.
-        holds: says of points (n, 3) [m] which (n,) are inside of some part.
-        reach: how far from a triangle one looks at what is beside it [m].
+        pairs: (m, 2) indices of all triangles that may meet away from their own edges.
+        holds: tests (n,) which points (n, 3) [m] are inside some part.
+        reach: distance from a triangle at which its sides are examined [m].
     """
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
@@ -194,8 +193,8 @@ def outer_surface(
 
 
 def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]:
-    """Cut a triangle (3, 3) into pieces (n, 3, 3) that no others (m, 3, 3) cross. Also count for each piece the
-    triangles (n,), itself included, that lie no further from its middle than ``reach``."""
+    """Cut a triangle (3, 3) into pieces (n, 3, 3) that none of the triangles (m, 3, 3) crosses. Also count for each
+    piece (n,) the triangles, including itself, within ``reach`` of its centre."""
     side, normal = corners[1] - corners[0], np.cross(corners[1] - corners[0], corners[2] - corners[0])
     if not normal.any():
         return np.zeros((0, 3, 3)), np.zeros(0)
@@ -222,7 +221,7 @@ def _sides(triangles: Points) -> Points:
 
 
 def _through(triangles: Points) -> Points:
-    """Return the segments (m, 2, 2) where triangles (n, 3, 3) cross the plane at height 0."""
+    """Return the segments (m, 2, 2) in which triangles (n, 3, 3) intersect the plane at height 0."""
     heights, following = triangles[..., 2], np.roll(triangles, -1, axis=1)
     crossed = (heights > 0.0) != (following[..., 2] > 0.0)
     along = (heights / np.where(crossed, heights - following[..., 2], 1.0))[..., None]
@@ -242,8 +241,8 @@ def _within_triangle(triangle: Points, points: Points) -> tuple[Which, Points]:
 
 
 def _pieces(segments: Points, lower: float, upper: float) -> Points:
-    """Return triangles (n, 3, 2), counterclockwise, between segments (s, 2, 2) in columns from one place to another
-    along the first axis. A new one begins where a segment begins or ends, or where two cross."""
+    """Return triangles (n, 3, 2), counterclockwise, that fill columns between segments (s, 2, 2) over an interval of
+    the first axis. A new column starts where a segment starts or ends, or where two cross."""
     order = np.argsort(segments[:, :, 0], axis=1)[..., None]
     (start, below), (end, above) = np.moveaxis(np.take_along_axis(segments, order, axis=1), (1, 2), (0, 1))
     leans = end > start
@@ -274,32 +273,32 @@ def _pieces(segments: Points, lower: float, upper: float) -> Points:
 
 
 LOW_DISCREPANCY = 0.7548776662466927 ** np.array([1.0, 2.0])
-"""Steps along two axes of a sequence that fills a square evenly: powers of 1 / p, p^3 = p + 1."""
+"""Increments along two axes of a sequence that fills a square evenly: powers of 1 / p, where p^3 = p + 1."""
 BESIDE = 1e-12
-"""Part of the length of a mesh: how far from a triangle one looks whether both sides of it are inside."""
+"""Relative to the length of a mesh: distance from a triangle at which both its sides are tested for being inside."""
 SEEN = 1e-3
-"""Part of the distance of points of a surface: how far outside of it one looks for another part of the solid."""
+"""Relative to the spacing of surface points: distance outside the surface where another part of the solid is sought."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh(Solid):
-    """The solid within a closed surface of triangles: all points around which it goes at least once.
+    """The solid within a closed surface of triangles: all points with a winding number of at least 1.
 
-    Parts may overlap: each is closed by itself, and the solid is their union. `cortado.discretise.mesh_checks` finds
-    parts, and says what is wrong with triangles.
+    Parts may overlap: each part is closed, and the solid is their union. `cortado.discretise.mesh_checks` finds parts
+    and reports faulty triangles.
     """
 
     vertices: Points
     """(m, 3) [m]"""
     triangles: Numbers
-    """(k, 3) numbers of the vertices of each, counterclockwise as seen from outside"""
+    """(k, 3) indices of the vertices of each triangle, counterclockwise as seen from outside"""
     parts: Sequence[Numbers] = ()
-    """The triangles of each part; without any, all are one, which does not cross itself."""
+    """Triangles of each part; if empty, all triangles are one part that does not cross itself."""
     known_trees: Sequence[TriangleTree] = ()
-    """The trees of the parts, if they are known."""
+    """Trees of the parts, if already built."""
 
     def moved(self, scale: float, shift: Points) -> "Mesh":
-        """Return the solid multiplied by a scale greater than 0 and then moved (3,) [m]."""
+        """Return the solid with coordinates multiplied by a positive scale and then shifted by (3,) [m]."""
         trees = [tree.moved(scale, shift) for tree in self._trees]
         return Mesh(scale * self.vertices + shift, self.triangles, self.parts, trees)
 
@@ -324,8 +323,8 @@ class Mesh(Solid):
         return self._ends
 
     def distance(self, points: Points) -> Points:
-        """Return the `Solid.distance` to round-off; where parts overlap, the depth beneath the surface of one of them,
-        which is less."""
+        """Return the `Solid.distance` to round-off. Inside overlapping parts it is the depth below the surface of one
+        of them, which is too small."""
         return self._looked_up(points, np.inf)[1]
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
@@ -348,7 +347,7 @@ class Mesh(Solid):
         return Faces(self.vertices, self.triangles)
 
     def _looked_up(self, points: Points, reach: float) -> tuple[Points, Points]:
-        """Return the nearest points (n, 3) of the surface, and the distances (n,), no larger than a reach [m]."""
+        """Return the nearest points (n, 3) of the surface, and the distances (n,), of at most a reach [m]."""
         found, best = np.empty_like(points), np.full(len(points), np.inf)
         for tree in self._trees:
             places, away = tree.nearest(points, reach)
@@ -358,11 +357,11 @@ class Mesh(Solid):
         return found, best
 
     def own_feet(self, fine: float) -> tuple[Points, Points]:
-        """Return points spread over the triangles at equal intervals of area, for `Solid.own_feet`.
+        """Return points evenly spread over the triangles by area, for `Solid.own_feet`.
 
-        Along the triangles, in an order in which those near each other in space follow one another, a point stands at
-        equal intervals of the area. In a triangle that has several, these are a sequence of low discrepancy (Roberts
-        2018, R2), folded into it.
+        The triangles are ordered so that neighbours in space follow one another, and a point is placed after every
+        equal portion of area. Several points in one triangle form a low-discrepancy sequence (Roberts 2018, R2), folded
+        into it.
         """
         order = np.concatenate([part[tree.order] for part, tree in zip(self._numbers, self._trees, strict=True)])
         areas = self.areas()[order]
@@ -396,7 +395,7 @@ class Mesh(Solid):
         return enclosed_moments(*outer_surface(self.corners, np.concatenate(pairs), self.holds, reach))
 
     def normals(self) -> Points:
-        """Return unit vectors (k, 3) outwards from each triangle; 0 where it has no area."""
+        """Return unit vectors (k, 3) outwards from each triangle, or 0 for a triangle without area."""
         across = self._across
         return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
 

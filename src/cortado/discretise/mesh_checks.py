@@ -1,4 +1,4 @@
-"""Triangles made a solid, or a sentence that says what is wrong with them, where, and what to do about it."""
+"""Checks that turn triangles into a solid, or else report in a sentence what is wrong, where, and what to do."""
 
 from dataclasses import dataclass
 
@@ -10,20 +10,20 @@ from cortado.discretise.shapes import Numbers, Points, Which, whole_origin
 from cortado.errors import InputError
 
 SAME = 1e-6
-"""Part of the length of a mesh: vertices that are no further apart are one where edges are open otherwise, as float32
-rounds them."""
+"""Relative to the length of a mesh: if edges are open, vertices within this distance are merged, as float32 may have
+rounded them apart."""
 COARSE, TOLD = 0.02, 1e-3
-"""Of the length of a mesh: coordinates that a file rounds to more are refused, and told of."""
+"""Relative to the length of a mesh: rounding of coordinates in a file above which the file is refused, or noted."""
 ASIDE = 1e-6
-"""Part of the length of a mesh: how far from a surface one looks at its sides."""
+"""Relative to the length of a mesh: distance from a surface at which its sides are examined."""
 CROSSED = 1e-7
-"""Part of the length of a mesh by which a triangle goes through another one at least; less is a touch."""
+"""Relative to the length of a mesh: least depth by which crossing triangles intersect; less counts as a touch."""
 LOOKED_AT = 8192
-"""Most triangles whose sides are looked at."""
+"""Most triangles whose sides are examined."""
 SAME_WAY = 1e-6
-"""Angle [rad] between triangles that lie on each other, where two bodies touch."""
+"""Angle [rad] below which triangles lie on each other, where two bodies touch."""
 TOGETHER = 1e-3
-"""The same as float32 may round it, where one only asks in how many directions a surface goes on."""
+"""The same angle for float32 coordinates, used only to count the directions in which a surface continues."""
 MEETING = (
     "{what} has {edges} at which three triangles or more meet without closing, the first at {place}, so that nothing "
     "says what is inside: delete faces that divide its inside or stick out of it."
@@ -43,11 +43,11 @@ class Edges:
     """The edges of triangles that share vertices."""
 
     ends: Numbers
-    """(e, 2) numbers of their vertices, the lower one first"""
+    """(e, 2) indices of the edges' vertices, the lower one first"""
     names: Numbers
-    """(k, 3) numbers of the edges that the sides of triangles are"""
+    """(k, 3) index of the edge on each side of the triangles"""
     ways: Numbers
-    """(k, 3) 1 where a side goes from the lower number to the higher, -1 where it goes back"""
+    """(k, 3) 1 if a side runs from the lower vertex index to the higher, otherwise -1"""
 
     @classmethod
     def of(cls, triangles: Numbers) -> "Edges":
@@ -65,11 +65,11 @@ class Edges:
         return np.bincount(self.names.ravel(), minlength=len(self.ends))
 
     def close(self) -> Which:
-        """Test (e,) whether triangles close at each edge: as many go along it one way as the other."""
+        """Test (e,) which edges are closed: equally many triangles run along the edge in both directions."""
         return np.asarray(np.bincount(self.names.ravel(), self.ways.ravel(), len(self.ends)) == 0.0)
 
     def check(self, vertices: Points, what: str) -> None:
-        """Raise `InputError`, a sentence that calls the mesh ``what``, where the triangles do not close."""
+        """Raise `InputError`, a sentence that calls the mesh ``what``, if the triangles are not closed."""
         unbalanced, counts = ~self.close(), self.counts
         for wrong, edge, sentence in (
             (unbalanced & (counts > 2), "edge", MEETING),
@@ -91,10 +91,10 @@ def place_in_file(place: Points) -> str:
 
 
 def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tuple[Points, Numbers]:
-    """Return triangles (k, 3) between vertices (m, 3) at different places, or further apart than a tolerance.
+    """Return triangles (k, 3) and vertices (m, 3), with vertices merged that are equal or closer than a tolerance.
 
-    Left out are those that have a vertex twice, what comes once more, and pairs that are back to back, as where two
-    bodies touch.
+    Triangles with a repeated vertex, duplicates, and pairs that are back to back, as where two bodies touch, are
+    removed.
     """
     vertices, names = _distinct(vertices)
     if tolerance > 0.0:
@@ -108,7 +108,7 @@ def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tupl
 
 
 def _distinct(vertices: Points) -> tuple[Points, Numbers]:
-    """Return vertices at different places, and the number of each given vertex among them."""
+    """Return the distinct vertices, and the index of each given vertex among them."""
     order = np.lexsort(vertices.T)
     new = np.append(True, (np.diff(vertices[order], axis=0) != 0.0).any(axis=1))
     names = np.empty(len(vertices), dtype=np.int64)
@@ -117,8 +117,7 @@ def _distinct(vertices: Points) -> tuple[Points, Numbers]:
 
 
 def _further_apart(vertices: Points, names: Numbers, tolerance: float) -> tuple[Points, Numbers]:
-    """Return vertices and names of `_distinct` with one vertex in the place of several no further apart than a
-    tolerance."""
+    """Merge vertices of `_distinct` that are closer than a tolerance, and return vertices and indices as it does."""
     from scipy.spatial import cKDTree
 
     groups = _connected(cKDTree(vertices).query_pairs(tolerance, output_type="ndarray"), len(vertices))
@@ -126,7 +125,7 @@ def _further_apart(vertices: Points, names: Numbers, tolerance: float) -> tuple[
 
 
 def _connected(links: Numbers, count: int) -> Numbers:
-    """Return the connected component (count,) of each of ``count`` nodes, with links (m, 2) between them."""
+    """Return the connected component (count,) of each of ``count`` nodes connected by links (m, 2)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -135,11 +134,11 @@ def _connected(links: Numbers, count: int) -> Numbers:
 
 
 def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, what: str) -> Numbers:
-    """Number the bodies of a closed mesh from 0 on, and return the number (k,) of each of its triangles (k, 3).
+    """Number the bodies of a closed mesh from 0 on, and return the body's number (k,) for each triangle (k, 3).
 
-    Triangles that follow one another at an edge with the solid between them are of one body. Raises `InputError`, a
-    sentence that calls the mesh ``what``, at an edge from which its surface goes on in more than two directions;
-    ``origin`` (3,) is the place of the mesh in the file.
+    Neighbours around an edge belong to one body if the solid is between them. Raises `InputError`, a sentence that
+    calls the mesh ``what``, at an edge from which the surface continues in more than two directions; ``origin`` (3,) is
+    the place of the mesh in the file.
     """
     names = edges.names.ravel()
     sides = np.argsort(names, kind="stable")
@@ -161,7 +160,7 @@ def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, w
 
 
 def _angles(edge: Points, opposite: Points) -> Points:
-    """Return the angles (m,) around an edge (2, 3) at which points (m, 3) are seen, right-handed."""
+    """Return the right-handed angles (m,) of points (m, 3) around an edge (2, 3)."""
     along = (edge[1] - edge[0]) / np.linalg.norm(edge[1] - edge[0])
     across = np.eye(3)[np.argmin(np.abs(along))]
     right = np.cross(along, across)
@@ -169,8 +168,8 @@ def _angles(edge: Points, opposite: Points) -> Points:
 
 
 def _directions(angles: Points, ways: Numbers) -> int:
-    """Return the number of directions in which a surface goes on from an edge that triangles share, at angles [rad] and
-    with ways (m,). Triangles that lie on each other and go opposite ways cancel."""
+    """Return the number of directions in which a surface continues from an edge shared by triangles at angles [rad]
+    with orientations (m,). Triangles that lie on each other with opposite orientations cancel."""
     order = np.argsort(angles)
     angles, ways = angles[order], ways[order]
     groups = np.cumsum(np.diff(angles, prepend=angles[0]) > TOGETHER)
@@ -179,8 +178,8 @@ def _directions(angles: Points, ways: Numbers) -> int:
 
 
 def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
-    """Return the pairs (m / 2, 2) of triangles around an edge (m,) that bound the same solid wedge: one at which it
-    begins and the next at which one ``ends`` (m,). Where two lie on each other, one ends before one begins."""
+    """Return the pairs (m / 2, 2) of triangles around an edge (m,) that bound the same wedge of solid: one that starts
+    it and the next that ``ends`` (m,) it. If two lie on each other, the ending one comes first."""
     turned = np.mod(angles - angles[np.argmin(ends)] + 0.5 * SAME_WAY, 2.0 * np.pi)
     order = np.lexsort((~ends, np.floor(turned / SAME_WAY)))
     begun, ended, pairs = list[int](), list[int](), []
@@ -196,16 +195,16 @@ def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
 def parts_of(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, crossings: Numbers, some: Numbers, beside: Points
 ) -> tuple[tuple[Numbers, ...], int | None, int | None]:
-    """Sort triangles into parts within each of which no bodies overlap; no parts if the mesh is one that does not cross
+    """Sort triangles into parts without overlapping bodies inside a part; return no parts if the mesh does not cross
     itself. Also return a triangle at which a body crosses itself, and one of a body inside another, or None.
 
     Args:
         mesh: closed.
-        tree: of its triangles.
+        tree: the tree of the mesh's triangles.
         labels: (k,) the body of each triangle.
         crossings: (m, 2) pairs of triangles that cross.
-        some: (s,) triangles, of each body at least one with an area.
-        beside: (s, 3) a place just outside of each of those [m].
+        some: (s,) triangles, including for each body at least one with an area.
+        beside: (s, 3) a point just outside each of these triangles [m].
     """
     count = int(labels.max()) + 1
     bodies = [np.flatnonzero(labels == body) for body in range(count)]
@@ -240,8 +239,8 @@ def parts_of(
 
 
 def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
-    """Return the body to which each body belongs, (bodies,): a cavity to the least of those around it, all others to
-    themselves. ``around`` (bodies, s): how often each goes around places beside the bodies ``seen`` (s,)."""
+    """Return the owner (bodies,) of each body: for a cavity the smallest body around it, for others the body itself.
+    ``around`` (bodies, s) are each body's winding numbers at points beside the bodies ``seen`` (s,)."""
     owners = np.arange(len(volumes))
     for cavity in np.flatnonzero(volumes < 0.0):
         holds = (around[:, seen == cavity] > 0).all(axis=1) & (volumes > -volumes[cavity])
@@ -252,7 +251,7 @@ def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
 
 
 def _apart(met: np.ndarray, sizes: list[int]) -> list[list[int]]:
-    """Put numbers into as few groups as are found, the largest first, so that none has met another of its group."""
+    """Divide numbers into few groups, largest first, so that no two in a group have met."""
     groups: list[list[int]] = []
     for number in sorted(range(len(sizes)), key=lambda one: -sizes[one]):
         free = next((group for group in groups if not met[number, group].any()), None)
@@ -264,7 +263,7 @@ def _apart(met: np.ndarray, sizes: list[int]) -> list[list[int]]:
 
 
 def _volume(corners: Points) -> float:
-    """Return the volume within a closed surface of triangles (k, 3, 3) [m3], negative if its normals point inwards."""
+    """Return the volume within a closed surface of triangles (k, 3, 3) [m3]; negative if its normals point inwards."""
     a, b, c = np.moveaxis(corners - corners[0, 0], 1, 0)
     return float((a * np.cross(b, c)).sum() / 6.0)
 
@@ -276,17 +275,17 @@ class FoundMesh:
     mesh: Mesh
     """The mesh in the file's unit of length, about an origin of its own."""
     origin: Points
-    """(3,) place of that origin in the file: near the middle of a mesh that is far from the origin of the file, and 0
-    of all others."""
+    """(3,) position of that origin in the file: near the middle of a mesh that is far from the file's origin, otherwise
+    0."""
     notes: tuple[str, ...]
-    """Sentences about what is probably not meant."""
+    """Sentences about features that are probably unintended."""
     left_out: int
-    """Number of triangles without area, or that came twice."""
+    """Number of triangles that were removed because they have no area or are duplicates."""
 
 
 def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float = 0.0) -> FoundMesh:
-    """Make the solid that triangles (k, 3) between vertices (m, 3) enclose; raise `InputError`, a sentence that calls
-    the mesh ``what``. In the file coordinates are whole multiples of a ``rounding``, if that is not 0."""
+    """Build the solid enclosed by triangles (k, 3) with vertices (m, 3); raise `InputError`, a sentence that calls the
+    mesh ``what``. Coordinates in the file are whole multiples of ``rounding``, unless that is 0."""
     used = vertices[triangles.ravel()]
     if not np.isfinite(used).all():
         wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
@@ -326,8 +325,8 @@ def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float 
 def _solid_parts(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, origin: Points, what: str
 ) -> tuple[tuple[Numbers, ...], tuple[str, ...]]:
-    """Return the parts of a closed mesh, whose bodies have labels (k,), and notes about it; raise `InputError` where it
-    is inside out. ``origin`` (3,) is the place of the mesh in the file."""
+    """Return the parts of a closed mesh, whose bodies have labels (k,), and notes about it; raise `InputError` if it is
+    inside out. ``origin`` (3,) is the mesh's position in the file."""
     size = np.ptp(mesh.corners, axis=(0, 1)).max()
     crossings = tree.crossings(mesh.triangles, CROSSED * size)
     some = np.unique(np.append(np.arange(0, len(labels), -(-len(labels) // LOOKED_AT)), crossings[:LOOKED_AT]))
@@ -355,8 +354,8 @@ def _solid_parts(
 
 
 def _inside_out(wrong: np.ndarray, labels: Numbers, seen: Numbers, what: str, corners: Points) -> str:
-    """Return the error message for a mesh whose normals point inwards. ``wrong`` marks such triangles among those
-    tested, ``seen`` has the bodies of these, and ``labels`` those of all; ``corners`` (3, 3) is one example."""
+    """Return the error message for a mesh whose normals point inwards. Of the triangles tested, ``wrong`` marks those
+    with inward normals, ``seen`` has the bodies; ``labels`` has all bodies, ``corners`` (3, 3) an example."""
     if wrong.all():
         return (
             f"The normals of {what} point inwards, so that its inside would be outside: turn all of its triangles "

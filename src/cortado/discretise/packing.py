@@ -1,9 +1,9 @@
-"""Particles moved until the fluid has its rest density everywhere, in float64.
+"""Packing of particles, so that the fluid has its rest density everywhere, in float64.
 
-In Colagrossi et al. (2012) and in Negi and Ramachandran (2021) particles push each other until they fill a shape
-evenly. Here nonlinear least squares (Gauss-Newton) do it: the density of every particle is to be that of the lattice,
-and no two particles are to be too near each other. Walls count with their weights, and air counts as if it were fluid.
-Only particles near a surface move, as those on a lattice have the rest density from the start.
+In Colagrossi et al. (2012) and in Negi and Ramachandran (2021) particles repel each other until they fill a shape
+evenly. Here nonlinear least squares (Gauss-Newton) give every particle the density of the lattice, and keep particles
+from coming too near each other. Walls count with their weights, and air counts as if it were fluid. Only particles near
+a surface move, because those on a lattice have the rest density from the start.
 """
 
 from contextlib import nullcontext
@@ -21,13 +21,13 @@ from cortado.files.terminal import timed_note
 
 Int32s = NDArray[np.int32]
 MOST_CELLS = 2_000_000
-"""Most cells of a grid: points that are further apart share them."""
+"""Most cells of a grid; for widely spread points several cells share one entry."""
 NO_LIMIT = 2**31 - 1
 
 
 @dataclass(frozen=True, eq=False)
 class PointsAround:
-    """The points that particles see, found by cells: first particles, if any, then fixed points of air and walls."""
+    """The neighbours of particles, found by cells: first the particles, if any, then fixed points of air and walls."""
 
     lattice: RestLattice
     """The lattice of the fluid at rest."""
@@ -36,25 +36,25 @@ class PointsAround:
     weights: Points
     """(m,) weight of each in the density, a particle being 1 [-]"""
     air: tuple[int, int]
-    """Number of the first point of air, which blind particles do not see, and of the first one behind the last."""
+    """Index of the first point of air, which ``blind`` particles do not see, and the index after the last."""
     lengths: Points
     """(d,) the lengths of the period [m], 0 for axes without one"""
     reach: float
-    """Distance up to which particles look [m]."""
+    """Distance within which neighbours are found [m]."""
 
     def near(self, particles: Points) -> Which:
-        """Test (n,) whether there is a point within the reach of particles (n, d) [m]."""
+        """Test (n,) which particles (n, d) [m] have a point within the reach."""
         return self._looked(particles, np.zeros(len(particles), dtype=bool), most=1)["counts"] > 0
 
     def sums(self, particles: Points, blind: Which) -> Points:
-        """Return the weighted sums (n,) of the points' kernels [1 / m^d] at particles (n, d) [m], of which those that
-        are ``blind`` (n,) see no air; the reach is the support."""
+        """Return the sums (n,) of the points' weighted kernels [1 / m^d] at particles (n, d) [m]. Particles that are
+        ``blind`` (n,) do not see air; the reach is the support."""
         return np.asarray(self._looked(particles, blind)["sums"])
 
     def lists(self, particles: Points, blind: Which) -> tuple[Int32s, Int32s, Int32s]:
-        """Return neighbour lists of the first n points, at ``particles`` (n, d) [m]: where each list begins (n,) and
-        ends (n,), and the numbers of neighbours, with gaps between lists. A list holds only points of higher numbers
-        within the reach."""
+        """Return neighbour lists of the first n points, now at ``particles`` (n, d) [m]: start (n,) and end (n,) of
+        each list, and the neighbours' indices, with gaps between lists. A list has only points of higher index within
+        the reach."""
         room = len(lattice_offsets(self.lattice.spacing, self.reach, self.lattice.dimension))
         while True:
             starts = (room * np.arange(len(particles) + 1)).astype(np.int32)
@@ -83,7 +83,7 @@ class PointsAround:
 
     @cached_property
     def kernels(self) -> Any:
-        """Make the `packing_kernels` for the lattice's smoothing kernel."""
+        """Build the `packing_kernels` for the lattice's smoothing kernel."""
         from cortado.device.modules import start_warp
 
         start_warp()
@@ -93,12 +93,12 @@ class PointsAround:
 
     @cached_property
     def in_space(self) -> Points:
-        """Return the points (m, 3) as kernels see them [m]."""
+        """Return the points (m, 3) in the form that kernels use [m]."""
         return in_space(self.points)
 
     @cached_property
     def on_cpu(self) -> Any:
-        """Return the points as the struct ``Around`` of kernels."""
+        """Return the points as the kernels' struct ``Around``."""
         around, dimension = self.kernels.around(), self.lattice.dimension
         around.x, around.weights = shared(self.in_space), shared(self.weights)
         around.air, around.behind_air = self.air
@@ -110,7 +110,7 @@ class PointsAround:
 
     @cached_property
     def _by_cell(self) -> tuple[Any, Any]:
-        """Return the points in the order of cells as wide as the reach, and the grid of these."""
+        """Return the points sorted by cells as wide as the reach, and the grid of these cells."""
         from cortado.device.grid import Grid
 
         ends = self.points.min(axis=0), self.points.max(axis=0)
@@ -131,44 +131,44 @@ def in_space(points: Points) -> Points:
 
 
 HIGHEST, AIM, LOWEST = 0.5 * SLACK, (-6e-3, -1e-3), -9e-3
-"""Of a packed particle's density beside that of the lattice, relative. It is not above, or pressure would drive the
-particles apart in the first step."""
+"""Bounds on the density of a packed particle, relative to the lattice's. It is not above, because pressure would then
+drive particles apart in the first step."""
 ROUNDS = 6
-"""Rounds of least squares, until the particles that move are chosen anew."""
+"""Most rounds of least squares before the moving particles are chosen again."""
 LISTED = 0.6
-"""Distance [spacings] beyond the support up to which pairs are kept for the rounds to come."""
+"""Distance [spacings] beyond the support within which pairs are listed, for later rounds."""
 NEAR = 0.9
-"""Distance [spacings] below which pairs of particles push each other apart."""
+"""Distance [spacings] below which pairs of particles repel each other."""
 PUSH = 0.1
-"""Weight of a pair that is too near by a spacing, beside a density that is wrong by its whole."""
+"""Weight of a pair that is one spacing too close, relative to a density error of 100 %."""
 FARTHEST = 0.15
-"""Greatest move [spacings] of a particle in a round, as the equations are linear only nearby."""
+"""Largest move [spacings] of a particle in a round, because the linearisation holds only nearby."""
 DAMPING, MOST_INNER_ROUNDS = 0.02, 20
-"""Of the linear least squares: among solutions that are nearly as good, the one that moves particles least."""
+"""For the linear least squares: among nearly equally good solutions, the damping prefers the one with least motion."""
 
 
 def density_errors(around: PointsAround, sums: Points, stays: Which) -> Points:
-    """Return by how much (n,) densities are above that of the lattice, relative, given sums of kernels (n,) [1 / m^d];
-    0 for particles that stay where it is below."""
+    """Return the relative excess (n,) of densities over the lattice's, from sums of kernels (n,) [1 / m^d]. For
+    particles that stay, a density below the lattice's counts as no error (0)."""
     errors = around.volume * sums - (1.0 - SLACK)
     return np.where(stays, np.maximum(errors, 0.0), errors)
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """A linearisation of densities, and of distances of close pairs, to first order in the moves of particles: products
-    of their derivatives at some places, without a matrix."""
+    """The linearisation, at given positions, of densities and of distances of close pairs. It multiplies by the
+    derivatives without building a matrix."""
 
     kernels: Any
     equations: Any
-    """The derivatives, as kernels see them."""
+    """The derivatives, in the form that kernels use."""
     sums: Points
     """(n,) sums of kernels at the particles [1 / m^d]"""
     distances: Points
-    """(m,) distances of pairs that are close [m]"""
+    """(m,) distances of close pairs [m]"""
 
     def multiply(self, moves: Points) -> tuple[Points, Points]:
-        """Return the changes of the sums (n,) [1 / m^d] and of the distances (m,) [m] by moves (n, 3) [m]."""
+        """Return the changes of the sums (n,) [1 / m^d] and of the distances (m,) [m] for moves (n, 3) [m]."""
         changes, approaches = np.zeros_like(self.sums), np.empty_like(self.distances)
         self._launch(self.kernels.multiply, moves=moves, changes=changes, approaches=approaches)
         return changes, approaches
@@ -184,9 +184,9 @@ class Linearised:
 
 
 class Relaxation:
-    """The least squares for the places of particles, the first n of the points around, of which some are ``free`` (n,)
-    to move. Those that stay (n,) do not see air. Pairs of neighbours are listed once for all iterations: no particle
-    moves so far that it gets others."""
+    """The least-squares problem for the positions of particles, the first n of the points around, of which ``free``
+    (n,) ones may move. Those that stay do not see air. Neighbour pairs are listed once for all iterations, because no
+    particle moves far enough to get new neighbours."""
 
     def __init__(self, around: PointsAround, stays: Which, free: Which):
         starts, ends, listed = around.lists(around.points[: len(free)], stays)
@@ -194,7 +194,7 @@ class Relaxation:
         self._given = {"around": around.on_cpu, "free": free, "starts": starts, "ends": ends, "listed": listed}
 
     def relaxed(self) -> Points:
-        """Return particles (n, d) [m] after at most `ROUNDS` steps of least squares that move the free particles."""
+        """Return particles (n, d) [m] after at most `ROUNDS` least-squares steps that move the free particles."""
         spacing, places = self._around.lattice.spacing, self._around.in_space[: len(self._free)]
         first, dimension = places.copy(), self._around.points.shape[1]
         for _ in range(ROUNDS):
@@ -206,7 +206,7 @@ class Relaxation:
         return places[:, :dimension].copy()
 
     def _solved(self) -> Points:
-        """Return moves (n, 3) [spacings] from where the particles are now."""
+        """Return moves (n, 3) [spacings] from the current positions."""
         from scipy.sparse.linalg import LinearOperator, lsmr
 
         spacing, count = self._around.lattice.spacing, len(self._free)
@@ -231,7 +231,7 @@ class Relaxation:
         return np.asarray(found.reshape(-1, 3))
 
     def linearised(self, close: float) -> Linearised:
-        """Return the derivatives where the particles are now, and those of distances below ``close`` [m]."""
+        """Return the derivatives at the current positions, including those of distances below ``close`` [m]."""
         kernels, count, most = self._around.kernels, len(self._free), self._most
         at_its_place = self._around.lattice.weights(np.zeros((1, self._around.lattice.dimension)))[0]
         sums, distances = np.full(count, at_its_place), np.empty(most)
@@ -254,18 +254,18 @@ class Relaxation:
 
 
 MOST_LOOKS, MOST_ROUNDS = 12, 36
-"""How often it is looked at all particles; rounds of least squares after each look."""
+"""Most checks of all particles, and most least-squares rounds after each check."""
 COMPRESSED, DIGITS = 0.03, 6
-"""By how much the density of a particle that is left out is above the lattice's, relative, and to how many decimals."""
+"""Relative excess of density above which a particle may be removed, and decimals to which excesses are compared."""
 BESIDE, MOST_OUT = 10.0, 40
-"""Particles are left out one at a time within so many supports, as others have more room then; and how often."""
+"""Removals happen one at a time within this many supports, as each gives its neighbours room; and the most removals."""
 ROUND_OFF = 1e-9
-"""By how much, relative, particles of a lattice may be further away than they are."""
+"""Relative tolerance by which lattice neighbours may seem further apart than they are."""
 MANY = 20_000
-"""Number of particles whose packing a line announces, as it takes some seconds or minutes."""
+"""Number of particles above which packing prints a line, because it takes seconds or minutes."""
 GRAINS = 2.0**13
-"""Particles move by whole numbers of this part of a spacing, so that round-off, which differs between machines, does
-not show in where they are."""
+"""Particles move in whole multiples of 1 / `GRAINS` spacings, so that round-off, which differs between machines, does
+not show in their positions."""
 
 
 @dataclass(frozen=True)
@@ -279,27 +279,27 @@ class Packing:
     weights: Points
     """(m,) weight of each in the density, a particle being 1 [-]"""
     air: int
-    """Number of the fixed points, the first ones, that are air."""
+    """Number of the fixed points that are air; these come first."""
     lengths: Points
     """(d,) the lengths of the period [m], 0 for axes without one"""
 
     def packed(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Return places at rest (m, d) [m] of particles (n, d) [m], of which some stay where they are, ``stays`` (n,),
-        and the numbers (m,) of those for which there is room. The last few answers are kept."""
+        """Return rest positions (m, d) [m] of particles (n, d) [m], and the indices (m,) of the particles for which
+        there is room. Particles marked by ``stays`` (n,) do not move. The last few results are cached."""
         arrays = self.fixed, self.weights, self.lengths, particles, stays
         found, kept = _packed(self.lattice, particles.shape, self.air, *(array.tobytes() for array in arrays))
         return found.copy(), kept
 
     def errors(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Points:
-        """Return the relative excess (m,) of the densities of ``some`` of particles (n, d) [m] over the lattice's. For
-        those that ``stays`` (n,) marks, around which no air is counted, a lack of density counts as 0."""
+        """Return the relative excess (m,) of density over the lattice's for ``some`` of particles (n, d) [m]. For
+        particles that ``stays`` (n,) marks, air is not counted and a lack of density counts as 0."""
         around = self._around(particles, self.lattice.support)
         return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 
     def settled(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Compute the result of `packed`. No particle moves that has the rest density already; while some are
-        compressed, as in wedges or where a small body was rounded up to a whole particle, those that are most are left
-        out."""
+        """Compute the result of `packed`. Particles already at rest density stay. While some are compressed, as in
+        wedges or small bodies rounded up to a whole particle, those more compressed than, or equal to, their neighbours
+        are removed."""
         kept, found = np.arange(len(particles)), self._at_rest(particles, stays)
         for _ in range(MOST_OUT):
             crowded = self._crowded(found, stays[kept])
@@ -311,8 +311,8 @@ class Packing:
         return np.asarray(particles[kept] + grain * np.rint((found - particles[kept]) / grain)), kept
 
     def _crowded(self, particles: Points, stays: Which) -> Numbers:
-        """Return the numbers (m,) of free particles, of n (n, d) [m], that are compressed, and no less than any free
-        one beside them. ``stays`` (n,) marks particles that are not free."""
+        """Return the indices (m,) of free particles, among n (n, d) [m], that are compressed, and at least as much as
+        every free neighbour. ``stays`` (n,) marks particles that are not free."""
         errors = np.round(self.errors(particles, np.ones(len(particles), dtype=bool)), DIGITS)
         over = np.flatnonzero((errors > COMPRESSED) & ~stays)
         points, reach = particles[over], BESIDE * self.lattice.support
@@ -322,7 +322,7 @@ class Packing:
         return np.delete(over, np.unique(less))
 
     def _at_rest(self, particles: Points, stays: Which) -> Points:
-        """Return places at rest (n, d) [m] of all particles (n, d) [m]."""
+        """Return the rest positions (n, d) [m] of all particles (n, d) [m]."""
         found = particles
         for _ in range(MOST_LOOKS):
             wrong = self._wrong(found, stays)
@@ -332,8 +332,8 @@ class Packing:
         return found
 
     def _settled_near(self, wrong: Which, particles: Points, stays: Which) -> Points:
-        """Return particles (n, d) [m] after those near the ones that are ``wrong`` (n,) were moved. Nothing further
-        away is looked at meanwhile, as there may be very much of it."""
+        """Return particles (n, d) [m] after moves of those near particles that are ``wrong`` (n,). Only the
+        neighbourhood is examined, because the rest may be very large."""
         support, near = self.lattice.support, self.lattice.support + self.lattice.spacing
         movable = self._near(particles, wrong, near) & ~stays
         region = self._near(particles, movable, support)
@@ -356,27 +356,27 @@ class Packing:
         return np.asarray((errors > HIGHEST) | (errors < LOWEST))
 
     def _near(self, particles: Points, some: Which, reach: float) -> Which:
-        """Test (n,) which particles are at most ``reach`` [m] from one of some of them."""
+        """Test (n,) which particles are at most ``reach`` [m] from any particle of a selection."""
         others = particles[some]
         weights, reach = np.ones(len(others)), reach * (1.0 + ROUND_OFF)
         found = PointsAround(self.lattice, others, weights, (0, 0), self.lengths, reach)
         return found.near(particles)
 
     def _around(self, particles: Points, reach: float) -> PointsAround:
-        """Return the surroundings of particles (n, d) [m] up to ``reach`` [m]: one another, and the fixed points."""
+        """Return the neighbours of particles (n, d) [m] within ``reach`` [m]: other particles, and the fixed points."""
         count = len(particles)
         points, weights = np.concatenate([particles, self.fixed]), np.append(np.ones(count), self.weights)
         return PointsAround(self.lattice, points, weights, (count, count + self.air), self.lengths, reach)
 
     def _among(self, others: Points) -> "Packing":
-        """Return this packing with further fixed particles (m, d) [m]."""
+        """Return this packing with additional fixed particles (m, d) [m]."""
         weights = np.append(self.weights, np.ones(len(others)))
         return replace(self, fixed=np.concatenate([self.fixed, others]), weights=weights)
 
 
 @lru_cache(maxsize=8)
 def _packed(lattice: RestLattice, shape: tuple[int, int], air: int, *arrays: bytes) -> tuple[Points, Numbers]:
-    """Pack particles as `Packing.packed` says, and keep the result: one scene is simulated more than once."""
+    """Pack particles as `Packing.packed` does, and cache the result: one scene is often simulated more than once."""
     *numbers, stays = arrays
     fixed, weights, lengths, particles = (np.frombuffer(one) for one in numbers)
     packing = Packing(lattice, fixed.reshape(-1, shape[1]), weights, air, lengths)

@@ -1,8 +1,8 @@
-"""Kernels of the packing, in float64: who is near whom, densities, and products with their derivatives.
+"""Kernels of the packing, in float64: neighbour search, densities, and products with their derivatives.
 
-Pairs are listed once, with the first of both, and add to what both have: these kernels are launched in one thread, and
-so in a fixed order. They add by reading and writing, as ``+=`` is an atomic addition, which takes longer. Sums over all
-that is around a particle are gathers, which cores may share.
+Each pair is listed once, with its first particle, and adds to the sums of both particles. So these kernels run in one
+thread, and thus in a fixed order. They add by a read and a write, because ``+=`` is a slower atomic addition. Sums over
+the neighbours of one particle are gathers, which run on several cores.
 """
 
 from functools import cache
@@ -24,16 +24,16 @@ cell_of, wrap, below, above = _cells.cell_of, _cells.wrap, _cells.below, _cells.
 
 @wp.struct
 class Around:
-    """The points that particles see in a packing, with their weights in the density."""
+    """The neighbours of particles in a packing, with their weights in the density."""
 
     x: wp.array(dtype=vector)
     """[m]"""
     weights: wp.array(dtype=real)
     """Weight of each in the density, a particle being 1 [-]."""
     air: wp.int32
-    """Number of the first point that some particles do not see."""
+    """Index of the first point that blind particles do not see."""
     behind_air: wp.int32
-    """One behind the last of these points."""
+    """Index after the last of these points."""
     is_periodic: wp.bool
     period: vector
     """[m], 0 along an axis without one"""
@@ -57,26 +57,26 @@ class Placed:
 
 @wp.struct
 class Equations:
-    """The derivatives of densities, and of the distances of pairs that are too near each other. Both are by lists of
-    pairs of which one may move at least; those with particle i as the first begin at ``starts[i]``."""
+    """The derivatives of densities, and of the distances of pairs that are too close. Both are stored by lists of pairs
+    in which at least one particle may move; the pairs whose first particle is i begin at ``starts[i]``."""
 
     starts: wp.array(dtype=wp.int32)
     others: wp.array(dtype=wp.int32)
     """Second particle of each pair within the support."""
     gradients: wp.array(dtype=vector)
-    """The derivative of the sum of kernels of either by their separation [1 / m^(d + 1)]."""
+    """Derivative of either particle's sum of kernels with respect to their separation [1 / m^(d + 1)]."""
     own: wp.array(dtype=vector)
-    """Derivative of a particle's sum by its own place, for fixed points [1 / m^(d + 1)]."""
+    """Derivative of a particle's sum over fixed points with respect to its own position [1 / m^(d + 1)]."""
     close_starts: wp.array(dtype=wp.int32)
     close_others: wp.array(dtype=wp.int32)
-    """Second particle of each pair that is too near."""
+    """Second particle of each pair that is too close."""
     directions: wp.array(dtype=vector)
-    """Unit vectors from it to the first."""
+    """Unit vectors from the second particle to the first."""
 
 
 @wp.func
 def separation(x_i: vector, x_j: vector, around: Around) -> vector:
-    """Return the separation x_i - x_j of the nearest image [m]."""
+    """Return the separation x_i - x_j to the nearest image [m]."""
     x_ij = x_i - x_j
     if around.is_periodic:
         s = wp.cw_mul(x_ij, around.frequency)
@@ -86,8 +86,8 @@ def separation(x_i: vector, x_j: vector, around: Around) -> vector:
 
 @cache
 def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
-    """Make the kernels of a packing for a smoothing kernel, with the structs ``around``, ``placed``, ``grid`` and
-    ``equations`` that they take."""
+    """Build the kernels of a packing for a smoothing kernel, and the structs ``around``, ``placed``, ``grid`` and
+    ``equations`` of their arguments."""
     functions = smoothing_functions(smoothing, FLOAT64)
     weight, slope = functions.weight, functions.slope
     module = kernel_module(f"packing_{smoothing.name}")
@@ -100,9 +100,9 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
     def look_around(
         first: int, x, blind, are_own: bool, around, placed, grid, reach: real, most: int, starts, counts, sums, others
     ):
-        """Count the points ``around`` within reach of particles at x, up to ``most``; list them, as far as there is
-        room from ``starts`` on; and sum up their weighted kernels. ``blind`` particles do not see air; where they
-        ``are_own``, particle i is the i-th of the points, and not within its own reach."""
+        """Count the points ``around`` within reach of particles at x, up to ``most``; list them from ``starts`` on
+        while there is room; and sum their weighted kernels. ``blind`` particles do not see air. If ``are_own``,
+        particle i is point i and no neighbour of itself."""
         i = first + wp.tid()
         x_i = x[i]
         c = cell_of(x_i, grid)
@@ -130,7 +130,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
     @typed.arrays
     def linearise(around, free, starts, ends, listed, close: real, sums, equations, distances):
         """Add the kernels of each particle and its ``listed`` neighbours to the ``sums`` of both. Append pairs with a
-        free particle to the ``equations``, and the distances of pairs nearer than ``close`` [m]."""
+        free particle to the ``equations``, and the distances of pairs closer than ``close`` [m]."""
         i = wp.tid()
         particles = free.shape[0]
         limit = real(1.0) / (around.per_support * around.per_support)

@@ -1,4 +1,4 @@
-"""Solids of simple shapes, which formulas describe, and lattice points within solids, in float64."""
+"""Solids of simple shapes described by formulas, and lattice points within solids, in float64."""
 
 from dataclasses import dataclass
 
@@ -20,12 +20,12 @@ from cortado.discretise.solid import (
 )
 
 FACING = 0.9
-"""Least cosine between the normals of two sides of a polygon, one of them turned round, where it is a sheet."""
+"""Least cosine of the angle between one side of a polygon and the reversed other side at which the two form a sheet."""
 
 
 @dataclass(frozen=True)
 class Box(Solid):
-    """A box about the origin, along the axes."""
+    """A box centred at the origin, with sides along the axes."""
 
     half: Points
     """(d,) half of its sides [m]"""
@@ -56,8 +56,8 @@ class Box(Solid):
 
 @dataclass(frozen=True)
 class Round(Solid):
-    """A round solid, all points no further than a radius from a segment about the origin: a capsule, or a sphere (in
-    2-D a disc) where the segment has no length."""
+    """A round solid, all points within a radius of a segment centred at the origin: a capsule, or a sphere (in 2-D a
+    disc) if the segment has no length."""
 
     half: Points
     """(d,) from the middle of the segment to its end [m]"""
@@ -88,7 +88,7 @@ class Round(Solid):
         return upright.moved(_standing(along), np.zeros(len(along)))
 
     def moments(self) -> Moments:
-        """Return the moments of a rod and two half balls at its ends."""
+        """Return the moments of a cylinder and two half balls at its ends."""
         dimension, length, r = len(self.half), float(np.linalg.norm(self.half)), self.radius
         disc, ball = (2.0 * r, np.pi * r**2) if dimension == 2 else (np.pi * r**2, 4.0 / 3.0 * np.pi * r**3)
         rod = 2.0 * length * disc
@@ -111,8 +111,8 @@ class Revolved(Solid):
     """A solid of revolution about an axis of space through the origin."""
 
     profile: Solid
-    """Its cut with a plane through the axis, in 2-D, with straight sides: across the axis, to both sides, and along
-    it."""
+    """Cross-section in a plane through the axis, in 2-D, with straight edges: coordinates are across the axis (to both
+    sides), and along it."""
     axis: int
 
     def extent(self) -> tuple[Points, Points]:
@@ -137,19 +137,19 @@ class Revolved(Solid):
         return revolved_moments(outer_edges(self.profile.faces(np.inf)), self.axis)
 
     def _flat(self, points: Points) -> Points:
-        """Return distance from the axis, and height, (n, 2) [m]."""
+        """Return the distance from the axis, and the height, (n, 2) [m]."""
         across = np.linalg.norm(np.delete(points, self.axis, axis=1), axis=1)
         return np.column_stack([across, points[:, self.axis]])
 
 
 @dataclass(frozen=True)
 class HalfSpace(Solid):
-    """A half space, all that is below a plane; pictures show the part of it in a box."""
+    """A half space, all points below a plane; pictures show only its part inside a box."""
 
     normal: Points
     """(d,) unit vector upwards"""
     height: float
-    """Height of the plane along it [m]."""
+    """Height of the plane along the normal [m]."""
     lower: Points
     """(d,) [m]"""
     upper: Points
@@ -183,7 +183,7 @@ class Polygon(Solid):
     """A polygon in 2-D, whose sides do not cross."""
 
     corners: Points
-    """(m, 2) [m], either way round"""
+    """(m, 2) [m], clockwise or counterclockwise"""
 
     def extent(self) -> tuple[Points, Points]:
         return self.corners.min(axis=0), self.corners.max(axis=0)
@@ -212,8 +212,8 @@ class Polygon(Solid):
         return enclosed_moments(edges, np.full(len(edges), -1.0 if clockwise else 1.0))
 
     def thinnest(self) -> float:
-        """Return the least thickness between sides that are nearly parallel, and share no corner [m]; infinite where no
-        two face each other."""
+        """Return the least thickness between nearly parallel sides without a common corner [m]; infinite if no two
+        sides face each other."""
         starts, sides = self.corners, np.roll(self.corners, -1, axis=0) - self.corners
         lengths = np.linalg.norm(sides, axis=1)
         along = sides / lengths[:, None]
@@ -252,13 +252,13 @@ def _standing(direction: Points) -> Points:
 
 
 def block_around(solid: Solid, spacing: float) -> Block:
-    """Return the lattice ``lower + (i + 1/2) spacing`` [m] in the box around a solid; its last cells may reach beyond
-    the end of the box by less than half a spacing."""
+    """Return the lattice ``lower + (i + 1/2) spacing`` [m] in the box around a solid. Its last cells may extend beyond
+    the box by less than half a spacing."""
     lower, upper = solid.extent()
     return block_between(lower, upper + 0.5 * spacing, spacing)
 
 
 def points_inside(solid: Solid, spacing: float) -> Points:
-    """Return the points (n, d) [m] of the lattice in the box around a solid that are inside of it."""
+    """Return the lattice points (n, d) [m] in the box around a solid that are inside the solid."""
     points = block_around(solid, spacing).points()
     return np.asarray(points[solid.distance_up_to(points, spacing) < 0.0])

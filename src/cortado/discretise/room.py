@@ -1,4 +1,4 @@
-"""Where fluid may be: in the region of a container, outside of solids, in a period that repeats."""
+"""The room for fluid: inside the region of a container, outside of solids, and within one period of periodic axes."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ from cortado.discretise.shapes import Points, apart, wrapped
 from cortado.discretise.solid import Placed, Solid
 
 TOLERANCE = 0.5
-"""In spacings: how far outside of its container a particle may be. Walls bring nearer ones back; light fluid among
-heavier is pressed there at times."""
+"""In spacings: largest distance of a particle outside its container. Walls push nearer ones back; light fluid among
+heavier fluid is pressed out so far at times."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class Region:
     base: Points
     """(d,) a point on the axis of the cylinder [m]"""
     across: Points
-    """(d,) 1 for the axes of space that lie across the cylinder, 0 for the one along it; all 0 without a cylinder, and
-    all 1 for a sphere, whose middle ``base`` then is"""
+    """(d,) 1 for the axes of space across the cylinder, 0 for the axis along it. All are 0 without a cylinder, and 1
+    for a sphere, whose centre is ``base``."""
     radius: float = np.inf
     """Radius of the cylinder or the sphere [m]."""
     rim: float = np.inf
-    """Height of the open end of a cylinder along its axis [m], infinite if it has a lid."""
+    """Height of the open end of a cylinder along its axis [m]; infinite if it has a lid."""
 
     @classmethod
     def between(cls, lower: Points, upper: Points) -> "Region":
@@ -52,23 +52,23 @@ class Region:
 
     @classmethod
     def cylinder(cls, base: Points, radius: float, height: float, axis: int) -> "Region":
-        """Return the region of a cylinder that stands on the middle of its base (d,) [m] along an axis of space."""
+        """Return the region of a cylinder along an axis of space, standing on the centre of its base (d,) [m]."""
         across = np.where(np.arange(len(base)) == axis, 0.0, 1.0)
         lower, upper = base - radius * across, base + radius * across
         upper[axis] += height
         return cls(lower, upper, base, across, radius)
 
     def distance(self, points: Points) -> Points:
-        """Return distances (n,) [m] of points (n, d) [m] from the region, negative inside; beyond an edge or a corner
-        that from the nearer face, which is less."""
+        """Return the distances (n,) [m] of points (n, d) [m] from the region, negative inside. Beyond an edge or a
+        corner it is the distance from the nearer face, which is too small."""
         from_faces = np.full(len(points), -np.inf)
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):  # as short rows take NumPy long
             from_faces = np.maximum(from_faces, np.maximum(lower - x, x - upper))
         return np.maximum(from_faces, self._from_axis(points) - self.radius)
 
     def sides(self) -> Iterator[Callable[[Points], Points]]:
-        """Yield for each side at a finite place the function of points (n, d) [m] that gives their distances (n,) from
-        it, positive inside [m]."""
+        """Yield, for each side at a finite position, a function from points (n, d) [m] to their distances (n,) from the
+        side, positive inside [m]."""
         for axis in np.flatnonzero(self.across == 0.0).tolist():
             for at, inwards in ((self.lower[axis], 1.0), (self.upper[axis], -1.0)):
                 if np.isfinite(at):
@@ -77,7 +77,7 @@ class Region:
             yield lambda points: np.asarray(self.radius - self._from_axis(points))
 
     def nearest(self, points: Points) -> Points:
-        """Return the points (n, d) [m] of the region nearest to points (n, d) [m]."""
+        """Return the nearest points (n, d) [m] of the region to given points (n, d) [m]."""
         boxed = np.clip(points, self.lower, self.upper)
         across = (boxed - self.base) * self.across
         from_axis = np.linalg.norm(across, axis=1, keepdims=True)
@@ -85,15 +85,15 @@ class Region:
         return np.asarray(boxed - inwards * across)
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
+        """Test (n,) which points (n, d) [m] are inside, or outside by at most the tolerance [m]."""
         found = self._from_axis(points) <= self.radius + tolerance
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):
             found &= (x >= lower - tolerance) & (x <= upper + tolerance)
         return np.asarray(found)
 
     def cell_shares(self, points: Points, spacing: float) -> Points:
-        """Return the part (n,) of the cell, a spacing [m] wide, around each of the points (n, d) [m] that is within the
-        region; along a cylinder's side the cell counts as turned with it."""
+        """Return the fraction (n,) of the cell, a spacing [m] wide, around each point (n, d) [m] that is inside the
+        region. Along a cylinder's side cells are taken as aligned with the side."""
         half, found = 0.5 * spacing, np.ones(len(points))
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):
             width = np.minimum(x + half, upper) - np.maximum(x - half, lower)
@@ -101,8 +101,8 @@ class Region:
         return np.asarray(found * np.clip((self.radius - self._from_axis(points)) / spacing + 0.5, 0.0, 1.0))
 
     def _from_axis(self, points: Points) -> Points:
-        """Return distances (n,) [m] of points (n, d) [m] from the axis of the cylinder or the middle of the sphere; 0
-        without either."""
+        """Return distances (n,) [m] of points (n, d) [m] from the axis of the cylinder, or from the sphere's centre; 0
+        for other regions."""
         squares = np.zeros(len(points))
         for x, base, is_across in zip(points.T, self.base, self.across, strict=True):
             if is_across:
@@ -110,19 +110,19 @@ class Region:
         return np.sqrt(squares)
 
     def escaped(self, before: Points, after: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which particles went through a wall from ``before`` (n, d) [m] to ``after`` (n, d) [m]. Over the
-        rim of an open cup they may go, and one that was outside already has not gone through."""
+        """Test (n,) which particles crossed a wall between ``before`` (n, d) [m] and ``after`` (n, d) [m]. Particles
+        may pass over the rim of an open cup, and those outside before do not count."""
         through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
         return np.asarray(through & self.is_below_rim(before) & self.is_below_rim(after))
 
     def is_below_rim(self, points: Points) -> np.ndarray:
-        """Test (n,) which points (n, d) [m] are lower than the rim of an open cup; all are without one."""
+        """Test (n,) which points (n, d) [m] are below the rim of an open cup; without a rim all are."""
         if not np.isfinite(self.rim):
             return np.ones(len(points), dtype=bool)
         return np.asarray(points @ (1.0 - self.across) < self.rim)
 
     def opened(self, periods: Points) -> "Region":
-        """Return the region without sides along axes with a period; ``periods`` (d,) [m] are 0 along the others."""
+        """Return the region without sides along periodic axes; ``periods`` (d,) [m] are 0 along other axes."""
         lower, upper = np.where(periods > 0.0, -np.inf, self.lower), np.where(periods > 0.0, np.inf, self.upper)
         return Region(lower, upper, self.base, self.across, self.radius, self.rim)
 
@@ -132,21 +132,21 @@ def _from_plane(points: Points, axis: int, at: float, inwards: float) -> Points:
 
 
 ALONG = 1e-3
-"""Angle [rad] below which directions count as one: images along them are not told apart."""
+"""Angle [rad] below which two directions count as equal, so that images along them are not distinguished."""
 
 
 @dataclass(frozen=True)
 class Domain:
-    """One period of a scene. Positions go on beyond its ends, and a place sees all images of particles."""
+    """One period of a scene. Positions may leave the period, and each place interacts with all images of particles."""
 
     lower: tuple[float, ...]
-    """(d,) beginning of the period [m]; 0 along an axis that is not periodic."""
+    """(d,) Start of the period [m]; 0 along an axis that is not periodic."""
     lengths: tuple[float, ...]
-    """(d,) length of the period [m]; 0 along an axis that is not periodic."""
+    """(d,) Length of the period [m]; 0 along an axis that is not periodic."""
 
     @classmethod
     def of(cls, lower: Points, lengths: Points) -> Self:
-        """Make the domain of a period that begins at (d,) [m] with lengths (d,) [m], 0 along axes without one."""
+        """Build the domain of a period with start (d,) [m] and lengths (d,) [m], which are 0 along other axes."""
         axes = lengths > 0.0
         return cls(tuple(np.where(axes, lower, 0.0).tolist()), tuple(np.where(axes, lengths, 0.0).tolist()))
 
@@ -157,18 +157,18 @@ class Domain:
         return vector(*self.lower, *rest), vector(*self.lengths, *rest), vector(*frequency, *rest)
 
     def wrapped(self, points: Points) -> Points:
-        """Return the images of points (..., d) [m] that are within the period; along other axes as they are."""
+        """Return the images of points (..., d) [m] inside the period; coordinates along other axes do not change."""
         lower = np.array(self.lower)
         return lower + wrapped(points - lower, np.array(self.lengths)) if any(self.lengths) else points
 
     def shortest(self, ways: Points) -> Points:
-        """Return ways (n, d) [m] to the nearest images, from those (n, d) [m] to any image."""
+        """Return the vectors (n, d) [m] to the nearest images, from vectors (n, d) [m] to any images."""
         return apart(ways, np.array(self.lengths)) if any(self.lengths) else ways
 
     def within(self, points: Points, lower: Points, upper: Points) -> tuple[Points, np.ndarray]:
-        """Return the images of points (n, d) [m] that are in a region between corners (d,) [m], or behind its lower
-        corner where none is, and a mask (n,) of those in it. An end that is infinite is that of the period, if there is
-        one; a region that is longer than the period is the period."""
+        """Return the images of points (n, d) [m] that lie in a region between corners (d,) [m], or above its lower
+        corner if no image does, and a mask (n,) of those inside. An infinite end is replaced by that of the period, if
+        any; a region longer than the period is the whole period."""
         start, lower, upper = self.ends(lower, upper)
         lengths = np.array(self.lengths)
         images = start + wrapped(points - start, lengths) if lengths.any() else points
@@ -176,7 +176,7 @@ class Domain:
         return images, np.all((images >= lower) & (images < upper), axis=1)
 
     def ends(self, lower: Points, upper: Points) -> tuple[Points, Points, Points]:
-        """Return where the images begin that `within` looks at, finite along periods, and the corners of its region
+        """Return the lower ends from which `within` counts images, finite along periods, and the corners of its region
         (d,) [m]."""
         begin, lengths = np.array(self.lower), np.array(self.lengths)
         start = np.where(np.isfinite(lower), lower, begin)
@@ -187,10 +187,10 @@ class Domain:
 
     def ways(self, points: Points, place: Points, reach: float, seen: Callable[[Points], Points]) -> list[Points]:
         """Return ``seen`` of the vectors from a place (d,) to all images of points (n, d) within a reach [m]: arrays
-        (n, k), each for one image of every point. ``seen`` is a linear function of vectors (n, d), such as their part
-        across a direction.
+        (n, k), each for one image of every point. ``seen`` is a linear function of vectors (n, d), such as their
+        component across a direction.
 
-        Images that ``seen`` does not tell apart count once: as those within the period.
+        Images with equal ``seen`` count once, as the image inside the period.
         """
         steps, inverse, shifts = self.images(reach, seen)
         way = seen(self.wrapped(points) - place)
@@ -199,8 +199,8 @@ class Domain:
         return [way + shift for shift in shifts] if len(steps) else [way]
 
     def images(self, reach: float, seen: Callable[[Points], Points]) -> tuple[Points, Points, Points]:
-        """Return the translations (m, k) [m] between the images that ``seen`` tells apart, their inverse (k, m), and
-        shifts (i, k) [m]. The shifts lead from the nearest image to all images within a reach [m] of a place."""
+        """Return the translations (m, k) [m] between images with different ``seen``, their inverse (k, m), and shifts
+        (i, k) [m]. The shifts lead from the nearest image to all images within a reach [m] of a place."""
         lengths = np.array(self.lengths)
         steps = _independent(seen(np.eye(len(lengths))), lengths) if lengths.any() else np.zeros((0, 0))
         if not len(steps):
@@ -212,12 +212,12 @@ class Domain:
 
 
 WITHOUT_PERIODS = Domain((), ())
-"""The domain in which nothing repeats."""
+"""The domain without periodic axes."""
 
 
 def _independent(axes: Points, lengths: Points) -> Points:
-    """Return the translations (m, k) between periodic images along a maximal independent set of axes, as projected by
-    ``axes`` (d, k), longest projections first."""
+    """Return translations (m, k) between periodic images, projected by ``axes`` (d, k): a maximal independent set, the
+    longest projections first."""
     left, found = np.where(lengths[:, None] > 0.0, axes, 0.0), []
     for _ in lengths:
         sizes = np.linalg.norm(left, axis=1)
@@ -232,12 +232,12 @@ def _independent(axes: Points, lengths: Points) -> Points:
 
 @dataclass(frozen=True)
 class Room:
-    """The room of fluid: a region less the solids in it, which come again with every period."""
+    """The room for fluid: a region without the solids in it, which repeat with every period."""
 
     region: Region
     solids: Sequence[Solid]
     periods: Points
-    """(d,) the lengths of the period [m], 0 for axes without one"""
+    """(d,) Lengths of the periods [m], 0 for axes that are not periodic."""
 
     @property
     def dimension(self) -> int:
@@ -245,32 +245,32 @@ class Room:
         return len(self.periods)
 
     def from_solids(self, points: Points, reach: float = np.inf) -> Points:
-        """Return distances (n,) [m] of points (n, d) [m] from the nearest solid, negative inside one; infinite without
-        any. A distance of a size not less than a reach [m] may be any other such number of its sign."""
+        """Return distances (n,) [m] of points (n, d) [m] from the nearest solid, negative inside; infinite without
+        solids. Beyond a reach [m] only the sign and a size of at least the reach are sure."""
         if not self.solids:
             return np.full(len(points), np.inf)
         images = [points + shift for shift in self.shifts()]
         return np.min([solid.distance_up_to(image, reach) for image in images for solid in self.solids], axis=0)
 
     def distance(self, points: Points, reach: float = np.inf) -> Points:
-        """Return distances (n,) [m] of points (n, d) [m] from the room, negative inside, up to a reach [m]."""
+        """Return distances (n,) [m] of points (n, d) [m] from the room, negative inside, exact up to a reach [m]."""
         return np.maximum(self.region.distance(points), -self.from_solids(points, reach))
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
+        """Test (n,) which points (n, d) [m] are inside, or outside by at most the tolerance [m]."""
         return self.region.contains(points, tolerance) & (self.from_solids(points, abs(tolerance)) >= -tolerance)
 
     def cell_shares(self, points: Points, spacing: float) -> Points:
-        """Return the part (n,) of the cell, a spacing [m] wide, around each of the points (n, d) [m] that is within the
-        room. Along the surfaces of solids the cell counts as turned with them."""
+        """Return the fraction (n,) of the cell, a spacing [m] wide, around each point (n, d) [m] that is inside the
+        room. Along the surfaces of solids cells are taken as aligned with the surface."""
         within = self.region.cell_shares(points, spacing)
         return within * np.clip(self.from_solids(points, 0.5 * spacing) / spacing + 0.5, 0.0, 1.0)
 
     def images(self, solid: Solid) -> list[Solid]:
-        """Return a solid and its copies a period away."""
+        """Return a solid and its copies, shifted by one period."""
         turn = np.eye(self.dimension)
         return [solid, *(Placed(solid, shift, turn) for shift in self.shifts()[1:])]
 
     def shifts(self) -> list[Points]:
-        """Return the shifts (d,) of images [m], the first of them 0."""
+        """Return the shifts (d,) to periodic images [m]; the first is 0."""
         return [np.array(shift) for shift in product(*((0.0, -a, a) if a else (0.0,) for a in self.periods))]

@@ -1,7 +1,7 @@
-"""Arrays of points in float64: blocks of a lattice and discs, pairs that are near each other, and how densely they lie.
+"""Arrays of points in float64: lattice blocks and discs, pairs of neighbouring points, and their density.
 
-Pairs are found across the ends of periods too. Kernels on the CPU are launched with such arrays (`launch_on_cpu`), as
-scenes are discretised there whatever device a simulation is on.
+Pairs are also found across the ends of periods. Kernels for these arrays run on the CPU (`launch_on_cpu`), because
+scenes are discretised there, whichever device a simulation uses.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,19 +22,19 @@ Which = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
 ROUND_OFF = 1e-6
-"""Share of a spacing by which a length may fall short of a whole number of cells: 0.25 / 0.05 holds 5."""
+"""Fraction of a spacing by which a length may be shorter than a whole number of cells: 0.25 / 0.05 counts as 5."""
 
 NEARBY = 4
-"""Number of cells along an axis by which the points of a stretched lattice may differ from those that fit."""
+"""Largest difference, along an axis, between the number of points of a stretched lattice and the number that fits."""
 EXCESS = 0.003
-"""Part by which the points of a stretched lattice may differ in number from those that its volume holds."""
+"""Largest relative difference between the number of points of a stretched lattice and the number for its volume."""
 MOST_STRETCHED = 0.03
-"""Logarithm of how much a lattice is stretched along an axis: up to there the density is that of the rest lattice
-within 1 %, beside walls too."""
+"""Largest logarithm of the stretching of a lattice along an axis: up to this value the density is that of the rest
+lattice within 1 %, also beside walls."""
 
 
 class Rows:
-    """A base of dataclasses whose fields are arrays with one first axis."""
+    """A base of dataclasses whose fields are arrays with a common first axis."""
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
@@ -43,7 +43,7 @@ class Rows:
         return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in names))
 
     def some(self, which: Any) -> Self:
-        """Return the rows that an index of arrays takes: a slice, numbers or a mask (n,)."""
+        """Return the rows selected by an array index: a slice, numbers or a mask (n,)."""
         return type(self)(*(getattr(self, field.name)[which] for field in fields(self)))  # type: ignore[arg-type]
 
     def __len__(self) -> int:
@@ -51,8 +51,8 @@ class Rows:
 
 
 def bisected(holds: Callable[[Points], Which], low: Points, high: Points, halvings: int) -> tuple[Points, Points]:
-    """Return bounds (n,) of where a condition on numbers (n,) ceases to hold, which holds at ``low`` (n,) and not at
-    ``high`` (n,), after a number of halvings."""
+    """Return, by bisection, bounds (n,) of where a condition on numbers (n,) stops being true; it is true at ``low``
+    (n,) and false at ``high`` (n,)."""
     for _ in range(halvings):
         middle = 0.5 * (low + high)
         good = holds(middle)
@@ -82,11 +82,11 @@ class Block:
         return self.first, self.first + (self.counts - 1.0) * self.spacings
 
     def grown(self, cells: int) -> "Block":
-        """Return this lattice with ``cells`` cells more on every side."""
+        """Return this lattice with ``cells`` additional cells on every side."""
         return Block(self.first - cells * self.spacings, self.counts + 2 * cells, self.spacings)
 
     def points(self) -> Points:
-        """Return the points (n, d) [m], the last axis fastest."""
+        """Return the points (n, d) [m]; the last axis varies fastest."""
         axes = zip(self.first, self.spacings, self.counts, strict=True)
         return grid([x + spacing * np.arange(int(n)) for x, spacing, n in axes])
 
@@ -99,10 +99,10 @@ def block_between(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
 
 
 def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
-    """Return points ``lower + (i + 1/2) spacing`` of a box whose sides are whole cells; lower and upper (d,) [m]. In
-    another box they are stretched along some axes and narrowed along others, by `MOST_STRETCHED` at most. Their number
-    matches the volume within `EXCESS`, and does not exceed it if possible: fluid that begins compressed bursts apart.
-    Where no lattice has both, the points are those whose cells lie within."""
+    """Return points ``lower + (i + 1/2) spacing`` of a box whose sides are whole cells; lower and upper (d,) [m]. For
+    other boxes the lattice is stretched along some axes and compressed along others, by `MOST_STRETCHED` at most. The
+    number of points matches the volume within `EXCESS`, if possible from below, because compressed fluid bursts apart.
+    If no lattice does both, return the points whose cells lie inside."""
     first, last = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cells, plain = (last - first) / spacing, block_between(lower, upper, spacing)
     if (np.abs(cells - np.rint(cells)) <= ROUND_OFF).all() or not plain.counts.all():
@@ -121,14 +121,14 @@ def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
 
 
 def block_about(centre: ArrayLike, half: ArrayLike, spacing: float) -> Block:
-    """Return a lattice that is symmetric about a centre (d,) [m] and reaches as far as half lengths (d,) [m] allow."""
+    """Return a lattice symmetric about a centre (d,) [m] that extends as far as half lengths (d,) [m] allow."""
     counts = whole_cells(2.0 * np.asarray(half, dtype=np.float64), spacing)
     first = np.asarray(centre, dtype=np.float64) - 0.5 * (counts - 1.0) * spacing
     return Block(first, counts, np.full(len(first), spacing))
 
 
 def lattice(counts: Points, spacing: float) -> Points:
-    """Return a lattice (n, d) [m] that is symmetric about the origin, with so many points (d,) along each axis."""
+    """Return a lattice (n, d) [m] symmetric about the origin, with the given number of points (d,) along each axis."""
     return Block(-0.5 * (counts - 1.0) * spacing, counts, np.full(len(counts), spacing)).points()
 
 
@@ -141,7 +141,8 @@ def disc(radius: float, spacing: float, dimension: int) -> Points:
 def across(direction: ArrayLike) -> Points:
     """Return unit vectors (d - 1, d), perpendicular to a unit vector (d,) and to one another.
 
-    They begin as the axes of space that the direction is least along, so that one along an axis gives the others.
+    They start from the axes of space most nearly perpendicular to the direction; for one along an axis they are the
+    others.
     """
     frame = [np.asarray(direction, dtype=np.float64)]
     for axis in np.argsort(np.abs(frame[0]), kind="stable")[:-1]:
@@ -152,8 +153,8 @@ def across(direction: ArrayLike) -> Points:
 
 
 def whole_origin(points: Points) -> Points:
-    """Return an origin (d,) [m] near the middle of points (n, d) [m] that are far from the origin beside how far they
-    spread, and 0 of all others. Whole multiples of a power of two, so that taking it off rounds nothing."""
+    """Return an origin (d,) [m] near the middle of points (n, d) [m] that are far from 0 relative to their extent,
+    otherwise 0. It is a multiple of a power of two, so that subtracting it causes no rounding."""
     lower, upper = points.min(axis=0), points.max(axis=0)
     step = 2.0 ** np.ceil(np.log2(max((upper - lower).max(), np.finfo(np.float64).tiny)))
     return np.asarray(step * np.round((0.5 * lower + 0.5 * upper) / step))
@@ -165,12 +166,12 @@ def whole_cells(lengths: Points, spacing: float) -> Points:
 
 
 def grid(axes: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return every combination (n, d) of the values of the axes, the last axis fastest."""
+    """Return all combinations (n, d) of the values of the axes; the last axis varies fastest."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
 def in_space(vectors: Any) -> Any:
-    """Return vectors (..., d) as (..., 3), with a 0 behind those of the plane."""
+    """Return vectors (..., d) as (..., 3), with a third component 0 for those of the plane."""
     return np.pad(vectors, [(0, 0)] * (np.ndim(vectors) - 1) + [(0, 3 - np.shape(vectors)[-1])])
 
 
@@ -180,7 +181,7 @@ def corners(lower: Points, upper: Points) -> Points:
 
 
 CHUNK = 8192
-"""Number of points that look for their neighbours at a time: bounds the memory."""
+"""Number of points whose neighbours are searched at a time, to limit the memory."""
 
 Period = tuple[Points, Points]
 Pairs = tuple[Numbers, Numbers, Points]
@@ -194,8 +195,8 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
         some: (n, d) [m].
         others: (m, d) [m].
         reach: [m].
-        lower: (d,) where the period begins [m].
-        lengths: (d,) the lengths of the period [m], 0 for axes without one; the nearest image counts.
+        lower: (d,) start of the period [m].
+        lengths: (d,) lengths of the period [m], 0 for other axes; distances are to the nearest image.
     """
     from scipy.spatial import cKDTree
 
@@ -215,7 +216,7 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
 
 
 def apart(separations: Points, lengths: ArrayLike) -> Points:
-    """Return separations (m, d) [m] of pairs with the nearest image, for a period's ``lengths`` (d,) [m]."""
+    """Return separations (m, d) [m] of pairs, to the nearest image for periods ``lengths`` (d,) [m]."""
     lengths = np.asarray(lengths, dtype=np.float64)
     if not lengths.any():
         return separations
@@ -223,8 +224,8 @@ def apart(separations: Points, lengths: ArrayLike) -> Points:
 
 
 def _around(some: Points, others: Points, reach: float, lengths: Points) -> Numbers:
-    """Return numbers of the ``others`` (m, d) [m] that are in the box around ``some`` (n, d) [m] and ``reach`` [m]
-    further. Return all of them where there is a period, or nothing to be near to."""
+    """Return the indices of the ``others`` (m, d) [m] in the box around ``some`` (n, d) [m], extended by ``reach`` [m].
+    Return all indices if an axis is periodic, or if ``some`` is empty."""
     if lengths.any() or not len(some):
         return np.arange(len(others))
     beyond = reach * (1.0 + 1e-9)
@@ -233,7 +234,7 @@ def _around(some: Points, others: Points, reach: float, lengths: Points) -> Numb
 
 
 def wrapped(positions: Points, lengths: Points) -> Points:
-    """Return positions (..., d) within [0, length) on periodic axes; round-off may not leave a length itself."""
+    """Return positions (..., d) inside [0, length) on periodic axes; rounding never gives the length itself."""
     if not lengths.any():
         return positions
     safe = np.where(lengths > 0.0, lengths, 1.0)
@@ -242,17 +243,17 @@ def wrapped(positions: Points, lengths: Points) -> Points:
 
 
 MOST_AVERAGE_COMPRESSION = 0.1
-"""Bound on the mean of (n - 1)+ of the first particles, where n is the number density: a lattice that is squeezed by
-more bursts."""
+"""Largest mean of (n - 1)+ over the first particles, where n is the number density; a more compressed lattice bursts
+apart."""
 MOST_DENSITY = 1.5
-"""Greatest number density of a first particle; on a disturbed lattice with all particles half a spacing apart it is
+"""Largest number density of a first particle; on a disturbed lattice whose particles are all half a spacing apart it is
 1.4."""
 NOTED_COMPRESSION = 0.03
-"""Average compression that is warned of; a lattice whose points are disturbed by a tenth of a spacing has 0.02."""
+"""Mean compression above which a warning is given; a lattice disturbed by a tenth of a spacing has 0.02."""
 NOTED_DENSITY = 0.5
-"""Greatest number density below which there is no fluid to speak of."""
+"""If no number density exceeds this value, the particles hardly form a fluid."""
 AT_ONE_PLACE = 1e-3
-"""In spacings: particles that are nearer to each other are at one place."""
+"""In spacings: particles closer than this count as coincident."""
 
 
 def check_crowding(
@@ -265,8 +266,8 @@ def check_crowding(
     period: Period,
     bodies: Sequence[str] | NDArray[np.str_] = (),
 ) -> str | None:
-    """Return a warning of particles that are crowded or hardly touch each other, where this may be meant; None of
-    others. Raise `InputError` where they would burst; it says if two bodies overlap that are sound by themselves.
+    """Return a warning about particles that are crowded, or that hardly touch each other; None otherwise. Raise
+    `InputError` if they would burst apart, and say so if two sound bodies overlap.
 
     Args:
         what: they in words, in the plural.
@@ -328,8 +329,8 @@ def _check_meeting(
 
 
 def check_apart(what: str, positions: Points, spacing: float, period: Period) -> None:
-    """Raise `InputError`, a sentence that begins with ``what``, where two particles (n, d) [m] are at one place. The
-    period begins at a corner (d,) and has lengths (d,) [m], 0 along axes without one."""
+    """Raise `InputError`, a sentence that begins with ``what``, if two particles (n, d) [m] coincide. The period starts
+    at a corner (d,) and has lengths (d,) [m], 0 along other axes."""
     first, second, _ = pairs_within(positions, positions, AT_ONE_PLACE * spacing, *period)
     pairs = np.flatnonzero(first < second)
     if pairs.size:
@@ -342,7 +343,7 @@ def check_apart(what: str, positions: Points, spacing: float, period: Period) ->
 
 
 def nearest(positions: Points) -> NDArray:
-    """Return the distance (n,) [m] from each of two or more particles (n, d) [m] to the nearest other one."""
+    """Return the distance (n,) [m] from each of at least two particles (n, d) [m] to its nearest neighbour."""
     from scipy.spatial import cKDTree
 
     return cKDTree(positions).query(positions, k=2)[0][:, 1]
@@ -358,9 +359,8 @@ def _in_bands() -> Any:
 
 
 def launch_on_cpu(kernel: Any, threads: int, in_bands: bool = True, **arguments: Any) -> None:
-    """Launch a kernel with arguments by name; it writes to the NumPy arrays that it is given. All cores take it in
-    bands (`cortado.device.launching`), where no two threads may write to one place, or otherwise one thread takes
-    it."""
+    """Launch a kernel with arguments by name; it writes to the NumPy arrays among them. All cores share the threads in
+    bands (`cortado.device.launching`) if no two threads write to one element, otherwise one core runs all."""
     from cortado.device.launching import launch
     from cortado.device.threads import WARP
 
@@ -374,7 +374,7 @@ def launch_on_cpu(kernel: Any, threads: int, in_bands: bool = True, **arguments:
 
 
 def shared(values: NDArray[Any], dtype: Any = None) -> Any:
-    """Return a Warp array in the memory of a NumPy array; one of more than one axis has vectors along the last one."""
+    """Return a Warp array that shares a NumPy array's memory; with more than one axis, the last becomes vectors."""
     import warp as wp
 
     types = {"float64": (wp.float64, wp.vec3d), "int32": (wp.int32, wp.vec3i), "bool": (wp.bool, None)}

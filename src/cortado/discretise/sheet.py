@@ -1,6 +1,5 @@
-"""Sheets, which are walls of no thickness, in float64: open surfaces of edges in the plane, of triangles in space;
-their wall particles, and what each counts for in the density.
-"""
+"""Sheets, walls without thickness, in float64: open surfaces of edges in the plane, of triangles in space. Also their
+wall particles and the weights of these in the density."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,23 +17,23 @@ from cortado.discretise.walls import Places, RestLattice, WallLayers, uneven_cha
 
 @dataclass(frozen=True, eq=False)
 class Sheet(Solid):
-    """A surface with fluid on both sides, to which nothing is inside: distances from it are never negative."""
+    """A surface with fluid on both sides. It has no inside, so distances from it are never negative."""
 
     vertices: Points
     """(m, d) [m]"""
     corners: Numbers
-    """(k, d) numbers of the vertices of each edge or triangle"""
+    """(k, d) indices of the vertices of each edge or triangle"""
 
     @classmethod
     def along(cls, places: Points) -> "Sheet":
-        """Return the sheet along a polyline (m, 2) [m], or the flat one within a convex polygon (m, 3) [m] of space."""
+        """Return the sheet along a polyline (m, 2) [m], or the flat one in a convex polygon (m, 3) [m] in space."""
         numbers, is_flat = np.arange(len(places)), places.shape[1] == 2
         around = [0 * numbers[2:], numbers[1:-1], numbers[2:]]
         return cls(places, np.stack([numbers[:-1], numbers[1:]] if is_flat else around, axis=1))
 
     @property
     def pieces(self) -> Points:
-        """Return the corners (k, d, d) of its edges or triangles [m]."""
+        """Return the corners (k, d, d) of the sheet's edges or triangles [m]."""
         return self.vertices[self.corners]
 
     @property
@@ -46,7 +45,7 @@ class Sheet(Solid):
         return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
 
     def centroid(self) -> Points:
-        """Return the middle (d,) of its length or its area [m]."""
+        """Return the centroid (d,) of the sheet's length or area [m]."""
         first, *others = np.moveaxis(self.pieces, 1, 0)
         along = [other - first for other in others]
         sizes = np.linalg.norm(along[0] if len(along) == 1 else np.cross(*along), axis=1)
@@ -54,13 +53,13 @@ class Sheet(Solid):
 
     @classmethod
     def joined(cls, sheets: Sequence["Sheet"]) -> "Sheet":
-        """Return several sheets, at least one, as one."""
+        """Join at least one sheet to a single one."""
         starts = np.cumsum([0, *(len(one.vertices) for one in sheets[:-1])])
         corners = [one.corners + start for one, start in zip(sheets, starts, strict=True)]
         return cls(np.concatenate([one.vertices for one in sheets]), np.concatenate(corners))
 
     def placed(self, position: Points, turn: Points) -> "Sheet":
-        """Return the sheet turned by a matrix (d, d) and then moved (d,) [m]."""
+        """Return the sheet rotated by a matrix (d, d) and then shifted by (d,) [m]."""
         return Sheet(self.vertices @ turn.T + position, self.corners)
 
     def extent(self) -> tuple[Points, Points]:
@@ -82,8 +81,8 @@ class Sheet(Solid):
         return found
 
     def aside(self, points: Points, distance: float) -> Points:
-        """Return the points (n, d) [m] at a distance [m] from the sheet on the sides of points (n, d) [m]; of
-        those that are on it, on the side of its normals."""
+        """Return, for points (n, d) [m], points (n, d) [m] at a distance [m] from the sheet on the same side; for
+        points on the sheet, on the side of its normals."""
         feet = self.nearest(points)
         away = points - feet
         length = np.linalg.norm(away, axis=1)
@@ -95,12 +94,11 @@ class Sheet(Solid):
         return np.asarray(feet + distance * away / length[:, None])
 
     def faces(self, fine: float) -> Faces:
-        """Return both sides of the sheet, which enclose nothing."""
+        """Return both sides of the sheet as a surface that encloses no volume."""
         return Faces(self.vertices, np.concatenate([self.corners, self.corners[:, ::-1]]))
 
     def crossed(self, starts: Points, ends: Points, spacing: float) -> Which:
-        """Test (n,) which segments between points (n, d) [m] go through the sheet, beside particles a spacing [m]
-        apart."""
+        """Test (n,) which segments between points (n, d) [m] cross the sheet, for particles with a spacing [m]."""
         from cortado.device.modules import start_warp
 
         start_warp()
@@ -123,7 +121,7 @@ class Sheet(Solid):
 
 @dataclass(frozen=True, eq=False)
 class Thickened(Solid):
-    """All that is no further from a sheet than a depth."""
+    """The points within a depth of a sheet, as a solid."""
 
     sheet: Sheet
     depth: float
@@ -143,7 +141,7 @@ class Thickened(Solid):
         return np.asarray(feet + self.depth * away / np.maximum(length, 1e-300))
 
     def faces(self, fine: float) -> Faces:
-        """Return its surface with sharp edges: the sheet moved to both sides, and strips between their ends."""
+        """Return the solid's surface with sharp edges: the sheet shifted to both sides, and strips between the ends."""
         sheet, count = self.sheet, len(self.sheet.vertices)
         aside = np.zeros_like(sheet.vertices)
         for corner in sheet.corners.T:
@@ -166,8 +164,8 @@ class Thickened(Solid):
 
 
 def sheet_points(sheet: Sheet, layers: WallLayers, lattice: RestLattice) -> WallPoints:
-    """Make the wall particles on both sides of a sheet and around its ends, in layers at the depths of those of flat
-    walls."""
+    """Build the wall particles on both sides of a sheet and around its ends, in layers with the depths of a flat
+    wall's."""
     apart = DENSITY * lattice.spacing
     parts = [surface_points(Thickened(sheet, depth), apart, 0.0) for depth in layers.depths]
     positions = np.concatenate([one.points for one in parts])
@@ -179,9 +177,9 @@ def sheet_points(sheet: Sheet, layers: WallLayers, lattice: RestLattice) -> Wall
 def sheet_weights(
     sheet: Sheet, points: Sequence[Points], flat: Sequence[Points], room: Room, lattice: RestLattice, least: float
 ) -> Points:
-    """Compute the weights (b,) of the wall particles of a sheet, as those of other solids are found: by places beside
-    it that are no nearer than ``least`` [m] to any surface. The lists have positions (b, d) [m] and weights (b,): first
-    those of the sheet in a flat wall, then those of others that are in the room."""
+    """Compute the weights (b,) of the wall particles of a sheet as for other solids: from points beside the sheet, at
+    least ``least`` [m] from any surface. The lists have positions (b, d) [m] and weights (b,): first the sheet's, as in
+    a flat wall, then those of other walls in the room."""
     spacing, own = lattice.spacing, len(points[0])
     heights = spacing * (np.arange(int(np.ceil(lattice.support / spacing - 0.5))) + 0.5)
     found = np.concatenate([surface_points(Thickened(sheet, height), spacing, 0.0).points for height in heights])

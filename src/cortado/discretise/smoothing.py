@@ -4,8 +4,8 @@ With q = r / h, s = x / h and the normalisation sigma [1 / m^d]:
 
     W = sigma w(q),    grad W = (sigma / h) f(q) s,
 
-where f(q) = w'(q) / q is finite at q = 0 for every kernel here, so that no direction is needed at r = 0.
-Cubic spline: Monaghan (1992). Wendland C2 and C4: Dehnen and Aly (2012). The same in Warp, with Hessians:
+where f(q) = w'(q) / q is finite at q = 0 for every kernel here, so no direction is needed at r = 0. Cubic spline:
+Monaghan (1992). Wendland C2 and C4: Dehnen and Aly (2012). The Warp versions, with Hessians, are in
 `cortado.discretise.smoothing_functions`.
 
 Constants of a filled neighbourhood on the lattice of the rest spacing are functions of a smoothing kernel, the spacing
@@ -77,22 +77,22 @@ KERNELS = {kernel.name: kernel for kernel in (CUBIC_SPLINE, WENDLAND_C2, WENDLAN
 
 
 def smoothing_kernel(name: str) -> SmoothingKernel:
-    """Return the smoothing kernel of a name; raise `InputError` where there is none."""
+    """Return the smoothing kernel with this name; raise `InputError` if there is no such kernel."""
     if name not in KERNELS:
         raise InputError(f"kernel is {name!r}, but must be one of {', '.join(KERNELS)}.")
     return KERNELS[name]
 
 
 SKIN = 0.03
-"""Reach of neighbour lists beyond the support radius, relative to it: density is also taken at predicted positions."""
+"""Extra radius of neighbour lists, relative to the support radius: density is also computed at predicted positions."""
 SLACK = 1e-4
-"""How far the lattice stays below the rest density, relative.
+"""Relative amount by which the lattice's density is below the rest density.
 
 At the rest density exactly, every particle of a block that starts as a lattice sits on the kink of the pressure clamp.
 Round-off would then choose the derivative of the pressure, and no finite difference could confirm it.
 """
 RATE_LIMIT = 1.5
-"""Bound on `greatest_rate`, as the iteration converges below 2; the margin is for particles off the lattice."""
+"""Bound on `greatest_rate`: the iteration converges below 2, and the margin is for particles off the lattice."""
 
 
 def lattice_offsets(spacing: float, support: float, dimension: int) -> np.ndarray:
@@ -108,8 +108,8 @@ def _waves(spacing: float, dimension: int, count: int = 25) -> np.ndarray:
 
 
 def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return V_0 = (1 - SLACK) / sum_j W_ij [m^d]: with a mass rho_0 V_0 the lattice has the rest density less
-    slack."""
+    """Return V_0 = (1 - SLACK) / sum_j W_ij [m^d]. With a mass rho_0 V_0 the lattice's density is the rest density
+    times 1 - SLACK."""
     distances = np.linalg.norm(lattice_offsets(spacing, support, dimension), axis=1)
     return float((1.0 - SLACK) / kernel.weight(distances, dimension, support).sum())
 
@@ -129,7 +129,7 @@ def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, 
 
     delta = 1 / (beta (S . S + sum_j G_ij . G_ij)), beta = 2 m^2 dt^2 / rho_0^2, S = sum_j G_ij,
 
-    lowered where the pressure iteration would diverge with it: where its `greatest_rate` is above `RATE_LIMIT`.
+    reduced if the pressure iteration would diverge with this value: if the `greatest_rate` exceeds `RATE_LIMIT`.
     """
     gradients = kernel.gradient(lattice_offsets(spacing, support, dimension), support)
     total = gradients.sum(axis=0)
@@ -143,8 +143,8 @@ def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
     """Return the factor by which one pressure iteration with the delta of a filled neighbourhood overcorrects the worst
     pressure wave on the lattice [-].
 
-    A pressure wave exp(i k . x) moves the particles so that their density answers with delta times |S(k)|^2 / (2 sum_j
-    G_j . G_j), where S(k) = sum_j G_j sin(k . x_j): the iteration converges where that is below 2. It is 1.4 for the
+    A pressure wave exp(i k . x) moves the particles. Their density responds with the factor delta |S(k)|^2 / (2 sum_j
+    G_j . G_j), where S(k) = sum_j G_j sin(k . x_j). The iteration converges if the factor is below 2. It is 1.4 for the
     cubic spline with a support of 2 spacings in 3-D, and 3.7 with 3 spacings.
     """
     offsets = lattice_offsets(spacing, support, dimension)
@@ -154,8 +154,8 @@ def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
 
 
 def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: float) -> np.ndarray:
-    """Return F = x . G / (|x|^2 + 0.01 h^2) (m,) [1 / m^(d + 2)], the factor of second derivatives by differences, at
-    separations (m, d) [m]."""
+    """Return F = x . G / (|x|^2 + 0.01 h^2) (m,) [1 / m^(d + 2)] at separations (m, d) [m], the factor of second
+    derivatives computed from differences."""
     squares = (separations**2).sum(axis=1)
     return (separations * kernel.gradient(separations, support)).sum(axis=1) / (squares + 0.01 * support**2)
 
@@ -169,7 +169,7 @@ def wall_response(kernel: SmoothingKernel, spacing: float, support: float, dimen
 def lattice_laplacian_correction(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """Return the factor [-] that makes the Laplacian 2 V sum_j (u_i - u_j) F_ij exact for a parabola on the lattice.
 
-    Without it second derivatives are 1 to 8 % small at any resolution, mostly by the 0.01 h^2 of F.
+    Without it second derivatives are 1 to 8 % too small at any resolution, mostly because of the 0.01 h^2 in F.
     """
     offsets, _, volume = _filled(kernel, spacing, support, dimension)
     return float(-1.0 / (volume * (shear_factor(kernel, offsets, support) * offsets[:, 0] ** 2).sum()))
@@ -197,7 +197,7 @@ def pairwise_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
 
     2 (d + 2) V sum_j F_ij x_ij x_ij^T / |x_ij|^2 (v_i - v_j).
 
-    In a wave of compression it is about three times that of the Laplacian.
+    For a compression wave it is about three times the Laplacian's eigenvalue.
     """
     offsets, _, volume = _filled(kernel, spacing, support, dimension)
     squares = (offsets**2).sum(axis=1)
@@ -218,8 +218,8 @@ def stress_control(kernel: SmoothingKernel, spacing: float, support: float, dime
 @cache
 def stress_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """Return the greatest eigenvalue [1 / m2] on the lattice of viscosity as a stress (`cortado.sph.stress_kernels`),
-    in a wave of compression. It is the greatest value of 2 |g|^2 + C (sum_j 2 s_j (1 - cos k . x_j) - m_2 |g|^2) over
-    wave vectors k, with g = sum_j s_j x_j sin(k . x_j) / m_2."""
+    reached by a compression wave. It is the maximum over wave vectors k of 2 |g|^2 + C (sum_j 2 s_j (1 - cos k . x_j) -
+    m_2 |g|^2), with g = sum_j s_j x_j sin(k . x_j) / m_2."""
     offsets, gradients, volume = _filled(kernel, spacing, support, dimension)
     others = np.any(offsets != 0.0, axis=1)
     offsets, gradients = offsets[others], gradients[others]

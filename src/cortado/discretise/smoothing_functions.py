@@ -4,9 +4,9 @@
 
 with q = r / h, s = x / h and f(q) = w'(q) / q.
 
-A GPU has one instruction for the reciprocal of a root, and none for a root or a quotient: q is q^2 / q, and what is
-divided by q is multiplied with 1 / q. Pieces are chosen between and not branched to, so that what two functions of one
-pair have in common is computed once.
+A GPU has one instruction for the reciprocal root, but none for a root or a quotient. So q is computed as q^2 (1 / q),
+and divisions by q become products with 1 / q. Pieces are selected without branches, so that terms which two functions
+of a pair share are computed once.
 """
 
 from functools import cache
@@ -20,8 +20,8 @@ from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C2, WENDLAND_C4, SmoothingKernel
 
 Radial = tuple[Any, Any, Any]
-"""Warp functions of a kernel's dimensionless form: w of q, f = w' / q for its gradient, and f' / q for its Hessian,
-both of q and 1 / q."""
+"""Warp functions of a kernel's dimensionless form: w, f = w' / q for the gradient, and f' / q for the Hessian. The
+arguments of the latter two are q and 1 / q."""
 
 
 def _cubic_spline(precision: Precision) -> Radial:
@@ -115,8 +115,8 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bo
 
     @wp.func
     def square(x: vector, per_h: real) -> real:
-        """Return q^2. tiny guards coincident particles: there 1 / q is finite and s = 0, so that the second term of the
-        Hessian is 0 and H = W''(0) I, as it should be."""
+        """Return q^2. tiny guards coincident particles: for them 1 / q is finite and s = 0, so that the second term of
+        the Hessian vanishes and H = W''(0) I, as it should be."""
         return wp.dot(x, x) * (per_h * per_h) + tiny
 
     @wp.func

@@ -1,4 +1,4 @@
-"""Solids to the discretisation: signed distances, faces, volume and moments, in float64."""
+"""Solids as the discretisation uses them: signed distances, faces, volume and moments, in float64."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -12,25 +12,25 @@ from cortado.discretise.shapes import corners as corners_of
 
 @dataclass(frozen=True)
 class Faces:
-    """A closed surface as flat faces, edges in 2-D and triangles in 3-D; its inside is on their left, or behind
-    them."""
+    """A closed surface of flat faces: edges in 2-D, with the inside on their left, and triangles in 3-D, with the
+    inside behind them."""
 
     vertices: Points
     """(m, d) [m]"""
     corners: Numbers
-    """(k, d) numbers of the vertices of each face, in 3-D counterclockwise as seen from outside"""
+    """(k, d) indices of the vertices of each face, in 3-D counterclockwise as seen from outside"""
 
     def moved(self, turn: Points, position: Points) -> "Faces":
-        """Return the faces turned by a matrix (d, d) and then moved (d,) [m]."""
+        """Return the faces rotated by a matrix (d, d) and then shifted by (d,) [m]."""
         return Faces(self.vertices @ turn.T + position, self.corners)
 
     def reversed(self) -> "Faces":
-        """Return the faces of the outside."""
+        """Return the faces with inside and outside exchanged."""
         return Faces(self.vertices, self.corners[:, ::-1])
 
 
 def box_faces(half: Points) -> Faces:
-    """Return the faces of a box about the origin with half its sides (d,) [m]."""
+    """Return the faces of a box centred at the origin, with half lengths (d,) [m]."""
     if len(half) == 2:
         return polygon_faces(half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]))
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
@@ -39,8 +39,8 @@ def box_faces(half: Points) -> Faces:
 
 
 def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -> Faces:
-    """Return the faces of the part of a box, between corners (d,) [m], that is below a plane with a unit normal (d,) at
-    a height along it [m]."""
+    """Return the faces of the part of a box, between corners (d,) [m], below a plane. The plane has a unit normal (d,)
+    and a height along the normal [m]."""
     from scipy.spatial import ConvexHull
 
     ends = corners_of(lower, upper)
@@ -58,7 +58,7 @@ def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -
 
 
 def polygon_faces(corners: Points) -> Faces:
-    """Return the edges of a polygon (m, 2) [m], given either way round."""
+    """Return the edges of a polygon (m, 2) [m], given clockwise or counterclockwise."""
     following = np.roll(corners, -1, axis=0)
     (x, y), (x_next, y_next) = (corners - corners[0]).T, (following - corners[0]).T
     area = (x * y_next - x_next * y).sum()
@@ -76,7 +76,7 @@ def arc(centre: Points, radius: float, start: float, end: float, fine: float) ->
 
 def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
     """Return the faces, about ``fine`` [m] wide, of a solid of revolution about an axis of space. Its profile is its
-    cut with a plane through the axis, the same on both sides."""
+    cross-section in a plane through the axis, symmetric about the axis."""
     count = max(int(np.ceil(2.0 * np.pi * profile.vertices[:, 0].max() / fine)), 12)
     angles = 2.0 * np.pi * np.arange(count) / count
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -104,14 +104,14 @@ def outer_edges(profile: Faces) -> Points:
 
 
 def _cut(start: Points, end: Points) -> Points:
-    """Return the start (2,) of an edge, or where the edge crosses the axis if it starts beyond."""
+    """Return the start (2,) of an edge, or its intersection with the axis if it starts beyond the axis."""
     if start[0] >= 0.0:
         return start
     return np.array([0.0, start[1] + (end[1] - start[1]) * start[0] / (start[0] - end[0])])
 
 
 NODES = 0.5 + np.sqrt(0.15) * np.array([-1.0, 0.0, 1.0])
-"""Nodes of Gauss's quadrature with three points from 0 to 1, exact for polynomials of degree 5."""
+"""Nodes of three-point Gauss quadrature on [0, 1], exact for polynomials of degree 5."""
 WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
 
@@ -128,9 +128,9 @@ class Moments:
 
 
 def enclosed_moments(corners: Points, weights: Points) -> Moments:
-    """Return the moments of a body that edges (k, 2, 2) or triangles (k, 3, 3) [m] enclose, by integrals over the
-    surface (Mirtich 1996). They run counterclockwise as seen from outside, and each has a weight (k,). They are bases
-    of cones about a place near by."""
+    """Return the moments of a body enclosed by edges (k, 2, 2) or triangles (k, 3, 3) [m], by integrals over the
+    surface (Mirtich 1996). Faces are counterclockwise as seen from outside, each with a weight (k,). Each is the base
+    of a cone with its apex at a point nearby."""
     d = corners.shape[1]
     origin = whole_origin(corners.reshape(-1, d))
     about = corners - origin
@@ -143,8 +143,9 @@ def enclosed_moments(corners: Points, weights: Points) -> Moments:
 
 
 def revolved_moments(edges: Points, axis: int) -> Moments:
-    """Return the moments of a solid of revolution about an axis of space, by the edges (k, 2, 2) [m] of its profile on
-    one side of the axis, distance from it and height, counterclockwise. Those on the axis may be left out."""
+    """Return the moments of a solid of revolution about an axis of space, from the edges (k, 2, 2) [m] of its profile
+    on one side of it. Coordinates are radius and height; edges run counterclockwise, those on the axis may be left
+    out."""
     height = edges[..., 1].mean()
     start, end = edges[:, 0], edges[:, 1]
     x, y = np.moveaxis(start[:, None] + NODES[:, None] * (end - start)[:, None], 2, 0)
@@ -165,12 +166,12 @@ class Solid(ABC):
 
     @property
     def is_bounded(self) -> bool:
-        """Return False for a solid without an end, which its box does not hold."""
+        """Return False for an unbounded solid, which extends beyond its box."""
         return True
 
     @abstractmethod
     def extent(self) -> tuple[Points, Points]:
-        """Return the box around it: lower and upper, each (d,) [m]."""
+        """Return the box around the solid: lower and upper corner, each (d,) [m]."""
 
     @abstractmethod
     def distance(self, points: Points) -> Points:
@@ -178,43 +179,43 @@ class Solid(ABC):
 
     @abstractmethod
     def nearest(self, points: Points) -> Points:
-        """Return the points (n, d) [m] of the surface that are nearest to points (n, d) [m]."""
+        """Return the nearest points (n, d) [m] of the surface to given points (n, d) [m]."""
 
     @abstractmethod
     def faces(self, fine: float) -> Faces:
-        """Return the solid's surface in flat faces, some ``fine`` [m] wide where it is round."""
+        """Return the solid's surface as flat faces, about ``fine`` [m] wide where it is curved."""
 
     def moments(self) -> Moments:
-        """Return its volume, centroid and second moments, to round-off; solids that may move freely have them."""
+        """Return volume, centroid and second moments, to round-off; available for solids that may move freely."""
         raise NotImplementedError(f"{type(self).__name__} has no moments")
 
     def shown_faces(self, fine: float) -> Faces:
-        """Return the `faces` for pictures: of an unbounded solid those within the box around it."""
+        """Return the `faces` for pictures; for an unbounded solid those inside its box."""
         return self.faces(fine)
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
-        """Return the `distance` (n,) [m] of points (n, d) [m] where its size is less than a reach [m]; elsewhere any
-        number of the same sign that is at least as large as the reach. Solids with many faces find it sooner."""
+        """Return the `distance` (n,) [m] of points (n, d) [m] up to a reach [m]; beyond, any number of the same sign
+        that is at least as large as the reach. For solids with many faces this is faster."""
         return self.distance(points)
 
     def own_feet(self, fine: float) -> tuple[Points, Points] | None:
-        """Return points of the surface (n, d) [m], each for an area of fine^(d - 1) [m^(d - 1)], and unit vectors (n,
-        d) outwards. None of a solid that has no quicker way to them than a lattice around it."""
+        """Return points of the surface (n, d) [m], one for each area fine^(d - 1) [m^(d - 1)], and outward unit vectors
+        (n, d). Return None if a lattice around the solid is as quick a way to find such points."""
         return None
 
     def outward(self, points: Points) -> Points:
-        """Return unit vectors (n, d) away from the solid at points (n, d) [m] that are not on its surface."""
+        """Return unit vectors (n, d) pointing away from the solid at points (n, d) [m] off its surface."""
         across = (points - self.nearest(points)) * np.sign(self.distance(points))[:, None]
         return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300))
 
 
 @dataclass(frozen=True)
 class Placed(Solid):
-    """A solid that is turned about the origin and then moved."""
+    """A solid that is rotated about the origin and then shifted."""
 
     solid: Solid
     position: Points
-    """(d,) place of its origin [m]"""
+    """(d,) Position of the solid's origin [m]"""
     turn: Points
     """(d, d) the rotation matrix"""
 
@@ -252,7 +253,7 @@ class Placed(Solid):
 
 @dataclass(frozen=True)
 class Hollow(Solid):
-    """All of space but a shape: a tank with walls of any thickness."""
+    """All of space except a shape: a tank with infinitely thick walls."""
 
     cavity: Solid
 
@@ -287,11 +288,11 @@ class Mass:
     volume: float
     """[m^d]"""
     inertia: Points
-    """(3, 3) about the centroid [m^(d + 2)]; in 2-D all but the entry about z is 0."""
+    """(3, 3) about the centroid [m^(d + 2)]; in 2-D only the entry about z is not 0."""
 
     @classmethod
     def of(cls, solid: Solid) -> "Mass":
-        """Compute the mass of a solid, by its moments."""
+        """Compute volume and inertia of a solid from its moments."""
         moments = solid.moments()
         about = np.trace(moments.second) * np.eye(3)
         if len(moments.centre) == 2:
@@ -299,5 +300,5 @@ class Mass:
         return cls(moments.volume, about - moments.second)
 
     def in_volumes(self, unit: float) -> "Mass":
-        """Return this mass with its volume and its inertia both divided by ``unit`` [m^d]."""
+        """Return this mass with volume and inertia both divided by ``unit`` [m^d]."""
         return Mass(self.volume / unit, self.inertia / unit)

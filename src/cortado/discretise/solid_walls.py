@@ -1,5 +1,5 @@
-"""The wall particles of solids, and places beside them where fluid may rest, in float64: points at a depth beneath the
-surface of a solid, or at a height above it, evenly spaced."""
+"""Wall particles of solids, and points beside solids where fluid may rest, in float64. Both are evenly spaced, at a
+depth below a solid's surface or at a height above it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,43 +16,43 @@ from cortado.discretise.solid import Solid
 from cortado.discretise.walls import Places, RestLattice, WallLayers
 
 Near = Callable[[Points, float], Which]
-"""Tells which points (n, d) [m] are less than a length [m] from something."""
+"""A test of which points (n, d) [m] are closer than a length [m] to an object."""
 FINE = {2: 12, 3: 3}
-"""Number of points of a surface along a spacing, among which those that stay are chosen, by the number of dimensions.
-With 3 in the plane, wall particles of discs push first rows of fluid unevenly by 9 % (12: 3 %)."""
+"""Number of candidate points of a surface per spacing, among which wall particles are chosen, by the number of
+dimensions. With 3 in the plane, wall particles of discs push first rows of fluid unevenly by 9 % (12: 3 %)."""
 CELLS = (3, 4)
-"""Into how many parts, along each axis, cells are cut in which a surface is looked for, until these are fine; the last
-of them is even."""
+"""Number of parts, along each axis, into which cells near a surface are divided until they are fine; the last number is
+even."""
 APART, LEAST_APART = 0.78, 0.65
-"""In spacings: points are chosen wherever none is nearer than the first; then they are moved, none nearer to another
-than the second."""
+"""In spacings: a point is chosen if no other is closer than the first number; then points are moved, to no closer than
+the second."""
 FIRST, GROWTH = 0.05, 1.7
-"""The part of points that is looked at at first, and how many more each time."""
+"""Fraction of the points that is processed first, and the factor by which each later portion grows."""
 ROUNDS = {2: 40, 3: 4}
-"""Rounds in which each point moves to the middle of its nearest candidates, by the number of dimensions."""
+"""Rounds in which each point moves to the centroid of its nearest candidates, by the number of dimensions."""
 OFF_FACES = (0.31, 0.17, 0.23)
-"""Shift of fine lattices off the faces of solids that are aligned with them, in cells."""
+"""Shift of fine lattices in cells, so that their points do not lie on the faces of aligned solids."""
 HALVINGS = 20
 MANY, MOST = 50_000, 2_000_000
-"""Numbers of points. Above the first, several cores search for the nearest faces; with fewer points they only wait for
-each other. At most the second number of points is searched at a time, which bounds the memory."""
+"""Numbers of points. Above the first, several cores search for the nearest faces; with fewer points they mostly wait
+for each other. At most the second number is searched at a time, to limit the memory."""
 SEED = 1
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points of a surface, each with the area around it."""
+    """Points of a surface, each with the area that it represents."""
 
     points: Points
     """(n, d) [m]"""
     shares: Points
-    """(n,) area over that of a lattice point, a spacing to the power of d - 1"""
+    """(n,) area, relative to that of a lattice point, spacing^(d - 1)"""
 
 
 def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
-    """Return points about a spacing [m] apart, ``depth`` [m] beneath the surface of a solid, above it where negative.
+    """Return points about a spacing [m] apart, ``depth`` [m] below the surface of a solid, or above it if negative.
 
-    Where a solid is thinner than twice the depth, they are in its middle.
+    Where a solid is thinner than twice the depth, the points are in the middle.
     """
     fine = spacing / FINE[len(solid.extent()[0])]
     feet, away = surface_feet(solid, fine)
@@ -63,10 +63,11 @@ def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
 
 
 def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoints:
-    """Choose points about a spacing [m] apart from points (n, d) [m] ``fine`` [m] apart on a surface.
+    """Choose points about a spacing [m] apart from candidates (n, d) [m], which are ``fine`` [m] apart on a surface.
 
-    First as many as can be so that no two are too near each other; then each is moved to the middle of what is nearest
-    to it (Lloyd 1982), and to a candidate. Then any that are too near another are left out, and gaps are filled.
+    First, as many points as possible are chosen so that no two are too close. Each then moves to the centroid of the
+    candidates nearest to it (Lloyd 1982), and on to a candidate. Points too close to another are removed, and gaps
+    filled.
     """
     dimension = candidates.shape[1]
     if not len(candidates):
@@ -88,9 +89,8 @@ def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoi
 
 
 def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tuple[Points, Points]:
-    """Return points of a surface (n, d) [m], about ``fine`` [m] apart, each with as much of its area, and unit vectors
-    (n, d) away from the solid. Where a lattice finds the surface, only points near something come, as ``is_near``
-    says."""
+    """Return points of a surface (n, d) [m], about ``fine`` [m] apart and representing equal areas, with unit vectors
+    (n, d) away from the solid. If a lattice is used to find them, only points that pass ``is_near`` are returned."""
     found = solid.own_feet(fine)
     if found is not None:
         return found
@@ -117,8 +117,8 @@ def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tupl
 
 
 def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
-    """Return depths (n,) beneath feet (n, d) [m], up to a depth [m], at which no other part of the surface is nearer
-    than the foot."""
+    """Return depths (n,) below feet (n, d) [m], at most a given depth [m], up to which the foot is the nearest point of
+    the surface."""
     if depth <= 0.0:
         return np.full(len(feet), depth)
     found, tolerance = np.full(len(feet), depth), 1e-3 * depth
@@ -132,9 +132,8 @@ def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
 
 
 def lattice_about(lower: Points, upper: Points, reach: float, fine: float, is_near: Near) -> Iterator[Points]:
-    """Yield points (n, d) of a lattice, ``fine`` [m] apart, in parts, with all of those that are no further than
-    ``reach`` [m] from a thing within the box between two corners. Cells of the box, and parts of these, are kept as far
-    as their middles are near the thing, by ``is_near``."""
+    """Yield points (n, d) of a lattice, ``fine`` [m] apart, in portions. They include all points within ``reach`` [m]
+    of an object inside a box between two corners. Cells of the box are divided while their centres pass ``is_near``."""
     dimension, size = len(lower), int(np.prod(CELLS)) * fine
     cells = block_about(0.5 * (lower + upper), 0.5 * (upper - lower) + reach + size, size).points()
     *coarse, last = CELLS
@@ -153,15 +152,16 @@ def lattice_about(lower: Points, upper: Points, reach: float, fine: float, is_ne
 
 
 def _divided(cells: Points, size: float, parts: int) -> Points:
-    """Return middles (n, d) [m] of ``parts`` parts along each axis of cells of a size [m] with middles (m, d) [m]."""
+    """Divide cells of a size [m] with centres (m, d) [m] into ``parts`` along each axis; return new centres (n, d)
+    [m]."""
     along = size / parts * (np.arange(parts) + 0.5) - 0.5 * size
     inside = np.array(list(product(along, repeat=cells.shape[1])))
     return (cells[:, None] + inside).reshape(-1, cells.shape[1])
 
 
 def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Numbers:
-    """Return numbers of points (n, d) [m]: those chosen already, and the numbers in an ``order`` that are further than
-    ``apart`` [m] from them and from all chosen before."""
+    """Return indices of points (n, d) [m]: those already chosen, and those in an ``order`` that are further than
+    ``apart`` [m] from all points chosen before."""
     size = int(FIRST * len(order)) + 1
     while len(order):
         some, order, size = order[:size], order[size:], int(GROWTH * size) + 1
@@ -173,8 +173,8 @@ def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Nu
 
 
 def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Points, Numbers]:
-    """Return distances (n,) from points (n, d) [m] to the nearest of some (m, d) [m], infinite from a reach [m] on, and
-    the numbers (n,) of these."""
+    """Return distances (n,) from points (n, d) [m] to the nearest of other points (m, d) [m], infinite beyond a reach
+    [m], and the indices (n,) of the nearest."""
     from scipy.spatial import cKDTree
 
     workers = usable_cores() if len(points) > MANY else 1
@@ -183,7 +183,8 @@ def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Point
 
 
 def _first_of_all_near(points: Points, apart: float) -> Which:
-    """Test (n,) which points (n, d) [m] stay if each in turn stays unless a nearer one than ``apart`` [m] does."""
+    """Test (n,) which points (n, d) [m] stay if each, in order, stays unless a point within ``apart`` [m] has
+    stayed."""
     from scipy.spatial import cKDTree
 
     first, second = cKDTree(points).query_pairs(apart, output_type="ndarray").T
@@ -201,44 +202,44 @@ def _first_of_all_near(points: Points, apart: float) -> Which:
 
 @dataclass(frozen=True)
 class WallPoints(Rows):
-    """Wall particles whose weights are not known yet."""
+    """Wall particles whose weights are still to be computed."""
 
     positions: Points
     """(b, d) [m]"""
     flat: Points
-    """(b,) weights in the density that they would have in a flat wall [-]"""
+    """(b,) weights that they would have in the density in a flat wall [-]"""
     feet: Points
-    """(b, d) from each to the nearest point of its surface [m]"""
+    """(b, d) vector from each to the nearest point of its surface [m]"""
 
 
 @dataclass(frozen=True, eq=False)
 class ContainerWalls:
-    """The wall particles that a container has without solids. Those so far from all solids that no fluid beside these
-    sees them keep their places and their cells."""
+    """The wall particles of a container without solids. Those far enough from all solids keep their positions and their
+    cells: fluid beside a solid does not interact with them."""
 
     points: WallPoints
     solids: Sequence[Solid]
-    """The solids that close the container."""
+    """Solids that form the container's walls."""
     room: Room
-    """Where fluid may be, outside of solids at rest."""
+    """Room for fluid, outside of solids at rest."""
     spacing: float
-    """Of particles [m]."""
+    """Particle spacing [m]."""
     support: float
-    """[m]"""
+    """Support radius [m]."""
 
     @property
     def _clear(self) -> float:
-        """Return the least distance from solids to the feet of wall particles that keep their places [m]."""
+        """Return the least distance from solids at which the feet of wall particles keep their positions [m]."""
         return 2.0 * self.support + self.spacing
 
     @cached_property
     def stay(self) -> Which:
-        """Test (b,) which wall particles keep their places."""
+        """Test (b,) which wall particles keep their positions."""
         feet = self.points.positions + self.points.feet
         return np.asarray(self.room.from_solids(feet, self._clear) >= self._clear)
 
     def keeps(self, points: Points) -> Which:
-        """Test (n,) which points (n, d) [m] beneath surfaces are in the cell of a wall particle that keeps its place,
+        """Test (n,) which points (n, d) [m] below surfaces are in the cell of a wall particle that keeps its position,
         or above the rim of the container."""
         from scipy.spatial import cKDTree
 
@@ -249,8 +250,8 @@ class ContainerWalls:
         return kept
 
     def is_near(self, points: Points, furthest: float) -> Which:
-        """Test (n,) which points (n, d) [m] are less than a length [m] from the surface where particles do not keep
-        their places, whose cells are cut there, or from solids; a few more are."""
+        """Test (n,) which points (n, d) [m] are closer than a length [m] to solids, or to the surface where wall
+        particles do not keep their positions. Some other points pass, too."""
         near = self._clear + 2.0 * self.spacing + furthest
         return np.asarray(self.room.from_solids(points, near) < near)
 
@@ -258,35 +259,35 @@ class ContainerWalls:
 DENSITY = 0.75
 """In spacings: distance between wall particles."""
 MARGIN = 0.01
-"""In spacings: a part of a surface that is no further within its room touches a wall or another solid."""
+"""In spacings: a part of a surface that extends less than this into its room touches a wall or another solid."""
 TOLERANCE = 0.05
-"""In spacings: by how much less deep points may be beneath one surface than beneath another."""
+"""In spacings: tolerance in the comparison of the depths of a point below two surfaces."""
 EDGE = 0.4
-"""In spacings: bound on the distance of edges from fine points of the surface."""
+"""In spacings: largest distance of edges from fine points of the surface."""
 EXPOSED_HALVINGS, EXPOSED_ROUNDS, DIGITS = 12, 30, 4
 
 
 @dataclass(frozen=True)
 class ExposedSurface:
-    """The surface that fluid in a room can touch of solids, which may touch each other, and of the container near them,
-    as fine points."""
+    """Fine points of the surface that fluid in a room can touch: that of solids, which may touch each other, and of the
+    container near them."""
 
     feet: Points
     """(n, d) [m]"""
     away: Points
-    """(n, d) unit vectors into the room"""
+    """(n, d) unit vectors from the surface into the room"""
     owner: Numbers
-    """(n,) index into `solids` of the one that each belongs to"""
+    """(n,) index into `solids` of each point's solid"""
     solids: Sequence[Solid]
-    """The solids that close the container, then the others."""
+    """Solids that form the container's walls, then the other solids."""
     container: ContainerWalls
     lower: Points
-    """(d,) where the period begins [m]"""
+    """(d,) Start of the period [m]"""
 
     @classmethod
     def of(cls, container: ContainerWalls, solids: Sequence[Solid], lower: Points) -> "ExposedSurface":
-        """Find the surface that fluid can touch, of solids and of the container near them, as points spacing / `FINE`
-        apart. Along periodic axes it goes on for a support beyond the period that begins at ``lower`` (d,) [m]."""
+        """Find the surface of solids, and of the container near them, that fluid can touch, as points spacing / `FINE`
+        apart. Along periodic axes it extends a support beyond the period, which starts at ``lower`` (d,) [m]."""
         room, spacing, fine = container.room, container.spacing, container.spacing / FINE[len(lower)]
         found = [surface_feet(side, fine, container.is_near) for side in container.solids]
         found += [surface_feet(solid, fine) for solid in solids]
@@ -297,7 +298,7 @@ class ExposedSurface:
 
     @property
     def room(self) -> Room:
-        """Return the room where fluid may be."""
+        """Return the room for fluid."""
         return self.container.room
 
     @property
@@ -307,7 +308,7 @@ class ExposedSurface:
 
     @property
     def _fine(self) -> float:
-        """Return the distance of fine points [m]."""
+        """Return the spacing of fine points [m]."""
         return self.spacing / FINE[self.feet.shape[1]]
 
     @cached_property
@@ -317,10 +318,9 @@ class ExposedSurface:
         return cKDTree(self.feet)
 
     def walls(self, layers: WallLayers, lattice: RestLattice) -> WallPoints:
-        """Make wall particles in layers at the depths of those of flat walls, each with the weight of as much of a flat
-        wall as its part of the layer is. Where it is less deep it has less, so that it counts the same for the first
-        row of fluid. None counts as deeper than its layer, as those may seem whose foot is hidden where parts of a
-        solid overlap."""
+        """Build wall particles in layers at the depths of a flat wall's layers. Each has the weight of a flat wall's
+        area equal to its part of the layer; at smaller depths the weight is reduced, so that the first row of fluid
+        sees the same. No depth exceeds the layer's, even if a foot is hidden where parts of a solid overlap."""
         parts, first_row = [], 0.5 * self.spacing
         for depth, weight in zip(layers.depths, layers.weights, strict=True):
             found = self.beneath(depth)
@@ -334,19 +334,19 @@ class ExposedSurface:
         return WallPoints.joined(parts)
 
     def owners(self, walls: WallPoints) -> Numbers:
-        """Return the index (b,) into `solids` of the one that each wall particle belongs to."""
+        """Return the index (b,) into `solids` of each wall particle's solid."""
         return np.asarray(self.owner[self._tree.query(walls.positions + walls.feet)[1]])
 
     def beneath(self, depth: float) -> SurfacePoints:
-        """Return points about a spacing apart, ``depth`` [m] beneath the surface, or in the middle of thinner parts,
-        except where the container keeps its walls."""
+        """Return points about a spacing apart, ``depth`` [m] below the surface, or in the middle of thinner parts.
+        Points where the container keeps its wall particles are left out."""
         points = np.concatenate([self._at(depth), self._in_the_middle(depth)])
         points = points[_within_a_period(points, self.lower, self.room.periods, 0.0) & ~self.container.keeps(points)]
         found = evenly_chosen(points, self._fine, DENSITY * self.spacing)
         return SurfacePoints(found.points, found.shares * DENSITY ** (points.shape[1] - 1))
 
     def _at(self, depth: float) -> Points:
-        """Return fine points (n, d) [m] at a depth."""
+        """Return fine points (n, d) [m] at a depth below the surface."""
         fine, found = self._fine, []
         if not len(self.feet):
             return self.feet
@@ -372,8 +372,8 @@ class ExposedSurface:
         return np.concatenate([np.zeros((0, self.feet.shape[1])), *found])
 
     def _feet_of(self, points: Points, reach: Points, nearest: Numbers) -> Points:
-        """Return the points (n, d) [m] of the surface, on a solid or where two of them meet, that are nearest to points
-        (n, d) [m] beneath it. ``nearest`` (n,) are the nearest of the fine points, ``reach`` (n,) [m] away."""
+        """Return the nearest points (n, d) [m] of the surface, on a solid or where two solids meet, to points (n, d)
+        [m] below it. ``nearest`` (n,) are the nearest fine points, at distances ``reach`` (n,) [m]."""
         fine = self._fine
         found, owner = self.feet[nearest], self.owner[nearest]
         best, furthest = np.full(len(points), np.inf), float(reach.max(initial=0.0)) + fine
@@ -393,7 +393,7 @@ class ExposedSurface:
 
     def _edges(self, feet: Points, owner: Numbers) -> Points:
         """Return points (n, d) [m] near feet (n, d) [m] where the solid of each foot, ``owner`` (n,), meets the next
-        one: the feet, moved to one surface and the other in turn."""
+        solid: the feet, moved onto one surface and the other in turn."""
         distances = np.abs([solid.distance(feet) for solid in self.solids])
         distances[owner, np.arange(len(feet))] = np.inf
         other, found = np.argmin(distances, axis=0), feet.copy()
@@ -406,41 +406,41 @@ class ExposedSurface:
         return np.where(near[:, None], found, feet)
 
     def _in_the_middle(self, depth: float) -> Points:
-        """Return points (n, d) [m] beneath those feet of which another part of the surface is nearer than a depth [m]:
-        as deep as the foot is the nearest point."""
+        """Return points (n, d) [m] below those feet for which another part of the surface is closer than a depth [m]:
+        as deep as possible with the foot still the nearest point."""
         thin = np.flatnonzero(~self._is_nearest(slice(None), np.full(len(self.feet), depth)))
         ends = np.zeros(len(thin)), np.full(len(thin), depth)
         low, _ = bisected(lambda depths: self._is_nearest(thin, depths), *ends, EXPOSED_HALVINGS)
         return np.asarray(self.feet[thin] - low[:, None] * self.away[thin])
 
     def _is_nearest(self, which: Any, depths: Points) -> np.ndarray:
-        """Test (n,) whether a foot is the surface nearest to the point at a depth (n,) [m] beneath it."""
+        """Test (n,) whether each foot is the nearest point of the surface to the point at a depth (n,) [m] below it."""
         distances = self._tree.query(self.feet[which] - depths[:, None] * self.away[which])[0]
         return np.asarray(distances > depths - TOLERANCE * self.spacing)
 
 
 def _within_a_period(points: Points, lower: Points, periods: Points, reach: float) -> Which:
-    """Test (n,) which points (n, d) [m] are no more than ``reach`` [m] outside of periods that begin at ``lower``."""
+    """Test (n,) which points (n, d) [m] are at most ``reach`` [m] outside of periods that start at ``lower``."""
     within = (points >= lower - reach) & (points < lower + periods + reach)
     return np.asarray((within | (periods == 0.0)).all(axis=1))
 
 
 def _is_exposed(feet: Points, away: Points, room: Room, spacing: float) -> Which:
-    """Test (n,) which points of surfaces (n, d) [m], with unit vectors (n, d) away from them, a room's fluid can
+    """Test (n,) which points of surfaces (n, d) [m], with unit vectors (n, d) away from the solids, fluid in a room can
     touch."""
     return room.contains(feet + 2.0 * MARGIN * spacing * away, -MARGIN * spacing)
 
 
 def solid_places(solid: Solid, spacing: float, reach: float) -> Places:
-    """Return places half a spacing, one and a half, ... up to ``reach`` [m] from a solid, where a lattice that is
-    turned as the surface is may rest."""
+    """Return points half a spacing, one and a half, ... up to ``reach`` [m] from a solid, where a lattice aligned with
+    the surface may rest."""
     heights = spacing * (np.arange(int(np.ceil(reach / spacing - 0.5))) + 0.5)
     points = np.concatenate([surface_points(solid, spacing, -height).points for height in heights])
     return Places(points, frames(solid.outward(points)))
 
 
 def frames(normals: Points) -> Points:
-    """Return axes (n, d, d), a unit vector a row, of which the first are unit vectors (n, d)."""
+    """Return axes (n, d, d), one unit vector in each row; the first ones are the given unit vectors (n, d)."""
     if normals.shape[1] == 2:
         return np.stack([normals, normals[:, ::-1] * np.array([-1.0, 1.0])], axis=1)
     least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]

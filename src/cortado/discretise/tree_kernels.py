@@ -1,11 +1,11 @@
-"""Questions to surfaces, in float64: the nearest point of a tree of triangles, how often the surface goes around a
-point, and which segments go through a sheet.
+"""Queries on surfaces, in float64: the nearest point of a tree of triangles, the winding number of a surface around a
+point, and which segments cross a sheet.
 
-Nodes are numbered as in a heap: those below node n are 2 n and 2 n + 1, and from ``leaves`` on nodes are leaves, of
-which the first has triangles ``starts[0]`` to ``starts[1]``.
+Nodes are numbered as in a heap: the children of node n are 2 n and 2 n + 1. Nodes from ``leaves`` on are leaves; the
+first leaf contains triangles ``starts[0]`` to ``starts[1]``.
 
-A sheet is an open surface of edges in the plane or of triangles in space: its faces. A segment that goes through the
-joint of two faces goes through the sheet, as faces reach a little beyond their edges.
+A sheet is an open surface of edges in the plane or of triangles in space: its faces. A segment through the joint of two
+faces crosses the sheet, because faces extend slightly beyond their edges.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from cortado.device.precision import FLOAT64, Precision, TypesByName
 from cortado.discretise.shapes import Points, in_space
 
 DEPTH = 32
-"""Number of nodes that may wait on the way down, more than a tree has levels."""
+"""Largest number of nodes on the search stack, more than a tree has levels."""
 real, vector = wp.float64, wp.vec3d
 box = wp.types.vector(length=6, dtype=wp.float64)
 """The type of a box: its lower and upper corner."""
@@ -33,7 +33,7 @@ typed = TypesByName(wp.int32, {**_kinds, wp.array2d(dtype=vector): "corners"})
 
 @wp.func
 def square_from_box(p: vector, b: box) -> real:
-    """Return the square of the distance from a box, 0 within."""
+    """Return the squared distance from a box, 0 inside."""
     square = real(0.0)
     for k in range(3):
         beyond = wp.max(wp.max(b[k] - p[k], p[k] - b[k + 3]), real(0.0))
@@ -74,8 +74,8 @@ def nearest_of_triangle(p: vector, a: vector, b: vector, c: vector) -> vector:
 @wp.kernel(module=_module, enable_backward=False)
 @typed.arrays
 def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach: real, nearest, squares):
-    """Find the nearest point of the triangles, and the square of its distance; the point itself and ``reach`` squared
-    where none is nearer than that."""
+    """Find the nearest point of the triangles and its squared distance. Without a triangle within ``reach``, the result
+    is the point itself and ``reach`` squared."""
     i = first + wp.tid()
     p = points[i]
     best = reach * reach
@@ -121,8 +121,8 @@ def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach:
 
 @wp.func
 def side_of_edge(p: vector, a: vector, b: vector) -> wp.int32:
-    """Return 1 where an edge that rises along the second axis is ahead of a point on the first one, -1 where one that
-    falls is, 0 elsewhere. Both triangles of an edge find the same but for the sign, whatever is rounded."""
+    """Return 1 if an edge rising along the second axis is ahead of a point along the first axis, -1 if a falling edge
+    is, otherwise 0. Both triangles of an edge get the same value up to the sign, despite rounding."""
     upwards = int(1)
     low = a
     high = b
@@ -139,7 +139,7 @@ def side_of_edge(p: vector, a: vector, b: vector) -> wp.int32:
 
 @wp.func
 def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
-    """Return 1 where a ray along the last axis leaves through a triangle, -1 where it enters, 0 elsewhere."""
+    """Return 1 if a ray along the last axis leaves through a triangle, -1 if it enters, otherwise 0."""
     around = side_of_edge(p, a, b) + side_of_edge(p, b, c) + side_of_edge(p, c, a)
     if around == 0 or p[2] > wp.max(a[2], wp.max(b[2], c[2])):
         return int(0)
@@ -153,7 +153,7 @@ def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
 @wp.kernel(module=_module, enable_backward=False)
 @typed.arrays
 def find_windings(first: int, points, boxes, starts, corners, leaves: int, windings):
-    """Compute winding numbers of closed surfaces about points: 1 within one with outward normals, 0 outside."""
+    """Compute winding numbers of closed surfaces about points: 1 inside a surface with outward normals, 0 outside."""
     i = first + wp.tid()
     p = points[i]
     total = int(0)
@@ -177,7 +177,7 @@ def find_windings(first: int, points, boxes, starts, corners, leaves: int, windi
 
 @wp.func
 def pierces(p: vector, q: vector, a: vector, b: vector, c: vector, tolerance: real) -> wp.bool:
-    """Test whether a segment goes through the inside of a triangle, and further than a tolerance to both sides."""
+    """Test whether a segment passes through the interior of a triangle, by more than a tolerance on both sides."""
     normal = wp.cross(b - a, c - a)
     size = wp.length(normal)
     above = wp.dot(normal, p - a)
@@ -203,7 +203,7 @@ def has(names: wp.vec3i, name: wp.int32) -> wp.bool:
 def some_edge_pierces(
     corners: wp.array2d(dtype=vector), names: wp.array(dtype=wp.vec3i), s: wp.int32, t: wp.int32, tolerance: real
 ) -> wp.bool:
-    """Test whether an edge of triangle s that has no vertex of triangle t goes through t."""
+    """Test whether an edge of triangle s, without a vertex of triangle t, passes through t."""
     found = wp.bool(False)
     for k in range(3):
         following = (k + 1) % 3
@@ -219,8 +219,8 @@ def some_edge_pierces(
 def find_crossings(
     first: int, points, boxes, starts, corners, leaves: int, names, tolerance: real, places, counts, others
 ):
-    """Find the triangles behind one that cross it, written to ``others`` from ``places`` on as far as there is room;
-    all have ``names`` of vertices. ``points`` are not looked at."""
+    """Find the later triangles that cross a given one, and write them to ``others`` from ``places`` on while there is
+    room. Triangles have ``names`` of vertices; ``points`` are not used."""
     i = first + wp.tid()
     low = wp.min(corners[i, 0], wp.min(corners[i, 1], corners[i, 2]))
     high = wp.max(corners[i, 0], wp.max(corners[i, 1], corners[i, 2]))
@@ -252,32 +252,32 @@ def find_crossings(
 
 
 MARGIN = {"float64": 1e-6, "float32": 1e-3}
-"""In spacings: by how much faces are wider than they are, more than round-off 1,000 spacings from the origin."""
+"""In spacings: widening of faces, more than the round-off 1,000 spacings from the origin."""
 AROUND = 1e-3
-"""In spacings: how far around a segment one looks for faces, in float32."""
+"""In spacings: distance around a segment within which faces are searched, in float32."""
 
 
 @cache
 def faces_type(precision: Precision) -> Any:
-    """Make the Warp struct of the faces of sheets, of one sheet after the other, each in the frame of its sheet."""
+    """Build the Warp struct with the faces of sheets, sheet after sheet, each in its sheet's frame."""
     real, vector = precision.real, precision.vector
 
     class Faces:
         trees: wp.array(dtype=wp.uint64)
-        """Of the boxes around the faces of each sheet."""
+        """Trees of the boxes around the faces, one for each sheet."""
         starts: wp.array(dtype=wp.int32)
         """Number of the first face of each sheet."""
         middles: wp.array(dtype=vector)
-        """Of each sheet, to which its faces are relative [m]."""
+        """Centre of each sheet, relative to which its faces are given [m]."""
         normals: wp.array(dtype=vector)
         """(faces,) unit vectors"""
         places: wp.array2d(dtype=vector)
         """(faces, 3) a point on each end or side of a face [m]"""
         inwards: wp.array2d(dtype=vector)
-        """(faces, 3) unit vectors from these into the face; 0 for a third one in the plane"""
+        """(faces, 3) unit vectors from these points into the face; in the plane the third is 0"""
         margin: real
         around: real
-        """[m]"""
+        """Distance around a segment within which faces are searched [m]."""
 
     Faces.__name__ = Faces.__qualname__ = f"Faces_{precision.name}"
     return wp.struct(Faces)
@@ -285,9 +285,9 @@ def faces_type(precision: Precision) -> Any:
 
 @cache
 def face_functions(precision: Precision) -> tuple[Any, Any, Any]:
-    """Make Warp functions, for places about the middle of sheet k: ``query``, which looks for its faces in the box
-    around two places and a way around them; ``meets``, whether a segment goes through a face; and ``goes_through``,
-    whether it does through any face of the sheet."""
+    """Build Warp functions for points relative to the centre of sheet k. ``query`` searches faces in the box around two
+    points, extended by a distance; ``meets`` tests whether a segment crosses a face; ``goes_through`` tests whether it
+    crosses any face of the sheet."""
     real, vector, faces_of = precision.real, precision.vector, faces_type(precision)
 
     @wp.func
@@ -324,8 +324,8 @@ def face_functions(precision: Precision) -> tuple[Any, Any, Any]:
 
 
 def faces_on(sheets: Sequence[tuple[Points, Points]], spacing: float, precision: Precision, device: Any) -> Any:
-    """Return the struct of the faces of sheets, by their corners (k, d, d) [m] and unit normals (k, d), beside
-    particles a spacing [m] apart, and the trees in it, which live as long as somebody has them."""
+    """Return the struct of the faces of sheets, from corners (k, d, d) [m] and unit normals (k, d), for particles with
+    a spacing [m]. Also return the trees inside it, which the caller must keep alive."""
     made, trees, middles, rows = faces_type(precision)(), [], [], []
     for corners, normals in sheets:
         middle = 0.5 * (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1)))
@@ -350,13 +350,13 @@ def faces_on(sheets: Sequence[tuple[Points, Points]], spacing: float, precision:
 
 
 def _three(rows: Points) -> Points:
-    """Return vectors (k, 2 or 3, 3) with rows of 0 behind them, (k, 3, 3)."""
+    """Pad vectors (k, 2 or 3, 3) with rows of 0 to (k, 3, 3)."""
     return np.pad(rows, [(0, 0), (0, 3 - rows.shape[1]), (0, 0)])
 
 
 @cache
 def find_crossing(precision: Precision = FLOAT64) -> Any:
-    """Make the kernel that tells which of some segments go through the one sheet that there is."""
+    """Build the kernel that tests which segments cross a single sheet."""
     goes_through, vector = face_functions(precision)[2], precision.vector
     typed = TypesByName(wp.bool, {faces_type(precision): "faces", vector: "starts ends"})
 

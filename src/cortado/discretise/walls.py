@@ -1,4 +1,4 @@
-"""Walls of boxes and cups, layer by layer, and what wall particles count for in the density, in float64."""
+"""Walls of boxes and cups, layer by layer, and the weights of wall particles in the density, in float64."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 
 
 def nearest_cells(length: float, spacing: float) -> int:
-    """Return the number of cells that fill a length [m] best, at least 1."""
+    """Return the number of cells, at least 1, that best fills a length [m]."""
     return max(int(np.floor(length / spacing + 0.5)), 1)
 
 
 def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, depth: float) -> Points:
     """Return one layer (n, d) around a box, ``depth`` outside of it: faces, edges and corners, each point once.
 
-    Along a face the points continue the lattice inside; an axis whose length is no multiple of the spacing is stretched
-    a little between its walls. A periodic axis has no wall. Axis by axis: outside on this axis, inside on those before
-    it, either on those after it.
+    Along a face the points continue the lattice inside; if an axis is no multiple of the spacing, they are slightly
+    stretched along it. A periodic axis has no wall. The points are built axis by axis: outside along this axis, inside
+    along earlier axes, either along later ones.
     """
     inside = [_cells(a, b, nearest_cells(b - a, spacing)) for a, b in zip(lower, upper, strict=True)]
     outside = [
@@ -37,10 +37,11 @@ def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: f
 
 
 def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: float) -> Points:
-    """Return the walls (n, 3) of an upright cup whose base is centred on the origin, the third axis along its height.
+    """Return the walls (n, 3) of an upright cup, with the centre of its base at the origin and its height along the
+    third axis.
 
-    The side: rings ``depth`` outside of the radius, about a spacing apart along and across. The base, and the lid if
-    there is one: the lattice that fluid in the cup has, ``depth`` outside, and a ring that continues the side.
+    The side consists of rings ``depth`` outside of the radius, about a spacing apart. Base and lid (if any) have the
+    lattice of fluid in the cup, ``depth`` outside, and a ring that continues the side.
     """
     side = ring(radius + depth, spacing)
     end = np.concatenate([disc(radius, spacing, 2), side])
@@ -62,34 +63,35 @@ def _cells(lower: float, upper: float, count: int) -> Points:
 
 
 def stacked(flat: Points, levels: Points) -> Points:
-    """Return a plane set of points (n, 2) repeated at every level, (levels n, 3)."""
+    """Repeat plane points (n, 2) at every level, and return them as (levels n, 3)."""
     return np.column_stack([np.tile(flat, (len(levels), 1)), np.repeat(levels, len(flat))])
 
 
 OVERLAP = 0.8
-"""Distance from the side of a cup, over the reach, up to which fluid on the base may rest upright."""
+"""Largest distance of resting, upright fluid from the side of a cup, as a fraction of the reach."""
 
 
 @dataclass(frozen=True)
 class Places(Rows):
-    """Places beside walls where fluid may rest, each with the axes of the lattice that it would rest on."""
+    """Positions beside walls where fluid may rest, each with the axes of the lattice on which it would rest."""
 
     points: Points
     """(n, d) [m]"""
     axes: Points
-    """(n, d, d) a unit vector a row"""
+    """(n, d, d) one unit vector in each row"""
 
     @classmethod
     def upright(cls, points: Points) -> "Places":
-        """Return places (n, d) [m] on lattices along the axes of space."""
+        """Return the points (n, d) [m] as places on lattices along the axes of space."""
         dimension = points.shape[1]
         return cls(points, np.broadcast_to(np.eye(dimension), (len(points), dimension, dimension)))
 
 
 def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, reach: float) -> Places:
-    """Return places less than ``reach`` [m] from a wall of a box, the first of them half a spacing from it.
+    """Return places less than ``reach`` [m] from a wall of a box, starting half a spacing from the wall.
 
-    Axis by axis: near a wall on this axis, far from all on those before it, anywhere on those after it.
+    They are built axis by axis: near a wall along this axis, far from walls along earlier axes, anywhere along later
+    ones.
     """
     every = [_between(a, b, open_axis, spacing) for a, b, open_axis in zip(lower, upper, periodic, strict=True)]
     beside = [
@@ -102,11 +104,11 @@ def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: 
 
 
 def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: float) -> Places:
-    """Return places less than ``reach`` [m] from a wall of an upright cup whose base is centred on the origin, the
-    third axis along its height.
+    """Return places less than ``reach`` [m] from a wall of an upright cup, with the centre of its base at the origin
+    and its height along the third axis.
 
-    Along the side the lattices are turned as the side is; on the base, up to where the side is hardly seen, they are
-    those of fluid in the cup. The uppermost part of an open cup, which may overflow, has none.
+    Along the side, lattices are aligned with the side. On the base they are those of fluid in the cup, as far as the
+    side has little influence. The top of an open cup, which may overflow, has no places.
     """
     levels = _between(0.0, height, False, spacing)
     closed = levels if lid else levels[levels < height - reach]
@@ -123,7 +125,7 @@ def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: f
 
 
 def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Points:
-    """Return places along an axis: from each wall on, a spacing apart, or evenly along a period."""
+    """Return coordinates along an axis: a spacing apart from each wall on, or evenly spaced along a period."""
     count = nearest_cells(upper - lower, spacing)
     cells = np.arange(count, dtype=np.float64) + 0.5
     if periodic:
@@ -132,20 +134,20 @@ def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Poin
 
 
 ENDS = 6.0
-"""In supports: wall particles this far from an edge have the weight of further ones, to 1e-6 of it and better."""
+"""In supports: wall particles this far from an edge have the weight of further ones, to a relative 1e-6."""
 WHOLE = 1e-9
-"""In cells: by how much a side may be off a whole number of them."""
+"""In cells: tolerance within which a side counts as a whole number of cells."""
 
 
 def short_box(
     lower: Points, upper: Points, spacing: float, support: float
 ) -> tuple[Points, Callable[[Points], Points]]:
-    """Shorten a box between corners (d,) [m] to one whose wall particles have the same weights, which repeat far from
-    edges and corners. Returns its upper corner (d,) [m], and a function that takes points (n, d) [m] of the walls of
-    the long box to those of the shorter one.
+    """Shorten a box between corners (d,) [m] so that its wall particles have the same weights, which repeat far from
+    edges and corners. Returns its upper corner (d,) [m], and a function that maps points (n, d) [m] on the walls of the
+    long box to those of the shorter one.
 
-    Cells of a spacing [m], beside fluid with a support [m], are left out in the middle of long sides, of those that are
-    a whole number of cells.
+    Cells of a spacing [m] are removed from the middle of long sides that are a whole number of cells, for fluid with a
+    support [m].
     """
     ends, lengths = int(np.ceil(ENDS * support / spacing)), upper - lower
     cells = np.array([nearest_cells(length, spacing) for length in lengths])
@@ -163,9 +165,10 @@ def short_box(
 
 
 SHALLOW = 0.4
-"""Depth of the shallow layer, in spacings; there is one where the second lattice layer of the fluid sees the wall.
+"""Depth of the shallow layer, in spacings; it exists if the fluid's second lattice layer reaches the wall.
 
-At half a spacing the deep layer would have to be so steep that it lies where the kernel ends."""
+With a shallow layer at half a spacing, the deep layer would have to be so steep that it lies at the kernel's edge.
+"""
 
 
 @dataclass(frozen=True)
@@ -190,8 +193,8 @@ class RestLattice:
         return self.kernel.weight(np.linalg.norm(separations, axis=1), self.dimension, self.support)
 
     def sums(self, separations: Points) -> Points:
-        """Return W, and the gradient of W times the spacing, (m, 1 + d), at separations (m, d) [m], both over the sum
-        of W on the lattice [-]."""
+        """Return W, and the gradient of W times the spacing, (m, 1 + d), at separations (m, d) [m]; both divided by the
+        sum of W on the lattice [-]."""
         gradients = self.kernel.gradient(separations, self.support)
         both = np.column_stack([self.weights(separations), self.spacing * gradients])
         return np.asarray(both / self.weights(self.offsets).sum())
@@ -206,7 +209,7 @@ class RestLattice:
         return float(self.weights(self._to_plane(distance)).sum())
 
     def plane_slope(self, distance: float) -> float:
-        """Return the derivative of `plane_weight` by the distance [1 / m^(d + 1)]."""
+        """Return the derivative of `plane_weight` with respect to the distance [1 / m^(d + 1)]."""
         return float(self.kernel.gradient(self._to_plane(distance), self.support)[:, 0].sum())
 
 
@@ -217,17 +220,17 @@ class WallLayers:
     depths: tuple[float, ...]
     """Distances behind the surface of the container [m]."""
     weights: tuple[float, ...]
-    """Weights of a particle of each layer in the density, a fluid particle being 1."""
+    """Weight in the density of a particle of each layer, a fluid particle being 1."""
 
 
 def wall_layers(lattice: RestLattice) -> WallLayers:
-    """Find the layers that meet these conditions at a flat wall, with fluid on the lattice from half a spacing on:
+    """Find the layers that meet these conditions at a flat wall, for fluid on a lattice that starts at half a spacing:
 
     - the fluid has the rest density (Band et al. 2018 scale volumes for that), in its first layer and in its second;
     - a uniform pressure pushes no particle of the first layer. The contribution of a wall to the density of a particle
       is steep enough to balance the pressure of the particle and of all its neighbours.
 
-    One layer is enough where the second layer of the fluid does not see the wall, with a support of up to two spacings.
+    One layer is enough if the second layer of fluid does not reach the wall: with supports of up to two spacings.
     """
     spacing, support, weight, slope = lattice.spacing, lattice.support, lattice.plane_weight, lattice.plane_slope
     below = spacing * np.arange(1, int(support / spacing) + 2)  # the lattice planes that the first layer misses
@@ -241,7 +244,7 @@ def wall_layers(lattice: RestLattice) -> WallLayers:
         return np.array([SHALLOW * spacing, deepest] if two else [deepest])
 
     def weights(deepest: float) -> np.ndarray:
-        """Return weights with which the first layers of the fluid, as many as the wall has, have the rest density."""
+        """Return weights that give the rest density to as many first layers of the fluid as the wall has layers."""
         layers = depths(deepest)
         seen = [[weight(height + depth) for depth in layers] for height in heights[: len(layers)]]
         return np.linalg.solve(np.array(seen), missing[: len(layers)])
@@ -257,30 +260,30 @@ def wall_layers(lattice: RestLattice) -> WallLayers:
 
 
 STIFFNESS = 3e-3
-"""How much a weight resists a change, relative, beside an error of the density: where densities leave a weight open it
-stays that of a flat wall."""
+"""Penalty on the relative change of a weight, compared with an error of the density. Where densities do not determine a
+weight, it stays that of a flat wall."""
 UNEVEN_STIFFNESS = 0.06
-"""This resistance where particles are not on a lattice. With 0.003 some of them have no weight, and fluid passes
+"""The same penalty for particles off a lattice. With 0.003 some of them would get no weight, and fluid would leak
 there."""
 LEAST, ROUNDS = 0.6, 4
-"""Of a weight over that of a flat wall, where particles are not on a lattice; rounds in which weights that would be
-less are set to it, and the others found anew."""
+"""Least weight of particles off a lattice, relative to a flat wall's. Also the rounds in which smaller weights are set
+to it, and the others are computed again."""
 BALANCE = 0.02
-"""Weight of the push of a uniform pressure beside an error of the density. Densities alone hardly say how steep two
-layers are: round a cup they would make them so shallow that fluid passes. At 0.1 corners would be too dense."""
+"""Weight of the push of a uniform pressure, compared with an error of the density. Densities alone hardly determine the
+slopes of two layers: around a cup they would become so shallow that fluid leaks. At 0.1 corners would be too dense."""
 RAISED = 3.0
-"""In spacings: how far along the first axis of a place, away from a solid, one looks how much room there is."""
+"""In spacings: distance along the first axis of a place, away from a solid, over which free room is measured."""
 CHUNK = 4096
-"""Number of places that are looked at at a time: bounds the memory."""
+"""Number of places processed at a time, to limit the memory."""
 
 
 Crossed = Callable[[Points, Points], Which]
-"""Tells which segments between points (n, d) [m] go through a sheet."""
+"""A test of which segments between points (n, d) [m] cross a sheet."""
 
 
 def _missing(lattice: RestLattice, places: Places, room: Room, crossed: Crossed | None) -> Points:
-    """Return for each of n places the part (n, 1 + d) of the `RestLattice.sums` that lattice points outside of the room
-    contribute, and those behind a sheet. A point near the boundary counts by the part of its cell that is outside."""
+    """Return, for each of n places, the part (n, 1 + d) of the `RestLattice.sums` from lattice points outside of the
+    room or behind a sheet. Points near the boundary count by the fraction of their cell that is outside."""
     offsets = lattice.offsets
     cells = places.points[:, None] + offsets @ places.axes
     raised = places.points + RAISED * lattice.spacing * places.axes[:, 0]
@@ -298,8 +301,8 @@ def _missing(lattice: RestLattice, places: Places, room: Room, crossed: Crossed 
 
 
 Fit = Callable[["csr_array", Points], Points]
-"""Finds changes (b,) of weights, relative to those of a flat wall, given a matrix (m, b) and what its product with them
-is to be, (m,)."""
+"""A function that finds relative changes (b,) of flat-wall weights, given a matrix (m, b) and the wanted product (m,)
+with them."""
 
 
 def wall_weights(
@@ -315,22 +318,22 @@ def wall_weights(
 ) -> Points:
     """Compute the weights (b,) of wall particles in the density [-], a fluid particle being 1.
 
-    With them the lattice has the rest density at all places, and a uniform pressure pushes no particle less than a
-    spacing from a wall. Both hold as nearly as can be, in the sense of least squares: along faces, edges and corners,
-    in a cup, and across the seam of a period. Against the push, as in `wall_layers`, the wall's part in the gradient is
-    twice that of the fluid that is missing.
+    With these weights the lattice has the rest density at all places, and a uniform pressure pushes no particle less
+    than a spacing from a wall. Both conditions are met in the least-squares sense: along faces, edges and corners, in a
+    cup, and across the seam of a period. To balance the push, as in `wall_layers`, the wall contributes twice the
+    gradient of the missing fluid.
 
     Args:
         walls: (b, d) wall particles [m].
-        flat: (b,) their weights in a flat wall [-], or those that are known.
-        places: where fluid may rest.
-        lattice: of the fluid at rest.
-        room: where fluid may be.
-        lower: (d,) where the period begins [m].
-        fit: `even_changes`, or `uneven_changes` where particles are on no lattice.
-        known: how many of the wall particles, the last ones, have weights that are known.
-        crossed: of a sheet that these are the walls of, without those that are known. Fluid sees its particles through
-            it, and nothing else.
+        flat: (b,) their weights in a flat wall [-], or known weights.
+        places: places where fluid may rest.
+        lattice: the lattice of the fluid at rest.
+        room: the room for fluid.
+        lower: (d,) start of the period [m].
+        fit: `even_changes`, or `uneven_changes` for particles off a lattice.
+        known: number of wall particles, the last ones, with known weights.
+        crossed: the test for the sheet to which the wall particles belong, except the known ones. Fluid interacts with
+            them only through the sheet.
     """
     from scipy.sparse import vstack
 
@@ -358,8 +361,8 @@ def _demands(
     is_sheet: Which,
     crossed: Crossed | None,
 ) -> tuple["csr_array", Points]:
-    """Return a matrix (m, b) of sums over wall particles at places, by their weights over the flat ones, and the sums
-    (m,) that fluid at rest needs there."""
+    """Return a matrix (m, b) of sums over wall particles at places, as functions of weights relative to flat walls, and
+    the sums (m,) that fluid at rest needs there."""
     from scipy.sparse import coo_array, vstack
 
     place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, room.periods)
@@ -377,7 +380,7 @@ def _demands(
 
 
 def even_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Find changes of weights, a `Fit`, for wall particles on lattices, whose weights are at least 0."""
+    """Find changes of weights, a `Fit`, for wall particles on lattices; weights are at least 0."""
     from scipy.optimize import lsq_linear
     from scipy.sparse import eye_array, vstack
 
@@ -388,8 +391,8 @@ def even_changes(sums: "csr_array", wanted: Points) -> Points:
 
 
 def uneven_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Find changes of weights, a `Fit`, for particles that are about evenly spaced, whose weights are at least `LEAST`
-    of those of a flat wall."""
+    """Find changes of weights, a `Fit`, for evenly spaced particles off a lattice; weights are at least `LEAST` of
+    those of a flat wall."""
     from scipy.sparse.linalg import lsmr
 
     changes, free = np.zeros(sums.shape[1]), np.ones(sums.shape[1], dtype=bool)
