@@ -1,10 +1,11 @@
-"""A coarse correction of the pressure, so that water that is shut in knows of its walls within one step.
+"""A coarse correction of the pressure, by which enclosed water feels all of its walls within one step.
 
-An iteration of `cortado.solvers.projection.pressure` hands a pressure on by a spacing or two. Before each of them but
-the first, which has the pressure of the step before, the smooth part of what is missing is found at once, on a grid
-with nodes two spacings apart. Takahashi and Lin 2016 have a multilevel particle solver;
-`cortado.solvers.projection.coarse_pressure` has the equations of this one. Before the first as well it would cost twice
-as much and gain a tenth at most, but in a cold scene, which has no pressure of the step before.
+An iteration of `cortado.solvers.projection.pressure` spreads a pressure by only one or two spacings. So before each
+iteration a coarse correction computes the smooth part of the error at once, on a grid with nodes two spacings apart.
+The first iteration begins with the pressure of the previous step and needs no correction. Takahashi and Lin 2016 have a
+multilevel particle solver; `cortado.solvers.projection.coarse_pressure` has the equations of this one. Another
+correction before the first iteration would double the cost and gain a tenth at most; it is made only in a cold scene,
+which has no pressure of the previous step.
 """
 
 from collections.abc import Callable
@@ -36,12 +37,13 @@ from cortado.sph.moment_functions import matrix_type, round_off, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 LEAST = 1e-5
-"""The regularisation eps of all particles around a node, relative to A_II on the lattice. It takes 0.7 % off the
-correction of the longest wave in water that is 100 spacings deep, and 3 % where it is 200 deep."""
+"""The regularisation eps of all particles around a node, relative to A_II on the lattice. It reduces the correction of
+the longest wave by 0.7 % in water 100 spacings deep, and by 3 % in water 200 spacings deep."""
 CLOSE = 1e-3
 """Part of the first residual, in the norm of A^-1, at which a solve in float32 ends. Derivatives of a dam of 24 x 24
 after 80 steps, the rest in float64, agree with differences of the same run within 2e-4, and reverse with forward mode
-within 6e-5. All in float32 the gradient is 0.9 % off that in float64, and 0.03 % with 3e-7 and twice the iterations."""
+within 6e-5. Entirely in float32 the gradient differs by 0.9 % from the one in float64, and by 0.03 % with 3e-7 and
+twice the iterations."""
 MOST = 1_000
 """Greatest number of iterations of a solve."""
 
@@ -71,7 +73,7 @@ class Coarse:
         self._particles, self._kinds = layout, (real, vector, precision.pair)
         self._tolerance = CLOSE if precision is FLOAT32 else round_off(precision)
         self.bodies = None if bodies is None else CoarseBodies(bodies, layout, dimension)
-        """Free ones; None without any."""
+        """The free bodies; None without any."""
         rows = 0 if self.bodies is None else self.bodies.rows
         self._levels = Levels(precision, dimension, grid.shape, layout.members, device, rows)
         self._parts = wp.zeros((2**dimension, len(self._levels.r)), dtype=real, device=device)
@@ -79,24 +81,25 @@ class Coarse:
         energy = 8.0 / 3.0 * (SPACING / spacing**2 if dimension == 3 else spacing**-2)  # of the gradient of a hat
         touched = (2.0 * SPACING) ** dimension
         self.spaced = {"spacing": spacing}
-        """As kernels call it."""
+        """The spacing by the name of its kernel argument."""
         self.grid = {"grid": self._sort.grid, "order": self._sort.order, "eps": LEAST * energy / touched}
-        """As kernels call them."""
+        """The grid's data by the names of kernel arguments."""
         self.pushed = layout.arrays(h=vector, N=matrix_type(precision), T=symmetric(precision).kind)
         """h, N and c L of the sorted particles."""
         self.sums, self.parts = layout.sum_of(precision.pair), layout.arrays(parts=precision.pair)
-        """Of alpha."""
+        """Both sums whose ratio is alpha, and each particle's terms in them."""
         self.warm, self._none_stays = (wp.zeros(layout.members, dtype=wp.int32, device=device) for _ in range(2))
-        """Whether scenes are (`cortado.solvers.projection.pressure`)."""
+        """By scene, whether it is warm (`cortado.solvers.projection.pressure`); and zeros for the argument
+        ``stays``."""
         self._all_warm = wp.zeros(1, dtype=wp.int32, device=device)
         self._none = self.numbers()
-        """Nothing: what a correction left may not be finite, if its run was lost."""
+        """Zeros, used instead of the results of an earlier correction: those may not be finite if its run was lost."""
         self.still = layout.arrays(still=vector)["still"]
-        """No velocities."""
+        """Zero velocities."""
         self.unmoved = {"carried": layout.arrays(carried=real)["carried"]}
-        """What a scene without bodies has of them."""
+        """Zeros for the terms of bodies in a scene without bodies."""
         self.source = layout.arrays(s_value=real, s_slope=vector, s_bent=vector, s_own=real)
-        """What is spread."""
+        """The particles' source that is spread to nodes."""
 
     def numbers(self) -> wp.array:
         """Make an array (nodes,) of zeros for the nodes of all scenes."""
@@ -109,7 +112,8 @@ class Coarse:
         return {**kept, "e": self.numbers(), "sums": wp.zeros(layout.members, dtype=pair, device=layout.device)}
 
     def begin(self, context: StepContext, around: Named) -> None:
-        """Compute the matrix of a step, and note whether all scenes are warm and need no first correction."""
+        """Compute the matrix of a step, and record whether all scenes are warm, so that no first correction is
+        needed."""
         if self.endless:
             return
         scenes = {"scenes": len(self.warm), "warm": self.warm}
@@ -125,7 +129,7 @@ class Coarse:
 
     def where_due(self, k: int, correct: Callable[[], None]) -> None:
         """Call ``correct`` before iteration k, before the first one only if a scene is cold. An endless scene has no
-        correction, as the level that it would give to pressures moves particles that are not on a lattice."""
+        correction: it would change the level of pressures, which moves particles that are not on a lattice."""
         if self.endless:
             return
         if k > 0:
@@ -134,7 +138,7 @@ class Coarse:
             wp.capture_if(self._all_warm, on_false=correct)
 
     def solve(self, context: StepContext, before: wp.array, e: wp.array) -> None:
-        """Write to ``e`` (nodes,) the solution of A e = the `source`, spread with the e ``before``."""
+        """Write to ``e`` (nodes,) the solution of A e = s, where s is the `source` spread with the e ``before``."""
         parts, r = self._parts, self._levels.r
         context.launch(self.nodes.spread, self.grid, self.source, e=before, parts=parts, threads=len(r))
         context.launch(self.nodes.gather, self.grid, parts=parts, r=r, threads=len(r))
@@ -142,7 +146,8 @@ class Coarse:
 
     def correct(self, context: StepContext, k: int, around: Named, at: Named, new: Named, T: wp.array) -> None:
         """Correct the pressure before iteration k: from an iterate ``at`` with A and divergence, write k, y and u of a
-        ``new`` one, which has `room` for the rest. ``around`` has the drift of walls; ``T`` is overwritten."""
+        ``new`` iterate, which has `room` for further results. ``around`` has the drift of walls; ``T`` is
+        overwritten."""
         context.launch(self.residual.forward, around, at, self.source, r=new["r"])
         self.solve(context, self._none, new["e"])
         own = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
@@ -160,7 +165,7 @@ class Coarse:
         return {"first": int(k == 0), "stays": self.warm if k == 0 else self._none_stays}
 
     def carried(self, context: StepContext, change: wp.array) -> dict[str, wp.array]:
-        """Return the divergence G d that a pressure change d takes away by moving free bodies."""
+        """Return the divergence G d that a pressure change d removes by moving free bodies."""
         return self.unmoved if self.bodies is None else {"carried": self.bodies.carried(context, change)}
 
 
@@ -241,8 +246,8 @@ class CoarseAdjoint:
         u_bar: wp.array,
     ) -> None:
         """Apply the adjoint of the correction before iteration k: from k_bar and y_bar of the ``new`` iterate, in
-        ``steps``, and ``u_bar``, to k and y of the iterate ``at``. It adds to d_bar and S there, which give the rest of
-        the adjoint of u."""
+        ``steps``, and ``u_bar``, to k and y of the iterate ``at``. Also add to its d_bar and S, from which the rest of
+        the adjoint of u is computed."""
         own, through, found = self._coarse, self._through, self._steps
         left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
         bars = {"k_out_bar": steps["k_bar"], "y_bar": steps["y_bar"], "u_bar": u_bar}

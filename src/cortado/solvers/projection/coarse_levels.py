@@ -1,11 +1,11 @@
-"""Ever coarser grids, which make the solves on the coarse grid of the pressure take few iterations.
+"""A multigrid of ever coarser grids, by which solves on the coarse grid of the pressure take few iterations.
 
-Each level has half of the nodes of the finer one along every axis that has an even number of them. The matrix of each
-is R A R^T (Galerkin), with the matrix A of the finer level and bilinear R; like A, it is a sum over cells. The solve
-(`cortado.solvers.projection.coarse_solve`) smooths it by steps of Jacobi's method, x + w (r - A x), with
-w_I = W / (sqrt(A_II) sum_J |A_IJ| / sqrt(A_JJ)). With W below 2 that converges for every matrix that is symmetric and
-not negative. With W = 1, w A has no eigenvalue above 1 (Baker, Falgout, Kolev and Yang 2011, applied to the matrix
-whose diagonal is scaled to 1). The grids wrap around as those of cells do.
+Each level has half of the nodes of the finer level along every axis with an even number of nodes. The matrix of each is
+R A R^T (Galerkin), with the matrix A of the finer level and bilinear R; like A, it is a sum over cells. The solve
+(`cortado.solvers.projection.coarse_solve`) smooths it by steps of Jacobi's method, x + w (r - A x), with w_I = W /
+(sqrt(A_II) sum_J |A_IJ| / sqrt(A_JJ)). With W below 2 this converges for every symmetric positive semidefinite matrix.
+With W = 1, w A has no eigenvalue above 1 (Baker, Falgout, Kolev and Yang 2011, applied to the matrix whose diagonal is
+scaled to 1). The grids are periodic, as grids of cells are.
 """
 
 from functools import cache
@@ -23,7 +23,7 @@ from cortado.solvers.projection.coarse_solve import BLOCK, solve_kernel, system_
 from cortado.sph.parts import StepContext
 
 FEWEST = 4
-"""Fewest nodes along an axis that a coarser grid may halve."""
+"""Least number of nodes along an axis that a coarser grid may halve."""
 W = wp.constant(1.9)
 
 
@@ -31,11 +31,11 @@ class LevelKernels(NamedTuple):
     """Kernels that make the matrices of ever coarser grids."""
 
     coarsen: Any
-    """The parts of a level's matrix that its cells add, from those of the ``fine`` level."""
+    """Computes the cells' parts of a level's matrix from the cells' parts of the ``fine`` level."""
     fill: Any
-    """The matrices of all levels, from the parts of their cells."""
+    """Computes the matrices of all levels from the parts of their cells."""
     weigh: Any
-    """The weight w of each node of all levels, 0 where there is no matrix."""
+    """Computes the weight w of each node of all levels; w is 0 where the matrix is 0."""
 
 
 @cache
@@ -50,8 +50,8 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
 
     @wp.struct
     class Place:
-        """A node: its number in its level, and where it is. Also how many nodes finer levels have, how many its level
-        has in all scenes, the number of its scene's first node, and the shape of the level."""
+        """A node: its number in its level, and its place. Also the number of nodes of finer levels, the number of nodes
+        of its level in all scenes, the number of its scene's first node, and the shape of its level."""
 
         start: int
         all: int
@@ -165,7 +165,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
 
 
 def pairs_of_corners(dimension: int) -> int:
-    """Return the number of pairs of a cell's corners, those of a corner with itself among them."""
+    """Return the number of pairs of a cell's corners, including pairs of a corner with itself."""
     return 2**dimension * (2**dimension + 1) // 2
 
 
@@ -213,7 +213,7 @@ class Levels:
         self.cells, self.r = self.levels[0].cells, residual[: counts[0]]
         """(pairs, cells) the parts of the matrix that cells of the finest grid add; (nodes,) the right-hand side."""
         self.B = numbers(rows * counts[0]).reshape((rows, counts[0]))
-        """(rows, nodes) of which B^T B is added to that matrix."""
+        """(rows, nodes) the matrix B; B^T B is added to the finest matrix."""
         self.count = wp.zeros(members, dtype=wp.int32, device=device)
         """(members,) iterations of the last solve."""
         table = [[*n, *factor] for n, factor in zip(shapes, factors, strict=True)]

@@ -1,7 +1,7 @@
-"""Hat functions at the nodes of a grid, as a particle sees them and as a node sees its particles.
+"""Hat functions of a grid's nodes: their values at particles, and sums over the particles around nodes.
 
-A node's hat phi is 1 there and falls to 0 at the nodes next to it, linearly along each axis. The cells of the grid are
-those of a `CellSort`; the node of the same number is at the lower corner of a cell.
+A node's hat phi is 1 at the node and falls linearly along each axis to 0 at the next nodes. The cells of the grid are
+those of a `CellSort`; node number k is at the lower corner of cell number k.
 
 Kernels of the nodes sum over the particles around each, also for the matrix A of
 `cortado.solvers.projection.coarse_pressure`.
@@ -20,21 +20,21 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.sph.moment_functions import matrix_type
 
 ALONE = 0.01
-"""The factor of h^2 in the term that holds the nodes around a particle."""
+"""The factor of h^2 in the regularisation of the nodes around a particle."""
 
 
 @dataclass(frozen=True)
 class NodeFunctions:
-    """Warp functions that number the nodes of a grid of some shape, which wraps around."""
+    """Warp functions that number the nodes of a periodic grid of any shape."""
 
     number_of: Any
-    """The number of a node, which may be as far outside as the grid is wide."""
+    """The number of a node, which may be outside of the grid by up to the grid's width."""
     node_of: Any
-    """The node of a number."""
+    """The node with a number."""
     step_of: Any
-    """The step from a node to one of its neighbours, itself among them, by the number of the step."""
+    """The step from a node to itself or to one of its neighbours, by the number of the step."""
     beside: Any
-    """The node a step away from another, of the same scene; both by their numbers among the nodes of all scenes."""
+    """The number of the node a step away from a given node of the same scene; nodes are numbered over all scenes."""
     corner_step: Any
     """The step from the lower corner of a cell to one of its corners."""
     pair_of: Any
@@ -89,15 +89,15 @@ class HatFunctions:
     """Warp functions that evaluate hat functions of a grid's nodes at particles."""
 
     hat: Any
-    """phi, its gradient and its mixed second derivatives, of one of the nodes at the corners of a position's cell."""
+    """phi, its gradient and its mixed second derivatives, for a node at one of the corners of a position's cell."""
     at: Any
     """A sum of hats at a particle with its derivatives: E, G and H of values e at nodes."""
     products: Any
-    """The sum of e u over the nodes that a particle touches."""
+    """The sum of e u over the nodes whose hats are not 0 at a particle."""
     bend: Any
     """H v"""
     held: Any
-    """The term eps + h^2 / 100, by which a particle holds the nodes around it."""
+    """The regularisation eps + h^2 / 100 by which a particle keeps the values at nodes around it small."""
 
 
 @cache
@@ -191,11 +191,11 @@ class NodeKernels:
     """Kernels that sum over the particles around each node of the coarse grid."""
 
     add_up: Any
-    """The part of A that the particles of a cell add, for each two of its corners."""
+    """Computes the terms of a cell's particles in A, for each pair of the cell's corners."""
     spread: Any
-    """The part of a sum over particles that those of a cell add, for each of its corners."""
+    """Computes the terms of a cell's particles in a sum over particles, for each of the cell's corners."""
     gather: Any
-    """The sum over particles at each node, from the parts of cells."""
+    """Computes the sum over particles at each node from the terms of cells."""
 
 
 @cache

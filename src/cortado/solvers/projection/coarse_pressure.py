@@ -9,31 +9,30 @@ With the share c of each particle, and N and h of `cortado.solvers.projection.co
     y' = y + alpha d,   u' = u - alpha D^T d / m,
     alpha = sum_i (r_i d_i + l_i) / sum_i (|D^T d|^2 / m + l_i), from 0 to 1,   l_i = m_i (1e-6 s / dt)^2.
 
-S is a smoothstep from -1e-6 to 1e-6 of dt (D u - b): 1 for a compression, and 0 for a tension.
-But for l, alpha is the step along d after which the kinetic energy is least, so that a correction adds none, whatever
-the clamp leaves of it. Where it is next to nothing, as in fluid that falls freely, alpha is 1 by l, and y' follows a
-small change of u linearly. Before the first iteration, l is in the second sum alone, and alpha is 0 there: a small
-change of u makes a pressure in a step, so that the next one is not cold. Free bodies add to A and to what alpha divides
-by.
+S is a smoothstep from -1e-6 to 1e-6 of dt (D u - b): 1 for compression, 0 for tension. Without l, alpha would be the
+step along d that minimises the kinetic energy, so that a correction never adds energy, whatever the clamp changes. If
+the correction is nearly 0, as in free fall, l makes alpha 1, and y' follows a small change of u linearly. Before the
+first iteration l is only in the second sum, which makes alpha 0 in free fall: a small change of u makes a pressure in a
+step, so that the next step is not cold. Free bodies add terms to A and to the denominator of alpha.
 
-eps makes e small at nodes that few particles touch. So does h^2 / 100, which is next to nothing in fluid and beside
-walls that close it. Where a particle has a wall beside it and no fluid, the nodes around it have a single equation
-between them. Without these terms, solves would take hundreds of iterations there, as in dams that have run out.
-Everything goes between nodes and particles in two ways: `spread` sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i +
-e_I o_i over the particles of the cells around a node, in their order, and `at` gives E = sum_I phi_I e_I, its gradient
-G and its mixed second derivatives at a particle. With w = (N G + h E) / m, A e is `spread` of s = h . w, t = N^T w and
-o = (eps + h^2 / 100) / m.
+eps makes e small at nodes with few particles. So does h^2 / 100, which is nearly 0 in fluid and beside walls that
+enclose it. If a particle has a wall beside it and no fluid, the nodes around it share a single equation. Without these
+terms solves would then take hundreds of iterations, for example in dams that have run out. Two operations transfer
+values between nodes and particles: `spread` sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i over the
+particles of the cells around a node, in their order, and `at` gives E = sum_I phi_I e_I, its gradient G and its mixed
+second derivatives at a particle. With w = (N G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 /
+100) / m.
 
-With free bodies on the grid a light body gives way from the first step on. Pressure impulses y give a body the momenta
-F = sum_i y_i gamma_i and T = sum_i y_i r_i x gamma_i
-(`cortado.solvers.projection.body_kernels`). So they give it the velocities V = F / (rho K) and W = R' I^-1 R'^T T /
-rho, which take (G y)_i = gamma_i . (V + W x r_i) from the divergence of particle i. G is symmetric and not negative: y
-. G y is twice the kinetic energy that y gives to bodies at rest. On the grid it adds
+Free bodies are included on the grid so that a light body gives way from the first step on. Pressure impulses y give a
+body the momenta F = sum_i y_i gamma_i and T = sum_i y_i r_i x gamma_i (`cortado.solvers.projection.body_kernels`). So
+the body gets the velocities V = F / (rho K) and W = R' I^-1 R'^T T / rho, which reduce the divergence of particle i by
+(G y)_i = gamma_i . (V + W x r_i). G is symmetric and positive semidefinite: y . G y is twice the kinetic energy that y
+gives to bodies at rest. On the grid G adds
 
     B^T B,   B_I = (F_I / sqrt(rho K), S R'^T T_I / sqrt(rho)),   S S = I^-1,
 
-with F_I and T_I of y = phi_I c, to the matrix A: three rows for a body in the plane and six in space. Of a body that is
-held it is what is left of them (`cortado.sph.moving_solids`).
+with F_I and T_I of y = phi_I c, to the matrix A: three rows for a body in the plane and six in space. For a held body
+the smaller matrices of `cortado.sph.moving_solids` replace 1 / (rho K) and I^-1.
 """
 
 from dataclasses import dataclass
@@ -66,11 +65,11 @@ class CoarsePressureKernels:
     correct_tangent: Any
     """The tangent of d, given that of e."""
     source_tangent: Any
-    """The source that is spread for the tangent of e."""
+    """The source that is spread to nodes for the tangent of e."""
     correct_adjoint: Any
-    """From the adjoint of d to the source that is spread for the adjoint of e."""
+    """Computes, from the adjoint of d, the source that is spread to nodes for the adjoint of e."""
     source_adjoint: Any
-    """From lambda, A lambda = the adjoint of e, to the adjoints of all inputs."""
+    """Computes the adjoints of all inputs from lambda, the solution of A lambda = adjoint of e."""
 
 
 @cache
@@ -188,7 +187,7 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
 
 
 SMALL = 1e-6
-"""Speed, in spacings a step, of the kinetic energy that is added to the sums of alpha."""
+"""Speed, in spacings per step, whose kinetic energy is added to the sums of alpha."""
 
 
 @dataclass(frozen=True)
@@ -197,11 +196,11 @@ class LengthKernels:
     ``carried`` the G d of free bodies, see `cortado.solvers.projection.coarse_pressure`."""
 
     share: Kernels
-    """A particle's share of both sums of alpha; the adjoint starts from that of the sums."""
+    """A particle's terms in both sums of alpha; the adjoint starts from the adjoint of the sums."""
     apply: Kernels
-    """k', y' and u', given both sums, of whose adjoint particles' shares are written."""
+    """k', y' and u', given both sums; the adjoint writes particles' shares of the adjoint of the sums."""
     every: Any
-    """Tells whether all scenes of a batch are warm."""
+    """Tests whether all scenes of a batch are warm."""
 
 
 @cache
@@ -213,7 +212,7 @@ def length_kernels(precision: Precision) -> LengthKernels:
 
     @wp.func
     def length(sums: pair_of) -> real:
-        """Return alpha, the ratio of both sums within 0 and 1; NaN stays NaN, which must not be hidden."""
+        """Return alpha, the ratio of both sums limited to 0 ... 1; NaN stays NaN, so that it is not hidden."""
         found = sums[0] / sums[1]
         return wp.where(found <= real(0.0), real(0.0), wp.where(found >= real(1.0), real(1.0), found))
 
@@ -264,12 +263,12 @@ class CoarseBodyKernels:
     gather: Any
     """The rows of one body in the matrix B."""
     lift: Any
-    """The pressure c E that particles feel from the grid, times a factor."""
+    """The pressure c E of particles from the grid, times a factor."""
     lift_tangent: Any
     source_tangent: Any
-    """The part of c G c E in the source that is spread for the tangent of e."""
+    """The term of c G c E in the source that is spread to nodes for the tangent of e."""
     source_adjoint: Any
-    """The adjoints of c and x from that of c E."""
+    """Computes the adjoints of c and x from the adjoint of c E."""
 
 
 @cache
@@ -375,7 +374,7 @@ class CoarseBodies:
             context.launch(self.kernels.gather, grid, own, around, *known, B=B, threads=B.shape[1])
 
     def carried(self, context: StepContext, y: wp.array) -> wp.array:
-        """Return G y, the divergence that pressures y take away by moving bodies; the next call overwrites it."""
+        """Return G y, the divergence that pressures y remove by moving bodies; the next call overwrites it."""
         return self.bodies.drifted(context, self._none, y)
 
 
@@ -401,7 +400,7 @@ class CoarseBodiesTangent:
         return {"carried": carried, "carried_dot": change}
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], source: Named) -> None:
-        """Add the tangent of c G c E to the source that is spread for the tangent of e."""
+        """Add the tangent of c G c E to the source that is spread to nodes for the tangent of e."""
         kernels, lifted = self._own.kernels, self._lifted
         context.launch(kernels.lift, *known, lifted, factor=1.0)
         context.launch(kernels.lift_tangent, *known, lifted)
@@ -422,7 +421,7 @@ class CoarseBodiesAdjoint:
         self._bodies.carried(context, self._bar, carried_bar, y, y_bar)
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], e: wp.array, multiplier: wp.array) -> None:
-        """Add the adjoints of - lambda . c G c E, given the ``multiplier`` lambda, to those of all inputs."""
+        """Add the adjoints of - lambda . c G c E, given the ``multiplier`` lambda, to the adjoints of all inputs."""
         kernels, (lifted, lifted_bar, carried_bar) = self._own.kernels, self._lifted.values()
         context.launch(kernels.lift, *known, e=e, lifted=lifted, factor=1.0)
         context.launch(kernels.lift, *known, e=multiplier, lifted=carried_bar, factor=-1.0)

@@ -1,16 +1,16 @@
-"""What a smooth pressure on the coarse grid pushes a particle with, and the divergence that it is to take away.
+"""The force of a smooth pressure on the coarse grid on a particle, and the divergence that this pressure has to remove.
 
-Sums over neighbours are the push by the share c alone, and the moment that its gradient has. For a pressure
-k_j = c_j phi(x_j) with a linear function phi, and T = c L, D^T k of `cortado.solvers.projection.pressure` is exactly
+The sums over neighbours are the push h by a constant pressure c, and the moment N for its gradient. For a pressure k_j
+= c_j phi(x_j) with a linear function phi, and T = c L, D^T k of `cortado.solvers.projection.pressure` is exactly
 
     (D^T k)_i = N_i grad phi + phi(x_i) h_i,
     N_i = -sum_j (T_j g_ij) x_ij^T - sum_j' eta_j c_j g_ij' x_ij^T,
     h_i = sum_j T_j g_ij + T_i g_i + c_i gamma_i + sum_j' (eta_i c_i + eta_j c_j) g_ij',
 
-with the images j' of particles j, which count eta times (h in `cortado.solvers.projection.effects`). N is 1 inside of
-the fluid, and h is 0 there, and beside mirrors too. Beside wall particles it is not: with those in place of images a
-tank 20 spacings wide and 100 deep had 0.89 of its pressure in its first step, and has 0.99 with images. The residual r
-of `cortado.solvers.projection.coarse_pressure` is the divergence that the coarse pressure takes away.
+with the images j' of particles j, whose weight eta is called h in `cortado.solvers.projection.effects`. N is the unit
+matrix inside of the fluid; h is 0 there, and beside mirrors too, but not beside wall particles. With wall particles a
+tank 20 spacings wide and 100 deep had 0.89 of its pressure after its first step; with images it has 0.99. The residual
+r of `cortado.solvers.projection.coarse_pressure` is the divergence that the coarse pressure has to remove.
 """
 
 from functools import cache
@@ -32,8 +32,8 @@ from cortado.sph.moment_functions import cross_terms_function, matrix_type, mome
 @cache
 def coarse_sums(discretisation: Discretisation) -> Kernels:
     """Make the Warp functions of the sums over neighbours of the push by a coarse pressure. For T = c L they are sum
-    T_j g_ij, which T_i g_i and c_i gamma_i complete to h, and the rows of N. From the adjoints of h and N follow the
-    adjoint of x and the symmetric part of the adjoint of T, as its diagonal and its other entries."""
+    T_j g_ij, which is h without the terms T_i g_i and c_i gamma_i, and the rows of N. The adjoint turns adjoints of h
+    and N into the adjoint of x and the symmetric part of the adjoint of T, as diagonal and other entries."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair = pair_functions(discretisation)
     packed, cross_terms = symmetric(precision), cross_terms_function(precision)
@@ -68,8 +68,8 @@ def coarse_sums(discretisation: Discretisation) -> Kernels:
 
 @cache
 def coarse_image_sums(discretisation: Discretisation) -> Kernels:
-    """Make the Warp functions of what images add to the push by a coarse pressure: to h, and to the rows of N. The
-    adjoint is from those of h and N to that of eta_i c_i, and to that of x."""
+    """Make the Warp functions of the images' terms in the push by a coarse pressure: in h, and in the rows of N. The
+    adjoint turns adjoints of h and N into the adjoints of eta_i c_i and x."""
     (real, vector, _), pair = discretisation.types, pair_functions(discretisation)
     gradient, hessian_product, typed = pair.gradient, pair.hessian_product, types_by_name(discretisation.precision)
 
@@ -193,16 +193,16 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 
 CALM = 1e-6
-"""The divergence, times the time step, beyond which a tension does not count in r at all, and a compression wholly;
-between, its share is a smoothstep. Where fluid at rest is let go, the divergence beside upright walls is 0 to
-round-off, in float32 to 1e-7. A step of the share would be a kink there, and round-off would choose the slope."""
+"""Bound q on the divergence times the time step: r excludes tension beyond q and includes compression beyond q in full;
+between, the share is a smoothstep. When fluid at rest is released, the divergence beside upright walls is 0 to
+round-off, in float32 to 1e-7. A jump of the share would be a kink there, and round-off would choose the slope."""
 
 
 @cache
 def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the residual r, the part of the divergence that a coarse pressure is to take away, in 2 or 3
-    dimensions. The adjoint is from that of r to d_bar of D u and to S = d_bar L, which the adjoint of the pressure's
-    update uses."""
+    """Make the kernels of the residual r, the part of the divergence that a coarse pressure has to remove, in 2 or 3
+    dimensions. The adjoint turns the adjoint of r into d_bar, the adjoint of D u, and S = d_bar L, which the adjoint of
+    the pressure's update uses."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     sums = projection_sums(discretisation)

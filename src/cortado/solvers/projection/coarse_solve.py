@@ -2,10 +2,11 @@
 1952) with a V-cycle over the grids of `cortado.solvers.projection.coarse_levels`. The V-cycle is that of A alone: the
 few rows of B cost an iteration each, or less.
 
-One text of C++ serves both devices. On a CPU a thread solves for a scene. On a GPU a team of blocks does, which wait
-for one another between the phases of an iteration; levels with few nodes are the work of the first block of a team. A
-solve of twenty iterations has some hundred phases, which would be as many launches, each of which takes longer than its
-work. Sums are made of parts of `BLOCK` nodes, so that the same bits come back whatever the size of a team.
+One text of C++ serves both devices. On a CPU a thread solves for a scene. On a GPU a team of blocks solves for a scene;
+blocks wait for one another between the phases of an iteration, and the first block of a team processes levels with few
+nodes. A solve of twenty iterations has some hundred phases. As separate launches these would take longer to launch than
+to run. Sums are computed from partial sums over `BLOCK` nodes, so that results have the same bits for any size of a
+team.
 """
 
 from functools import cache
@@ -19,7 +20,7 @@ from cortado.device.precision import Precision
 BLOCK = 512
 """Threads of a block on a GPU."""
 ALONE = 4 * BLOCK
-"""Nodes of a level that one block works on, at most."""
+"""Greatest number of nodes of a level that one block processes alone."""
 
 ON_A_CPU = """
     const int first = thread, teams = system.members;
@@ -33,7 +34,7 @@ ON_A_CPU = """
     };
 """
 """Macros that the text of a solve needs: the scenes of a thread, `each` and `sum` over nodes, and `meet`, a barrier
-after which all see what others wrote."""
+after which each thread sees the values that other threads wrote."""
 ON_A_GPU = """
     __shared__ T room[BLOCK];
     const int first = blockIdx.x / system.team, teams = gridDim.x / system.team, rank = blockIdx.x % system.team;
@@ -210,20 +211,22 @@ SOLVE = """
         if (lead) system.count.data[member] = done;
     }
 """
-"""The native code of a solve, one scene after the other. An iteration ends where r z, of what nearly solves A z = r,
-has fallen by the square of a tolerance; nodes without a matrix have no weight, and get 0."""
+"""The native code of a solve, one scene after the other. Iterations end when r . z, with the V-cycle's approximate
+solution z of A z = r, has fallen by the square of a tolerance. Nodes where the matrix is 0 have the weight 0 and the
+result 0."""
 
 
 @cache
 def system_type(precision: Precision) -> Any:
-    """Make the struct of a solve's system: the matrices and the work arrays of all levels, one behind the other, each
-    with the nodes of all scenes."""
+    """Make the struct of a solve's system: the matrices and the work arrays of all levels, concatenated; each level has
+    the nodes of all scenes."""
     numbers = wp.array(dtype=precision.real)
 
     @wp.struct
     class System:
         shapes: wp.array(dtype=wp.int32)
-        """Six numbers for each level: nodes along each axis, and the ratios of the finer grid's numbers to them."""
+        """Six numbers for each level: the numbers of nodes along the axes, and the ratios of the finer grid's numbers
+        to these."""
         starts: wp.array(dtype=wp.int64)
         """The first node of each level."""
         members: wp.int32
@@ -244,11 +247,11 @@ def system_type(precision: Precision) -> Any:
         rows: wp.int32
         """Number of rows of B."""
         B: numbers
-        """Row by row, each with the nodes of all scenes."""
+        """The matrix B row by row; each row has the nodes of all scenes."""
         partial: numbers
         """Partial sums of blocks."""
         gate: wp.array(dtype=wp.int32)
-        """For each team, how many blocks wait at a barrier, and how often all have met."""
+        """For each team: the number of blocks that wait at a barrier, and the number of barriers passed."""
         count: wp.array(dtype=wp.int32)
         """(members,) iterations of the last solve."""
 
