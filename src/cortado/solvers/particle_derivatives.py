@@ -1,4 +1,4 @@
-"""Tangent and adjoint of what solvers of particles have in common; a solver adds those of its own loops."""
+"""Tangent and adjoint of the common base of solvers of particles; a solver adds the derivatives of its own loops."""
 
 from functools import partial
 from weakref import finalize
@@ -26,7 +26,7 @@ class ParticleTangent:
         self.carried_dot = Carried(solver.carried_fields, solver.layout)
         kick = solver.kick_of(self.carried_dot)
         self.dot = Tangents(fields, solver.new_fractions(), parameters_dot, bodies, kick)
-        """Of the sorted particles, once `sort` has been called, and of the parameters."""
+        """Tangents of the parameters, and after `sort` of the sorted particles."""
         self.density = solver.density.new_tangent()
         self._accelerations_dot = [solver.vectors() for _ in range(len(solver.forces) + 1)]
         finalize(self, solver.launch.forget)
@@ -95,7 +95,7 @@ class ParticleAdjoint:
         )
         """Adjoints; those of the parameters are complete after `collect`."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
-        """Of what the step carries on, once `unsort` has been called."""
+        """Adjoints of the fields that the step carries on, valid after `unsort`."""
         self.density, self._acceleration_bar = solver.density.new_adjoint(), solver.vectors()
         self._collect = CapturedGraph(partial(self.bar.shares.collect, self.bar.parameters), solver.launch)
         finalize(self, solver.launch.forget)
@@ -113,8 +113,8 @@ class ParticleAdjoint:
         return self.bar.parameters
 
     def unsort(self, context: StepContext, state_bar: State) -> State:
-        """Apply the adjoint of `ParticleSolver.unsort`: return adjoints of positions and velocities without what parts
-        prescribe, in the scene's order."""
+        """Apply the adjoint of `ParticleSolver.unsort`: return adjoints of positions and velocities before parts
+        prescribe values, in the scene's order."""
         self.carried_bar.sort(context, state_bar)
         free_bar = state_bar
         for part in self._parts:
@@ -123,13 +123,13 @@ class ParticleAdjoint:
 
     def begin_step(self, context: StepContext, free_bar: State, v_star: wp.array) -> None:
         """Write the adjoints of the fields of a step that ends with x' = x + dt v', given the result of `unsort`. v' is
-        the ``v_star`` of an explicit prediction; earlier values are overwritten."""
+        the ``v_star`` of an explicit prediction. Earlier values are overwritten."""
         scene = {"x_scene_bar": free_bar.positions, "v_scene_bar": free_bar.velocities}
         context.launch(self._solver.integration.begin_adjoint, *self.bar.named, v_star=v_star, **scene)
 
     def predict(self, context: StepContext, within: WithinBar | None = None) -> None:
-        """Apply the adjoint of a prediction v* = v + dt a, taken from the adjoint of velocities at that point, and of
-        `accelerate`; adjoints ``within`` the step are added."""
+        """Apply the adjoints of a prediction v* = v + dt a and of `accelerate`, starting from the adjoint of velocities
+        at that point; adjoints ``within`` the step are added."""
         fields = self.bar.fields
         if within is not None:
             add(within.v_star, fields["v"])
@@ -152,7 +152,7 @@ class ParticleAdjoint:
             part.sort(context, self.bar, state_bar)
 
     def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
-        """Apply the adjoint of `ParticleSolver.sort`, but for the sorting of parts' fields."""
+        """Apply the adjoint of `ParticleSolver.sort`, except the sorting of parts' fields."""
         solver, b = self._solver, self.bar.fields
         self.density.measure(context, self.bar)
         with context.aside():

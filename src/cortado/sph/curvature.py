@@ -11,25 +11,25 @@ b:
     k_i = (a_i / b_i) / (1 + delta a_i / b_i),   m_i times the acceleration = (sigma / J) k_i w_i q_i.
 
 g is the gradient of the colour of the fluid, which is 1 in it and 0 outside. Its average q (Shepard 1968) points into
-the fluid and forgets how the particles of a surface lie. The weight w tells the surface from the inside, and e is its
-normal. D B^-1 is the gradient of normals, corrected so that it is exact where they are linear (Bonet and Lok 1999). The
-particles that feel the force lie a mean depth delta below the surface, where a curvature of 1 / R is 1 / (R - delta): k
-is that of the surface. Over the layers of a flat surface w |q| adds up to J. Delta and J are from surfaces whose
-curvature is known. D comes as its symmetric part, which is all that the trace needs.
+the fluid and forgets how the particles of a surface lie. The weight w is 1 at the surface and 0 inside, and e is the
+surface's normal. D B^-1 is the gradient of normals, corrected so that it is exact where they are linear (Bonet and Lok
+1999). The force acts at a mean depth delta below the surface, where the curvature 1 / R of the surface becomes 1 / (R -
+delta); k is the curvature of the surface. Over the layers of a flat surface w |q| adds up to J. Delta and J were
+computed from surfaces of known curvature. Only the symmetric part of D is computed, because the trace needs no more.
 
-Tangents go the way of the sums, adjoints from the last one to the first. Each takes up the terms that the one before it
-adds to the adjoints of q, w, e, c, g and z. J is that of flat surfaces: a lattice is cut across an axis and across a
-diagonal of a plane. In a layer all particles are alike, so that the sums of a few layers are all that it takes.
+Tangents are computed in the order of the sums, adjoints in reverse order; each adjoint starts from terms that the
+previous one added to the adjoints of q, w, e, c, g and z. J is the mean of two flat surfaces: a lattice cut across an
+axis and across a diagonal of a plane. All particles of a layer are equal, so that sums over a few layers suffice.
 
-What delta has to make up for was found on discs and balls whose particles lie in concentric rings and shells, a spacing
-apart. It is in spacings, for every kernel with a support of 2.5 spacings or more within 0.05. The curvature is found
-`DEEP` below the surface, where it is greater. And w |q| adds up to 1 + `EXCESS` / R times J, as more of what surrounds
-a particle is outside of a curved surface. With delta = DEEP / (d - 1) + EXCESS, d - 1 being the number of curvatures in
-the sum, the pressure in a drop is (d - 1) sigma / R. But the force acts `ACTS` below the surface, where a wave of the
-surface moves less. The square of the frequency of the mode n would be n ACTS / R too small in the plane, and (n + 1)
-ACTS / R in space. A smaller delta raises pressures, and twice as much the force that a change of the curvature makes.
-So ACTS d / (3 (d - 1)) is taken off. Pressure and squared frequency of the mode 2 then err equally, in opposite
-directions. The error is 0.5 / R in the plane and 0.75 / R in space, and gets less where particles are finer.
+The constants in delta were fitted on discs and balls whose particles lie in concentric rings and shells, a spacing
+apart. They are in spacings, and within 0.05 for every kernel with a support of 2.5 spacings or more. The curvature is
+found `DEEP` below the surface, where it is greater. And w |q| adds up to 1 + `EXCESS` / R times J, because more of a
+particle's surroundings is outside of a curved surface. With delta = DEEP / (d - 1) + EXCESS, d - 1 being the number of
+curvatures in the sum, the pressure in a drop is (d - 1) sigma / R. But the force acts `ACTS` below the surface, where a
+wave of the surface moves less. The square of the frequency of the mode n would be n ACTS / R too small in the plane,
+and (n + 1) ACTS / R in space. A smaller delta raises pressures, and twice as much the force that a change of the
+curvature makes. So ACTS d / (3 (d - 1)) is subtracted from delta. Then the errors of pressure and of the squared
+frequency of mode 2 are equal and opposite: 0.5 / R in the plane and 0.75 / R in space, less with finer particles.
 """
 
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ class CurvatureConstants:
 
 
 def _indicator(size: np.ndarray) -> np.ndarray:
-    """Return w, how much a particle is part of the surface, from s |q|: 0 below `FAINT`, 1 above `CLEAR`."""
+    """Return w, the weight of a particle in the surface, from s |q|: 0 below `FAINT`, 1 above `CLEAR`."""
     t = np.clip((size - FAINT) / (CLEAR - FAINT), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
@@ -94,14 +94,14 @@ def _width(kernel: SmoothingKernel, support: float, dimension: int, cut: tuple[i
 
 
 FAINT, CLEAR = 0.03, 0.1
-"""s |q| below which a particle is no part of the surface, and above which all of it is."""
+"""s |q| below which the weight w of a particle is 0, and above which w is 1."""
 SINGULAR = {2: 1e-3, 3: 1e-4}
-"""By dimension, the number added to det B: neighbours may lie on a line, or be missing. There kappa is 0."""
+"""By dimension, the number added to det B, so that kappa is 0 if neighbours lie on a line or are missing."""
 LONE = 1e-6
-"""The number added to sum V W w: where no neighbour is part of the surface, the mean curvature is 0."""
+"""The number added to sum V W w, so that the mean curvature is 0 if no neighbour is part of the surface."""
 HOLLOW = 0.25
-"""delta kappa below which the depth of a hollow surface counts less, in a parabola, until it counts no more. Such are
-bubbles of a radius below 3 delta, in which the divisor 1 + delta kappa would be 0."""
+"""-delta kappa above which the divisor 1 + delta kappa of a hollow surface falls by a parabola to a constant above 0.
+Such surfaces are bubbles with a radius below 3 delta."""
 
 
 @cache
@@ -123,8 +123,8 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Si
 
     @wp.func(module=module)
     def normal_work(q: vector, spacing: real, w_bar: real, e_bar: vector) -> real:
-        """Return w w_bar + e . e_bar. Its gradient by q is the adjoint of q; with 0 for w_bar it is also the change of
-        e along e_bar, as that is symmetric."""
+        """Return w w_bar + e . e_bar. Its gradient with respect to q is the adjoint of q. With w_bar = 0 the gradient
+        is also the change of e along e_bar, because de / dq is symmetric."""
         w, e = normal(q, spacing)
         return w * w_bar + wp.dot(e, e_bar)
 
@@ -229,7 +229,7 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
     @fluid_sum(discretisation)
     @typed
     def bend_back(x_ij, e_i, e_j, w_i, w_j, B_bar_i, B_bar_j, D_bar_i, D_bar_j, s) -> tuple[vector, real, vector]:
-        """Return a pair's adjoints of e, w and x; in the sums of i it has w_j, in those of j w_i as a factor."""
+        """Return a pair's adjoints of e, w and x; its factor is w_j in the sums of i, and w_i in the sums of j."""
         g, turn = s.volume * gradient(x_ij, s), e_j - e_i
         moved = (w_j * B_bar_i + w_i * B_bar_j) * x_ij
         turned = w_j * D_bar_i + w_i * D_bar_j
@@ -264,7 +264,7 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 
 def entries(precision: Precision) -> dict[str, Any]:
-    """Return names and types of the arrays of particles that surface tension by curvature keeps, with c = w kappa."""
+    """Return names and types of the arrays of particles in surface tension by curvature; c is w kappa."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     vectors, matrices, numbers = dict.fromkeys("gqe", vector), dict.fromkeys("BD", matrix), dict.fromkeys("zwcab", real)
     return {**vectors, **matrices, **numbers}
@@ -273,8 +273,8 @@ def entries(precision: Precision) -> dict[str, Any]:
 @cache
 def curvature_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
     """Make the kernels of the four sums ``colour``, ``normal``, ``bend`` and ``mean``, in 2 or 3 dimensions, each with
-    its tangent and its adjoint, which comes after those of the later sums. The adjoint of ``mean`` has a first part
-    without neighbours. ``depth`` is delta and ``per_width`` 1 / J."""
+    its tangent and its adjoint. Adjoints run in reverse order; the adjoint of ``mean`` has a first part without
+    neighbours. ``depth`` is delta and ``per_width`` 1 / J."""
     precision, (real, vector, _) = discretisation.precision, discretisation.types
     matrix, sums, typed = matrix_type(precision), curvature_sums(discretisation), types_of(discretisation)
     moments = moment_functions(precision, dimension)
@@ -321,7 +321,7 @@ def curvature_kernels(discretisation: Discretisation, dimension: int) -> SimpleN
 
 
 def types_of(discretisation: Discretisation) -> TypesByName:
-    """Return the Warp types, by name, of what kernels of tension by curvature compute with."""
+    """Return the Warp types, by name, of the variables in kernels of tension by curvature."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     vectors = "q g r x e diagonal others turned mixed acceleration"
     return TypesByName(real, {vector: vectors, matrix_type(precision): "B D", neighbourhood: "s"})
@@ -392,7 +392,7 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
 
 @cache
 def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: str) -> tuple[Any, ...]:
-    """Make the adjoints of the four curvature kernels; the last has two, the first of which has no neighbours."""
+    """Make the adjoints of the four curvature kernels; the last has two adjoints, the first one without neighbours."""
     precision, (real, vector, _) = discretisation.precision, discretisation.types
     matrix, sums, typed = matrix_type(precision), curvature_sums(discretisation), types_of(discretisation)
     module = discretisation.module(False, topic)
@@ -404,7 +404,7 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
     def force_adjoint(
         depth, per_width, surface_tension, m_i, q_i, w_i, a_i, b_i, acceleration_bar_i
     ) -> tuple[real, real, vector, real, real, real]:
-        """Turn the adjoint of the acceleration into those of a particle's own m, sigma, q, w, a and b."""
+        """Turn the adjoint of the acceleration into the adjoints of a particle's own m, sigma, q, w, a and b."""
         k = outermost(a_i, b_i, depth)
         by_a, by_b, _by_depth = wp.grad(outermost)(a_i, b_i, depth)
         strength, work = surface_tension * per_width / m_i, wp.dot(q_i, acceleration_bar_i)
@@ -424,7 +424,7 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
     def mean_adjoint(
         i: int, c_part, w_part, x_part, w_i, a_bar_i, b_bar_i, B_i, D_i, s
     ) -> tuple[vector, real, matrix, matrix]:
-        """Turn the adjoints of a and b into those of B and D, and add to those of x and w."""
+        """Turn the adjoints of a and b into the adjoints of B and D, and add to the adjoints of x and w."""
         self_weight = real(1 - s.filling[i]) * s.self_weight * s.volume
         c_bar = c_part + self_weight * a_bar_i
         by_B, by_D = wp.grad(curvature_of)(B_i, D_i)
@@ -435,7 +435,7 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
     @particle_kernel(module, "+x_bar r z_bar", [over(sums.bend.adjoint, "e_bar w_part x_part")], numbers=["spacing"])
     @typed
     def bend_adjoint(e_bar, w_part, x_part, spacing, q_i, z_i, w_bar_i, q_bar_i) -> tuple[vector, vector, real]:
-        """Turn the adjoints of B, D, w and q into those of z and of V sum W_ij g_j, which is r."""
+        """Turn the adjoints of B, D, w and q into the adjoint of z, and into r, the adjoint of V sum W_ij g_j."""
         by_q, _spacing, _w, _e = wp.grad(normal_work)(q_i, spacing, w_bar_i + w_part, e_bar)
         r = (q_bar_i + by_q) / z_i
         return x_part, r, -wp.dot(q_i, r)

@@ -2,18 +2,18 @@
 
 n_i = V (W(0) + sum_j W_ij + sum_b w_b W_ib),   rho_i = m_i n_i.
 
-V is the rest volume on the lattice and m_i a particle's mass over V. No mass of a neighbour enters (Solenthaler and
-Pajarola 2008): the density of a heavy fluid is not smeared into a light one.
+V is the rest volume on the lattice and m_i a particle's mass over V. Masses of neighbours do not enter (Solenthaler and
+Pajarola 2008), so that the density of a heavy fluid does not smear into a light fluid.
 
-`Density` measures it in a step, with derivatives; a solver that measures more of the same neighbours at once has a
-subclass of its own.
+`Density` computes n in a step, with derivatives. A solver that computes further sums over the same neighbours at once
+has a subclass of its own.
 
 For the pressure, walls act on a particle by the sums
 
 g_i = sum_b w_b G_ib,   g_i' = sum_b w_b H_ib x_ib' + w_b' G_ib.
 
-A particle with the pressure p_i pushes the walls around it with the force V^2 p_i / n_i^2 g_i. H is symmetric: its sum
-of forward mode is that of reverse mode too.
+A particle with the pressure p_i pushes the walls around it with the force V^2 p_i / n_i^2 g_i. H is symmetric, so that
+the sum with H of forward mode also serves reverse mode.
 """
 
 from functools import cache, cached_property, partial
@@ -34,9 +34,9 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 @cache
 def density_sums(discretisation: Discretisation) -> Kernels:
-    """Make the Warp functions of the raw neighbour sums of the density: the sum of W, with what fills the list up, and
-    its derivatives. The adjoint is that of positions for an adjoint r of every particle's sum, sum_j (r_i + r_j) G_ij +
-    sum_b w_b r_i G_ib."""
+    """Make the Warp functions of the raw neighbour sums of the density: the sum of W, including the entries that pad
+    the list, and its derivatives. The adjoint of positions, for an adjoint r of every particle's sum, is sum_j (r_i +
+    r_j) G_ij + sum_b w_b r_i G_ib."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, slope, gradient = pair.weight, pair.slope, pair.gradient
@@ -60,7 +60,8 @@ def density_sums(discretisation: Discretisation) -> Kernels:
 
 @cache
 def density_solid_kernel(discretisation: Discretisation, topic: str = "density", looped: bool = False) -> Any:
-    """Make the kernel from the adjoint ``bar`` of number densities to those of solids (`SolidShares.add`)."""
+    """Make the kernel that turns the adjoint ``bar`` of number densities into adjoints of solids
+    (`SolidShares.add`)."""
     return solid_kernel(discretisation, topic, _density_work, looped=looped)
 
 
@@ -75,8 +76,8 @@ def _density_work(d: Discretisation) -> Any:
 
 @cache
 def density_kernels(discretisation: Discretisation, topic: str = "density") -> Kernels:
-    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the number density, in the Warp modules of a topic; a
-    topic that a solver has anyway saves it a module to load."""
+    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the number density, in the Warp modules of a topic;
+    sharing a solver's topic saves loading a module."""
     real, neighbourhood = discretisation.precision.real, neighbourhood_type(discretisation.precision)
     module, tangent_module, adjoint_module = discretisation.modules(topic)
     sums = density_sums(discretisation)
@@ -127,10 +128,10 @@ class DensityAdjoint:
         self._density = density
 
     def begin(self) -> None:
-        """Forget the adjoints that an earlier step back has left."""
+        """Set adjoints from an earlier backward step to 0."""
 
     def measure(self, context: StepContext, bar: Adjoints) -> None:
-        """Turn the adjoint of the number density n into those of positions and of solids."""
+        """Turn the adjoint of the number density n into the adjoints of positions and of solids."""
         density = self._density
         context.launch(density.kernels.adjoint, *bar.named)
         kernel = partial(density_solid_kernel, density.discretisation, density.topic)
@@ -139,8 +140,8 @@ class DensityAdjoint:
 
 @cache
 def wall_slope_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of sums over walls: the ``slope`` g, its ``tangent``, and the sum ``change`` of H with a
-    vector ``along`` of each particle."""
+    """Make the Warp functions of sums over walls: the ``slope`` g, its ``tangent``, and ``change``, the sum of H times
+    a vector ``along`` of each particle."""
     _, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     gradient, hessian_product = pair.gradient, pair.hessian_product
@@ -180,14 +181,15 @@ class WallAction(Protocol):
     number of wall particles of a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def total(self, step: StepContext, solid: int) -> wp.array:
-        """Return the action (n,) of walls on sorted particles, vectors; of a force its accelerations [m / s2]."""
+        """Return the action (n,) of walls on sorted particles, vectors; for a force these are accelerations [m /
+        s2]."""
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
         """Return the tangents (n,) of the action of walls, after forward mode of the step."""
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
-        """Turn the adjoints of the action into those of sorted particles, parameters and solids, in ``bar``, and those
-        (n,) of v* = v + dt a, of velocities after all explicit forces."""
+        """Turn the adjoints of the action into adjoints of sorted particles, parameters and solids, in ``bar``, and
+        into adjoints (n,) of v* = v + dt a, the velocities after all explicit forces."""
 
 
 class WallSums:
@@ -199,7 +201,7 @@ class WallSums:
 
     @cached_property
     def _arrays(self) -> dict[str, wp.array]:
-        """Make the arrays of totals when they are first asked for, as runs do without."""
+        """Make the arrays of totals on first use, because most runs need none."""
         vector = self._layout.precision.vector
         return self._layout.arrays(total=vector, total_dot=vector)
 
@@ -219,12 +221,12 @@ class WallSums:
     def adjoint(
         self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array, *groups: Named
     ) -> None:
-        """Apply the adjoint of the sums over walls as `WallAction` says; the adjoint of v* gets nothing."""
+        """Apply the adjoint of the sums over walls, see `WallAction`; the adjoint of v* is not changed."""
         step.launch(self.term.kernels.adjoint, {self.term.bar: total_bar}, *groups, *bar.named, self._known(solid))
         self.give(step, bar, solid, total_bar, *groups)
 
     def give(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, *groups: Named) -> None:
-        """Add to the adjoints of moving solids by the adjoint of the sums over walls."""
+        """Add to the adjoints of moving solids, given the adjoint of the sums over walls."""
         given = {self.term.bar: total_bar}
         kernel, factors = self.term.solid_kernel, self._constants
         bar.solids.add(step.launch, kernel, given, *groups, *bar.named, constants=factors, over=solid)

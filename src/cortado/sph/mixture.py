@@ -2,12 +2,13 @@
 
     1 / rho_0i = sum_k c_k,i / rho_0k,    ln mu_i = sum_k c_k,i ln mu_k    (Arrhenius 1887)
 
-Masses are constant (Yang et al. 2015 leave open whether mass or volume is; with mass
-fractions it is the mass), so that a particle's rest volume follows its rest density. The logarithms keep the viscosity
-positive where fractions stray out of [0, 1].
+A particle's mass is constant and its rest volume follows from its rest density (Yang et al. 2015 leave open which of
+the two is constant; with mass fractions it is the mass). The logarithms keep the viscosity positive if fractions stray
+out of [0, 1].
 
-In the mixture step phases diffuse into one another, and each particle gets the material of its new fractions. It comes
-first in a step, on the particles at rest at x(t); what it makes of a particle holds for the rest of the step.
+In the mixture step phases diffuse into one another, and each particle gets the density and viscosity of its new
+fractions. The mixture step comes first in a step, with particles fixed at x(t); the rest of the step uses the new
+values.
 """
 
 from contextlib import nullcontext
@@ -34,15 +35,15 @@ def mixture_module(precision: Precision, phases: int, forward: bool, taped: bool
 
 @cache
 def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNamespace:
-    """Make the kernels of a number of phases: ``order`` carries mass fractions into a step and out of it, ``blend`` are
-    those of densities and viscosities. Materials are arrays (members, phases). A tape can differentiate ``taped``
-    ones."""
+    """Make the kernels of a number of phases: ``order`` sorts and unsorts mass fractions, ``blend`` computes densities
+    and viscosities. Materials are arrays (members, phases). A tape can differentiate ``taped`` kernels."""
     real, fractions = precision.real, precision.fractions(phases)
     tiny, numbers = wp.constant(real(precision.tiny)), wp.array2d(dtype=real)
 
     @wp.func
     def logarithm(viscosity: real) -> real:
-        """Return ln(mu + tiny) of a viscosity mu: any amount of a phase without viscosity makes a mixture thin."""
+        """Return ln(mu + tiny) of a viscosity mu: any amount of a phase with viscosity 0 makes the mixture's viscosity
+        nearly 0."""
         return wp.log(viscosity + tiny)
 
     materials = {numbers: "rest_density viscosity", wp.array(dtype=fractions): "c_scene"}
@@ -77,7 +78,8 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNam
     def blend_adjoint(
         member: int, order_i, c_i, rest_density, viscosity, rho_0_i, mu_i, rho_0_bar_i, mu_bar_i, c_scene_bar
     ) -> tuple[fractions, fractions, fractions]:
-        """Return adjoints of densities, viscosities and fractions; ``c_scene_bar`` is of the new fractions."""
+        """Return adjoints of densities, viscosities and fractions; ``c_scene_bar`` is the adjoint of the new
+        fractions."""
         c_bar = fractions(c_scene_bar[order_i])  # a copy: what follows writes to its components
         rest_density_bar, viscosity_bar = fractions(), fractions()
         power_bar = mu_bar_i * mu_i
@@ -94,7 +96,7 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNam
 
 MASS_FRACTIONS = StateField("mass_fractions", "", Entry.FRACTIONS, first="mass_fractions")
 REFERENCE_DENSITY = StateField("reference_density", "kg/m³", Entry.NUMBER, is_constant=True)
-"""Of a particle: its mass over its volume on the rest lattice, which its first fractions decide."""
+"""A particle's mass over its volume on the rest lattice, which follows from its first fractions."""
 
 
 @dataclass(frozen=True)
@@ -117,19 +119,19 @@ class Mixture(Part):
     def __init__(self, phases: Phases, layout: Layout, requires_grad: bool = False):
         self.phases = phases
         self.fields = (replace(MASS_FRACTIONS, is_constant=phases.count == 1), REFERENCE_DENSITY)
-        """What it carries from step to step: one phase stays what it is."""
+        """Fields carried from step to step; the fractions of a single phase are constant."""
         self.kernels = mixture_kernels(layout.precision, phases.count, requires_grad)
         if phases.diffusion and phases.diffusion.energy not in FREE_ENERGIES.values():
             phases.diffusion.energy.check(layout.precision, phases.count, layout.device)
         self.diffusion = diffusion_kernels(phases.diffusion) if phases.diffusion else None
         self.shares = ("rest_density", "viscosity", *(("mobility", "interface_width") if phases.diffusion else ()))
-        """Parameters, numbers or those of phases, in whose adjoints every particle has a share."""
+        """Parameters, numbers or per phase, to whose adjoints every particle adds a share."""
         self.substeps = 0
         """Explicit steps of diffusion within a time step."""
         self._layout = layout
         self._options = {"device": layout.device, "requires_grad": requires_grad}
         self.c: list[wp.array] = []
-        """Sorted fractions (n,) before each substep; those after the last are the step's."""
+        """Sorted fractions (n,) before each substep, and after the last one; the rest of the step uses the latter."""
         self.chi: list[wp.array] = []
         """Chemical potentials (n,) of each substep [-]."""
         self.w: list[wp.array] = []
@@ -198,8 +200,8 @@ class MixtureAdjoint(PartAdjoint):
         self._y, self._z = (mixture.fractions() for _ in range(2))
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Replace the adjoint of the new fractions, in scene order, by that of the old ones, to which materials and
-        forces add."""
+        """Replace the adjoint of the new fractions, in scene order, by the adjoint of the old fractions, including
+        terms from materials and forces."""
         with step.aside() if not self._mixture.substeps else nullcontext():
             self._unmix(step, bar, state_bar.mass_fractions)
 
@@ -229,7 +231,7 @@ class MixtureTangent(PartTangent):
         self._w_dot = mixture.numbers()
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Take the tangent of the old fractions, in scene order, on to those of the materials."""
+        """Compute the tangents of the materials from the tangent of the old fractions, in scene order."""
         mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, dot.named
         substeps, now = mixture.substeps, {"chi_dot": self._chi_dot, "w_dot": self._w_dot}
         course = [*(self._c_dot[k % 2] for k in range(substeps)), dot.fractions]

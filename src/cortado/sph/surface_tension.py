@@ -7,16 +7,17 @@ continuum surface stress of Lafaurie et al. 1994, between particles):
 
 The mass of a particle is m_i s^d, with the spacing s of the lattice at rest. The vector n points out of the fluid. Its
 size is 1 in the outermost layer of a cut lattice, and about 0 inside. S pulls along the surface, and with PART below 1
-also a little across it. A stress along the surface alone lets particles go, and one that is the same in all directions
-makes a solid. The force of a pair grows with its distance up to 0.65 h, so that particles of the surface do not clump.
+also a little across it. With a stress only along the surface particles detach, and with an isotropic stress the fluid
+acts like a solid. The force of a pair grows with its distance up to 0.65 h, so that particles of the surface do not
+clump.
 
 N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis. Gamma is the tension of
 that surface without it, times `RELAXED`.
 
-Forces of pairs are opposite, so that momentum is kept; as they are not along the pair, angular momentum is so only
-nearly. They are the gradient of no energy either, and that by curvature is not: a fluid that has hardly any viscosity
-takes up energy from them, see `LEAST_VISCOSITY`. Walls have no part in either, as if there were air between: a surface
-meets them at 180 degrees.
+Forces of a pair are opposite, so that momentum is conserved; they are not parallel to the pair, so that angular
+momentum is conserved only approximately. Neither these forces nor the force by curvature is the gradient of an energy:
+fluids with very low viscosity gain energy from them, see `LEAST_VISCOSITY`. Walls do not take part in either force, as
+if air were between: a surface meets walls at 180 degrees.
 """
 
 from collections.abc import Callable
@@ -41,7 +42,7 @@ from cortado.sph.curvature import CurvatureConstants, curvature_kernels, entries
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 
 PART = 2.0 / 3.0
-"""The part by which the stress across the surface is less than along it; see above."""
+"""The relative amount by which the stress across the surface is less than along the surface; see above."""
 
 
 def tension_term(discretisation: Discretisation) -> Callable[..., Any]:
@@ -102,7 +103,8 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
     @tangent_of(arrows)
     @fluid_sum(discretisation)
     def change(x_ij: vector, v_ij: vector, s: neighbourhood) -> vector:
-        """Return the derivative of a pair's term along v. It is symmetric, and serves the tangent and the adjoint."""
+        """Return the derivative of a pair's term along v. The derivative is symmetric, so it serves both the tangent
+        and the adjoint."""
         h2 = s.support * s.support
         d = wp.max(one - wp.dot(x_ij, x_ij) / h2, real(0.0))
         return (d * d) * v_ij - (real(4.0) * d * wp.dot(x_ij, v_ij) / h2) * x_ij
@@ -128,7 +130,7 @@ class CurvatureTension:
         kinds = entries(layout.precision)
         self._of = layout.arrays(requires_grad=discretisation.taped, **kinds)
         self._change = layout.arrays(**kinds, r=kinds["g"])
-        """Tangents or adjoints, and r."""
+        """Arrays of tangents or adjoints, and r."""
         self._dot, self._bar = ({f"{name}_{kind}": self._change[name] for name in kinds} for kind in ("dot", "bar"))
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
@@ -152,13 +154,14 @@ class CurvatureTension:
 
 
 RELAXED = {2: 1.1, 3: 1.25}
-"""By dimension: the tension of a surface that has flown over that of a cut lattice, measured in drops: see
-docs/records/surface_tension.md."""
+"""By dimension: the ratio of the tension of a surface after flow, measured in drops, to the tension of a cut lattice;
+see docs/records/surface_tension.md."""
 LEAST_SUPPORT = {"pairs": 1.8, "curvature": 2.5}
-"""In spacings: below, drops fall apart in pairs, and curvatures are too noisy."""
+"""In spacings: with a smaller support drops fall apart into pairs, and curvatures are too noisy."""
 LEAST_VISCOSITY = 0.05
-"""Over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid. Of pairs, drops of 16 to 64
-particles across hold; by curvature, those of 24 and 48 across lose energy with it, but not all of them with 0.03."""
+"""Over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid. With the force of pairs, drops 16 to 64
+particles across are stable with this viscosity. With the force by curvature, drops 24 and 48 across lose energy, but
+with 0.03 not all of them do."""
 
 
 class SurfaceTension:
@@ -168,7 +171,7 @@ class SurfaceTension:
     batches = True
 
     def __init__(self, discretisation: Discretisation, inverse: float, scale: float, layout: Layout):
-        """Prepare the force with ``inverse`` and ``scale`` as `tension_constants` gives them."""
+        """Prepare the force with ``inverse`` and ``scale`` from `tension_constants`."""
         self._normal, self._kernels = normal_kernels(discretisation), surface_tension_kernels(discretisation)
         self._inverse, self._scale = inverse, scale
         vector = layout.precision.vector
@@ -212,7 +215,7 @@ def tension_constants(spacing: float, support: float, dimension: int) -> tuple[f
 
 
 def force(setting: Setting) -> Force:
-    """Make the surface tension of a scene, None without any; warn where it is likely to tear the fluid apart."""
+    """Make the surface tension of a scene, None without any; warn if it is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
     form = "pairs" if scene.solver.kind == "pcisph" else "curvature"
     support, least = scene.discretisation.support, LEAST_SUPPORT[form]

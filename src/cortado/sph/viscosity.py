@@ -1,4 +1,5 @@
-"""The viscous force of pairs of particles (Monaghan 2005), which scenes with PCISPH may have in place of the stress:
+"""The viscous force of pairs of particles (Monaghan 2005), which scenes with PCISPH may use instead of the viscous
+stress:
 
     a_i = kappa / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + mu_i sum_b V w_b phi(x_ib, v_ib)),
     phi(x, v) = v . x / (|x|^2 + 0.01 h^2) G(x),   kappa = 2 (d + 2).
@@ -6,8 +7,8 @@
 The gradient of the smoothing kernel is G = a x. Functions call a the ``slope``, and 1 / (|x|^2 + 0.01 h^2) ``per_size``
 (`cortado.particles.neighbourhood.pair_functions`). A pair has the dynamic viscosity mu_ij = 2 mu_i mu_j / (mu_i + mu_j)
 [Pa s]. This harmonic mean keeps the shear stress continuous between fluids (Cleary and Monaghan 1999). The sum over b
-is over walls without slip, where v_ib is against the wall's velocity. phi is odd in (x, v) together and central, so
-that momentum and angular momentum are kept.
+is over walls without slip; v_ib is the velocity relative to the wall. phi is odd in (x, v) together and central, so
+that momentum and angular momentum are conserved.
 """
 
 from functools import cache
@@ -140,7 +141,7 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
     def force_adjoint(
         x_ij, v_ij, n_i, n_j, m_i, m_j, mu_i, mu_j, bar_i, bar_j, kappa, s
     ) -> tuple[vector, vector, real, real, real]:
-        """Return a pair's part in the adjoints of x, v, n, m and mu of i; seen from i, it is that of j too."""
+        """Return a pair's terms in the adjoints of x, v, n, m and mu of i, from the sums of i and of j."""
         w_i = bar_i * reciprocal(m_i)
         w_ij = w_i - bar_j * reciprocal(m_j)
         per_volume = kappa * s.volume * reciprocal(n_i) * reciprocal(n_j)

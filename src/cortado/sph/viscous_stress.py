@@ -1,17 +1,18 @@
-"""The viscous force as a stress (`cortado.sph.stress_kernels`): explicit, and at the end of a step, where its time step
-has no limit.
+"""The viscous force as a stress (`cortado.sph.stress_kernels`): explicit, or implicit at the end of a step, which does
+not limit the time step.
 
-T_i and mu_i of a particle follow from sums over all of its neighbours, so that the way back goes on from them to these.
+T_i and mu_i of a particle are computed from sums over its neighbours, so that reverse mode goes from T_i and mu_i to
+these sums.
 
 Let a be the acceleration by all other forces, and g(v) the acceleration by the stress of fluid with velocities v, with
 M and mu of the velocities at the start. The acceleration at the end of a step is a' of
 
     a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y),
 
-which `cortado.sph.moment_functions` solves to round-off. B is symmetric and positive with respect to the product
-sum_i m_i a_i . b_i. mu is that of the velocities v at the start, the stress that of u = v + dt a' at the end. So the
-derivatives are those of the solution, whatever way led to it. The tangent is one more solve with B, and so is the
-adjoint, as B is symmetric in the product weighted with masses.
+which `cortado.sph.moment_functions` solves to round-off. B is symmetric and positive with respect to the product sum_i
+m_i a_i . b_i. mu belongs to the velocities v at the start, the stress to u = v + dt a' at the end. Derivatives are
+those of the exact solution and do not depend on the iterations. Tangent and adjoint are one more solve with B each,
+because B is symmetric in the product weighted with masses.
 """
 
 from collections.abc import Sequence
@@ -45,7 +46,8 @@ from cortado.sph.stress_forces import Law, newtonian_law, stress_couple_work, st
 from cortado.sph.stress_kernels import moment_sums, stress_kernels, stress_solid_kernels, traction_function
 
 CLOSEST = 0.25
-"""In spacings: walls without slip pull no harder on particles that are closer, see `cortado.sph.stress_forces`."""
+"""In spacings: distance below which the pull of walls without slip does not increase, see
+`cortado.sph.stress_forces`."""
 
 
 class ViscousStress:
@@ -59,12 +61,12 @@ class ViscousStress:
         scene, discretisation, layout = setting.scene, setting.discretisation, setting.layout
         cut, self._law = scene.discretisation, law or newtonian_law()
         self._made_for = (discretisation, scene.dimension, self._law, scene.sticks)
-        """What its kernels are made for."""
+        """The choices for which the kernels are made."""
         self._kernels, self._layout = stress_kernels(*self._made_for), layout
         control = stress_control(discretisation.smoothing, cut.spacing, cut.support_radius, scene.dimension)
         self.constants: dict[str, Any] = {"control": control, "least": CLOSEST * cut.spacing}
         self.free = FreeFriction(setting, self.constants)
-        """Friction with free bodies, which only an implicit solve has."""
+        """Friction with free bodies; only an implicit solve has it."""
         self._packed = Packed(parameters, layout, discretisation.taped)
         self._of = self.arrays("M", "A", "R", "T", "eta", taped=discretisation.taped)
         self._change = self.arrays("M", "A", "A_u", "R", "T", "eta")
@@ -81,7 +83,7 @@ class ViscousStress:
         return self._layout.arrays(requires_grad=taped, **kinds)
 
     def compile(self, what: str) -> None:
-        """Compile the kernels with the law of viscosity; raise `InputError` where Warp cannot."""
+        """Compile the kernels with the law of viscosity; raise `InputError` if Warp cannot compile them."""
         compiled(what, self._kernels.stress.forward.module, self._layout.device, "number")
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
@@ -122,8 +124,8 @@ class ViscousStress:
         return None
 
     def _back(self, step: StepContext, bar: Adjoints, acceleration_bar: wp.array, now: Named, v_bar: wp.array) -> None:
-        """Go back from the adjoint of the acceleration to those of its inputs; ``now`` has the arrays of `resisted`,
-        and the adjoint of the resisted velocities is added to ``v_bar``."""
+        """Add to the adjoints of the acceleration's inputs, given the adjoint of the acceleration. ``now`` has the
+        arrays of `resisted`; the adjoint of the resisted velocities is added to ``v_bar``."""
         bars = {**{f"{name}_bar": array for name, array in self._change.items()}, "v_bar": v_bar}
         known = bars, now, *bar.named, self.constants, self._of, {"acceleration_bar": acceleration_bar}
         of_stress, of_particles = self._kernels.force.adjoint
@@ -134,9 +136,9 @@ class ViscousStress:
         self._give(step, bar, 1, *known)
 
     def back_to_sums(self, step: StepContext, bar: Adjoints, bars: dict[str, wp.array], now: Named) -> None:
-        """Turn the adjoints of T and mu into those of particles and solids, by way of the sums; ``now`` has the arrays
-        of `resisted`. ``bars`` has ``v_bar``, to which the adjoint of its velocities is added, and room for the
-        adjoints of M, R, A and A_u."""
+        """Turn the adjoints of T and mu into adjoints of the sums, and these into adjoints of particles and solids;
+        ``now`` has the arrays of `resisted`. ``bars`` has ``v_bar``, to which the adjoint of its velocities is added,
+        and arrays for the adjoints of M, R, A and A_u."""
         theta = {"theta": self._packed.theta(step), "theta_bar": self._packed.shares}
         step.launch(self._kernels.stress.adjoint, theta, bars, now, *bar.named, self.constants, self._of)
         at_the_start, A_bar = now["v"] is step.fields["v"], bars["A_u_bar"]
@@ -158,7 +160,8 @@ class ViscousStress:
         return {f"{name}_bar": array for name, array in self.arrays("M", "R").items()}
 
     def _give(self, step: StepContext, bar: Adjoints, which: int, *known: Named) -> None:
-        """Add to the adjoints of moving solids by those of the sums (``which`` 0) or of the acceleration (1)."""
+        """Add to the adjoints of moving solids, given adjoints of the sums (``which`` 0) or of the acceleration
+        (``which`` 1)."""
         if self._made_for[-1]:
             constants, kernels = (
                 (self.constants["least"], self.constants["control"]),
@@ -167,7 +170,8 @@ class ViscousStress:
             bar.solids.add(step.launch, kernels[which], *known, self._of, constants=constants)
 
     def resisted(self, step: StepContext) -> dict[str, wp.array]:
-        """Return T, eta, the velocities ``v`` that are resisted, and their A as ``A_u``, in a step."""
+        """Return T, eta, the velocities ``v`` that friction resists in the step, and the sums A of these velocities as
+        ``A_u``."""
         return {**{name: self._of[name] for name in ("T", "eta")}, "A_u": self._of["A"], "v": step.fields["v"]}
 
     def resisted_tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
@@ -175,7 +179,7 @@ class ViscousStress:
         return {**{f"{name}_dot": self._change[name] for name in ("T", "eta")}, "v_dot": dot.fields["v"]}
 
     def resisted_adjoint(self, step: StepContext, v_bar: wp.array, bar: Adjoints, v_star_bar: wp.array) -> None:
-        """Add the adjoint of the resisted velocities to that of the velocities at the start."""
+        """Add the adjoint of the resisted velocities to the adjoint of the velocities at the start."""
         add(v_bar, bar.fields["v"])
 
 
@@ -184,7 +188,7 @@ class StressWalls:
 
     def __init__(self, setting: Setting, stress: ViscousStress, work: WorkMaker, bar: str, name: str):
         """Take ``work`` and ``bar`` of its `WallTerm`: `stress_work` for accelerations, `stress_couple_work` for their
-        couples; and the ``name`` that these have in the friction with free bodies."""
+        couples; and the ``name`` of this action in the friction with free bodies."""
         self._stress, self._layout, self._name = stress, setting.layout, name
         term = WallTerm(setting.discretisation, "viscous_stress", work, bar, rubs=True)
         self._sums = WallSums(term, setting.layout, (stress.constants["least"], stress.constants["control"]))
@@ -213,7 +217,7 @@ class StressWalls:
 
     @cached_property
     def _bars(self) -> dict[str, wp.array]:
-        """Make arrays of adjoints when they are first asked for, as runs do without."""
+        """Make arrays of adjoints on first use, because runs without derivatives need none."""
         own = self._stress.arrays("M", "A", "A_u", "R", "T", "eta")
         v_bar = self._layout.arrays("_bar", v=self._layout.precision.vector)
         return {**{f"{name}_bar": array for name, array in own.items()}, **v_bar}
@@ -221,7 +225,8 @@ class StressWalls:
 
 @cache
 def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> tuple[Any, Any]:
-    """Make the kernel of the stress T for some velocities with M and mu kept, and that of the implicit operator B."""
+    """Make the kernel of the stress T for given velocities with fixed M and mu, and the kernel of the implicit operator
+    B."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     module = discretisation.module(False, f"implicit_viscosity_{law.topic}{dimension}d" + "_no_slip" * sticks)
@@ -252,7 +257,7 @@ def implicit_kernels(precision: Precision) -> SimpleNamespace:
 
     @particle_kernel(module, "u")
     def predict(time_step: real, v_i: vector, acceleration_i: vector) -> vector:
-        """Return u = v + dt a. With tangents in place of v and dt it is the tangent of u for an a that stays."""
+        """Return u = v + dt a. Given the tangents of v and dt instead, it returns the tangent of u for constant a."""
         return v_i + time_step * acceleration_i
 
     @particle_kernel(module, "r")
@@ -265,7 +270,7 @@ def implicit_kernels(precision: Precision) -> SimpleNamespace:
 
     @particle_kernel(module, "+v_bar +time_step_bar")
     def end_adjoint(acceleration_i: vector, u_bar_i: vector) -> tuple[vector, real]:
-        """Return the adjoints of v and dt by that of u."""
+        """Return the adjoints of v and dt, given the adjoint of u."""
         return u_bar_i, wp.dot(u_bar_i, acceleration_i)
 
     return by_name(predict, weigh, unweigh, end_adjoint)
@@ -289,7 +294,7 @@ class Solve(ConjugateGradients):
 
     def __call__(self, step: StepContext, known: Any, r: wp.array, y: wp.array) -> None:
         """Write to ``y`` the solution of B y = r, (n,) vectors both, and overwrite ``r``; ``known`` has arguments of
-        B's kernels. The rows of bodies are solved along."""
+        B's kernels. The system includes the rows of bodies."""
 
         self.solve(step, partial(self._apply, step, known), step.fields["m"], r, y, self._free.rows)
 
@@ -301,7 +306,8 @@ class Solve(ConjugateGradients):
         self._free.multiply(step, known, p, found)
 
     def respond(self, step: StepContext, known: Any, still: wp.array, r: wp.array) -> None:
-        """Add to ``r`` the product of B with velocities of bodies alone; those of particles are 0, ``still``."""
+        """Add to ``r`` the product of B with velocities of bodies alone; velocities of particles are 0, given as
+        ``still``."""
         found = {name: self._own[name] for name in ("product", "share")}
         self._apply(step, known, still, found)
         add(found["product"], r)
@@ -324,11 +330,11 @@ class ImplicitViscousStress(ViscousStress):
         vectors = layout.arrays(**dict.fromkeys(("u", "r", "y", "still"), layout.precision.vector))
         self._u, self._r, self._y, self._still = vectors.values()
         self._at_end = self.arrays("A", "T")
-        """A and T of u."""
+        """The sums A and stresses T of the velocities u at the end."""
         self._after: Any = None
-        """a' of the last step."""
+        """The acceleration a' of the last step."""
         self._after_dot: Any = None
-        """Its tangent, after forward mode of the step."""
+        """The tangent of a', after forward mode of the step."""
 
     @property
     def iterations(self) -> NDArray:

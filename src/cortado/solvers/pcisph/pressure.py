@@ -5,11 +5,11 @@
     ap_i = -(V / m_i) (sum_j (c_i + c_j) G_ij + sum_b w_b c_i G_ib)
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
-n is the number density (`cortado.sph.density`; for fluids of different masses: Solenthaler and Pajarola 2008),
-y the relaxation beside walls (`cortado.solvers.pcisph.solver`). G is taken at x(t), n* at the predicted
-positions over the neighbours of x(t). The force is the transpose of the derivative of n with respect to positions,
-that of walls included: moving particles against it takes the work V sum_i c_i dn_i. After the last iteration (x*, v*)
-is the new state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
+n is the number density (`cortado.sph.density`; for fluids of different masses: Solenthaler and Pajarola 2008), y the
+relaxation beside walls (`cortado.solvers.pcisph.solver`). G is taken at x(t), n* at the predicted positions over the
+neighbours of x(t). The force, including the force of walls, is the transpose of the derivative of n with respect to
+positions: moving particles against the force takes the work V sum_i c_i dn_i. After the last iteration (x*, v*) is the
+new state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
 """
 
 from functools import cache
@@ -184,7 +184,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     def force_adjoint(
         x_ij: vector, c_i: real, c_j: real, scaled_bar_i: vector, scaled_bar_ij: vector, s: neighbourhood
     ) -> tuple[vector, real, real]:
-        """Return a pair's Hessian product, its divergence, and the work of the own share c_i."""
+        """Return a pair's Hessian product, its divergence, and the work of particle i's own c_i."""
         a = slope(x_ij, s)
         c_ij = c_i + c_j
         change = (c_ij * a) * scaled_bar_ij + (c_ij * slope_change(x_ij, scaled_bar_ij, s)) * x_ij

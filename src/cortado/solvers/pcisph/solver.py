@@ -5,25 +5,24 @@ tangent and adjoint, and two factors on the pressure correction delta of an iter
 iterations and keeps every intermediate value, for the derivatives.
 
 The factors are the density-ratio relaxation of a heavy particle among lighter ones, and the pressure relaxation beside
-walls. delta is made for particles of one mass. The pressure of a particle with lighter neighbours moves these further,
-by the ratio of the masses, and where the answer of its own density is more than twice what is wanted the iteration
-diverges. So its pressure relaxation is multiplied with
+walls. delta is derived for particles of equal mass. The pressure of a particle with lighter neighbours moves these
+further, by the ratio of the masses. If its own density then changes by more than twice the wanted amount, the iteration
+diverges. So its pressure relaxation is multiplied by
 
     1 / (1 + e(t_i)),   t_i = V sum_j W_ij (m_i / m_j - 1),   e(t) = t^2 / (2 (t + a)) for t > 0, else 0,
 
-which is 1 among particles of its own mass or heavier ones, and tends to the mean 1 / (1 + t / 2) that the lattice asks
-for. a makes it smooth at 0.
+which is 1 among particles of equal or greater mass, and tends to 1 / (1 + t / 2), the value for a lattice. The constant
+a makes it smooth at t = 0.
 
-delta is made for a particle with a filled neighbourhood. Beside a wall the same pressure moves a particle's own
-density further, by |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = sum_b w_b G_ib, and where that is above 2
-the iteration overshoots and kicks it away. A particle that nears a wall within the step meets a steeper one than at the
-step's start, where S_i is taken, so that the answer counts twice. delta is multiplied by the pressure relaxation
+delta is derived for a particle with a filled neighbourhood. Beside a wall the same pressure changes a particle's own
+density more, by |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = sum_b w_b G_ib. If this exceeds 2, the
+iteration overshoots and kicks the particle away. S_i is computed at the start of the step, but a particle that
+approaches a wall meets a steeper gradient, so the response is doubled: delta is multiplied by the pressure relaxation
 
     y_i = 1 / (1 + |S_i|^2 / response),   response = sum_j G_j . G_j,
 
-which is 1 away from walls, and smooth. It changes how fast the iteration converges, not what it converges to. Sums are
-multiplied with the response scale, response^(-1/2), before they are squared: in float32 the square of a gradient
-overflows where spacings are small.
+which is 1 away from walls, and smooth. The relaxation changes the rate of convergence, not the limit. Sums are
+multiplied by response^(-1/2) before they are squared: in float32 the square of a gradient overflows for small spacings.
 """
 
 from collections.abc import Callable, Sequence
@@ -65,7 +64,7 @@ class DensityRatio:
     total: Kernels
     """t"""
     relaxation: Kernels
-    """y from t and the relaxation beside walls, whose adjoints are written."""
+    """y from t and the relaxation beside walls; the adjoint kernel overwrites the adjoints of both."""
 
 
 @cache
@@ -150,7 +149,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def scaling_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel of the adjoint of the pressure acceleration over m, with which the way back begins."""
+    """Make the kernel of the adjoint of the pressure acceleration over m, with which reverse mode begins."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
 
     @particle_kernel(discretisation.module(False, "pcisph"), "scaled_bar")
@@ -166,7 +165,7 @@ class PcisphKernels:
 
     wall_relaxation: Kernels
     density_ratio: DensityRatio | None
-    """Only where there are several phases."""
+    """None with a single phase."""
     pressure: Kernels
     force: Kernels
     scale_adjoint: wp.Kernel
@@ -216,7 +215,7 @@ class PcisphSteps(ParticleSolver):
         self.limits, self.kernels = limits, PcisphKernels.of(self.discretisation, self.layout.phases)
         self.wall_relaxation, self.density_ratio = self.numbers(), self.numbers()
         self.pressure_relaxation = self.numbers() if self.layout.phases > 1 else self.wall_relaxation
-        """(n,) what delta is multiplied with [-]: beside walls, and with several phases among lighter neighbours."""
+        """(n,) the factor of delta [-], below 1 beside walls, and with several phases among lighter neighbours."""
         self.iterates = Iterates(self.numbers, self.vectors)
         self.pressure_loop = Loop(limits, self.layout, self.launch)
         self.loops = (self.pressure_loop,)
@@ -247,8 +246,8 @@ class PcisphSteps(ParticleSolver):
         return None if self.limits is None else self.iterates.p[1]
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
-        """Do all of a step before the pressure iterations: sort and measure the density (`sort`), write the relaxation
-        y, add up the explicit forces, gravity among them. Then predict v* = v + dt a, x* = x + dt v*."""
+        """Do the part of a step before the pressure iterations: sort and compute the density (`sort`), write the
+        relaxation y, add up the explicit forces including gravity. Then predict v* = v + dt a, x* = x + dt v*."""
         it, context = self.iterates, self.sort(state, parameters)
         with context.aside():
             self._relax(context)
@@ -267,7 +266,8 @@ class PcisphSteps(ParticleSolver):
             context.launch(kernels.density_ratio.relaxation.forward, found)
 
     def iterate(self, k: int, slot: int, context: StepContext) -> None:
-        """Take pressure iteration k, from the predicted state of the slot before to ``slot`` (0: the only one)."""
+        """Do pressure iteration k, from the predicted state in the previous slot to ``slot``; slot 0 is the only one of
+        a run."""
         it, kernels, before = self.iterates, self.kernels, max(slot - 1, 0)
         going = {"k": k, "rounds": self.pressure_loop.rounds}
         context.launch(
@@ -308,7 +308,7 @@ class PcisphAdjoint(ParticleAdjoint):
         self._go_back(counts, state_bar, parameters, within)
 
     def _begin(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
-        """Go back from the adjoint of a step's result to that of the last prediction."""
+        """Turn the adjoint of a step's result into the adjoint of the last prediction."""
         (iterations,) = counts
         solver = self._solver
         context = solver.context(parameters)
@@ -321,7 +321,7 @@ class PcisphAdjoint(ParticleAdjoint):
     def _go_back(
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
-        """Go back from the adjoint of the last prediction to that of the state, through the step in reverse: the
+        """Turn the adjoint of the last prediction into the adjoint of the state, through the step in reverse: the
         iterations, prediction with all forces, relaxation of the pressure, sorting."""
         (iterations,) = counts
         solver, it, kernels, scaled_bar = self._solver, self._solver.iterates, self._solver.kernels, self._scaled_bar
@@ -425,7 +425,7 @@ class PcisphMaker:
         self._table = table
 
     def build(self, setting: SolverSetting) -> Solver:
-        """Make the PCISPH solver of a scene that is cut into particles, on a device."""
+        """Make the PCISPH solver of a scene discretised into particles, on a device."""
         table, counts = self._table, (self._table.minimum_iterations, self._table.maximum_iterations)
         greatest = inf if table.maximum_density_tolerance is None else table.maximum_density_tolerance
         limits = LoopLimits(*counts, table.density_tolerance, greatest) if setting.scene.forces.pressure else None
