@@ -1,4 +1,4 @@
-"""``cortado compare``: two runs, or a run's sensors and measured data; and ``cortado convergence``: several runs.
+"""``cortado compare`` compares two runs, or a run's sensors with measured data; ``cortado convergence`` several runs.
 
 For two runs: how far apart their last states are, and possible reasons. For several runs of different resolution: the
 order of convergence and the limit.

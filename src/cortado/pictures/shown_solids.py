@@ -1,4 +1,4 @@
-"""The solids of a scene as pictures show them: shapes in poses with colours, edges as lines, and triangles."""
+"""The solids of a scene for pictures: shapes with pose and colour, edges as lines, and triangle meshes."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -15,13 +15,13 @@ from cortado.scene.scene import Scene
 
 Numbers = NDArray[np.int64]
 SAME = 1e-9
-"""Distance below which vertices are one, relative to the size of all."""
+"""Distance below which two vertices are merged, relative to the size of the mesh."""
 SHARP = 0.8
 """Cosine of the angle between the normals of two triangles below which the edge between them is sharp."""
 
 
 def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray[np.bool_]]:
-    """Return triangles with one vertex where there were several, and a mask of the kept ones, which have an area."""
+    """Merge coincident vertices; return vertices, the triangles that keep an area, and a mask of these triangles."""
     whole = np.rint((vertices - vertices.min(axis=0)) / (SAME * np.ptp(vertices, axis=0).max()))
     _, first, number = np.unique(whole, axis=0, return_index=True, return_inverse=True)
     found = number.reshape(-1)[corners]
@@ -30,7 +30,7 @@ def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray
 
 
 def sides_of(corners: Numbers) -> Numbers:
-    """Return the sides (3 t, 2) of triangles (t, 3), those across each corner in turn."""
+    """Return the sides (3 t, 2) of triangles (t, 3): for each corner in turn the opposite side."""
     return corners[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
 
 
@@ -40,19 +40,19 @@ def lengths_of(vertices: Points, sides: Numbers) -> Points:
 
 
 def across_of(vertices: Points, corners: Numbers) -> Points:
-    """Return normals (t, 3) of triangles, outwards, as long as twice the area of each [m2]."""
+    """Return outward normals (t, 3) of triangles, with length twice the triangle's area [m2]."""
     a, b, c = vertices[corners].transpose(1, 0, 2)
     return np.asarray(np.cross(b - a, c - a))
 
 
 def unit(vectors: NDArray[Any]) -> Points:
-    """Scale vectors (..., 3) to a length of 1, but for those of no length."""
+    """Scale vectors (..., 3) to length 1; zero vectors are unchanged."""
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
 
 
 def cosines_of(vertices: Points, corners: Numbers) -> Points:
-    """Return cosines (t, 3) of the angle between the normals of each triangle and the one beyond the side across each
-    corner; -1 without exactly one triangle beyond it."""
+    """Return cosines (t, 3) of the angle between the normals of each triangle and its neighbour at the side opposite to
+    each corner. Sides without exactly one neighbour have -1."""
     flat = unit(across_of(vertices, corners))
     _, which, counts = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True, return_counts=True)
     which = which.reshape(-1)
@@ -62,18 +62,18 @@ def cosines_of(vertices: Points, corners: Numbers) -> Points:
 
 @dataclass(frozen=True)
 class ShownSolid:
-    """A solid in a pose, as pictures show it."""
+    """A solid at a pose, for pictures."""
 
     name: str
     shape: Solid
-    """About its middle, not turned; of a tank the cavity."""
+    """Shape about the solid's middle, not rotated; for a tank, of the cavity."""
     position: Points
-    """(d,) where its middle is [m]"""
+    """(d,) position of the solid's middle [m]"""
     turn: Points
     """(d, d) rotation matrix"""
     finish: Finish
     is_tank: bool
-    """True where fluid is inside of it."""
+    """True if the solid contains fluid."""
 
     @property
     def colour(self) -> Points:
@@ -92,21 +92,22 @@ class ShownSolid:
 
     @property
     def solid(self) -> Solid:
-        """Return the solid where fluid cannot be: outside of the cavity for a tank."""
+        """Return the region that fluid cannot enter: for a tank, the outside of the cavity."""
         return Hollow(self.body) if self.is_tank else self.body
 
     def moved(self, position: Points, turn: Points) -> "ShownSolid":
-        """Return the solid in another pose: its middle at a position (d,) [m], turned by a matrix (d, d)."""
+        """Return the solid at another pose: with its middle at ``position`` (d,) [m] and rotation matrix ``turn`` (d,
+        d)."""
         return replace(self, position=position, turn=turn)
 
     def within(self, frame: Points, origin: Points) -> "ShownSolid":
-        """Return the solid in other axes: those of a frame (d, d), from an origin (d,) [m]."""
+        """Return the solid in other coordinates: with axes ``frame`` (d, d) and origin ``origin`` (d,) [m]."""
         return self.moved(frame @ (self.position - origin), frame @ self.turn)
 
 
 def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
-    """Return the solids of a scene where its tables have them, or as images within a period that they went beyond;
-    behind them the images a period away that reach into the container."""
+    """Return the solids of a scene at the poses in its tables, moved into the period along periodic axes. They are
+    followed by periodic images that reach into the container."""
     found, domain = [], scene.domain
     for table in scene.solid:
         shape, is_tank = table.shown_shape(scene.discretisation.spacing), table.side == "inside"
@@ -121,17 +122,17 @@ def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
 
 
 def extents_of_solids(scenes: Iterable[Scene]) -> list[tuple[Points, Points]]:
-    """Return lower and upper ends (d,) [m] of each solid in scenes."""
+    """Return lower and upper ends (d,) [m] of each solid of the scenes."""
     return [one.body.extent() for scene in scenes for one in shown_solids(scene)]
 
 
 def extent_with(ends: tuple[Points, Points], scenes: Iterable[Scene]) -> tuple[Points, Points]:
-    """Return lower and upper ends (d,) [m] of a box and of the solids of scenes together."""
+    """Return lower and upper ends (d,) [m] of the smallest box around a given box and the solids of scenes."""
     return union([ends, *extents_of_solids(scenes)])
 
 
 def union(boxes: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
-    """Return lower and upper ends (d,) [m] of boxes, which are pairs of such ends."""
+    """Return lower and upper ends (d,) [m] of the smallest box around boxes, given as pairs of such ends."""
     both = np.array(boxes)
     return both[:, 0].min(axis=0), both[:, 1].max(axis=0)
 
@@ -142,25 +143,25 @@ def _overlap(one: tuple[Points, Points], other: tuple[Points, Points]) -> bool:
 
 
 SIDES = 48
-"""Number of sides of the polygon that stands for a circle."""
+"""Number of sides of the polygon drawn for a circle."""
 FLAT = 1.0 - 1e-9
-"""Cosine of the angle between triangles below which they are not of one plane."""
+"""Cosine of the angle between two triangles below which they do not count as coplanar."""
 
 
 def solid_outline(scene: Scene) -> Points:
-    """Return ends (k, 2, d) [m] of the lines that draw the solids of a scene at rest; none without solids."""
+    """Return ends (k, 2, d) [m] of the outlines of a scene's solids at rest; k is 0 without solids."""
     lines = [own_lines(one) @ one.turn.T + one.position for one in shown_solids(scene)]
     return np.concatenate([np.zeros((0, 2, scene.dimension)), *lines])
 
 
 def own_faces(shown: ShownSolid) -> Faces:
-    """Return faces of a solid about its middle, not turned, few enough for lines and for viewers."""
+    """Return a solid's faces about its middle, not rotated; few enough for outlines and viewers."""
     sizes = np.ptp(shown.shape.extent(), axis=0)
     return shown.shape.shown_faces(np.pi / SIDES * float(max(sizes.min(), 0.25 * sizes.max())))
 
 
 def own_lines(shown: ShownSolid) -> Points:
-    """Return ends (k, 2, d) [m] of the lines that draw a solid about its middle, not turned."""
+    """Return ends (k, 2, d) [m] of a solid's outline about its middle, not rotated."""
     faces = own_faces(shown)
     if len(shown.turn) == 2:
         return faces.vertices[faces.corners]
@@ -172,7 +173,7 @@ def own_lines(shown: ShownSolid) -> Points:
 
 
 def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
-    """Return lines (k, 2, 3) [m] where triangles cross the plane through the origin across an axis."""
+    """Return lines (k, 2, 3) [m] in which triangles intersect the plane through the origin perpendicular to an axis."""
     above = points[:, axis] >= 0.0
     crossing = corners[(above[corners] != above[corners[:, :1]]).any(axis=1)]
     start, end = points[sides_of(crossing)].transpose(1, 0, 2)
@@ -185,8 +186,8 @@ def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
 def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
     """Cut triangles (t, 3) of vertices (v, 3) [m] into smaller ones, and return the parent (p,) of each.
 
-    Every side has a power of two of equal parts, as many as it needs to have none longer than ``longest`` [m], so that
-    triangles beside each other fit. Other sides of the parts are at most the square root of 2 longer.
+    Each side is cut into 2^k equal parts no longer than ``longest`` [m], with the least k; so adjacent triangles fit.
+    Other sides of the parts are longer by at most a factor of the square root of 2.
     """
     parts = _parts(lengths_of(vertices, sides_of(corners)), longest).reshape(-1, 3)
     thin = (parts.min(axis=1) == 1) & (np.sort(parts, axis=1)[:, 1] > 1)
@@ -204,12 +205,12 @@ def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points,
 
 
 def _parts(lengths: Points, longest: float) -> Numbers:
-    """Return into how many parts a side is cut."""
+    """Return the number of parts into which each side is cut."""
     return 2 ** np.ceil(np.log2(np.maximum(lengths / longest, 1.0))).astype(np.int64)
 
 
 def _halved(vertices: Points, corners: Numbers, parents: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
-    """Cut each long side of triangles in two again and again."""
+    """Bisect long sides of triangles repeatedly."""
     while len(corners):
         sides, which = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True)
         is_long = _parts(lengths_of(vertices, sides), longest) > 1
@@ -223,7 +224,8 @@ def _halved(vertices: Points, corners: Numbers, parents: Numbers, longest: float
 
 
 def _cut(corners: Numbers, middles: Numbers, parents: Numbers) -> tuple[Numbers, Numbers]:
-    """Cut triangles (t, 3) into parts: ``middles`` (t, 3) is the new vertex of the side across each corner, or -1."""
+    """Cut triangles (t, 3) into parts: ``middles`` (t, 3) are the new vertices on the sides opposite to each corner, or
+    -1."""
     count, found, own = (middles >= 0).sum(axis=1), [], []
 
     def add(which: NDArray[np.bool_], *parts: tuple[Numbers, Numbers, Numbers]) -> None:
@@ -262,9 +264,9 @@ def _in_strips(triangles: Points, parents: Numbers, first: int, second: int) -> 
 
 
 ROUNDS = 8
-"""Rounds of smoothing, which removes the steps that light from few directions leaves on round solids."""
+"""Rounds of smoothing, which removes steps in the light on round solids caused by few light directions."""
 FAR = 1e9
-"""Distance [m] from a sharp edge of a triangle that has none."""
+"""Distance [m] assigned to triangles without a sharp edge."""
 
 
 @dataclass(frozen=True)
@@ -278,8 +280,8 @@ class SolidMesh:
     triangles: Numbers
     """(t, 3) numbers of points"""
     from_edges: Points
-    """(t, 3, 3) distance of each corner (a column) from each side (a row) of the face that its triangle is part of [m];
-    `FAR` where the side is no sharp edge"""
+    """(t, 3, 3) distance [m] of each corner (column) from each side (row) of the face to which the triangle belongs;
+    `FAR` if the side is no sharp edge"""
 
     @classmethod
     def of(cls, faces: Faces, longest: float) -> "SolidMesh":
@@ -307,7 +309,7 @@ class SolidMesh:
         return values
 
     def moved(self, turn: Points, position: Points) -> "SolidMesh":
-        """Return the mesh turned by a matrix (3, 3) and then moved (3,) [m]."""
+        """Return the mesh rotated by a matrix (3, 3) and then shifted (3,) [m]."""
         return SolidMesh(self.points @ turn.T + position, self.normals @ turn.T, self.triangles, self.from_edges)
 
     @classmethod
@@ -323,7 +325,7 @@ class SolidMesh:
 
 
 def _normals(corners: Numbers, across: Points) -> Points:
-    """Return at each corner (t, 3, 3) the mean of the normals of triangles there, without those beyond sharp edges."""
+    """Return at each corner (t, 3, 3) the mean normal of the adjacent triangles, except those beyond sharp edges."""
     order = np.argsort(corners.ravel(), kind="stable")
     counts = np.bincount(corners.ravel())
     ends = np.cumsum(counts)
@@ -350,7 +352,7 @@ def _from_edges(points: Points, corners: Numbers, parts: Points, parents: Number
 
 
 def turn_in_space(turn: Points) -> Points:
-    """Return a rotation (d, d) as one of space, about z in the plane."""
+    """Extend a rotation (d, d) to three dimensions; a 2-D rotation becomes one about z."""
     found = np.eye(3)
     found[: len(turn), : len(turn)] = turn
     return found

@@ -1,4 +1,4 @@
-"""Where a picture of fluid in space is taken: which way is up, the floor, the container, the lamps, and a camera."""
+"""The surroundings of fluid in a 3-D picture: up direction, floor, container, lamps and camera."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -14,19 +14,19 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import INDEX_OF_AXIS, BoxContainer, Container, CylinderContainer
 
 DROPS = 0.002
-"""The share of particles at either end of an axis that may lie outside of a picture."""
+"""Fraction of particles at each end of an axis that may lie outside the picture."""
 SPILT, BEYOND = 0.1, 0.15
-"""The share of particles at either end of an axis that does not widen the picture if it is far away; and how much wider
-than all others a picture is, in their widths."""
+"""Fraction of particles at each end of an axis that does not widen the picture if far away; and the picture's margin
+around all others, relative to their extent."""
 NEAR = 0.25
-"""How far from the first state, solids and container fluid is near enough for every drop to count, in their size."""
+"""Distance from first state, solids and container within which every drop counts, relative to their size."""
 ENOUGH = 1_000_000
-"""Number of positions, of all particles in all frames, that tell where the fluid comes to."""
+"""Number of positions, sampled from all particles and frames, that determine the fluid's extent."""
 
 
 def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIODS) -> list[Points]:
-    """Return states (m, d) [m] of positions (n, d) or (frames, n, d) [m] that tell where the fluid comes to: all, or
-    `ENOUGH` positions together if there are more. They are images within the period of a domain."""
+    """Return states (m, d) [m] that determine the fluid's extent, from positions (n, d) or (frames, n, d) [m]: all, or
+    `ENOUGH` positions in total if there are more. They are moved into the period of ``domain``."""
     states = [positions] if isinstance(positions, np.ndarray) and positions.ndim == 2 else list(positions)
     stride = max(sum(map(len, states)) // ENOUGH, 1)
     return [domain.wrapped(state[k % min(stride, len(state) or 1) :: stride]) for k, state in enumerate(states)]
@@ -35,9 +35,9 @@ def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIO
 def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
     """Return lower and upper ends (d,) [m] of the fluid that a picture shows, in states (n, d) [m].
 
-    ``around`` are the ends of everything else in the picture. All of the first state counts. Of a later state the bulk
-    counts, and drops that are near the first state and near everything else: drops that fall far away do not make the
-    rest of the picture small.
+    ``around`` are the ends of everything else in the picture. All of the first state counts. Of later states the bulk
+    counts, and drops near the box around the first state and everything else. Drops that fall far away do not shrink
+    the picture.
     """
     first, *later = states
     found = [_ends(first, DROPS)]
@@ -57,25 +57,26 @@ def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points
 
 
 def _ends(positions: Points, share: float) -> tuple[Points, Points]:
-    """Return lower and upper ends (d,) [m] of positions (n, d) [m], without a share of them at both ends of an axis."""
+    """Return lower and upper ends (d,) [m] of positions (n, d) [m], leaving out a fraction ``share`` at both ends of
+    each axis."""
     lower, upper = np.quantile(positions, (share, 1.0 - share), axis=0)
     return lower, upper
 
 
 TINT = 2.6
-"""Ratio of the depth at which light is scattered to that at which it takes the colour of a fluid without a material."""
+"""Scattering depth / depth at which light takes the fluid's colour, for fluids without a material."""
 SPAN = 0.1
-"""Thickness of fluid for which transparency is told, in sizes of the contents."""
+"""Thickness of fluid for which transparency is defined, relative to the size of the contents."""
 LAYERS, LAYERS_OF_SPHERES = 3.0, 1e3
-"""How often light is scattered within a spacing of what is opaque."""
+"""Number of scattering events within one spacing of opaque fluid, and of spheres."""
 
 
 def media_of(scene: Scene, size: float) -> tuple[Points, float]:
-    """Return scattering and absorption (phases, 2) [1/m] for contents of a size [m], and the part of light that goes
-    through `SPAN` of it, the mean of all phases.
+    """Return scattering and absorption (phases, 2) [1/m] for contents of ``size`` [m], and the fraction of light
+    transmitted through `SPAN`, averaged over phases.
 
-    They are those of materials, unless the picture has a transparency of its own or particles have other colours than
-    those of phases. A layer of particles hides what is behind it where fluid without a material is opaque.
+    They are the materials' values, unless the picture sets a transparency or particles have other colours than their
+    phases. One layer of particles of an opaque fluid without a material hides everything behind.
     """
     picture, spacing = scene.picture or Picture(), scene.discretisation.spacing
     by_phase, transparency = picture.colour == "phase", picture.transparency
@@ -101,18 +102,19 @@ def media_of(scene: Scene, size: float) -> tuple[Points, float]:
 MARGIN = 1.10
 """Ratio of a picture's width to that of its contents."""
 AROUND = 1.08
-"""Factor by which a camera that goes around is further off, as the contents are not in its middle from all sides."""
+"""Distance factor for an orbiting camera, as the contents are not central from all sides."""
 AIR = 0.1
-"""Space beside fluid that no container holds, in its widths."""
+"""Space beside fluid without a container, relative to the fluid's width."""
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
-"""Elevation of the camera [degrees]: where the fluid is drawn on, as in latte art, and elsewhere."""
+"""Elevation of the camera [degrees]: for scenes with a pattern on the fluid, such as latte art, and for others."""
 AZIMUTH = 24.0
 """Azimuth of the camera, to the right of the direction towards the viewer [degrees]."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Everything around the fluid, in the frame of the picture: y is up, the origin in the middle of what is shown."""
+    """Everything around the fluid, in picture axes: y is up, and the origin is in the middle of the picture's
+    contents."""
 
     frame: Points
     """(3, 3) rotation from the scene's axes to those of the picture"""
@@ -123,15 +125,15 @@ class Stage:
     upper: Points
     """(3,) [m]"""
     seen: tuple[Points, Points]
-    """Lower and upper ends (3,) [m] of what the camera sees, in the frame of the picture."""
+    """Lower and upper ends (3,) [m] of the region that the camera sees, in picture axes."""
     elevation: float
-    """Elevation of the camera, where the picture does not place it [degrees]."""
+    """Elevation [degrees] of the camera, unless the table [picture] sets its place."""
     eye: Points
-    """(3,) where the camera is [m]"""
+    """(3,) position of the camera [m]"""
     look_at: Points
     """(3,) [m]"""
     azimuth: float
-    """Azimuth from which the camera looks at home: the lamps stay where they are when it moves [degrees]."""
+    """Azimuth [degrees] of the camera's home view; the lamps keep their places when the camera moves."""
     picture: Picture
     container: Any
     spacing: float
@@ -141,14 +143,14 @@ class Stage:
     media: Points
     """(phases, 2) scattering and absorption [1/m], as `media_of`"""
     cuts: bool
-    """True where fluid is shown within the container only."""
+    """True if fluid is shown only inside the container."""
     solids: tuple[ShownSolid, ...]
     """The solids in the frame of the picture."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "Stage":
-        """Make the stage of a scene in 3-D, whose fluid is at positions (n, 3) or (frames, n, 3) [m]; ``poses`` as of
-        `painter`."""
+        """Make the stage of a scene in 3-D, whose fluid is at positions (n, 3) or (frames, n, 3) [m]; ``poses`` are as
+        in `painter`."""
         states, picture = thinned(positions, scene.container.domain(3)), scene.picture or Picture()
         ends = scene.container.extent()
         scenes = [scene, *poses]
@@ -177,8 +179,8 @@ class Stage:
         return own.framed((lower, upper), picture).at(scene, None)
 
     def framed(self, ends: tuple[Points, Points], picture: Picture) -> "Stage":
-        """Return the stage in a picture of another size, with a camera that sees all between ``ends`` (3,) [m], in the
-        scene's axes, or is where the picture says."""
+        """Return the stage for a picture of another size. The camera sees all between ``ends`` (3,) [m] in the scene's
+        axes, unless ``picture`` sets its place."""
         lower, upper = _box((corners(*ends) - self.origin) @ self.frame.T)
         eye, look_at = fitted(lower, upper, self.elevation, picture)
         if picture.look_at is not None:
@@ -197,17 +199,18 @@ class Stage:
 
     @property
     def seen_size(self) -> Points:
-        """Return width and height (2,) [m] of the camera's view of the contents, across its direction."""
+        """Return width and height (2,) [m] of the camera's view of the contents, perpendicular to its direction."""
         return np.ptp(corners(*self.seen) @ np.stack(screen_axes(self.look_at - self.eye), axis=1), axis=0)
 
     @property
     def home(self) -> View:
-        """Return the view of the camera at its own place, in the scene's axes."""
+        """Return the camera's home view, in the scene's axes."""
         return View(*(self.frame.T @ place + self.origin for place in (self.eye, self.look_at)))
 
     @property
     def home_around(self) -> View:
-        """Return the home view, but far enough to see all from all sides, if the picture does not place the camera."""
+        """Return the home view, moved far enough away to see all from every side, unless [picture] sets the camera's
+        place."""
         if self.picture.camera is not None:
             return self.home
         back, middle = self.eye - self.look_at, 0.5 * (self.seen[0] + self.seen[1])
@@ -218,7 +221,8 @@ class Stage:
         return View(*(self.frame.T @ place + self.origin for place in (eye, middle)))
 
     def at(self, pose: Scene | None, view: View | None) -> "Stage":
-        """Return the stage with solids where a scene has them, and with the camera at a view, each if it is given."""
+        """Return the stage with solids at the poses in the scene ``pose``, and with the camera at ``view``, each if
+        given."""
         found = self
         if pose is not None:
             solids = tuple(one.within(self.frame, self.origin) for one in shown_solids(pose))
@@ -230,7 +234,7 @@ class Stage:
 
     @property
     def cuts_solids(self) -> bool:
-        """Return True where solids are shown within the container only: not beside a cup without a lid."""
+        """Return True if solids are shown only inside the container, which is not so for a cup without a lid."""
         return bool(getattr(self.container, "lid", self.container.extent() is not None))
 
     @property
@@ -240,16 +244,16 @@ class Stage:
 
     @property
     def clearness(self) -> float:
-        """Return the part of the light that fluid lets through onto other fluid."""
+        """Return the fraction of light that passes through fluid to other fluid."""
         return 0.85 * self.transparency
 
     def placed(self, positions: Points) -> Points:
-        """Return positions (n, 3) [m] of the scene in the frame of the picture."""
+        """Convert positions (n, 3) [m] from the scene's axes to picture axes."""
         return (positions - self.origin) @ self.frame.T
 
     def on_screen(self, points: Points) -> Points:
-        """Return column and row (n, 2), in pixels from the upper left corner, where points (n, 3) [m] of the scene are
-        in the picture."""
+        """Return column and row (n, 2) in the picture, in pixels from the upper left corner, of points (n, 3) [m] of
+        the scene."""
         forward = self.look_at - self.eye
         forward = forward / np.linalg.norm(forward)
         off = self.placed(points) - self.eye
@@ -259,7 +263,7 @@ class Stage:
 
     @property
     def up_axis(self) -> int:
-        """Return the axis of the scene that is upright."""
+        """Return the scene's axis that points upwards."""
         return int(np.abs(self.frame[1]).argmax())
 
     @property
@@ -273,13 +277,13 @@ class Stage:
 
     @property
     def glass_ends(self) -> tuple[Points, Points]:
-        """Return lower and upper ends of the container [m], (3,) each, in the frame of the glass."""
+        """Return lower and upper ends of the container [m], (3,) each, in the axes of `glass_frame`."""
         return _box(self.placed(corners(*self.container.extent())) @ self.glass_frame.T)
 
     @property
     def room(self) -> tuple[Points, Points]:
-        """Return the ends, (3,) each [m], of the space where fluid is shown, in the frame of the glass; infinite
-        upwards, where an emitter may be, and along an axis that is periodic."""
+        """Return the ends [m], (3,) each, of the region where fluid is shown, in the axes of `glass_frame`. They are
+        infinite upwards, as emitters may be there, and along periodic axes."""
         lower, upper = (end.copy() for end in self.glass_ends)
         up = self.glass_frame @ (0.0, 1.0, 0.0)
         axis = int(np.abs(up).argmax())
@@ -292,7 +296,7 @@ class Stage:
 
     @property
     def panes(self) -> Points:
-        """Return (2, 3) 1 where a box has a pane of glass at its lower and at its upper ends; it is open on top."""
+        """Return (2, 3), 1 where a box has a pane of glass at its lower and upper ends, else 0; the top is open."""
         found = np.ones((2, 3))
         if isinstance(self.container, BoxContainer):
             found *= 1.0 - np.abs(self.frame) @ np.asarray(self.container.periodic, dtype=float)
@@ -321,7 +325,7 @@ def _box(points: Points) -> tuple[Points, Points]:
 
 
 def spilled(container: Container, positions: Points, spacing: float) -> bool:
-    """Test whether fluid at positions (n, 3) [m] came over the rim of a cup."""
+    """Test whether fluid at positions (n, 3) [m] has flowed over the rim of a cup."""
     if not isinstance(container, CylinderContainer) or container.lid:
         return False
     off = np.delete(positions - np.asarray(container.base), INDEX_OF_AXIS[container.axis], axis=1)
@@ -329,8 +333,8 @@ def spilled(container: Container, positions: Points, spacing: float) -> bool:
 
 
 def upright(gravity: Points) -> Points:
-    """Return the rotation (3, 3) from the scene's axes to right, up, towards the viewer: up is the axis against gravity
-    (3,), y where there is none."""
+    """Return the rotation (3, 3) from the scene's axes to (right, up, towards the viewer). Up is the axis opposite to
+    gravity (3,), or y without gravity."""
     axis = int(np.abs(gravity).argmax()) if gravity.any() else 1
     up, towards = np.zeros(3), np.zeros(3)
     up[axis] = -1.0 if gravity[axis] > 0.0 else 1.0
@@ -346,7 +350,7 @@ def _towards(azimuth: float, elevation: float) -> Points:
 def fitted(
     lower: Points, upper: Points, elevation: float, picture: Picture, azimuth: float = AZIMUTH
 ) -> tuple[Points, Points]:
-    """Return a place for the camera and one to look at, (3,) each [m], for a box to fill the picture."""
+    """Return the camera's position and its target point, (3,) each [m], so that a box fills the picture."""
     back, box = _towards(azimuth, elevation), corners(lower, upper)
     half = np.tan(0.5 * np.radians(picture.field_of_view)) / MARGIN
     halves = half, half * picture.height / picture.width

@@ -142,7 +142,8 @@ def axes_of(axes: Any, is_carried: bool) -> Axes:
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}
 """Normalisation of w by number of dimensions: this factor / reach^dimensions gives w the integral 1."""
 LEAST_REACH = 5.0
-"""Reach in spacings with which the weights of a lattice add up to 1 within 0.1 %, wherever the plane or column is."""
+"""Reach in spacings with which the weights of a lattice add up to 1 within 0.1 %, wherever the sensor's plane or column
+lies."""
 MOST_PARTS = 40
 """Greatest number of parts along an axis: enough for a reach of half a spacing; smaller reaches cause a warning."""
 

@@ -154,8 +154,8 @@ class QuantityEvaluator:
     def tangents(
         self, names: Iterable[str], moment: Moment, dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]
     ) -> Arrays:
-        """Return tangents of quantities along those of the state, by fields, and of the parameters of the step, as
-        `Moment` has them."""
+        """Return tangents of quantities, given tangents ``dot`` of the state's fields and ``parameters_dot`` of the
+        step's parameters, which are as in `Moment`."""
         wanted, solver = self._checked(names), self.solver
         step, p = self._begin(wanted, moment, replay=True)
         state_dot, along = solver.new_state(), solver.new_parameters(1)

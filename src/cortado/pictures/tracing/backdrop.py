@@ -1,6 +1,6 @@
-"""What is around the fluid, as Warp functions: lit surfaces, the sky with its lamps, the floor, a container of glass.
+"""The surroundings of the fluid as Warp functions: lit surfaces, sky with lamps, floor, and glass container.
 
-All is in the frame of the picture: y points upwards. Colours are linear.
+Coordinates are in picture axes, with y upwards; colours are linear.
 """
 
 from typing import Any
@@ -23,19 +23,19 @@ class LitSurface:
     colours: Vec3s
     """(points,)"""
     light: Vec3s
-    """(points,) light that falls on the surface, of which white reflects 1"""
+    """(points,) light that falls on the surface, in units in which a white surface reflects 1"""
     media: Vec2s
     """(points,) of a fluid: scattering and absorption [1/m]"""
     is_flat: wp.int32
-    """True where its colours are shown as they are, without light and shadow."""
+    """True if colours are shown unshaded, without light and shadow."""
     reach: wp.float32
-    """How far behind a wall the triangles of fluid that touches it are, at most [m]."""
+    """Greatest distance behind a wall of the triangles of fluid that touches the wall [m]."""
     left: Vec2s
-    """(triangles,) of transparent solids: the part of the light that comes through, seen from within and outside"""
+    """(triangles,) of transparent solids: fraction of light transmitted, seen from inside and from outside"""
     reflectivity: Floats
-    """(triangles,) of opaque solids: the part of the light that they reflect as a mirror in their colour does"""
+    """(triangles,) of opaque solids: fraction of light that they reflect like a mirror of their colour"""
     from_edges: wp.array(dtype=wp.mat33)
-    """(triangles,) of transparent solids: how far corners, the columns, are from up to three sharp edges [m]"""
+    """(triangles,) of transparent solids: distances [m] of corners (columns) from up to three sharp edges (rows)"""
 
 
 @wp.func
@@ -124,14 +124,14 @@ def shading_module(has_opaque: bool, has_clear: bool) -> Any:
 
 @wp.struct
 class Solids:
-    """The solids that fluid flows around, or is inside of, as meshes on the device."""
+    """The solids around or inside which fluid flows, as meshes on the device."""
 
     opaque: wp.uint64
     """The mesh of opaque solids."""
     are_cut: wp.int32
     """True where opaque solids are shown within the container only."""
     clear: wp.uint64
-    """The mesh of transparent solids and of tanks, which all of space outside of a cavity is within."""
+    """The mesh of transparent solids and of tanks; all space outside a tank's cavity counts as inside the tank."""
     has_tank: wp.int32
     surfaces: wp.array(dtype=LitSurface)
     """(2,) of opaque and of clear ones, if there are any; in an array, as functions get a copy of their arguments"""
@@ -142,11 +142,11 @@ class Environment:
     """Everything around the fluid, as kernels of the ray tracer take it."""
 
     size: wp.float32
-    """Size of the contents [m]: floor, grid and rims go by it."""
+    """Size of the contents [m], which scales floor, grid and rims."""
     nearest: wp.float32
-    """Distance of a ray's start from the surface that sends it [m]."""
+    """Distance [m] between a ray's start and the surface from which it starts."""
     segments: wp.int32
-    """Most parts of the way of a ray that is refracted into fluid, within it and between two places of it."""
+    """Greatest number of segments of a ray refracted into fluid: inside fluid, and between two bodies of fluid."""
     sun: wp.vec3
     """Unit vector towards the lamp."""
     fill: wp.vec3
@@ -156,7 +156,7 @@ class Environment:
     strip: wp.vec3
     """Colour of the second lamp in reflections."""
     sunlight: wp.vec3
-    """Light of the lamp that falls on surfaces that face it."""
+    """Light of the lamp on surfaces that face it."""
     horizon: wp.vec3
     zenith: wp.vec3
     has_floor: wp.int32
@@ -190,7 +190,7 @@ class Environment:
     edge_colour: wp.vec3
     """Colour of the container's edges."""
     has_walls: wp.int32
-    """True for an opaque container: one looks into it from outside, and sees its walls from within."""
+    """True for an opaque container: walls are invisible from outside and visible from inside."""
     wall_colour: wp.vec3
     wall_reflectivity: wp.float32
     solids: Solids
@@ -226,13 +226,14 @@ def sky(s: Environment, d: wp.vec3):
 
 @wp.func
 def open_light(s: Environment, normal: wp.vec3):
-    """Return the light that falls on a surface that nothing hides."""
+    """Return the light that falls on an unobstructed surface."""
     return 0.35 * (s.horizon + s.zenith) + s.sunlight * wp.max(wp.dot(normal, s.sun), 0.0)
 
 
 @wp.func
 def shadow_at(s: Environment, shadow: Vec3s2d, x: wp.float32, z: wp.float32):
-    """Return the part of light that reaches a place of the floor, interpolated between nodes; all of it elsewhere."""
+    """Return the fraction of light that reaches a place of the floor, interpolated between nodes; 1 outside the
+    nodes."""
     u = (x - s.shadow_corner[0]) / s.shadow_cell
     v = (z - s.shadow_corner[2]) / s.shadow_cell
     i = wp.int32(wp.floor(u))
@@ -292,8 +293,8 @@ def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, 
 
 @wp.func
 def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
-    """Return the span of a ray within the upright cylinder, open at its ends, that a box holds; from FAR to -FAR where
-    it is not."""
+    """Return the span of a ray inside the upright cylinder, open at its ends, inscribed in a box; from FAR to -FAR if
+    the ray misses it."""
     radius = 0.5 * (upper[0] - lower[0])
     x = o[0] - 0.5 * (lower[0] + upper[0])
     z = o[2] - 0.5 * (lower[2] + upper[2])
@@ -311,7 +312,7 @@ def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Return the span of a ray within the walls of the container; from FAR to -FAR where it is not."""
+    """Return the span of a ray inside the container's walls; from FAR to -FAR if the ray misses the container."""
     p = s.glass_frame * o
     q = s.glass_frame * d
     span = wp.vec2(-FAR, FAR)
@@ -327,7 +328,7 @@ def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def room(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Return the span of a ray in which fluid is shown; from FAR to -FAR where there is none."""
+    """Return the span of a ray in which fluid is shown; from FAR to -FAR if there is no such span."""
     if s.has_room == 0:
         return wp.vec2(-FAR, FAR)
     return within_walls(s, o, d)
@@ -366,12 +367,12 @@ GLASS_EDGE = wp.constant(wp.vec3(*EDGE))
 
 
 MILKY = wp.constant(wp.float32(0.07))
-"""Greatest part of the light that a pane of glass reflects, so that one sees through panes along which one looks."""
+"""Greatest fraction of light that a glass pane reflects, so that panes stay transparent at grazing angles."""
 
 
 @wp.struct
 class Passed:
-    """The light that the glass on a ray's way adds, and the part that it leaves."""
+    """The light that glass adds along a ray, and the fraction of light that it transmits."""
 
     light: wp.vec3
     through: wp.float32
@@ -381,8 +382,7 @@ class Passed:
 def pane(
     s: Environment, d: wp.vec3, normal: wp.vec3, rim: wp.float32, is_pane: wp.float32, colour: wp.vec3, behind: Passed
 ):
-    """Add one more sheet of glass behind those that are passed; ``rim``: how much of its coloured edge is seen, 0 to
-    1."""
+    """Add a sheet of glass behind the sheets already passed; ``rim``: visibility of its coloured edge, from 0 to 1."""
     cosine = wp.abs(wp.dot(d, normal))
     f = schlick(0.04, cosine)
     reflectance = is_pane * wp.min(1.4 * f / (1.0 + f), MILKY)
@@ -399,5 +399,5 @@ def pane(
 
 @wp.func
 def rim_of(off: wp.float32, width: wp.float32):
-    """Return how much of an edge is seen at a distance from it."""
+    """Return the visibility of an edge at a distance from it."""
     return 0.8 * (1.0 - smooth_step(0.55 * width, width, off))

@@ -63,9 +63,9 @@ def mirrored(
 ) -> tuple[Points, np.ndarray]:
     """Return mirror images (m, d) [m] of points (n, d) [m] behind solids, and the point of each, (m,).
 
-    Points have images if they are nearer to a solid than ``touching`` [m]: behind each side of it that they touch, and
-    behind corners between these. Where a solid is too thin to hide fluid that is drawn there, images are nearer to the
-    surface, or there are none.
+    A point closer to a solid than ``touching`` [m] has an image behind each touched side, and behind the corner between
+    two touched sides. If the solid is too thin to hide fluid drawn at the images, they are closer to the surface or
+    left out.
     """
     dimension = points.shape[1]
     images, of = [np.zeros((0, dimension))], [np.zeros(0, dtype=int)]
@@ -82,8 +82,8 @@ def mirrored(
 
 
 def _ways(points: Points, shown: ShownSolid, touching: float, spacing: float) -> list[Points]:
-    """Return the way (n, d) [m] from each of the points (n, d) [m] to its image behind each side that it touches; 0
-    where there is none. Sides are looked for towards the nearest point, and along the axes of the solid."""
+    """Return for each touched side the vectors (n, d) [m] from points (n, d) [m] to their images behind this side; 0
+    without an image. Sides are searched towards the solid's nearest point and along its axes."""
     solid, normals, ways = shown.solid, list[Points](), list[Points]()
     for probe in touching * np.concatenate([np.zeros((1, len(shown.turn))), shown.turn.T, -shown.turn.T]):
         feet, away = solid.nearest(points + probe), solid.outward(points + probe)

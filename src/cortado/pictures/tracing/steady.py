@@ -1,9 +1,9 @@
-"""Fluid at rest is drawn at rest: what is drawn of it is averaged over those frames of a film in which it stays.
+"""Keep fluid at rest from moving in films: its drawn surface is averaged over the frames in which it is at rest.
 
-Particles of water at rest go on swimming about, and move its surface by parts of a spacing. In each block of the
-lattice the mean level tells how far the fluid is from where it is in the frames before and after. Frames in which that
-is less than a part of a spacing, one after the other without a gap, have a share in the level that is drawn. Where
-fluid moves further from frame to frame, and in drops, no other frame has one, and the level stays as it is, to the bit.
+Particles of water at rest keep drifting and move its surface by fractions of a spacing. In each block of the lattice
+the mean level tells how far the fluid has moved in earlier and later frames. Consecutive frames with a displacement
+below a fraction of a spacing contribute to the drawn level. Where fluid moves further between frames, and in drops, no
+other frame contributes, and the level stays the same bit for bit.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,8 @@ from cortado.pictures.tracing.near_particles import (
 from cortado.pictures.tracing.surface_net import CUBES, WIDTH, Blocks, block_at, index_of, place_of
 
 WINDOW, SHADOW_WINDOW = 30, 6
-"""Frames before and after one that have a share in its level and in its shadow, the less the farther they are."""
+"""Number of frames before and after a frame that contribute to its level, and to its shadow, with weights that fall
+with distance."""
 LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.35, 0.7), (0.4, 0.8), (0.02, 0.04)
 """How far the fluid in a block is, in spacings, and how much the level at a node and the light on the floor differ, for
 a frame to count fully, and not at all."""
@@ -65,7 +66,8 @@ def share(way: wp.float32, limits: wp.vec2):
 
 @wp.func
 def nearness(j: wp.int32, before: wp.int32, window: wp.int32):
-    """Return the weight of another frame, of which ``before`` come first, nearest first: it falls from 1 to 0."""
+    """Return the weight of another frame j, falling from 1 to 0; the first ``before`` frames are earlier ones, nearest
+    first."""
     away = wp.where(j < before, j, j - before) + 1
     return 1.0 - float(away) / float(window + 1)
 

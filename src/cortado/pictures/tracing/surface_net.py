@@ -1,9 +1,9 @@
-"""The surface where the level of a fluid is reached: a net with one corner in each cube that it passes (Gibson 1998).
+"""The isosurface of a fluid's level, as a net with one corner in each lattice cube that it passes (Gibson 1998).
 
-The level stands on the nodes of a lattice that is fixed in space, which is cut into blocks of `WIDTH` cubes along each
-axis. The level at the corners of all blocks tells which of them the surface may pass; those alone are looked at more
-closely. Corners of the net in cubes side by side are neighbours, so that each has at most six. The net has a
-quadrilateral across each side of a cube whose ends are on either side of the surface.
+The level is stored at the nodes of a lattice fixed in space, divided into blocks of `WIDTH` cubes along each axis. The
+level at the blocks' corners tells which blocks the surface may pass; only in these all nodes are computed. Corners of
+the net in adjacent cubes are neighbours, so each has at most six. The net has a quadrilateral across each cube edge
+whose ends are on different sides of the surface.
 """
 
 from dataclasses import dataclass

@@ -60,7 +60,7 @@ def effort_of(picture: Picture) -> Effort:
 
 
 BOUNCED = wp.constant(wp.float32(0.45))
-"""The part of the light around that falls on solids, and back from them."""
+"""Fraction of the surrounding light that solids receive and reflect."""
 
 
 @wp.func
@@ -144,9 +144,8 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
 INDEX = wp.constant(wp.float32(1.33))
 """Refractive index of water."""
 FAINT = wp.constant(wp.float32(0.05))
-"""Reflectance below which light that leaves fluid is not split. The reflectance that counts grows from 0 there, and is
-1 where reflection is total. Otherwise there would be an edge in the light where a smooth surface comes near that
-angle."""
+"""Reflectance below which light leaving fluid is not split. Above it a rescaled reflectance is used, which grows from 0
+here to 1 at total reflection: otherwise the picture would show an edge at this angle."""
 DARK = wp.constant(wp.float32(10.0))
 """Number of free paths of light within fluid beyond which nothing is seen: a part of 5e-5 goes as far."""
 
