@@ -101,7 +101,7 @@ class ParticleSolver(Staying):
         self.substeps = 0
         """Number of substeps of diffusion in each step."""
         self.carried = Carried(self.carried_fields, layout, requires_grad)
-        """Sorted, as they were at the start of the step."""
+        """The carried fields of sorted particles at the start of the step."""
         of_parts = (field for part in self.parts for field in part.fields)
         self.state_fields = (POSITIONS, VELOCITIES, *of_parts, *self.carried_fields)
         """The fields of a state."""
@@ -278,7 +278,7 @@ class ParticleSolver(Staying):
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
         """Return densities (n,) of a state in the scene's order [kg / m3]; in a batch the scenes are concatenated.
-        Solids are where they are at the end of a ``step``, counted from 0. The solver's arrays are overwritten."""
+        Solids have the poses at the end of ``step``, counted from 0. The solver's arrays are overwritten."""
         self.reset(step)
         self.sort(state, parameters)
         while self.make_room():

@@ -1,8 +1,8 @@
-"""Drains: particles that come into one are taken out of the fluid, and fluid flows to a sink as its flow rate says.
+"""Drains, which remove particles that enter them, and sinks, to which fluid flows at a given flow rate.
 
 A particle that is in a drain as a step begins is taken: from the end of the step on it rests at a place of its own, far
-from all others, with ``drained`` = 1, 2, ..., the number of the drain. Of the choice there is no derivative, and what
-was taken has none.
+from all others, with ``drained`` = 1, 2, ..., the number of the drain. The choice has no derivative, nor have the
+removed particles.
 
 A sink makes fluid around it flow to its middle c, with y = x - c, r = |y| and the flow rate Q:
 
@@ -53,9 +53,9 @@ MEMORY = 0.98
 """lambda: which part of what pressure did in the step before a sink works against."""
 BOX, PLANE, BALL = 0, 1, 2
 MOST = 0.25
-"""The greatest part of M that a sink is behind."""
+"""Greatest |E| / M of a sink."""
 DRAINED = StateField("drained", "", Entry.NUMBER)
-"""The number of the drain that took a particle, from 1 on; 0 of one in the fluid."""
+"""The number, from 1 on, of the drain that removed a particle; 0 for particles in the fluid."""
 
 
 def behind(name: str) -> StateField:
@@ -96,11 +96,11 @@ class Drained:
 
     mouths: Sequence[Mouth]
     pulls: Mapping[str, Pull]
-    """Of those that suck, by their names."""
+    """How fluid flows to the sinks, by their names."""
     places: Points
     """(n, d) [m]"""
     nozzles: Sequence[Nozzle]
-    """In which particles wait that no drain takes."""
+    """Nozzles; no drain removes the particles that wait in them."""
     periods: Points
     """(d,) [m], 0 along an axis that is not periodic"""
 
@@ -296,7 +296,7 @@ class Drains(Part):
     def __init__(self, of: Drained, layout: Layout, taped: bool):
         self.layout, precision, device, real = layout, layout.precision, layout.device, layout.precision.real
         self.free = layout.state((POSITIONS, VELOCITIES), taped)
-        """Room for the end of a step if no particle were taken."""
+        """The state at the end of a step if no particle were removed."""
         self.wait, self.take, self.parks = drain_kernels(precision, taped)
         self.tally, self.fall_behind, self.drive, self.flows = pull_kernels(precision, taped)
         self.shares = tuple(f"{name}.position" for name in of.pulls)

@@ -1,4 +1,4 @@
-"""Fluid that comes out of a nozzle: particles are prescribed until they pass its opening, and then are free.
+"""Fluid from a nozzle: the motion of particles is prescribed until they pass the nozzle's opening; then they are free.
 
 A particle starts u upstream of the opening, o beside the axis. It is prescribed in step n = 0, 1, ..., while it is s =
 u - l > 0 upstream, where l grows by w dt in each step, w = Q / A:
@@ -6,12 +6,12 @@ u - l > 0 upstream, where l grows by w dt in each step, w = Q / A:
     x = q_n + o - s e,   v = (q_n - q_(n-1)) / dt + w e
 
 q_n is where the opening is after step n (it rests before the first), e its direction, Q the flow rate in the step and A
-its area. Position and velocity do not jump when a particle becomes free. Particles in reserve are further upstream
-than the column is long. They rest at places of their own until they join its end, which have no derivative.
+its area. Position and velocity do not jump when a particle becomes free. Particles in reserve are further upstream than
+the column is long. They rest at separate places, which have no derivative, until they join the column's end.
 
-A nozzle that drains feed gives the particles out again that they took. Whenever the column has room for a layer at its
-end, as many of them join it as are there, with u from their places in line, which go on behind those of the first
-particles. Which ones join has no derivative, and what they were before has none.
+A nozzle fed by drains emits again the particles that the drains removed. Whenever the column has room for a layer at
+its end, available particles join it, with u from places in line behind the first particles. The choice has no
+derivative, nor have the particles' earlier values.
 """
 
 from dataclasses import dataclass
@@ -47,9 +47,9 @@ def nozzle_type(precision: Precision) -> Any:
 
     class Nozzle:
         first: wp.int32
-        """Number of its first particle."""
+        """Number of the emitter's first particle."""
         count: wp.int32
-        """Number of its particles."""
+        """Number of the emitter's particles."""
         layer: wp.int32
         """Number of particles in a layer."""
         upstream: wp.array(dtype=real)
@@ -284,15 +284,15 @@ class Nozzle:
     area: float
     """Area of the opening [m2], in 2-D [m]."""
     places: np.ndarray
-    """Places (n, d) [m] at which particles of a scene rest that are in reserve."""
+    """Places (n, d) [m] at which the particles in reserve rest."""
     feeding: np.ndarray
-    """(drains + 1,) true where it gives the particles out again that the drain of this number took."""
+    """(drains + 1,) true if the nozzle emits again the particles that the drain with this number removed."""
 
     def part(self, layout: Layout, requires_grad: bool) -> "Emitter":
         return Emitter(self, layout, requires_grad)
 
     def constants(self, layout: Layout) -> Any:
-        """Return the struct of its constants."""
+        """Return the Warp struct of the emitter's constants."""
         precision, device, sample = layout.precision, layout.device, self.sample
         constants = nozzle_type(precision)()
         constants.first, constants.area, constants.layer = self.first, self.area, sample.layer
@@ -325,10 +325,10 @@ class Emitter(Part):
         drift = wp.zeros(layout.members, dtype=precision.vector, device=device, requires_grad=requires_grad)
         places = to_device(nozzle.places, precision, device)
         self.own = layout.state(self.fields, requires_grad)
-        """Its fields at the end of a step."""
+        """The emitter's fields at the end of a step."""
         serial = wp.zeros(layout.all_particles, dtype=wp.float64, device=device)
         self.constants = {"nozzle": nozzle.constants(layout), "drift": drift, "places": places, "serial": serial}
-        """Of the nozzle, and of a step once it has begun, for kernels."""
+        """Kernel arguments: constants of the nozzle, and after `begin` those of the step."""
         self.constants |= {"outlet": self.own[outlet_name(name)], "emitted": self.own[emitted_name(name)]}
         if is_fed:
             self.constants["serial"] = self.own[again_name(name)]
@@ -341,7 +341,7 @@ class Emitter(Part):
         return {f"path{suffix}": parameters[path_name(name)], f"flow{suffix}": parameters[f"{name}.flow_rate"]}
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Compute the motion of the column in the step, from the state before it, which the end may write over."""
+        """Compute the motion of the column in the step from the state before the step, which `end` may overwrite."""
         name = self.nozzle.name
         before = {"outlet_in": state[outlet_name(name)], "emitted_in": state[emitted_name(name)]}
         known = self.constants, self.parameters(step.parameters)
@@ -393,7 +393,7 @@ class EmitterTangent(PartTangent):
 
 
 FOLLOWED = ("outlet", "drift", "emitted")
-"""What has derivatives."""
+"""Names of the values that have derivatives."""
 
 
 class EmitterAdjoint(PartAdjoint):

@@ -315,7 +315,7 @@ class FrictionTangent(FrictionChanges):
             rows.launch(step, rows.kernels.give, given, dots.impulse)
 
     def act(self, step: StepContext, dot: Tangents, solid: int, name: str, total_dot: wp.array, *known: Named) -> None:
-        """Add to the tangent of the sum that `FreeFriction.act` adds to."""
+        """Add the tangents of the terms of `FreeFriction.act` to the tangent of the sum."""
         for change, dots, own, _ in self._each(step, dot):
             if solid in (ALL_WALLS, change.body.table.number):
                 self._rub(step, dot, dots, own, *known)

@@ -64,7 +64,7 @@ def hold_type(precision: Precision) -> Any:
 
 
 def hold_numbers(hold: Hold, precision: Precision) -> Any:
-    """Return a `hold_type` of how a body is held."""
+    """Return a ``hold`` as a Warp struct of `hold_type`."""
     made = hold_type(precision)()
     for name in ("moving", "arm", "axis"):
         setattr(made, name, precision.vector(*getattr(hold, name)))

@@ -1,18 +1,19 @@
-"""Springs that pull free bodies, and what turns them about hinges, as momenta that a step gives to bodies.
+"""Springs that pull free bodies, and springs and motors that turn bodies about hinges, as momenta that a step gives to
+bodies.
 
 A spring leads from the point q = c + R p of a body to the point q' of another solid, or of the world. With its length l
 = |q' - q|, the unit vector n along it and its stiffness k, rest length l_0 and damping C, it pulls with
 
     t = k (l - l_0) + C n . (w' - w),
 
-where w and w' are how fast both points go in the step if nothing but their present motion moves them. The body gets the
-momentum dt t n and its moment about the body's middle, the other solid the opposite. All is of where bodies are at the
-start of a step, with whose new velocities they then go on: symplectic Euler. Without damping a spring of the frequency
-omega has the period of arccos(1 - (omega dt)^2 / 2) / dt, within (omega dt)^2 / 24. Its energy swings and does not
-drift, and dt has no bound but 2 / omega.
+where w and w' are the velocities of both points by the present motion of the solids. The body gets the momentum dt t n
+and its moment about the body's middle; the other solid gets the opposite. Forces use the poses at the start of a step,
+and the new velocities then move the bodies: symplectic Euler. Without damping a spring of the frequency omega has the
+period of arccos(1 - (omega dt)^2 / 2) / dt, within (omega dt)^2 / 24. Its energy oscillates without drift, and the only
+bound on dt is 2 / omega.
 
-One that is slack only pulls: max(k (l - l_0) + s C n . (w' - w), 0), with s from 0 at l_0 to 1 at 1.01 l_0, and 0 below
-l_0. The derivative there is that of one side.
+A slack spring only pulls: t = max(k (l - l_0) + s C n . (w' - w), 0), with s from 0 at l_0 to 1 at 1.01 l_0, and t = 0
+below l_0. At the corner the derivative is one-sided.
 
 About its hinge with the axis a, a body that is turned by the angle phi from how the scene begins gets the torque T -
 k (phi - phi_0) - C (a . (W - W') - s), with the motor's torque T and speed s, and the other solid the opposite. Of a
@@ -38,7 +39,7 @@ from cortado.sph.free_solids import Changes, FreeSolidsPart, given_to
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 TAUT = 0.01
-"""By which part of its rest length a slack spring is longer where it is damped in full."""
+"""Relative extension of a slack spring from which on the damping is full."""
 OWN = ("before", "turns_before", "after", "turns")
 NUMBERS = ("stiffness", "rest_length", "damping")
 TURNING = ("stiffness", "rest_angle", "damping", "torque", "speed")
@@ -46,7 +47,7 @@ TURNING = ("stiffness", "rest_angle", "damping", "torque", "speed")
 
 @cache
 def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
-    """Make the kernels of springs and hinges, with a thread for each scene. They give the momenta by a spring, its
+    """Make the kernels of springs and hinges, with a thread for each scene. They compute the momenta by a spring, its
     force and length as the first two components of a vector, and the angular momentum by a hinge."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     taut, tiny, no, one = (wp.constant(real(value)) for value in (TAUT, precision.tiny, 0.0, 1.0))
@@ -187,13 +188,13 @@ class Springs:
         self._rest = resting_pose(layout)
 
     def ends(self, of: Ends | Joint) -> Named:
-        """Return the poses of both solids, with their tangents, by the names that kernels have."""
+        """Return the poses of both solids, with their tangents, by the names of kernel arguments."""
         each = self.part.made_of.walls.each
         other = self._rest if of.against < 0 else each[of.against]
         return {**each[self.number(of.body)], **{f"other_{name}": array for name, array in other.items()}}
 
     def poses(self, spring: Ends) -> tuple[Named, ...]:
-        """Return the poses of both solids of a spring, and what is constant, by the names that kernels have."""
+        """Return the poses of both solids of a spring, and its constants, by the names of kernel arguments."""
         vector = self.layout.precision.vector
         own, anchor = (vector(*padded(place[None])[0]) for place in (spring.point, spring.anchor))
         return self.ends(spring), {"own": own, "anchor": anchor, "slack": spring.slack, "is_free": spring.other >= 0}
@@ -203,7 +204,7 @@ class Springs:
         return self.part.bodies[body].table.number
 
     def known(self, of: Joint) -> tuple[Named, ...]:
-        """Return what kernels know of a body that is turned about a hinge."""
+        """Return kernel arguments about a body that is turned about a hinge."""
         matrix, body = matrix_of(self.layout.precision), self.part.bodies[of.body]
         begun, other_begun = (matrix(*one.turn.ravel()) for one in of.begun)
         constants = {"axis": self.layout.precision.vector(*of.axis), "begun": begun, "other_begun": other_begun}
@@ -229,7 +230,7 @@ class Springs:
 
 
 def numbers_of(parameters: Parameters, name: str, ends: Sequence[str], suffix: str = "") -> Named:
-    """Return the parameters of a spring or a hinge by the names that kernels have for them."""
+    """Return the parameters of a spring or a hinge by the names of kernel arguments."""
     return {f"{end}{suffix}": parameters[f"{name}.{end}"] for end in ends}
 
 
@@ -265,7 +266,7 @@ class PoseBars:
         self.named = {f"{way}{name}": wp.zeros(members, **vectors) for way in ("", "other_") for name in names}
 
     def add(self, of: Ends | Joint, bar: Adjoints) -> None:
-        """Add what a kernel has written to the adjoints of the solids' poses, and set it to 0."""
+        """Add the values written by a kernel to the adjoints of the solids' poses, and set these values to 0."""
         for way, number in (("", self._springs.number(of.body)), ("other_", of.against)):
             if number >= 0:
                 bar.solids.add_whole(number, **{name: self.named[f"{way}{name}"] for name in self._names})
@@ -298,7 +299,7 @@ class SpringsAdjoint:
 
 
 def springs_in(solver: Any) -> Iterator[tuple[Springs, Ends]]:
-    """Return the springs of a solver's parts, each with what computes it."""
+    """Return the springs of a solver's parts, each with the object that computes it."""
     for part in solver.parts:
         for pushes in part.pushes if isinstance(part, FreeSolidsPart) else ():
             if isinstance(pushes, Springs):

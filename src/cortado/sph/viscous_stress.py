@@ -187,8 +187,8 @@ class StressWalls:
     """The sums by which walls act on particles through viscous stress: a `cortado.sph.density.WallAction`."""
 
     def __init__(self, setting: Setting, stress: ViscousStress, work: WorkMaker, bar: str, name: str):
-        """Take ``work`` and ``bar`` of its `WallTerm`: `stress_work` for accelerations, `stress_couple_work` for their
-        couples; and the ``name`` of this action in the friction with free bodies."""
+        """Take ``work`` and ``bar``, the arguments of a `WallTerm`: `stress_work` for accelerations,
+        `stress_couple_work` for their couples; and the ``name`` of this action in the friction with free bodies."""
         self._stress, self._layout, self._name = stress, setting.layout, name
         term = WallTerm(setting.discretisation, "viscous_stress", work, bar, rubs=True)
         self._sums = WallSums(term, setting.layout, (stress.constants["least"], stress.constants["control"]))

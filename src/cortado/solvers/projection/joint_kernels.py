@@ -1,22 +1,21 @@
 """Hinges between free bodies and other solids in a step of the projection, with derivatives.
 
-A hinge keeps a point of a body A at a point of another solid B. In A's frame the point is at a, so that in a step it is
-on an arm R a from A's middle at first, and on R' a where A would go. Whatever gives the bodies new velocities, those
-by which they are faster, V - V_0 and W - W_0 (`cortado.sph.free_solids`), are to be such that at the end of the step
+A hinge keeps a point of a body A at a point of another solid B. In A's frame the point is at a. So its arm from A's
+middle is R a at the start of a step, and R' a at the predicted pose of A. The velocity changes V - V_0 and W - W_0
+(`cortado.sph.free_solids`), whatever their cause, must satisfy at the end of the step
 
     b = (V - V_0)_A + (W - W_0)_A x R'_A a_A - (the same of B) + (p'_A - p'_B) / dt = 0,
 
-where p' = c' + R' a is where the points would go. For this A gets the momentum lambda at R_A a_A, and B gets - lambda.
-So momentum is kept, and angular momentum too, as both act at one point. What is left of the gap is of the order of
-dt^4, and the next step takes it away. In space a hinge with the axis n keeps two of the three angles as well: with P =
-I - n n^T A gets the angular momentum P lambda, B the opposite, and
+where p' = c' + R' a is the predicted place of each point. For this A gets the momentum lambda at R_A a_A, and B gets -
+lambda. So momentum is conserved, and angular momentum too, because both act at one point. The remaining gap is of the
+order of dt^4, and the next step removes it. In space a hinge with the axis n also keeps two of the three angles: with P
+= I - n n^T A gets the angular momentum P lambda, B the opposite, and
 
     b = P ((W - W_0)_A - (W - W_0)_B) + n x (n'_A - n'_B) / dt = 0.
 
-Each of both is a row, and rows with the same body depend on each other: b is b_0 + K lambda with the blocks K_kl of
-three by three numbers, and a step solves K lambda = - b_0 once for each pressure by an elimination of blocks. A body
-that a prescribed solid holds gets all, as that has a motion of its own. So what pressures move are bodies on their
-hinges, beside fluid too; the coarse grid alone, which only has to come near, sees them loose.
+Each of these equations is a row, and rows with the same body are coupled: b is b_0 + K lambda with 3 x 3 blocks K_kl,
+and a step solves K lambda = - b_0 once for each pressure by block elimination. A solid with a prescribed motion gets no
+momentum. So pressures always move bodies with their hinges; only the approximate coarse grid treats the bodies as free.
 """
 
 from collections.abc import Sequence
@@ -34,18 +33,19 @@ from cortado.sph.moving_solids import hold_functions
 
 POSES = ("turns_before", "after", "turns")
 ROW = ("give", "take", "other_give", "other_take", "apart")
-"""What a row has: see `joint_kernels`."""
+"""Names of the arrays of a row: see `joint_kernels`."""
 
 
 @cache
 def joint_kernels(precision: Precision) -> SimpleNamespace:
     """Make the kernels of hinges, with a thread for each scene.
 
-    The kernels ``point`` and ``lean`` give the four matrices and the gap over the time step of a row: ``give`` makes
-    the moment of lambda on a body, and ``take`` the part of its W - W_0 in b. Then ``weigh`` adds to a block of K what
-    one body does, ``read`` gives b of velocities, and ``push`` adds to velocities what lambda does. Of whole systems
-    ``factor`` eliminates, ``solve`` gives lambda = - K^-1 b or the same of the transpose of K, ``lengthen`` adds K'
-    lambda to a tangent of b, and ``spread`` the outer product of the adjoint of b and lambda to the adjoint of K."""
+    The kernels ``point`` and ``lean`` compute a row's four matrices and its gap divided by the time step. The matrix
+    ``give`` maps lambda to its moment on a body, and ``take`` maps a body's W - W_0 to its term in b. Then ``weigh``
+    adds a body's term to a block of K, ``read`` computes b from velocities, and ``push`` adds the effect of lambda to
+    velocities. For whole systems ``factor`` eliminates, ``solve`` computes lambda = - K^-1 b, also with the transpose
+    of K, ``lengthen`` adds K' lambda to a tangent of b, and ``spread`` the outer product of the adjoint of b and lambda
+    to the adjoint of K."""
     real, vector, matrix, holds = precision.real, precision.vector, matrix_of(precision), hold_functions(precision)
     spin, held = holds.spin, holds.kind
     module = kernel_module(f"joints_derivative_{precision.name}")

@@ -20,21 +20,21 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 Arrays = dict[str, wp.array]
 GUARD = {"float32": 1e-5, "float64": 1e-10}
-"""Part of its trace that each diagonal block of K gets, by the names of precisions. Along a way in which neither body
-may go K is 0, and so is b; lambda is 0 there, and its derivative too. Along others b is left with this part of it.
-Along the axis of a hinge, where K and b of its angles are 0, K gets all of the trace."""
+"""By precision, the part of its trace that is added to each diagonal block of K. Along directions in which neither body
+can move, K and b are 0, and so are lambda and its derivative. Along other directions this part of b remains. Along the
+axis of a hinge, where K and b of the angles are 0, the whole trace is added."""
 BARS = ("turned_before_bar", "after_bar", "turned_bar")
 
 
 class JointArrays:
-    """The arrays of the hinges of one solver in a step, or with a ``suffix`` of names their tangents or adjoints."""
+    """The arrays of the hinges of one solver in a step, or tangents or adjoints with names that end in ``suffix``."""
 
     def __init__(self, rows: int, layout: Layout, suffix: str = ""):
         matrix, vector, self._suffix = matrix_of(layout.precision), layout.precision.vector, suffix
         kinds = {**dict.fromkeys(ROW, matrix), "apart": vector}
         sizes = {f"{name}{suffix}": (layout.members, kind) for name, kind in kinds.items()}
         self.rows = [zeros(sizes, layout.device) for _ in range(rows)]
-        """What `point` or `lean` have written."""
+        """Results of the kernels `point` or `lean`."""
         many = {"blocks": (rows * rows, matrix), "wanted": (rows, vector), "pushes": (rows, vector)}
         self.whole = zeros(
             {f"{name}{suffix}": ((count, layout.members), kind) for name, (count, kind) in many.items()}, layout.device
@@ -63,7 +63,7 @@ class JointArrays:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the equations of the hinges: three numbers that are to be 0."""
+    """A row of the hinges' equations: three numbers that must be 0."""
 
     joint: Joint
     straight: bool
@@ -71,25 +71,25 @@ class Row:
 
     @property
     def share(self) -> float:
-        """Return 1 where lambda is a momentum, and 0 where it is an angular momentum alone."""
+        """Return 1 if lambda is a momentum, 0 if lambda is only an angular momentum."""
         return 0.0 if self.straight else 1.0
 
     @property
     def sides(self) -> list[tuple[int, bool]]:
-        """Return the numbers of its free bodies, and whether each is the other one."""
+        """Return the numbers of the row's free bodies, each with True if it is the hinge's second solid."""
         return [(body, other) for body, other in ((self.joint.body, False), (self.joint.other, True)) if body >= 0]
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A row and a column of K that depend on each other by a body."""
+    """A row and a column of K that are coupled by a body."""
 
     block: tuple[int, int]
     """Their numbers."""
     body: int
     """Number of the body among the free bodies."""
     far: tuple[bool, bool]
-    """Whether it is the other one of each."""
+    """For the row and for the column, True if the body is the hinge's second solid."""
 
 
 class Joints:
@@ -119,11 +119,11 @@ class Joints:
 
     @cached_property
     def kernels(self) -> SimpleNamespace:
-        """Make the kernels when they are first asked for, as scenes without such hinges do without."""
+        """Make the kernels on first use, because scenes without such hinges need none."""
         return joint_kernels(self.layout.precision)
 
     def poses(self, row: Row) -> tuple[Named, ...]:
-        """Return the poses of both solids of a row, with their tangents, and where they begin."""
+        """Return the poses of both solids of a row, with tangents, and the poses at the start of the step."""
         joint, each = row.joint, self.part.made_of.walls.each
         named = {**each[self.number(row)], **{f"other_{name}": array for name, array in each[joint.against].items()}}
         known: dict[str, Any] = {} if joint.axis is None else {"axis": self.layout.precision.vector(*joint.axis)}
@@ -137,7 +137,7 @@ class Joints:
         return self.part.bodies[row.joint.body].table.number
 
     def frame(self, row: Row) -> Kernels:
-        """Return the kernels that find the matrices of a row."""
+        """Return the kernels that compute the matrices of a row."""
         found: Kernels = self.kernels.lean if row.straight else self.kernels.point
         return found
 
@@ -154,7 +154,7 @@ class Joints:
         return {name: (take if name.startswith("take") else give)[name] for name in take}
 
     def begin(self, step: StepContext) -> None:
-        """Find the matrices of all rows in a step, and eliminate."""
+        """Compute the matrices of all rows in a step, and eliminate."""
         members = self.layout.members
         self.own.whole["blocks"].zero_()
         for row, arrays in zip(self.rows, self.own.rows, strict=True):
@@ -167,13 +167,14 @@ class Joints:
             step.launch(self.kernels.factor, self.own.whole, self.factors, rows=len(self.rows), threads=members)
 
     def solve(self, step: StepContext, wanted: wp.array, pushes: wp.array, transposed: int = 0) -> None:
-        """Write - K^-1 times what is wanted, or the same of the transpose of K."""
+        """Write - K^-1 times ``wanted``, or the same with the transpose of K."""
         known = {"rows": len(self.rows), "transposed": transposed, "wanted": wanted, "pushes": pushes}
         if self.rows:
             step.launch(self.kernels.solve, self.factors, known, threads=self.layout.members)
 
     def read(self, step: StepContext, moved: Sequence[Arrays]) -> None:
-        """Write lambda of bodies that nothing has joined yet: ``moved`` are `move_kernels`' results of each."""
+        """Write lambda for bodies whose hinges are not enforced yet: ``moved`` has the results of `move_kernels` for
+        each body."""
         for k, row in enumerate(self.rows):
             known = self.velocities(row, moved), self.own.rows[k], self.own.entries[k], self.numbers(row)
             step.launch(self.kernels.read.forward, *known, threads=self.layout.members)
@@ -184,7 +185,8 @@ class Joints:
         return {"share": row.share, "is_free": row.joint.other >= 0}
 
     def velocities(self, row: Row, moved: Sequence[Arrays], suffix: str = "") -> Arrays:
-        """Return how much faster both bodies of a row are, or tangents or adjoints, as `read` knows them."""
+        """Return the velocity changes of both bodies of a row, or tangents or adjoints, by the argument names of
+        `read`."""
         own = moved[row.joint.body]
         other = own if row.joint.other < 0 else moved[row.joint.other]
         names = [f"{name}{suffix}" for name in ("faster", "turned_faster")]
@@ -197,14 +199,15 @@ class Joints:
                 yield k, body, other, {"share": row.share, "sign": -1.0 if other else 1.0}
 
     def push(self, step: StepContext, moved: Sequence[Arrays]) -> None:
-        """Add what lambda does to the velocities ``moved``."""
+        """Add the effect of lambda to the velocities ``moved``."""
         for k, body, other, known in self.ends():
             arrays = self.own.side(k, other), self.own.entries[k], moved[body]
             own = self.part.bodies[body].known(step)
             step.launch(self.kernels.push.forward, *arrays, known, *own, threads=self.layout.members)
 
     def join(self, step: StepContext, moved: Sequence[Arrays]) -> None:
-        """Give hinged bodies velocities with which their hinges hold, in place of those that each would have alone."""
+        """Replace the velocities that hinged bodies would have without hinges by velocities that satisfy the hinges'
+        equations."""
         self.read(step, moved)
         self.push(step, moved)
 
@@ -271,8 +274,8 @@ class JointsAdjoint:
         moved_bar: Sequence[Arrays],
         turned: Sequence[Arrays],
     ) -> None:
-        """Apply the adjoint of `Joints.join`: from adjoints of joined velocities to those of velocities ``moved``, not
-        joined yet, and of the further turn of each body, ``turned``."""
+        """Apply the adjoint of `Joints.join`: turn adjoints of the corrected velocities into adjoints of the
+        uncorrected velocities ``moved`` and of each body's further turn, ``turned``."""
         of, bars, members = self._joints, self._bars, self._joints.layout.members
         of.read(step, moved)
         bars.whole["pushes_bar"].zero_()
@@ -291,7 +294,7 @@ class JointsAdjoint:
             step.launch(of.kernels.spread, of.own.whole, bars.whole, rows=len(of.rows), threads=members)
 
     def finish(self, step: StepContext, bar: Adjoints, turned: Sequence[Arrays]) -> None:
-        """Apply the adjoint of `Joints.begin`, to those of poses, of densities and of where hinges are."""
+        """Apply the adjoint of `Joints.begin`: add to the adjoints of poses, of densities and of the hinges' places."""
         of, bars, members = self._joints, self._bars, self._joints.layout.members
         for pair in of.pairs:
             body = of.part.bodies[pair.body]
