@@ -318,7 +318,7 @@ def _search(
 def _forces(
     scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, layout: Layout, makers: Sequence[ForceMaker]
 ) -> list[Force]:
-    """Make the forces of a scene's parameters, in the order of the registry, and after them those of the makers."""
+    """Make the forces of a scene's parameters, in the order of the registry, and then the forces of the makers."""
     setting = Setting(scene, discretisation, discrete.lattice, discrete.wall_layers, layout)
     replaced = {getattr(maker, "replaces", None) for maker in makers}
     modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene) and p.force not in replaced]

@@ -47,7 +47,7 @@ class StepTangent(Protocol):
     """The tangent of steps that a solver has replayed, along tangents of the parameters (forward mode)."""
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
-        """Replace the tangent of the replayed step's state by that of its result."""
+        """Replace the tangent of the replayed step's state by the tangent of the step's result."""
 
 
 class StepAdjoint(Protocol):
@@ -57,7 +57,7 @@ class StepAdjoint(Protocol):
         """Set the adjoints of the parameters to 0, before a backward pass."""
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
-        """Replace the adjoint of the replayed step's result by that of its state."""
+        """Replace the adjoint of the replayed step's result by the adjoint of the step's state."""
 
     def collect(self) -> Parameters:
         """Return the adjoints of the parameters, summed over all steps since `begin`."""

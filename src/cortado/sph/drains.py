@@ -65,7 +65,7 @@ def behind(name: str) -> StateField:
 
 @dataclass(frozen=True)
 class Mouth:
-    """Where a drain takes particles."""
+    """The region in which a drain removes particles."""
 
     name: str
     shape: int
@@ -114,7 +114,7 @@ def mouth_type(precision: Precision) -> Any:
         shape: wp.int32
         number: real
         lower: vector
-        """The direction of a plane."""
+        """Lower corner of a box from its middle [m]; the direction of a plane."""
         upper: vector
         radius: real
         period: vector
@@ -331,18 +331,18 @@ class Drains(Part):
         return self.layout.sum_of(self.layout.precision.real)
 
     def _middle(self, one: Mouth) -> Any:
-        """Return the name of the parameter that a mouth's middle is, or its places in all scenes."""
+        """Return the name of the parameter for a mouth's middle, or the middle in all scenes."""
         if one.shape == BALL:
             return f"{one.name}.position"
         return to_device(np.tile(one.middle, (self.layout.members, 1)), self.layout.precision, self.layout.device)
 
     def _pull(self, pull: Pull, periods: Points) -> dict[str, Any]:
-        """Return the numbers of a sink by the names that kernels have for them."""
+        """Return the numbers of a sink by the names of kernel arguments."""
         own = {"inner": pull.shell[0], "outer": pull.shell[1], "sphere": pull.sphere, "holds": pull.holds}
         return {**own, "power": float(len(periods)), **_period(periods, self.layout.precision)}
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Find the particles that are taken, by where they are as the step begins."""
+        """Find the particles that are removed, by their positions at the start of the step."""
         wp.copy(self.taken["taken"], state["drained"])
         self.taken["waits"].zero_()
         for nozzle, constants in self._nozzles:
@@ -361,7 +361,7 @@ class Drains(Part):
                 step.launch(self.fall_behind, counted, self._of(step.parameters, one.name), threads=self.layout.members)
 
     def _of(self, parameters: Parameters, name: str) -> dict[str, Any]:
-        """Return what kernels know of a sink; ``table`` is its flow rate, or the tangent or adjoint of that."""
+        """Return kernel arguments about a sink; ``table`` is the flow rate, or its tangent or adjoint."""
         return {**self._pulls[name], "gain": self._gains[name], "table": parameters[f"{name}.flow_rate"]}
 
     def target(self, moved: State) -> State:
@@ -427,7 +427,7 @@ class Drains(Part):
 
 
 class DrainsTangent(PartTangent):
-    """The tangent of particles that drains take: it is 0."""
+    """The tangent of particles that drains remove: it is 0."""
 
     def __init__(self, of: Drains):
         self._of = of
@@ -438,7 +438,7 @@ class DrainsTangent(PartTangent):
 
 
 class DrainsAdjoint(PartAdjoint):
-    """The adjoint of particles that drains take: they pass nothing on."""
+    """The adjoint of particles that drains remove: it is 0 before the removal."""
 
     def __init__(self, of: Drains):
         self._of, self._free = of, of.free.like()

@@ -231,7 +231,7 @@ class FrictionChanges:
 
     @cached_property
     def _own(self) -> dict[str, BodyFriction]:
-        """Make the tangents or adjoints of arrays when they are first asked for, as runs do without."""
+        """Make the tangents or adjoints of arrays on first use, because runs without derivatives need none."""
         return {name: BodyFriction(self._friction.layout, self.suffix) for name in self._friction.own}
 
     def _each(

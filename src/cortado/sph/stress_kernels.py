@@ -303,8 +303,8 @@ def stress_solid_kernels(discretisation: Discretisation) -> list[Callable[[], An
 
 @cache
 def gradient_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
-    """Make the Warp functions of a particle's velocity gradient [1/s] and shear rate [1/s]. Their arguments are sums
-    over its neighbours, M = sum s_ij x_ij x_ij^T and A = sum s_ij v_ij x_ij^T."""
+    """Make the Warp functions of a particle's velocity gradient [1/s] and shear rate [1/s]. The functions take sums
+    over the particle's neighbours, M = sum s_ij x_ij x_ij^T and A = sum s_ij v_ij x_ij^T."""
     real, matrix = precision.real, matrix_type(precision)
     part, regular = part_functions(precision, dimension)
     inverse, slowest = moment_functions(precision, dimension).inverse, wp.constant(real(SLOWEST**2))

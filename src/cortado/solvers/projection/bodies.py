@@ -182,7 +182,7 @@ class BodiesTangent:
         around_dot: Arrays,
         pressures: tuple[wp.array, wp.array],
     ) -> None:
-        """Apply the tangent of `Bodies.begin`, given the pressures of the step before and their tangents."""
+        """Apply the tangent of `Bodies.begin`, given the pressures of the previous step and their tangents."""
         kernels = self._bodies.kernels
         edges = {"edge": around["edge"], "edge_dot": around_dot["edge_dot"]}
         self._joints.begin(context, dot)

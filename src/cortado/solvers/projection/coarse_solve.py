@@ -4,8 +4,8 @@ few rows of B cost an iteration each, or less.
 
 One text of C++ serves both devices. On a CPU a thread solves for a scene. On a GPU a team of blocks solves for a scene;
 blocks wait for one another between the phases of an iteration, and the first block of a team processes levels with few
-nodes. A solve of twenty iterations has some hundred phases. As separate launches these would take longer to launch than
-to run. Sums are computed from partial sums over `BLOCK` nodes, so that results have the same bits for any size of a
+nodes. A solve of twenty iterations has some hundred phases. If each were a launch, launching would take longer than
+computing. Sums are computed from partial sums over `BLOCK` nodes, so that results have the same bits for any size of a
 team.
 """
 

@@ -309,12 +309,12 @@ class ProjectionSteps(ParticleSolver):
 
     @cached_property
     def _pressures(self) -> dict[str, wp.array]:
-        """Make arrays of pressures when they are first asked for, as runs do without."""
+        """Make arrays of pressures on first use, because most runs need none."""
         return {"push": self.numbers(), "stress": self.numbers()}
 
     @cached_property
     def mean_stress(self) -> MeanStress:
-        """Make the kernels and arrays of mean stresses when stresses are first asked for."""
+        """Make the kernels and arrays of mean stresses on first use."""
         own = self.discretisation, self.layout, self.system.walled.dimension
         return MeanStress(*own, len(self.system.faces.solids))
 

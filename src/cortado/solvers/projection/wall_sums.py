@@ -255,7 +255,7 @@ class ProjectionPush:
 
     @cached_property
     def _arrays(self) -> dict[str, wp.array]:
-        """Make arrays when they are first asked for, as runs do without."""
+        """Make arrays on first use, because runs without derivatives need none."""
         names = "push", "push_dot", *(f"{name}_bar" for name, _, _ in self._each(ALL_WALLS))
         return self._layout.arrays(**dict.fromkeys(names, self._layout.precision.vector))
 
