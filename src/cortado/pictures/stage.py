@@ -106,7 +106,7 @@ AROUND = 1.08
 AIR = 0.1
 """Space beside fluid without a container, relative to the fluid's width."""
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
-"""Elevation of the camera [degrees]: for scenes with a pattern on the fluid, such as latte art, and for others."""
+"""Elevation of the camera [degrees]: for a view into an opaque cup, as of latte art, and for all others."""
 AZIMUTH = 24.0
 """Azimuth of the camera, to the right of the direction towards the viewer [degrees]."""
 
@@ -244,7 +244,7 @@ class Stage:
 
     @property
     def clearness(self) -> float:
-        """Return the fraction of light that passes through fluid to other fluid."""
+        """Return the fraction of light that reaches fluid through other fluid."""
         return 0.85 * self.transparency
 
     def placed(self, positions: Points) -> Points:

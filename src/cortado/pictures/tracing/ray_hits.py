@@ -1,4 +1,4 @@
-"""What rays meet, as Warp functions: solids, walls, panes of glass, and the surface of the fluid."""
+"""Warp functions that compute hits of rays on solids, walls, panes of glass, and the surface of the fluid."""
 
 from functools import cache
 from typing import Any
@@ -32,7 +32,7 @@ from cortado.pictures.tracing.backdrop import (
 from cortado.pictures.tracing.near_particles import Vec3s2d
 
 LAYERS = 8
-"""Most surfaces of transparent solids that a ray passes."""
+"""Greatest number of surfaces of transparent solids that a ray passes."""
 
 
 @wp.struct
@@ -40,9 +40,9 @@ class SolidHit:
     """The hit of a ray on an opaque solid."""
 
     t: wp.float32
-    """Distance along the ray; FAR where it hits none."""
+    """Distance along the ray; FAR if it hits no solid."""
     is_cut: wp.bool
-    """True for a hit on a wall of the container, through which the solid reaches."""
+    """True for a hit on a container wall where the solid crosses it."""
     face: wp.int32
     u: wp.float32
     v: wp.float32
@@ -94,7 +94,7 @@ def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32):
-    """Return the light of a solid where a ray meets it; ``glossy`` is 0 where it is in fluid."""
+    """Return the light of a solid where a ray meets it; ``glossy`` is 0 for a hit inside fluid."""
     r = mirrored(d, met.normal)
     seen = sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))
     seen = wp.vec3(wp.min(seen[0], 1.8), wp.min(seen[1], 1.8), wp.min(seen[2], 1.8))
@@ -108,9 +108,9 @@ def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32
 
 @wp.func
 def clear_layers(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32, before: Passed):
-    """Add surfaces of transparent solids up to ``most`` [m] on a ray's way, but not those on the floor, seen there.
+    """Add the surfaces of transparent solids that a ray passes up to ``most`` [m].
 
-    Those on the floor are left out, as the floor is seen there.
+    Surfaces on the floor are left out: there the floor is drawn.
     """
     passed = before
     start = s.nearest
@@ -150,7 +150,7 @@ def wall_hit(s: Environment, t: wp.float32, normal: wp.vec3):
 
 @wp.func
 def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before: Passed):
-    """Add the wall that a ray meets where it leaves the container, if that is no further than ``most`` [m]."""
+    """Add the wall through which a ray leaves the container, if it is no further than ``most`` [m]."""
     part = within_walls(s, o, d)
     t = part[1]
     if t <= wp.max(part[0], s.nearest) or t >= most:
@@ -287,7 +287,7 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
 
     @wp.func
     def background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spread: wp.float32):
-        """Return the light that a ray sees which meets no fluid."""
+        """Return the light along a ray that hits no fluid."""
         most = FAR
         if s.has_floor > 0 and d[1] < -1.0e-4:
             most = wp.max((s.floor_height - o[1]) / d[1], 0.0)
@@ -328,7 +328,7 @@ def behind_wall(surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, norm
 
 @wp.func
 def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
-    """Find where a ray enters the fluid on a part of its way, on which no transparent solid is."""
+    """Find where a ray enters the fluid within a part of the ray that contains no transparent solid."""
     met = SurfaceHit()
     met.found = False
     met.t = FAR
@@ -355,7 +355,7 @@ def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part
 
 @wp.func
 def into_fluid_among_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
-    """Find where a ray enters the fluid among transparent solids, within which there is no fluid."""
+    """Find where a ray enters the fluid among transparent solids, which contain no fluid."""
     met = SurfaceHit()
     met.found = False
     met.t = FAR
@@ -416,8 +416,8 @@ def surface_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
 
     @wp.func
     def leave(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, most: wp.float32):
-        """Find where a ray within the fluid leaves it, or meets an opaque solid, within a way of ``most`` [m], beyond
-        which it is not followed."""
+        """Find where a ray inside the fluid leaves the fluid or hits an opaque solid. It is followed for at most
+        ``most`` [m]."""
         part = room(s, o, d)
         wall_at = wp.where(part[1] > 0.0, part[1], FAR)
         hit = wp.mesh_query_ray(surface.mesh, o, d, wp.min(wall_at, most))

@@ -1,6 +1,6 @@
 """Surfaces of the solids of a stage on the device that traces rays, and the shadow on the floor.
 
-Fluid and solids cast it; it is soft, and in the colour of the fluid.
+Fluid and solids cast the shadow; it is soft and has the colour of the fluid.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,15 +23,15 @@ from cortado.pictures.tracing.near_particles import Floats, Look, Particles, Vec
 NODES = 320
 """Number of nodes along either side of the floor that may lie in shadow."""
 ABOVE = 1e-3
-"""In sizes of the contents: a side of a solid that is no higher lies on the floor."""
+"""Height, relative to the size of the contents, up to which a side of a solid counts as lying on the floor."""
 REACH = 1.5
-"""Half the width of the floor that may lie in shadow, in sizes of the contents."""
+"""Half the width of the floor that may lie in shadow, relative to the size of the contents."""
 KEY, AROUND = 0.022, 0.05
-"""How soft the shadows of the lamp and of the sky are, in sizes of what is shown."""
+"""Softness of the shadows of the lamp and of the sky, relative to the size of the contents."""
 CLOSE = 0.15
-"""About how far above the floor the sky's shadow ends, in sizes of the contents."""
+"""Approximate height above the floor from which on nothing shades the sky, relative to the size of the contents."""
 SKY = 0.32
-"""The part of the light that comes from the sky."""
+"""Fraction of the light that comes from the sky."""
 
 
 Soften = Callable[[wp.array], wp.array]
@@ -39,7 +39,7 @@ Soften = Callable[[wp.array], wp.array]
 
 @dataclass(frozen=True)
 class DeviceSurface:
-    """A surface of triangles on a device, which exist as long as this object, with no light on them yet."""
+    """A triangle surface on a device, without light at first. Its arrays exist as long as this object."""
 
     mesh: wp.Mesh
     lit: Any
@@ -74,9 +74,9 @@ class DeviceSurface:
 
 
 FINE, FINE_OWN = 0.03, 0.05
-"""How wide faces of round solids are: in sizes of what is shown, and of the solid itself, if that is less."""
+"""Width of the faces of round solids: relative to the contents and relative to the solid; the smaller width counts."""
 LONGEST = 0.04
-"""Of the sides of triangles, at whose corners light is found, in sizes of what is shown."""
+"""Greatest side of the triangles at whose corners light is computed, relative to the size of the contents."""
 
 
 Placed = tuple[ShownSolid, SolidMesh]
@@ -141,7 +141,7 @@ def blur(first, across, weights, sharp, found):
 
 @wp.func
 def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.float32):
-    """Return the part of the light that a thickness keeps off, less of its own colour than of others."""
+    """Return the fraction of light absorbed by a thickness; its own colour is absorbed less than others."""
     reached = 1.0 - wp.exp(-above[3] / (0.75 * layer))
     colour = wp.vec3(above[0], above[1], above[2])
     hue = colour / wp.max(wp.max(colour), 1.0e-6 * wp.max(above[3], 1.0e-12))
@@ -151,7 +151,7 @@ def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def darken(first, key, around, strength, layer, opacity, tinted, begin, light):
-    """Darken the nodes from ``begin`` on by the shadows of the lamp and of the sky, of a ``strength`` each."""
+    """Darken the nodes from ``begin`` on by the shadows of lamp and sky, each with its ``strength``."""
     n = first + wp.tid()
     i = n / key.shape[1]
     j = n % key.shape[1]
@@ -174,21 +174,21 @@ class Caster:
     """(n,) the volumes as the sky sees them"""
     opacity: float = 1.0
     tinted: float = 0.0
-    """How much more light of its own colour comes through, from 0 to 1."""
+    """Additional transmission of light of the object's own colour, from 0 to 1."""
 
 
 class FloorShadow:
-    """The shadow on the floor: the part of the light that reaches each of its nodes."""
+    """The shadow on the floor: the fraction of light that reaches each floor node."""
 
     def __init__(self, stage: Stage, launch: BandLauncher):
         middle = 0.5 * (stage.lower + stage.upper)
         self._stage, self._launch, self._device = stage, launch, launch.device
         self.corner = np.array([middle[0], stage.lower[1], middle[2]]) - np.array([REACH, 0.0, REACH]) * stage.size
-        """(3,) [m] where the first node is"""
+        """(3,) position of the first node [m]"""
         self.cell = 2.0 * REACH * stage.size / (NODES - 1)
-        """How far nodes are apart [m]."""
+        """Distance between nodes [m]."""
         self.light = wp.ones((NODES, NODES), dtype=wp.vec3, device=self._device)
-        """(nodes, nodes) by x and z"""
+        """(nodes, nodes) fraction of light at the nodes along x and z"""
 
     def of_fluid(self, particles: Particles) -> None:
         """Add the shadow of particles, in the frame of the picture."""
@@ -229,8 +229,8 @@ class FloorShadow:
         self._launch(darken, key.size, key=key, around=around, **how, begin=seen["begin"], light=self.light)
 
     def _reached(self, parts: Particles, slope: Points, around: int) -> tuple[list[int], tuple[int, int]]:
-        """Return the first node of the floor that the shadow of an object may reach, with ``around`` nodes more, and
-        the number along each side. Nodes elsewhere stay light, and take no time."""
+        """Return the first floor node that an object's shadow may reach, with a margin of ``around`` nodes, and the
+        number of nodes along each side. Other nodes stay fully lit and cost no time."""
         lower, upper = (end - self.corner for end in parts.ends(self._launch))
         shifts = np.outer((0.0, lower[1], upper[1]), slope)
         first = np.floor((lower[::2] - shifts.max(axis=0)) / self.cell) - around
@@ -261,7 +261,8 @@ def _bell(sigma: float) -> Points:
 
 
 class SolidSurfaces:
-    """The surfaces of a stage's solids, whose triangles are found once, and which are posed for each picture."""
+    """The surfaces of a stage's solids: triangles are computed once, and moved to the solids' poses for each
+    picture."""
 
     def __init__(self, stage: Stage, device: Any):
         self._stage, self._device = stage, device
@@ -269,7 +270,7 @@ class SolidSurfaces:
 
     @property
     def kinds(self) -> tuple[bool, bool]:
-        """Return whether there are opaque, and transparent solids."""
+        """Return two booleans: whether opaque and whether transparent solids exist."""
         clear = [_is_clear(one) for one in self._stage.solids]
         return not all(clear), any(clear)
 
@@ -333,6 +334,6 @@ def _is_clear(shown: ShownSolid) -> bool:
 
 
 def _left(shown: ShownSolid) -> tuple[float, float]:
-    """Return the part of the light that comes through one surface, seen from within a solid and from outside: one looks
-    into a tank whatever its walls are."""
+    """Return the fraction of light transmitted by one surface, seen from inside a solid and from outside. Tanks can
+    always be seen into, whatever their walls are."""
     return (1.0, shown.transparency) if shown.is_tank else (shown.transparency**0.5,) * 2

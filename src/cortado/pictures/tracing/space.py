@@ -1,5 +1,5 @@
-"""Pictures of fluid in 3-D, by a ray tracer on the device of the run. With mirror images of particles that touch walls
-and solids the surface goes on behind these, which cut or hide it, so that no gap is seen between fluid and wall."""
+"""Pictures of fluid in 3-D, by a ray tracer on the device of the run. Particles that touch walls and solids get mirror
+images, so that the surface continues behind these and no gap is visible between fluid and wall."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -49,11 +49,12 @@ from cortado.scene.appearance import View
 from cortado.scene.scene import Scene
 
 SKIN = 0.7
-"""In spacings: about how far beyond a particle fluid is drawn."""
+"""Approximate distance in spacings to which fluid is drawn beyond a particle."""
 DEPTHS = (1.0, 0.7, 0.4, 0.1)
-"""Of mirror images behind a surface, in parts of the distance of what they show; the first that a thin solid hides."""
+"""Depths of mirror images behind a surface, relative to the particle's distance from it; the first one that a thin
+solid hides is used."""
 ON_SURFACE = 0.05
-"""In spacings: how near to a surface a point is on it."""
+"""Distance in spacings below which a point counts as on a surface."""
 SAME_SIDE = 0.8
 """Greatest cosine between the normals of two sides of a corner."""
 
@@ -102,8 +103,8 @@ def _ways(points: Points, shown: ShownSolid, touching: float, spacing: float) ->
 
 
 TOUCHING, TOUCHING_SOLID, TOUCHING_ROUND = wp.constant(wp.float32(0.8)), 1.1, wp.constant(wp.float32(1.5))
-"""In spacings: fluid that is nearer to a flat wall, to a solid and to a round wall touches it. A cubic lattice in a
-round cup ends up to one and a half spacings from its wall."""
+"""Distances in spacings below which fluid touches a flat wall, a solid and a round wall. A cubic lattice in a round cup
+ends up to one and a half spacings from its wall."""
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -116,8 +117,7 @@ def particles_of(
     stage: Stage, positions: np.ndarray, colours: np.ndarray, launch: BandLauncher, fractions: Points | None = None
 ) -> Particles:
     """Return particles in the picture's frame, at positions (n, 3) [m] in the scene's axes, with colours (n, 3) and
-    mass fractions (n, phases), even ones if left out. Along a periodic axis they are where their images within the
-    period are."""
+    mass fractions (n, phases), even ones if left out. Along periodic axes they are moved into the period."""
     media = stage.media.mean(axis=0) if fractions is None else mixed(fractions, stage.media)
     places = stage.container.domain(3).wrapped(positions)
     found = Particles.on(launch.device, np.subtract(places, stage.origin), colours, media)
@@ -127,8 +127,8 @@ def particles_of(
 
 @wp.func
 def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32):
-    """Return which images a particle, in the container's frame, has along an axis, as bits 1 and 2: those behind the
-    lower and the upper wall. Along the first axis of a cylinder they are behind its round wall."""
+    """Return which mirror images a particle (in the container's axes) has along an axis: bit 1 for the lower wall, bit
+    2 for the upper. Along a cylinder's first axis, they are behind its round wall."""
     found = wp.int32(0)
     if s.glass == wp.static(GLASS_BOX) or axis == 1:
         if wp.abs(q[axis] - s.room_lower[axis]) < TOUCHING * spacing:
@@ -145,7 +145,8 @@ def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32
 
 @wp.func
 def image_along(s: Environment, q: wp.vec3, axis: wp.int32, which: wp.int32, spacing: wp.float32):
-    """Return the way from a particle to an image: 0 to image 0, itself, and then to those of `images_along`."""
+    """Return the vector from a particle to an image: 0 for image 0, the particle itself; others are those of
+    `images_along`."""
     way = wp.vec3(0.0)
     if which == 0:
         return way
@@ -163,7 +164,7 @@ def has_image(which: wp.int32, images: wp.int32):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def count_images(first: wp.int32, s: Environment, spacing: wp.float32, places: Vec3s, counts: Ints):
-    """Count the images of each particle, itself among them."""
+    """Count the images of each particle, including the particle itself."""
     i = first + wp.tid()
     q = s.glass_frame * places[i]
     count = wp.int32(1)
@@ -258,16 +259,16 @@ def _round_length(length: float) -> float:
 
 
 class State(NamedTuple):
-    """A state of a run as a picture shows it."""
+    """A state of a run, for drawing."""
 
     positions: Points
     """(n, d) of particles [m], in the scene's axes"""
     colours: Points
     """(n, 3) of particles, linear from 0 to 1"""
     pose: Scene | None = None
-    """The scene with its solids in poses; where it has them if left out."""
+    """The scene with its solids at the state's poses; if left out, at the scene's own."""
     view: View | None = None
-    """View of the camera; home if left out."""
+    """View of the camera; the home view if left out."""
     fractions: Points | None = None
     """(n, phases) mass fractions of particles; left out with one phase"""
 
@@ -285,7 +286,7 @@ class Scenery:
 
 
 def scenery(home: Stage, state: State, launch: BandLauncher, steady: Any = None) -> Scenery:
-    """Make the scenery of a state in 3-D; ``steady`` is a `Still` that is drawn in the place of the state's own."""
+    """Make the scenery of a state in 3-D; ``steady`` is a `Still` drawn instead of the state's own."""
     stage, s, particles, shadow = _placed(home, state, launch)
     if steady is None:
         shadow.of_fluid(particles)
@@ -295,7 +296,7 @@ def scenery(home: Stage, state: State, launch: BandLauncher, steady: Any = None)
 
 
 def still(home: Stage, state: State, launch: BandLauncher) -> Any:
-    """Return the `Still` of a state in 3-D; None where its fluid is not drawn with a surface around it."""
+    """Return the `Still` of a state in 3-D; None if the fluid is not drawn as a surface."""
     stage, s, particles, shadow = _placed(home, state, launch)
     if stage.picture.surface != "liquid" or not len(particles):
         return None
@@ -356,7 +357,8 @@ class SpacePainter:
             cast,
             cell_kernels(FLOAT32).count,
         )
-        """One of each module that a picture needs: they are compiled side by side before the first."""
+        """One kernel of each module that a picture needs, so that the modules are compiled in parallel before the first
+        picture."""
         effort, is_liquid = effort_of(stage.picture), stage.picture.surface == "liquid"
         self._lamps = self._rays_to_light(*(effort.lights if is_liquid else SPHERE_LIGHTS))
         self._lamps_of_solids = self._rays_to_light(*SOLID_LIGHTS)
@@ -370,13 +372,14 @@ class SpacePainter:
             return self._rays(scenery(self.stage, State(*state), self._launch))
 
     def still(self, state: State) -> Any:
-        """Return the data of a `State` that other frames of a film need; None where none is steadied."""
+        """Return the data of a `State` that other frames of a film need; None if the film does not steady fluid at
+        rest."""
         with WARP:
             compile_ahead(self, self.device)
             return still(self.stage, state, self._launch)
 
     def steady_image(self, state: State, own: Any, before: Sequence[Any], after: Sequence[Any]) -> Points:
-        """Draw a state as one frame of a film, in which fluid at rest is drawn at rest; see `steadied`."""
+        """Draw a state as a frame of a film in which fluid at rest does not move; see `steadied`."""
         with WARP:
             steady = steadied(own, before, after, self.stage.spacing, self._launch)
             return self._rays(scenery(self.stage, state, self._launch, steady))

@@ -1,12 +1,11 @@
 """A ray tracer for one surface of fluid: light that it reflects, refracts, absorbs and scatters.
 
-Before rays are traced from the eye, `illuminate_kernel` finds the light that falls on surfaces. A ray that meets the
-fluid is split in two, by Fresnel's law. Reflected light sees the surroundings, or other fluid. Refracted light goes on
-through the fluid and out of it, up to ``segments`` times. On a way L within the fluid it loses the part
-1 - exp(-scattering L), and gets instead the colour of the fluid in the light that falls on it. Of the rest the part
-colour^(absorption L) is left, by Beer and Lambert's law. Where it leaves the fluid for the surroundings near the
-critical angle, it is split again, and what is reflected goes on. Fluid is all the way what it is where a ray comes into
-it.
+Before rays are traced from the eye, `illuminate_kernel` computes the light on surfaces. A ray that hits the fluid is
+split by Fresnel's law. The reflected ray continues to the surroundings or other fluid. The refracted ray passes through
+fluid and out again, up to ``segments`` times. Along a length L in fluid, the fraction 1 - exp(-scattering L) of its
+light is replaced by the fluid's colour under the light that falls on it. The rest is multiplied by colour^(absorption
+L), by the Beer-Lambert law. A ray that leaves the fluid near the critical angle is split again, and its reflected part
+is followed. A ray uses the fluid's properties at its entry point all the way.
 """
 
 from functools import cache
@@ -35,27 +34,27 @@ from cortado.scene.appearance import Picture
 
 
 class Effort(NamedTuple):
-    """The effort that a picture of a quality takes."""
+    """Settings of the ray tracer for a picture quality."""
 
     cube: float
-    """Least width of the cubes of the surface's lattice, in spacings."""
+    """Least width of the surface lattice's cubes, in spacings."""
     segments: int
-    """Most parts of a ray's way that is refracted into fluid."""
+    """Greatest number of segments of a ray refracted into fluid."""
     contrast: float
-    """Contrast around a pixel, in linear light, above which more rays go through it."""
+    """Contrast around a pixel, in linear light, above which the pixel gets more rays."""
     again: int
-    """Number of these rays, of those in `ROTATED_GRID`."""
+    """Number of these additional rays, taken from `ROTATED_GRID`."""
     lights: tuple[int, int]
-    """Rays that find how much light falls on a point of the surface: from all around, and from the lamp."""
+    """Numbers of rays that sample the light on a point of the surface: from all directions, and from the lamp."""
 
 
 EFFORTS = {"traced": Effort(0.0, 4, 0.045, 4, (20, 4)), "quick": Effort(0.5, 1, 0.045, 2, (8, 2))}
 SPHERE_LIGHTS, SOLID_LIGHTS = (10, 1), (40, 6)
-"""Numbers of rays to the light from spheres, and from solids, which have fewer points and even sides."""
+"""Numbers of such rays for spheres, and for solids, which have fewer points and flat sides."""
 
 
 def effort_of(picture: Picture) -> Effort:
-    """Return the effort of a picture."""
+    """Return the ray tracer's settings for a picture."""
     return EFFORTS[picture.quality or "traced"]
 
 
@@ -65,10 +64,10 @@ BOUNCED = wp.constant(wp.float32(0.45))
 
 @wp.func
 def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light: wp.vec3):
-    """Return the part of ``light`` that comes to a point against a direction d past solids.
+    """Return the part of ``light`` that reaches a point from direction d past solids.
 
-    A solid within ``reach`` [m] hides it, the less the further off it is, and sends a little light in its own colour.
-    Nothing is hidden from points within a solid, which are not seen.
+    A solid within ``reach`` [m] blocks light, less so with distance, and sends a little light of its own colour. Points
+    inside a solid are invisible and get all light.
     """
     hit = wp.mesh_query_ray(s.solids.opaque, p, d, reach)
     if not hit.result or hit.sign < 0.0:
@@ -102,9 +101,9 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed
     def illuminate(first, s, surface, points, normals, directions, sun_directions, reach, clearness, light):
-        """Compute the light on each point of a surface with normals: from the lamp, and from all directions in which
-        neither other fluid nor a solid is within ``reach`` [m]. ``clearness``, 0 to 1: the part of the light that goes
-        through fluid."""
+        """Compute the light on each point of a surface with normals: from the lamp, and from all directions without
+        other fluid or a solid within ``reach`` [m]. ``clearness``, 0 to 1: fraction of light transmitted through
+        fluid."""
         i = first + wp.tid()
         n = normals[i]
         p = points[i] + s.nearest * n
@@ -147,7 +146,7 @@ FAINT = wp.constant(wp.float32(0.05))
 """Reflectance below which light leaving fluid is not split. Above it a rescaled reflectance is used, which grows from 0
 here to 1 at total reflection: otherwise the picture would show an edge at this angle."""
 DARK = wp.constant(wp.float32(10.0))
-"""Number of free paths of light within fluid beyond which nothing is seen: a part of 5e-5 goes as far."""
+"""Number of mean free paths in fluid beyond which light is neglected: a fraction of 5e-5 gets that far."""
 
 
 @wp.struct
@@ -164,7 +163,7 @@ class Eye:
 
 @wp.func
 def toned(colour: wp.vec3):
-    """Bend bright light below 1; light up to 0.75 stays as it is."""
+    """Compress bright light to below 1; light up to 0.75 is unchanged."""
     found = wp.vec3(0.0)
     for k in range(3):
         x = colour[k]
@@ -176,7 +175,8 @@ def toned(colour: wp.vec3):
 
 @wp.func
 def tinted(colour: wp.vec3, taken: wp.float32):
-    """Return the rest of white light where coloured fluid takes away other colours, up to the colour itself at 1."""
+    """Return white light after coloured fluid has absorbed a fraction ``taken`` of the other colours; at 1 the fluid's
+    colour."""
     base = wp.vec3(wp.max(colour[0], 0.02), wp.max(colour[1], 0.02), wp.max(colour[2], 0.02))
     return wp.vec3(wp.pow(base[0], taken), wp.pow(base[1], taken), wp.pow(base[2], taken))
 
@@ -191,7 +191,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     @wp.func
     @typed
     def within(s, shadow, surface, start, direction, entered, spread):
-        """Return the light that comes out of the fluid against a ray that was refracted into it."""
+        """Return the light that leaves the fluid backwards along a ray that was refracted into it."""
         found = wp.vec3(0.0)
         through = wp.vec3(1.0)
         o = start
@@ -257,7 +257,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
     @wp.func
     def seen(s: Environment, shadow: Vec3s2d, surface: LitSurface, o: wp.vec3, d: wp.vec3, spread: wp.float32):
-        """Return the light that comes to the eye against a ray."""
+        """Return the light that reaches the eye along a ray."""
         met = meet(s, surface, o, d)
         floor_at = FAR
         if s.has_floor > 0 and d[1] < -1.0e-4:
@@ -318,15 +318,15 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
 
 ROTATED_GRID = ((-0.375, -0.125), (0.375, 0.125), (-0.125, 0.375), (0.125, -0.375))
-"""Places in a pixel of more rays, in pixels from its middle."""
+"""Offsets of additional rays from the middle of a pixel, in pixels."""
 MIDDLE = ((0.0, 0.0),)
 TILE = 8, 4
 """Pixels that rays are sent through together."""
 
 
 def in_tiles(columns: int, rows: int) -> np.ndarray:
-    """Return the numbers of every second pixel, as on a chequered board, in small tiles, whose rays go nearly the same
-    way."""
+    """Return the numbers of every second pixel, as on a chequerboard, ordered in small tiles, whose rays are nearly
+    parallel."""
     wide, high = TILE
     row, column = np.divmod(np.arange(columns * rows), columns)
     tile = (row // high) * -(-columns // wide) + column // wide
@@ -336,9 +336,9 @@ def in_tiles(columns: int, rows: int) -> np.ndarray:
 
 @wp.kernel(module=kernel_module("contrast"), enable_backward=False)
 def find_contrast(first: wp.int32, columns: wp.int32, image: Vec3s, contrast: wp.float32, found: Ints):
-    """Fill the black squares of a chequered ``image`` whose white ones are drawn by the mean of those around, and mark
-    the pixels that need more rays in ``found``: those in whose neighbourhood a colour differs by more than
-    ``contrast``, between white squares, which are on either side of a black one, or around the corners of a white one.
+    """Fill the black squares of a chequered ``image``, whose white squares are drawn, by the mean of their neighbours.
+    Mark in ``found`` the pixels that need more rays. These have colours that differ by more than ``contrast`` between
+    the white squares on two sides of a black one, or around the corners of a white one.
     """
     i = first + wp.tid()
     column = i % columns
