@@ -35,7 +35,7 @@ class WallArrays(Rows):
     weights: np.ndarray
     """(b,) weight of each in the density, a fluid particle being 1 [-]"""
     grips: np.ndarray
-    """(b,) weights of wall particles without slip, and 0 of those along which fluid slips freely"""
+    """(b,) weights of wall particles without slip, and 0 for wall particles along which fluid slips freely"""
     feet: np.ndarray
     """(b, 3) from each to the surface [m]"""
     slides: np.ndarray

@@ -106,7 +106,8 @@ class Discretisation:
 
     @property
     def still(self) -> "Discretisation":
-        """Return this discretisation where walls do not move, for terms linear in the fluid's velocities alone."""
+        """Return a copy of this discretisation for walls at rest, for terms that depend linearly on the fluid's
+        velocities alone."""
         return replace(self, moving=False)
 
     def module(self, forward: bool, topic: str) -> Any:

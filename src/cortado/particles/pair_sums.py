@@ -179,7 +179,7 @@ Body = Callable[[Mapping[str, str]], Iterable[str]]
 def over_fluid(
     d: Discretisation, arrays: Types, body: Body, ahead: bool, numbered: bool, separated: bool = True
 ) -> str:
-    """Return the text of a loop over the fluid, which reads neighbours' entries of these arrays.
+    """Return the source of a loop over the fluid that reads neighbours' entries of these arrays.
 
     ``ahead`` loads the entries of `UNROLL` neighbours before using any, so that loads do not wait for one another.
     ``numbered`` loops define the neighbour's number _j, ``separated`` loops _x_ij.

@@ -184,7 +184,7 @@ def sum_kernels(
 
 
 def _arrays(read: Types, written: Types, taped: bool) -> tuple[dict[str, Any], list[str]]:
-    """Return a kernel's arguments for arrays, and lines that name those in bundles."""
+    """Return a kernel's arguments for arrays, and source lines that give names to arrays in bundles."""
     if taped or len(read) + len(written) <= MOST_ARRAYS:
         return {each: wp.array(dtype=kind) for each, kind in {**read, **written}.items()}, []
     groups = {label: kinds for label, kinds in (("at", read), ("to", written)) if kinds}

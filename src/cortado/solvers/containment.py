@@ -198,9 +198,9 @@ def lost_kernel(precision: Precision) -> Any:
 
         A particle is lost if it is not finite, too far away, a mixture without volume, or went through a wall: it was
         inside before the step and is outside after it, or then is in a solid. Fluid may cross the rim of an open cup.
-        Particles moved by a nozzle or a drain may pass walls; only particles from ``first_waiting`` on, in scene order,
-        can be such. ``x`` is the new state in that order. All other arrays are sorted; ``x_free`` and ``v_free`` are
-        the new state without nozzle and drains.
+        Particles moved by a nozzle or a drain may pass walls; these have numbers from ``first_waiting`` on, in scene
+        order. ``x`` is the new state in that order. All other arrays are sorted; ``x_free`` and ``v_free`` are the new
+        state without nozzle and drains.
         """
         i = wp.tid()
         member = i // particles

@@ -218,7 +218,7 @@ def lift_kernels(precision: Precision) -> Kernels:
 def row_kernels(precision: Precision) -> SimpleNamespace:
     """Make the kernels of a body's rows in a solve, with a thread for each scene; a row is a momentum of six numbers.
     ``rise`` are the velocities that the momenta in r give the body, which may be held (`cortado.sph.moving_solids`),
-    and V and W are the velocities by p.
+    and V and W are the velocities that p gives the body.
 
     `Rows` of `cortado.sph.moment_functions` need ``lift``, ``begin``, ``multiply``, ``descend`` and ``turn``. ``give``
     adds the impulse of the solution to the momenta that a body gets. ``lengthen`` adds the time step's tangent to the

@@ -159,7 +159,7 @@ class Tables:
         return self._packed(step, self._table) if self._size else {}
 
     def along(self, step: StepContext, parameters_dot: Parameters) -> dict[str, Any]:
-        """Return the arguments of a tangent kernel for the arrays of a step and their tangents."""
+        """Return the arguments of a tangent kernel: the arrays in a step, and the tangents of these arrays."""
         if not self._size:
             return {}
         self._arrays.pack(step, parameters_dot, self._along.dots)

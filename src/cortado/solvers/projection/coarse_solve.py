@@ -1,6 +1,6 @@
 """Solves (A + B^T B) e = r on the coarse grid of the pressure in one launch: conjugate gradients (Hestenes and Stiefel
-1952) with a V-cycle over the grids of `cortado.solvers.projection.coarse_levels`. The V-cycle is that of A alone: the
-few rows of B cost an iteration each, or less.
+1952) with a V-cycle over the grids of `cortado.solvers.projection.coarse_levels`. The V-cycle uses A alone, without B^T
+B: each of the few rows of B costs at most one more iteration.
 
 One text of C++ serves both devices. On a CPU a thread solves for a scene. On a GPU a team of blocks solves for a scene;
 blocks wait for one another between the phases of an iteration, and the first block of a team processes levels with few

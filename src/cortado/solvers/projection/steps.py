@@ -9,7 +9,7 @@ the shift delta; and optionally by velocities that follow the new positions.
 
 Particles of the interior are shifted towards regions with fewer particles (Lind et al. 2012; Skillen, Lind, Stansby and
 Rogers 2013). Pairs that are nearer than 0.65 s are moved apart everywhere. The rate follows the velocity gradient and
-the tension, so that a fluid at rest is not stirred:
+the tension, so that the shift does not stir a fluid at rest:
 
     delta = r (4 sum_j p_ij - s^2 u P grad C),   p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij,
     grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
