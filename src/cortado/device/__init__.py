@@ -1,4 +1,4 @@
-"""What runs on a device: precisions, launches, compiling, memory, threads, and processes that share work."""
+"""The device layer: precisions, launches, compiling, memory, threads, and processes that share work."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Particles sorted by cell, the scenes of a batch one behind the other.
+"""Particles sorted by cell, scene after scene of a batch.
 
 The grid of cells wraps around in every direction, so that no position lies outside of it. Along a periodic axis the
 cells divide the period; elsewhere the distance test tells apart cells that share a number.
@@ -38,8 +38,8 @@ def cell_grid_type(precision: Precision) -> Any:
 
 @cache
 def cell_functions(precision: Precision) -> SimpleNamespace:
-    """Make the Warp functions of a grid of cells: ``wrap`` and ``cell_of``, and ``below`` and ``above``, between which
-    are the relative cells to visit along an axis."""
+    """Build the Warp functions of a grid of cells: ``wrap`` and ``cell_of``, and ``below`` and ``above``, the limits of
+    the relative cells to visit along an axis."""
     vector = precision.vector
     grid_type = cell_grid_type(precision)
 
@@ -66,7 +66,7 @@ def cell_functions(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def above(n: int) -> int:
-        """Return the relative cell behind the last to visit along an axis of n cells."""
+        """Return the relative cell after the last one to visit along an axis of n cells."""
         return wp.where(n > 1, 2, 1)
 
     return by_name(wrap, cell_of, below, above)
@@ -74,9 +74,9 @@ def cell_functions(precision: Precision) -> SimpleNamespace:
 
 @cache
 def cell_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels ``count``, ``place`` and ``rank`` of a counting sort: atomic additions count each cell's
-    particles, and sums of the counts assign places in the cell. That order differs from run to run, so each particle
-    then counts those of its cell before it in the given order, and takes the place of that number."""
+    """Build the kernels ``count``, ``place`` and ``rank`` of a counting sort. Atomic additions count each cell's
+    particles and assign places, in an order that differs from run to run. So each particle then counts the particles of
+    its cell before it in the given order, and takes the place of that number."""
     vector, real = precision.vector, precision.real
     grid_type = cell_grid_type(precision)
     cell_of = cell_functions(precision).cell_of
@@ -137,10 +137,9 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
 class CellSort:
     """A sort of a fixed number of particles by scene and by cell, on one device and without a host read.
 
-    On a GPU the work grows with the square of how many particles are in one cell. The fill of the neighbour lists
-    compares the same pairs and more, so that it takes longer still. And particles that are so far away that they cannot
-    be neighbours, which may be all of an exploded scene, are spread over all cells. On a CPU, which counts particles in
-    the given order, they arrive in their cells in that order, and need no rank.
+    On a GPU the work grows with the square of the number of particles in one cell. Filling the neighbour lists compares
+    the same pairs and more, so it takes even longer. Particles too far away to be neighbours, perhaps all of an
+    exploded scene, are spread over all cells. A CPU counts particles in the given order, so they need no rank.
     """
 
     def __init__(self, grid: Grid, particles: int, precision: Precision, device: Any, members: int = 1):
@@ -152,10 +151,10 @@ class CellSort:
         self._arrivals = wp.empty(self._all, dtype=wp.vec2i, device=device)
         self._before = wp.full(self._all + 1, -1, dtype=wp.int32, device=device)
         self.order = wp.empty(self._all, dtype=wp.int32, device=device)
-        """(n,): sorted -> given."""
+        """(n,): given index of each sorted particle."""
         self._placed = self.order if device.is_cpu else wp.empty_like(self.order)
         self.grid = cell_grid_type(precision)()
-        """What kernels see."""
+        """The grid struct that kernels use."""
         self.grid.origin = precision.vector(*grid.origin)
         self.grid.frequency = precision.vector(*(1.0 / grid.cell))
         self.grid.shape = wp.vec3i(*grid.shape)

@@ -1,4 +1,4 @@
-"""A grid of cells over a region, without Warp, as the reference engine has it too."""
+"""A grid of cells over a region, without Warp, because the reference engine uses the grid, too."""
 
 from dataclasses import dataclass
 

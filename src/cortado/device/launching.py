@@ -2,8 +2,8 @@
 
 Several arrays that a kernel takes as one argument are a bundle, so that its arguments can be read. A launch finds the
 arrays of a bundle by their names, as it finds arguments. In a bundle called ``dot`` or ``bar``, x is the array
-``x_dot`` or ``x_bar``. Kernels with few arrays take them one by one: with a bundle, that of the density is 6 %
-slower on an H200. Kernels that a tape differentiates take them one by one too.
+``x_dot`` or ``x_bar``. Kernels with few arrays take them as separate arguments: with a bundle, the density kernel is 6
+% slower on an H200. So do kernels that a tape differentiates.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -195,10 +195,10 @@ def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Cal
 class KernelLauncher:
     """A launcher of kernels with one thread a particle on one device, with arguments by name (see `bound`).
 
-    On a CPU Warp launches in one thread. A kernel whose first argument is the neighbourhood ``s`` is cut into ranges of
-    particles there, several for each core where there are many, and a core that has done one takes the next. Such a
-    kernel works on particle ``s.first + wp.tid()``, and not on a number of threads of its own.
-    The sums are gathers, so that the bits do not depend on the cut, or on who took what.
+    On a CPU Warp launches in one thread. So a launch of a kernel whose first argument is the neighbourhood ``s`` is cut
+    into ranges of particles, several for each core if there are many. A core that has finished a range takes the next
+    one. Such a kernel works on particle ``s.first + wp.tid()``. Sums are gathers, so the bits do not depend on the
+    ranges or the cores.
     """
 
     def __init__(self, particles: int, device: Any, record_tape: bool):
@@ -208,7 +208,7 @@ class KernelLauncher:
         each = min(PARTS_A_CORE, MOST_PARTS // self._cores, particles // (self._cores * LEAST_SHARED_PART))
         most = self._cores * max(each, 1) if self._cores > 1 else 1
         self.parts = max(min(most, particles // LEAST_PART), 1)
-        """Ranges of particles that a sum over neighbours is cut into."""
+        """Number of ranges of particles into which a sum over neighbours is cut."""
         self._bounds = [particles * part // self.parts for part in range(self.parts + 1)]
         self._side = wp.Stream(device) if device.is_cuda and not record_tape else None
         self._side_is_busy = False
@@ -283,8 +283,8 @@ class KernelLauncher:
 class CapturedGraph:
     """Work repeated with fixed arrays, as a captured graph from the second call on, or from the first if it is warm.
 
-    The first time loads modules and allocates, which a capture must not; work is warm if that is done. On a CPU a graph
-    saves the packing of arguments: half of the time with a hundred particles.
+    The first call loads modules and allocates memory, which is forbidden in a capture; work is warm if this is done. On
+    a CPU a graph saves the packing of arguments: half of the time with a hundred particles.
     """
 
     def __init__(self, work: Callable[[], None], launch: KernelLauncher, is_warm: bool = False):
@@ -307,7 +307,7 @@ class CapturedGraph:
 BANDS = 8
 """Number of bands for each core, as one may take longer than another."""
 LEAST, LEAST_SHARED_OFTEN = 1_000, 50_000
-"""Threads of a band, and of a launch that is cut where it is one of many that take little time each."""
+"""Least number of threads in a band, and in a launch that is cut if it is one of many short launches."""
 
 
 class BandLauncher:
@@ -335,9 +335,9 @@ class BandLauncher:
     def to_and_fro(
         self, kernel: wp.Kernel, rounds: int, values: wp.array, other: wp.array, **arguments: Any
     ) -> wp.array:
-        """Launch a kernel ``rounds`` times, with a thread for each of the ``values``: it computes ``found`` from
-        ``values``, and the next launch begins with what it found. ``values`` and ``other`` are written to alternately;
-        returns the array of the last launch."""
+        """Launch a kernel ``rounds`` times, with a thread for each of the ``values``. It computes ``found`` from
+        ``values``, and the next launch starts from ``found``. Launches write alternately to ``values`` and ``other``;
+        the array of the last launch is returned."""
         count, both = len(values), ({"values": values, "found": other}, {"values": other, "found": values})
         if self.device.is_cpu and count > LEAST_SHARED_OFTEN:
             ways: list[Callable[[], None]] = [partial(self, kernel, count, **arguments, **one) for one in both]

@@ -1,19 +1,19 @@
-"""Warp is started without a word, and the Warp modules of a step are compiled before they are launched, side by side;
-one line says so.
+"""Start of Warp without its messages, and compilation of a step's Warp modules in parallel before their launch, which
+one line announces.
 
-On a CPU, LLVM vectorises loops over neighbours, four numbers at a time, if it looks deep enough. These loops take
-`UNROLL` neighbours at once (`cortado.particles.neighbourhood`). With Warp's depth of 4 a step of the projection takes a
-fifth longer and a step of PCISPH a twentieth, with the same bits. With LLVM's own depth of 12 the density takes a fifth
-longer than with 7.
+On a CPU, LLVM vectorises loops over neighbours, four numbers at a time, if its search depth is large enough. These
+loops process `UNROLL` neighbours at once (`cortado.particles.neighbourhood`). With Warp's depth of 4 a step of the
+projection takes a fifth longer and a step of PCISPH a twentieth, with the same bits. With LLVM's own depth of 12 the
+density takes a fifth longer than with 7.
 
-Warp compiles a module when the first of its kernels is launched, one module after the other. `wp.force_load` of all of
-them with workers of its own is as fast as what is done here. But after Ctrl-C it waits for all of them, and of a few at
-a time it takes 1.7 times as long.
+Warp compiles a module when the first of its kernels is launched, one module after the other. `wp.force_load` of all
+modules, with its own workers, is as fast as the code here. But after Ctrl-C it waits for all modules, and for a few
+modules at a time it takes 1.7 times as long.
 
-What Warp says of itself is kept back, unless it is asked for. Who sets the environment variable CORTADO_VERBOSE to 1
-hears all of it: the greeting, a line for every module that is loaded, warnings about drivers. Who sets
-``warp.config.log_level`` before the first simulation is made keeps that level, if it is another one than Warp's own.
-Containers and clusters often have a home that is read-only or full.
+Warp's messages are suppressed by default. If the environment variable CORTADO_VERBOSE is 1, they are printed: the
+greeting, a line for every loaded module, and warnings about drivers. A ``warp.config.log_level`` other than Warp's
+default, set before the first simulation is built, is kept. Home folders in containers and clusters are often read-only
+or full.
 """
 
 import atexit
@@ -42,9 +42,10 @@ from cortado.errors import ComputationError, InputError, shown
 from cortado.files.terminal import note, say, timed_note
 
 SHALLOW, DEEP = "-slp-recursion-max-depth=4", "-slp-recursion-max-depth=7"
-"""An option of LLVM, as Warp gives it and as it is for our modules. Other flags are those of Warp's configuration."""
+"""An option of LLVM: Warp's default, and the value for Cortado's modules. Other flags are as Warp's configuration
+has."""
 UNUSED = "-DWP_NO_BFLOAT16="
-"""Compiler flag that leaves bfloat16 functions out of Warp's headers, whose precompilation takes 1.0 s then instead of
+"""Compiler flag that leaves bfloat16 functions out of Warp's headers. Their precompilation then takes 1.0 s instead of
 1.7 s on a 2.5 GHz core."""
 
 
@@ -74,10 +75,10 @@ def by_name(*made: Any) -> SimpleNamespace:
 
 
 def kind_of(forward: bool, taped: bool) -> str:
-    """Return the part of a Warp module's name that tells its kernels: "forward", "taped" or "derivative".
+    """Return the part of a Warp module's name that shows the kind of its kernels: "forward", "taped" or "derivative".
 
     Warp's own adjoint of forward kernels, which `gradients.Tape` needs, takes three times as long to compile as the
-    kernels: those that a tape can differentiate are others, in modules of their own.
+    kernels. So kernels that a tape can differentiate are separate, in modules of their own.
     """
     if not forward:
         return "derivative"
@@ -92,7 +93,7 @@ def is_derivative(module: Any) -> bool:
 _ahead: WeakValueDictionary[int, Any] = WeakValueDictionary()
 """Objects, by identity, whose kernels were compiled ahead."""
 _begun: dict[Any, Future[None]] = {}
-"""Futures of modules that another thread compiles or has compiled, and that nobody has awaited yet."""
+"""Futures of modules that another thread compiles or has compiled, and for which nobody has waited yet."""
 _looked_at: set[Any] = set()
 """Modules of kernels that were launched."""
 
@@ -256,9 +257,8 @@ ROOM = 16 * 2**20
 
 @cache
 def start_warp() -> None:
-    """Start Warp, once a process, without its greeting. Where its cache cannot be written, a warning says so, and
-    kernels that are not in it are compiled in a temporary folder; raises `ComputationError` where there is none either.
-    """
+    """Start Warp, once a process, without its greeting. If its cache cannot be written, a warning says so, and missing
+    kernels are compiled in a temporary folder. Raises `ComputationError` if there is no temporary folder either."""
     reason = _start()
     folder = wp.config.kernel_cache_dir
     reason = reason or _trouble(folder)
@@ -295,7 +295,7 @@ def complaint(error: Exception) -> str | None:
 
 
 def _start() -> str | None:
-    """Start Warp, unless it has started; return why its cache cannot be made, None if it can."""
+    """Start Warp, unless it has started; return the reason if its cache cannot be created, otherwise None."""
     try:
         with silenced():
             wp.init()
@@ -305,7 +305,7 @@ def _start() -> str | None:
 
 
 def _trouble(folder: str) -> str | None:
-    """Return why a folder has no room for kernels, or that one in it is damaged; None if all is well."""
+    """Return why a folder cannot store kernels: no space, or a damaged kernel in it; None if all is well."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             free = shutil.disk_usage(folder).free
@@ -392,7 +392,7 @@ def _shown(version: Version) -> str:
 
 
 def device_named(name: str) -> Any:
-    """Return Warp's device of a name; raises `InputError` where there is none."""
+    """Return Warp's device with this name; raises `InputError` if there is no such device."""
     found = ", ".join(str(device) for device in wp.get_devices())
     none = "" if wp.get_cuda_device_count() else f"; {why_no_gpu()}"
     if not isinstance(name, str):

@@ -1,11 +1,11 @@
 """The two floating-point precisions: scalar, vector and NumPy types that belong together; roots and reciprocals; and
 types of parameters by their names.
 
-Lanes are several threads of a GPU that share a particle; each takes some of its neighbours, and sums are added up. One
-thread a particle leaves a large GPU empty where there are few particles. A kernel that is made for lanes finds its
-particle with `wp.tid() // LANES`, and is launched with so many threads for each. A lane takes `UNROLL` neighbours at a
-time, and then those LANES times further down the list. What lanes have summed up is added in a butterfly of shuffles,
-of which every lane gets the same bits, and the first one writes. On a CPU, and for Warp's tape, there is one lane.
+Lanes are several GPU threads that share a particle: each processes some of its neighbours, and their sums are added.
+With one thread per particle, few particles leave a large GPU mostly idle. A kernel for lanes is launched with LANES
+threads per particle, and finds its particle as `wp.tid() // LANES`. A lane processes `UNROLL` neighbours, then the
+group LANES groups further down the list. A butterfly of shuffles adds the lanes' sums, with the same bits in every
+lane; the first lane writes the result. On a CPU, and for Warp's tape, there is one lane.
 """
 
 import inspect
@@ -76,7 +76,7 @@ def precision_named(name: str) -> Precision:
 
 
 class TypesByName:
-    """The types of names that many functions of Warp share, so that each is told once, and not at every parameter.
+    """The types of parameter names that many Warp functions share, so that each type is given only once.
 
         typed = TypesByName(real, {vector: "x v", neighbourhood: "s"})
 
@@ -88,17 +88,17 @@ class TypesByName:
     begin with x. One that begins with none of them has the usual type, which is that of numbers as a rule."""
 
     def __init__(self, usual: Any, *names: Mapping[Any, str]):
-        """Take the usual type, and tables of words that are names of each other type, of which later ones count."""
+        """Set the usual type, and tables with the names of each other type; later tables have priority."""
         self._usual = usual
         self._types = {name: kind for own in names for kind, words in own.items() for name in words.split()}
 
     def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Give types to the parameters of a function."""
+        """Add types to the parameters of a function."""
         return self._give(function, lambda kind: kind)
 
     def arrays(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Give types to the parameters of a kernel: those without a type are arrays of entries, or Warp's structs, and
-        those that a kernel writes come last."""
+        """Add types to the parameters of a kernel. Those without a type become arrays of entries, or Warp's structs;
+        arrays that a kernel writes must come last."""
         return self._give(function, lambda kind: wp.array(dtype=kind) if isinstance(kind, type) else kind)
 
     def _give(self, function: Callable[..., Any], whole: Callable[[Any], Any]) -> Callable[..., Any]:
@@ -116,8 +116,8 @@ class TypesByName:
 
 @cache
 def arithmetic(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Make the Warp functions ``root``, ``inverse_root`` and ``reciprocal`` of a positive number that is neither
-    subnormal nor infinite; ``taped`` ones have derivatives, and round as IEEE 754 asks."""
+    """Build the Warp functions ``root``, ``inverse_root`` and ``reciprocal`` of a positive number that is neither
+    subnormal nor infinite. ``taped`` ones have derivatives, and round as IEEE 754 demands."""
     return _of_the_gpu() if precision == FLOAT32 and not taped else _plain(precision)
 
 
@@ -140,7 +140,7 @@ def _plain(precision: Precision) -> SimpleNamespace:
 
 
 def _of_the_gpu() -> SimpleNamespace:
-    """Return approximate float32 roots and reciprocal of CUDA; on the CPU they are the plain ones."""
+    """Return CUDA's approximate float32 roots and reciprocal; on a CPU they are the usual functions."""
 
     def native(cuda: str, cpu: str) -> str:
         return f"\n#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{cpu}\n#endif\n"
@@ -213,8 +213,8 @@ def checked_lanes(lanes: Any) -> int | None:
 
 
 def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
-    """Return the lanes of a particle on a device: ``wanted`` on a GPU, if given, or a number suited to the particles of
-    one scene."""
+    """Return the lanes of a particle on a device: on a GPU the number ``wanted``, if given, otherwise a number that
+    suits the particles of one scene."""
     if device.is_cpu:
         return 1
     return wanted or next((lanes for most, lanes in BY_SIZE if particles <= most), 1)
@@ -222,11 +222,11 @@ def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
 
 @cache
 def lane_functions(precision: Precision, lanes: int) -> SimpleNamespace:
-    """Make the Warp functions of kernels for a number of lanes, a power of 2 up to 32.
+    """Build the Warp functions of kernels for a number of lanes, a power of 2 up to 32.
 
-    ``lane`` returns the number of a thread's lane, ``add_up`` and ``add_up_vectors`` sums over the lanes. ``vote``
-    returns a number whose bit k is set where lane k says yes; ``ones`` counts the bits of a vote, and ``before`` those
-    of lanes before one's own."""
+    ``lane`` returns the number of a thread's lane, ``add_up`` and ``add_up_vectors`` return sums over the lanes.
+    ``vote`` returns a number whose bit k is set if lane k votes yes; ``ones`` counts the bits of a vote, and ``before``
+    the bits of earlier lanes."""
     return _of_one(precision) if lanes == 1 else _of_several(precision, lanes)
 
 

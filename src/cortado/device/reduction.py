@@ -1,8 +1,8 @@
 """Sums over particles in a fixed order, so that the same bits come back every time.
 
-Each scene of a batch has ``count`` values, one scene behind the other, which come down to ``stride`` partial ones. On a
-CPU each of these is the work of one thread, on a GPU of a block of threads, which add up in a tree in shared memory.
-`wp.tile_sum` adds up in another order, so with other bits, and has no sum and maximum of pairs in one pass.
+Each scene of a batch has ``count`` values, scene after scene, which are reduced to ``stride`` partial values. On a CPU
+one thread computes a partial value, on a GPU a block of threads, by a tree in shared memory. `wp.tile_sum` adds in
+another order, thus with other bits, and cannot compute the sum and maximum of pairs in one pass.
 """
 
 from dataclasses import dataclass
@@ -118,7 +118,7 @@ def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
 
 
 def _kernel(name: str, module_name: str, function: Any, **options: Any) -> Any:
-    """Return a kernel of a name in a module of its own, as code for a GPU alone is in no module for a CPU."""
+    """Return a named kernel in a module of its own, because modules for a CPU cannot contain code for a GPU only."""
     module = kernel_module(module_name)
     function.__qualname__ = name
     return wp.kernel(function, module=module, enable_backward=False, **options)

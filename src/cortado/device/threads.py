@@ -1,11 +1,11 @@
-"""Cores, threads, processes and memory: how many cores launches use, who may use Warp when, what a fork leaves of both,
-how a call travels to a worker process, and how much memory a computation takes and how much is free.
+"""Cores, threads, processes and memory: the number of cores of launches, the locks on Warp and on simulations (also
+after a fork), calls in worker processes, and the memory that is needed and free.
 
 Warp keeps one state for a whole process: the graph that is being captured, the tape that is being recorded, the modules
-that are loaded. Two threads in there at a time spoil each other's results, so that Cortado lets them in one by one.
+that are loaded. Two threads in Warp at a time would spoil each other's results, so Cortado lets in only one at a time.
 
-A worker keeps the last functions that it was sent, so that a problem is made once in each process and not for each of
-its evaluations.
+A worker process caches the last functions that it received, so that a problem is built once in each process and not for
+each evaluation.
 
 Memory is estimated before it is allocated, for a sentence. Estimates count particles with their neighbour lists, wall
 particles, tables and records of every step, the frames that a report reads back, and in a renderer nodes, pixels and
@@ -63,9 +63,9 @@ def helpers() -> ThreadPoolExecutor:
 
 
 def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int) -> None:
-    """Call ``work`` for each item on several cores: this thread and its helpers take one item after the other. After a
-    failure, which is raised, and after an interruption no further item is begun. Returns once all have ended, as
-    nothing may go on behind the back of what comes next."""
+    """Call ``work`` for each item on several cores: this thread and its helpers take item after item. After a failure,
+    which is raised, and after an interruption no further item is started. Returns once all calls have ended, so that no
+    work continues in the background."""
     waiting = iter(items)
 
     def take() -> None:

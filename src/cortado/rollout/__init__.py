@@ -1,4 +1,4 @@
-"""Steps one after another, forward and back: states, checkpoints, and the way of parameters to a device."""
+"""Sequences of steps, forward and backward: states, checkpoints, and the transfer of parameters to a device."""
 
 from typing import TYPE_CHECKING
 

@@ -1,8 +1,8 @@
-"""States that a run keeps on its way forward, so that another way may lead back, and one that it goes on from.
+"""States that a forward run keeps for its backward pass, and the state at which a resumed run starts.
 
-If a run loses a particle, they say where it was lost, for the error.
+If a run loses a particle, these states show where, for the error message.
 
-Protocols say what is computed of states while they are on the device: beside each step, and behind each chunk.
+Protocols define what is computed from states on the device: with each step, and after each chunk.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -40,9 +40,9 @@ class Checkpoints:
         """Begin with the first state alone; a checkpoint is kept every ``interval`` steps."""
         self._first, self._interval = first, interval
         self._states: dict[int, Callable[[], State]] = {0: lambda: first}
-        """By their number, each as what gives the state."""
+        """States by number, each as a function that returns it."""
         self._copies: list[StateSeries] = []
-        """Of whole chunks, which hold them."""
+        """Series with copies of whole chunks."""
 
     def __len__(self) -> int:
         return len(self._states)

@@ -1,5 +1,5 @@
-"""States of steps, and derivatives with respect to them, as NumPy arrays or on the device: there other programs take
-and give them by DLPack, and parameters over time may stay there, too."""
+"""States of steps, and derivatives with respect to them, as NumPy arrays or on the device. Other programs exchange
+device arrays by DLPack; parameters over time may stay on the device, too."""
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -115,7 +115,7 @@ class HostStates:
                 raise InputError(f"{what} has a value that is not finite, but must be numbers.")
 
     def read(self, state: State, lost: OfLost) -> dict[str, Any]:
-        """Return the derivatives of a state's fields by name, in float64, with NaN or 0 for lost scenes."""
+        """Return the derivatives of a state's fields by name, in float64. Rows of lost scenes are NaN or 0."""
         found = {name: array.astype(np.float64) for name, array in state.numpy(self._simulation.dimension).items()}
         return without_lost(lost, found)
 
@@ -152,8 +152,8 @@ def clocks_after(rollout: Rollout, steps: int) -> list[Clock]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DeviceState:
-    """A state, or those of all scenes of a batch, that stay on the device: `Simulation.on_device` makes one, and steps
-    from it lead to others, each with arrays of its own.
+    """A state, or those of all scenes of a batch, that stay on the device. `Simulation.on_device` returns one, and
+    steps from it return others, each with arrays of its own.
 
     ``state["positions"]`` is a Warp array whose memory ``torch.from_dlpack``, ``jax.dlpack.from_dlpack`` and their like
     share; nobody may write to it. It has the precision of the simulation, and vectors have three components in 2-D too.
@@ -197,9 +197,9 @@ class DeviceStates(HostStates):
 
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> DeviceState:
         """Return the state of a rollout after ``steps`` steps as a `DeviceState` with arrays of its own. It shares
-        those that no step changes with the `DeviceState` at which the rollout has ``begun``."""
+        arrays that no step changes with the `DeviceState` at which the rollout has ``begun``."""
         made: dict[tuple[int, int], RestartState] = {}
-        """One for all scenes of a clock and an origin: a batch has hundreds."""
+        """One restart state for all scenes with equal clock and origin: a batch has hundreds of scenes."""
         keys = []
         for clock, origin in zip(clocks_after(rollout, steps), rollout.origins, strict=True):
             keys.append((id(clock), id(origin)))
@@ -264,8 +264,8 @@ class DeviceStates(HostStates):
 
 
 def copy_to(state: State, what: str, given: Mapping[str, Any]) -> None:
-    """Copy arrays that speak DLPack to fields of a state; raises `InputError` for arrays of another shape, type or
-    device."""
+    """Copy arrays with the DLPack interface to fields of a state; raises `InputError` for arrays of another shape, type
+    or device."""
     for name, value in given.items():
         own, array = state.numbers(name), _taken(f"{what} {name}", value)
         if (array.device, array.dtype, array.shape) != (own.device, own.dtype, own.shape):
@@ -296,8 +296,7 @@ def _without_lost(lost: OfLost, state: State) -> State:
 
 class DeviceRows:
     """Parameters with a row for each step that stay on the device, as Warp arrays in the simulation's precision; a
-    number has shape (1,). Their values are never checked: neither for being finite, nor for how far a solid moves in a
-    step."""
+    number has shape (1,). Values are not checked: they may be infinite, and a solid may move too far in a step."""
 
     def __init__(self, simulation: Simulated, space: ParameterSpace):
         self._simulation, self._space = simulation, space

@@ -1,4 +1,4 @@
-"""What to say of a run: that its pressure did not converge, that an emitter runs dry, or that a batch lost scenes."""
+"""Warnings about a run: that its pressure did not converge, that an emitter runs dry, or that a batch lost scenes."""
 
 from collections.abc import Iterator, Mapping
 
@@ -13,10 +13,10 @@ from cortado.sph.viscous_stress import Solve
 
 TORN = 0.015
 """Divergence, times the step, above which a warning is given. Vortices, water at rest, and dams within the longest step
-of a coarse grid reach 0.014. Tanks that sink as pressure travels reach 0.02, longer steps with a coarse grid 0.02 to
-0.06, and dams at their limit without one 0.04."""
+of a coarse grid reach 0.014. Tanks that sink while pressure builds up reach 0.02, longer steps with a coarse grid 0.02
+to 0.06, and dams at their limit without a coarse grid 0.04."""
 RARE = 0.05
-"""Part of steps that may exceed `TORN` without a warning: the first has no earlier pressure, and splashes strike."""
+"""Fraction of steps that may exceed `TORN` without a warning: the first has no earlier pressure, and splashes hit."""
 SAME = 1e-6
 """Relative shortfall of an emitter's supply that still counts as enough."""
 

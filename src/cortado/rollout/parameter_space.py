@@ -1,5 +1,5 @@
-"""Parameters by name: what a user writes, checked, and the way to the arrays of a rollout and back; and how many steps
-a run takes with them."""
+"""Parameters by name: checks of what a user writes, and the conversion to the arrays of a rollout and back. Also the
+number of steps of a run with these parameters."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cached_property
@@ -54,18 +54,18 @@ class ParameterSpace:
         self._one = SceneParameters(simulation, steps)
         self._first_positions = FirstPositions(simulation)
         self._told: set[str] = set()
-        """What was warned of: limits of stability by their names, and sentences."""
+        """Warnings already given: names of stability limits, and sentences."""
         self._begun: tuple[Rollout, int, Arrays, frozenset[str]] | None = None
-        """How a rollout began last: in which evaluation, with which values, and which are varied."""
+        """How a rollout last began: its evaluation, its values, and the names of varied parameters."""
         self._constants: dict[str, wp.array] = {}
-        """Arrays that no step changes of the device state at which it began."""
+        """Arrays that no step changes, of the device state at which the rollout began."""
         self._judged: Arrays | None = None
-        """The last values that make sense: a step after another often has the same ones."""
+        """Values that passed the last check: successive steps often have the same values."""
         self._strongest: tuple[Arrays, float] | None = None
-        """Values that were judged by limits of stability, but for gravity, and the strongest gravity [m/s2] so far."""
+        """Values last checked against stability limits, except gravity, and the strongest gravity [m/s2] so far."""
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
-        """Return values as float64 arrays; raises `InputError`. Where ``what`` is "direction", negative ones pass."""
+        """Return values as float64 arrays; raises `InputError`. If ``what`` is "direction", they may be negative."""
         if not isinstance(values, Mapping):
             raise InputError(f"{what}s are {shown(values)}, but must be given by name, as {{'gravity': value}}.")
         for view, name in self._known.views.items():
@@ -112,7 +112,7 @@ class ParameterSpace:
         return {name: value for name, value in found.items() if self._known[name].role is not Role.CLOCK}
 
     def depends_on_time(self, values: Arrays) -> bool:
-        """Test if parameters other than these change by the clock of a state, or the length of its next steps does."""
+        """Test if the clock of a state changes any other parameters than these, or the lengths of its next steps."""
         courses = self._one.courses(values).values()
         still = [isinstance(course, Steady) and course.greatest() == 0.0 for course in courses]
         return self._simulation.scene.solver.chooses or not all(still)
@@ -133,8 +133,8 @@ class ParameterSpace:
         """Set the first state and the parameters of a rollout: ``values``, and the scene's own, as scheduled, for those
         left out.
 
-        ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
-        diffusion even where it is 0. ``states`` replace the scene's first state. Their fields come from them or from
+        ``varied`` are the parameters whose derivatives are wanted. If the mobility is one, there is a substep of
+        diffusion even if it is 0. ``states`` replace the scene's first state. Their fields come from them or from
         ``arrays``; those that come from arrays are checked by `check_restarts`.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
@@ -193,7 +193,7 @@ class ParameterSpace:
         members: list[Arrays],
         arrays: State | None,
     ) -> list[Arrays]:
-        """Note how a rollout has begun, and return the values of each scene."""
+        """Record how a rollout has begun, and return the values of each scene."""
         each, scene = members * (len(rollout.clocks) // len(members)), self._simulation.scene
         rollout.advice = lambda member: divergence_advice(scene, each[member], float(rollout.time_steps[member]))
         own = {name: value.copy() for name, value in values.items()}
@@ -202,8 +202,8 @@ class ParameterSpace:
         return each
 
     def _goes_on(self, rollout: Rollout, values: Arrays, varied: Iterable[str], states: Sequence[RestartState]) -> bool:
-        """Test if nothing but the state and gravity is other than when the rollout began last, as in most chains of
-        steps, so that nothing else has to be written and judged again."""
+        """Test if only the state and gravity have changed since the rollout last began, as in most chains of steps.
+        Then nothing else has to be written and checked again."""
         if self._begun is None or self._begun[:2] != (rollout, rollout.evaluation) or not self._is_still:
             return False
         _, _, last, others = self._begun
@@ -217,7 +217,7 @@ class ParameterSpace:
         )
 
     def _go_on(self, rollout: Rollout, members: list[Arrays], states: Sequence[RestartState], arrays: State) -> None:
-        """Set only the state and gravity of a rollout of which nothing else has changed."""
+        """Set only the state and gravity of a rollout; nothing else has changed."""
         rollout.begin_evaluation()
         rollout.clocks = [state.clock for state in states]
         for name in arrays.names:
@@ -229,7 +229,7 @@ class ParameterSpace:
 
     @cached_property
     def _is_still(self) -> bool:
-        """Tell if nothing of the scene changes by the clock, moves by itself or comes in."""
+        """Return True if nothing in the scene depends on the clock, moves by itself or enters."""
         scene = self._simulation.scene
         return not (self.depends_on_time({}) or scene.emitter or any(table.moves for table in scene.solid))
 
@@ -252,8 +252,8 @@ class ParameterSpace:
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
-        """Return tangents of the first state (0 if that was given) and of the parameters for a direction by name, at
-        ``values``. The next call for this rollout overwrites the latter, so captured graphs stay valid."""
+        """Return tangents of the first state (0 if it was given) and of the parameters for a direction by name, at
+        ``values``. The next call for this rollout overwrites the latter tangents, so captured graphs stay valid."""
         if self._parameters_dot is None or self._parameters_dot[0] is not rollout:
             self._parameters_dot = rollout, rollout.solver.new_parameters(self._steps)
         dot, parameters = rollout.solver.new_state(), self._parameters_dot[1]
@@ -381,8 +381,8 @@ class ParameterSpace:
             warn(sentence)
 
     def _is_stronger(self, values: Arrays) -> bool:
-        """Test if limits of stability may be broken by values as they were not by those that were judged last: not by a
-        gravity that is no stronger, as a policy gives in every step."""
+        """Test if values may exceed stability limits that the last checked values met. A change of gravity alone, as
+        policies make in every step, counts only if it is stronger than before."""
         others = {name: np.zeros(0) if name == "gravity" else value.copy() for name, value in values.items()}
         strength = float(np.linalg.norm(np.atleast_2d(values["gravity"]), axis=1).max()) if "gravity" in values else 0.0
         last, self._strongest = self._strongest, (others, strength)
@@ -399,8 +399,8 @@ class ParameterSpace:
 
 
 def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, values: Mapping[str, Any]) -> int:
-    """Return the number of steps of a run, given as such or by a time [s] to reach; where steps are chosen, the number
-    that there is room for. Raises `InputError`."""
+    """Return the number of steps of a run, given directly or by a time [s] to reach. With adaptive steps it is the
+    number for which there is room. Raises `InputError`."""
     if steps is None and time is None:
         raise InputError("steps is left out, but must be given where no time says how long the run is.")
     if steps is not None and time is not None:

@@ -1,8 +1,8 @@
-"""The only time loop: run forward, keep checkpoints, go back.
+"""The only time loop: forward runs, checkpoints and backward passes.
 
 Steps are launched in chunks without a host read in between. At the end of a chunk the host checks whether a particle
 was lost, and whether the neighbour lists were long enough; if not, they grow and the chunk is repeated. A chunk of
-steps, or a step back or along, is a captured graph on a GPU, and on a CPU where launches take one thread.
+steps, or a step of reverse or forward mode, is a captured graph on a GPU, and on a CPU if launches use one thread.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,7 +41,7 @@ OBSERVED = "a number of steps", "a state"
 CHUNK = {"cpu": 8, "cuda": 64}
 """Greatest number of steps between two reads by the host: on a CPU a capture costs four launches, a read little."""
 FILLED = {"cpu": 32_000, "cuda": 16_000_000}
-"""Particles times steps of a chunk, by kind of device, above which a read by the host costs hardly anything."""
+"""Particles times steps of a chunk, by kind of device, above which a read by the host costs almost nothing."""
 
 
 class BackwardStep(Protocol):
@@ -87,7 +87,7 @@ class AdjointStep:
 
 class Rollout(Staying):
     """A number of steps of a solver from a first state, which can be repeated and differentiated. Between evaluations
-    ``steps`` may be set to fewer than it was made with, its ``room``."""
+    ``steps`` may be set to any number up to the one given at construction, its ``room``."""
 
     instead = "but the simulation that it is of can"
 
@@ -101,57 +101,57 @@ class Rollout(Staying):
         self.substeps = 0
         """Explicit steps of diffusion within each step."""
         self.time_steps = np.zeros(solver.layout.members)
-        """(members,) [s], as they were given: the device rounds them."""
+        """(members,) [s], as given; the device rounds them to its precision."""
         self.advice: Callable[[int], str] = lambda member: "try a smaller time step, or more pressure iterations"
-        """What to try where a member diverged, in words."""
+        """Function that returns advice, in words, for a member that diverged."""
         self.clocks = [Clock()] * solver.layout.members
-        """Of the first state of each scene of a batch."""
+        """Clocks of the first states, one for each scene of a batch."""
         self.origins: list[Origin] = []
-        """Of the particles of each scene of a batch."""
+        """Origins of the particles, one for each scene of a batch."""
         self.lost: dict[int, DivergedError] = {}
-        """The scenes of a batch that lost a particle in the last forward run, by number: what follows means nothing."""
+        """Scenes of a batch that lost a particle in the last forward run, by number; later states mean nothing."""
         self.log = solver.new_log(steps)
-        """What the solver noted of the steps of the last forward run."""
+        """What the solver recorded of the steps of the last forward run."""
         self.step_sizes = StepSizes()
-        """How long the steps are; in a scene that chooses them others, which a `ParameterSpace` makes."""
+        """Lengths of the steps; for adaptive steps a `ParameterSpace` replaces this object."""
         self.progress = Progress()
-        """Where forward runs of the present evaluation begin; at its first state unless it is set."""
+        """Where forward runs of the present evaluation start; by default at its first state."""
         self.taken = 0
-        """The steps of the last forward run: all of them, unless it ended before."""
+        """Number of steps of the last forward run: all of them, unless it ended earlier."""
         state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
         self._checkpoints = Checkpoints(self.initial, self._interval)
         self._spare: list[StateSeries] = []
-        """Those of earlier runs that nobody will come back to, for the next run that keeps states."""
+        """Series of earlier runs that are no longer needed, for the next run that keeps states."""
         self._buffer, self._bar = self.initial.following(), self.initial.like()
         self._input = self._buffer
-        """The state at which a chunk begins: the first one where all steps are in one chunk."""
+        """State at which a chunk begins: the first state, if all steps are in one chunk."""
         kind = "cpu" if self._device.is_cpu else "cuda"
         length = max(min(CHUNK[kind], FILLED[kind] // max(solver.layout.all_particles, 1), steps), 1)
         self._series = StateSeries(self.initial, length)
         self._chunk = [self._series.state(k) for k in range(length)]
-        """The states of the last chunk."""
+        """States of the last chunk."""
         self._tangent: tuple[Parameters, StepTangent, State] | None = None
-        """The last one, with the tangents of the parameters that it was made for, and that of the present state."""
+        """The last tangent step, the parameters' tangents for which it was built, and the present state's tangent."""
         self._generation = -1
         self._forget_stale_graphs()
         self.copies: list[State] = []
-        """Memory of the host for states that observers have yet to look at, kept from run to run."""
+        """Host memory for states that observers have yet to read, kept from run to run."""
         self.beside: dict[tuple[str, ...], Beside] = {}
-        """What was launched beside steps, by the names of what it computes, kept from run to run."""
+        """Launches added to steps, by the names of what they compute, kept from run to run."""
         self.longest_chunk = length
         """Greatest number of steps in a chunk."""
         self.goes_on = False
-        """Whether the first state was given whole, so that it depends on no parameter."""
+        """Whether the whole first state was given, so that it depends on no parameter."""
         self.evaluation = 0
-        """Which first state and parameters these are: a way back belongs to one evaluation."""
+        """Number of the present evaluation (first state and parameters); a backward pass belongs to one evaluation."""
         self._evaluations = count(1)
         self.pending: WeakSet[Residual] = WeakSet()
-        """Who will come back to the present evaluation."""
+        """Residuals that may return to the present evaluation."""
         self.aside: list[tuple[State, StepLog]] = []
-        """First states and logs that were put aside and are written back, for the next that are put aside."""
+        """First states and logs that residuals saved and no longer need, reused for the next ones."""
         self._kept = self._run = -1
-        """The evaluations that states were kept of, and that the last run was of."""
+        """The evaluations for which states were kept, and to which the last run belonged."""
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
@@ -401,14 +401,14 @@ class Residual:
     """A handle on one evaluation of a rollout (first state, parameters, checkpoints), which allows a backward pass also
     after later evaluations.
 
-    Nothing is copied until another evaluation begins. From then on it keeps the first state and, as long as it is held,
-    the checkpoints.
+    Nothing is copied until another evaluation begins. Then the residual saves the first state and, for as long as it
+    exists, the checkpoints.
     """
 
     def __init__(self, rollout: Rollout):
         self.rollout = rollout
         self._write_back: Callable[[], None] | None = None
-        """What was put aside, to the rollout."""
+        """Function that writes the saved data back to the rollout."""
         rollout.pending.add(self)
 
     @property

@@ -1,5 +1,5 @@
-"""Whether what a run is given makes sense for its scene: parameters, first positions, paths of solids, and states to go
-on from."""
+"""Checks that the input of a run suits its scene: parameters, first positions, paths of solids, and states at which a
+run resumes."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import chain
@@ -27,7 +27,7 @@ from cortado.scene.scene import Scene
 from cortado.scene.stability import broken_limits
 
 CROWDED = 0.5
-"""Part of the fluid's volume at rest: particles with less room than this in all cannot be pushed apart."""
+"""Fraction of the fluid's volume at rest: particles with less room than this in total cannot be pushed apart."""
 
 
 def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
@@ -43,8 +43,8 @@ def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
 
 
 def check_places(values: Arrays, scene: Scene, free: int) -> None:
-    """Raise `InputError` where fluid starts outside the container, or an emitter's opening is. Only the first ``free``
-    particles are checked, as others wait in emitters."""
+    """Raise `InputError` if fluid, or an emitter's opening, starts outside the container. Only the first ``free``
+    particles are checked; the others wait in emitters."""
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
@@ -78,8 +78,8 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
 
 
 def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
-    """Return a warning on the tightest limit of stability that the time step exceeds and that ``told`` does not hold,
-    else None. All exceeded limits are added to ``told``."""
+    """Return a warning about the tightest stability limit that the time step exceeds, among those not yet in ``told``;
+    None if there is none. All exceeded limits are added to ``told``."""
     if scene.solver.time_step == "auto":
         return None
     time_step = float(values.get("time_step", scene.solver.time_step))
@@ -93,7 +93,7 @@ def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | Non
 
 
 def outside(room: Room, points: Any, spacing: float) -> np.ndarray:
-    """Return the indices of the points (n, d) [m] outside a room; along a periodic axis none is."""
+    """Return the indices of the points (n, d) [m] outside a room; along a periodic axis no point is outside."""
     return np.flatnonzero(~room.contains(points, TOLERANCE * spacing))
 
 
@@ -102,8 +102,8 @@ def place_in_words(point: np.ndarray) -> str:
 
 
 MOVED = 0.05
-"""Distance in spacings: positions that all moved less along every axis since their last check are not checked again.
-Searches, ensembles and difference checks move them so little between runs that they skip the cost."""
+"""Distance in spacings: positions that all moved less than this along every axis since their last check are not checked
+again. Searches, ensembles and difference checks move particles so little between runs that they skip the cost."""
 
 
 class FirstPositions:
@@ -112,7 +112,7 @@ class FirstPositions:
     def __init__(self, simulation: Simulated):
         self._simulation, self._warned = simulation, False
         self._judged: dict[int, NDArray] = {}
-        """(n, d) [m], those of each scene that were judged last; at first they are the scene's own."""
+        """(n, d) [m], each scene's last checked positions; at first those of the scene itself."""
 
     def check(self, values: Arrays, member: int) -> str | None:
         """Return a warning where a scene's first positions are crowded, else None. Raises `InputError` where two

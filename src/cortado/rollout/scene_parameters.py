@@ -1,4 +1,4 @@
-"""The way from the parameters of one scene, by name, to what a run of it depends on, and back: as NumPy arrays.
+"""The conversion from the named parameters of one scene to the NumPy arrays on which a run depends, and back.
 
 n counts fluid particles in the order in which the scene lists them, d is the scene's dimension.
 """
@@ -83,7 +83,7 @@ class SceneParameters:
         self._scheduled = simulation.scene.schedule.courses
         absent = {name: np.zeros(self.shapes(name)[0]) for name in self._known.run}
         self.values: Arrays = absent | scene_values(simulation, self._known)
-        """As the scene has them."""
+        """Values of the parameters in the scene."""
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
         """Return the shapes that a parameter may have; () is a number."""
@@ -95,14 +95,14 @@ class SceneParameters:
         return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
 
     def courses(self, values: Arrays) -> dict[str, Changing]:
-        """Return the courses, by parameter, that apply; a given gravity or tilt replaces either."""
+        """Return the courses, by parameter, that apply; a given gravity or tilt replaces scheduled gravity and tilt."""
         replaced = {"gravity", "tilt"} if not values.keys().isdisjoint(("gravity", "tilt")) else set()
         courses = {**self._scheduled, **self._known.courses}
         found = {name: course for name, course in courses.items() if name not in values and name not in replaced}
         return found | {name: Steady(values[rate]) for rate, name in self._rates(values).items()}
 
     def _rates(self, values: Arrays) -> dict[str, str]:
-        """Return, for values that are growth rates of other parameters, the names of the latter."""
+        """Return the names of the parameters whose growth rates are among the values."""
         known = self._known
         return {name: known.views[name] for name in values if name in known.views and known[known.views[name]].grows}
 

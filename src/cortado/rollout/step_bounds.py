@@ -1,5 +1,5 @@
-"""What bounds the time steps of a run whatever the speed of the fluid: limits of the scene, gravity that is scheduled,
-and what moves along paths; and how many steps a run takes."""
+"""Bounds on the time steps of a run that hold at any speed of the fluid: limits of the scene, scheduled gravity, and
+motion along paths. Also the number of steps of a run."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from cortado.scene.solvers import COURANT
 from cortado.scene.stability import SOLID_STEP, chosen_limits, gravity_limits, stability_limits
 
 ROOM = 4
-"""Factor of reserve over the steps of fluid that falls through the whole container throughout."""
+"""Safety factor on the number of steps for fluid that falls through the whole container all the time."""
 MOST = 1e17
 """Greatest number of steps of a run given by its time."""
 LEAST = 1e-4
@@ -124,7 +124,7 @@ class Travel:
 
 @dataclass(frozen=True, eq=False)
 class Pull:
-    """The bound that a gravity changing over time, as such or by a tilt, sets on steps."""
+    """The bound on steps from gravity that changes over time, either directly or by a tilt."""
 
     scene: Scene
     course: Knots
@@ -196,8 +196,8 @@ class Courses:
 
 
 def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
-    """Return an estimate of the steps of a run over a time [s]: fluid that falls through the whole container
-    throughout, and paths beside it. Raises `InputError` above `MOST` steps."""
+    """Return an estimate of the number of steps of a run over a time [s]. It assumes that fluid falls through the whole
+    container all the time, and adds steps for paths. Raises `InputError` above `MOST` steps."""
     scene = simulation.scene
     courant = COURANT if scene.solver.courant is None else scene.solver.courant
     limits = stability_limits(scene, values)

@@ -1,11 +1,11 @@
-"""How long the steps of a rollout are: fixed, or chosen on the device before each, recorded, and taken again so; and
-which steps of the projection that were chosen are taken again, shorter.
+"""Lengths of a rollout's steps: fixed, or chosen on the device before each step, recorded, and reused when the step is
+repeated. Some adaptive steps of the projection are taken again with a shorter length.
 
-Taken again are steps that press fluid together, or lose a particle. Between walls that face one another, nearer than a
-spacing, a pressure that is right on one side of the middle is wrong on the other. A particle that a step takes too far
-goes to and fro there, and then through a wall. A step keeps its length where a shorter one does not help, as fluid was
-compressed before it, or repairs compress it. The state before a step alone decides, so that a run that goes on has the
-steps of one that did not stop.
+A step is taken again if it compresses fluid or loses a particle. Between facing walls, closer than a spacing, a
+pressure that is right on one side of the middle is wrong on the other. If a step moves a particle too far there, it
+oscillates, and then passes through a wall. A step keeps its length if a shorter one does not help, because fluid was
+compressed before, or because repairs compress it. Only the state before a step decides, so that a resumed run has the
+steps of an uninterrupted one.
 """
 
 from collections.abc import Sequence
@@ -27,8 +27,8 @@ from cortado.solvers.projection.steps import ProjectionSteps
 from cortado.solvers.solver import Solver
 
 PRESSED = 0.2
-"""Part of the density: a step that adds more compression than this to a particle is retaken. In dam breaks, with ink
-and with a jug that pours, repairs had added 0.15 at most."""
+"""Fraction of the density: a step that adds more compression than this to a particle is taken again. In dam breaks,
+with ink and with a jug that pours, repairs added at most 0.15."""
 SHORTER = 0.25
 """Factor by which a retaken step is shortened."""
 TIMES = 2
@@ -46,7 +46,7 @@ class Try:
     size: float
     """Length of the step [s]."""
     added: float
-    """Compression that the step added to a particle, at most; infinite where a particle was lost."""
+    """Greatest compression that the step added to a particle; infinite if a particle was lost."""
 
 
 class Retaken:
@@ -75,7 +75,7 @@ class Retaken:
         return again
 
     def _next(self, key: tuple[int, int], now: Try, least: float) -> float | None:
-        """Return the next length [s] of a step that went badly; None if it stays."""
+        """Return the next length [s] to try for a step that failed; None if it keeps its length."""
         least, tries = self._tries.setdefault(key, (least, []))
         tries.append(now)
         helped = len(tries) == 1 or not np.isfinite(tries[-2].added) or now.added <= HELPED * tries[-2].added
@@ -160,8 +160,8 @@ def compression_kernels(precision: Precision) -> tuple[Any, Any]:
 GROWTH = 1.1
 """Greatest ratio of the lengths of two successive steps."""
 LEAST = 1e-6
-"""Least part of its other bounds to which the fluid's speed shortens a step. Faster fluid was thrown about by walls
-that leave it no room, ever faster from step to step."""
+"""Least fraction of its other bounds to which the fluid's speed shortens a step. Faster fluid was thrown about, ever
+faster from step to step, by walls that leave it no room."""
 
 
 class Scheduled(Protocol):

@@ -1,5 +1,5 @@
-"""Steps of a simulation as a function of a state and of parameters, with its derivatives; `Stepping` gives simulations
-these functions."""
+"""Steps of a simulation as a function of a state and of parameters, with derivatives. `Stepping` adds these functions
+to simulations."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -39,7 +39,7 @@ KEPT = 4
 
 
 MOST_GROWTH = 10.0
-"""Growth from which on there is a warning [e-folds]: what began the chain is then 1/22,000 of the adjoint."""
+"""Growth above which a warning is given [e-folds]: the start of the chain is then 1/22,000 of the adjoint."""
 
 
 class Steppable(Simulated, Protocol):
@@ -120,9 +120,9 @@ class StepResidual(Staying):
 class AdjointGrowth:
     """The growth of the adjoint of a simulation's states from call to call of a way back.
 
-    A call continues the chain of the call before where it ends at the time at which that one began. The growth in
-    e-folds is the smaller one of two: that of the norm since the chain began, and the sum of those within calls. So
-    neither a loss of each segment, nor what a policy takes away again, counts as growth. The norm is that of
+    A call continues the previous call's chain if it ends at the time at which the previous call began. The growth in
+    e-folds is the smaller of two numbers: the norm's growth since the chain began, and the sum of the growths within
+    calls. So neither the losses of segments, nor growth that a policy removes again, count. The norm is that of
     `cortado.certificate`, sqrt(|x^|^2 + |v^|^2 / T^2) with the time T of the chain.
     """
 
@@ -132,8 +132,8 @@ class AdjointGrowth:
         self._warned = False
 
     def follow(self, rollout: Rollout, last: State, first: State) -> None:
-        """Note a call that took the adjoint of the ``last`` state to that of the ``first``; warn once, in the call in
-        which the growth exceeds `MOST_GROWTH`."""
+        """Record a call that computed the adjoint of the ``first`` state from that of the ``last``. Warn once, in the
+        call in which the growth exceeds `MOST_GROWTH`."""
         start, end = (clocks_after(rollout, steps)[0].time for steps in (0, rollout.steps))
         into, out = _norms(last), _norms(first)
         if not (abs(end - self._reached) < 0.5 * (end - start) / rollout.steps and any(self._begun)):
@@ -175,7 +175,7 @@ class Stepper:
         self._simulation, self._space = simulation, ParameterSpace(simulation, steps)
         self._rows = DeviceRows(simulation, self._space)
         self.rollout = Rollout(simulation.solver, steps)
-        """What takes the steps, with the parameters of the last ones."""
+        """The rollout that takes the steps, with the parameters of the last ones."""
         self._derivatives = BackwardSteps(self.rollout)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -212,8 +212,8 @@ class Stepper:
     def advance(self, state: Given | DeviceState, parameters: Values | None = None) -> States | DeviceState:
         """Return the state after the steps, on the device if the given one is.
 
-        A parameter over time may be a Warp array on the device, in the simulation's precision: it stays there, and is
-        not looked at.
+        A parameter over time may be a Warp array on the device, in the simulation's precision. It stays there and is
+        not checked.
         """
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows)
@@ -222,8 +222,8 @@ class Stepper:
     @in_turn
     def follow(self, state: DeviceState, rows: Arrays) -> DeviceState:
         """Return the state after the steps with the parameters of the last `advance`, except ``rows`` over time (batch,
-        steps, ...), which are not checked: for controllers of many scenes. All that `advance` was given over time has
-        to be among them."""
+        steps, ...), which are not checked: for controllers of many scenes. ``rows`` must include all parameters over
+        time that `advance` was given."""
         place = DeviceStates(self._simulation)
         if self._space.depends_on_time(rows):
             place.begin(self._space, self.rollout, state, dict(rows), set())
@@ -238,9 +238,9 @@ class Stepper:
     ) -> tuple[States | DeviceState, StepResidual]:
         """Return the state after the steps, and a residual for `vjp` and `jvp`; several may be held at once.
 
-        Any number of residuals may be held at a time, each with states of its own. ``along`` are further parameters
-        that `jvp` will be given directions of; only the mobility has to be said before, as where it is 0 nothing
-        diffuses. Parameters may be on the device as those of `advance`.
+        Any number of residuals may exist at a time, each with states of its own. ``along`` names further parameters of
+        later `jvp` directions. Only the mobility must be named, because fluid with mobility 0 is computed without
+        diffusion. Parameters may be on the device, as for `advance`.
         """
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows, {*values, *self._space.checked_names("along", along)})
@@ -251,15 +251,14 @@ class Stepper:
     def vjp(
         self, residual: StepResidual, state_bar: Values, gradient: ReverseEstimator | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return adjoints of the state before the steps and of the given parameters, from that of the state after them
-        (reverse mode), by the estimator ``gradient``, exact if left out: see `docs/gradients.md`.
+        """Return the adjoints of the state before the steps and of the given parameters, given the adjoint of the state
+        after the steps (reverse mode). ``gradient`` is the estimator, exact if left out: see `docs/gradients.md`.
 
-        The adjoint of a state is a table of arrays, those of its fields by name and in their shapes, and of its
-        ``time``, a number; what is left out is 0. Of a `DeviceState` it is taken and returned as arrays on the device;
-        all else that is returned is in float64. A batch has a first axis for the scenes; of one that was lost all is
-        NaN, or 0 where its adjoint is 0 throughout. A parameter on the device has
-        its adjoint there, in its own shape. Raises `InputError` for fields that the state does not have, or that have
-        other shapes.
+        The adjoint of a state is a table of arrays by field name, in the fields' shapes, and of its ``time``, a number;
+        missing entries are 0. For a `DeviceState` its arrays are on the device; all other results are in float64. In a
+        batch arrays have a first axis for the scenes. Results for a lost scene are NaN, or 0 if its given adjoint is 0
+        throughout. The adjoint of a parameter on the device is on the device, in the parameter's shape. Raises
+        `InputError` for fields that the state does not have, or that have other shapes.
         """
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
         adjoint = self._derivatives.of(gradient)
@@ -282,8 +281,8 @@ class Stepper:
 
     @in_turn
     def jvp(self, residual: StepResidual, state_dot: Values, parameter_dots: Values | None = None) -> dict[str, Any]:
-        """Return the tangent of the state after the steps, from those of the state before and of parameters (forward
-        mode), in the forms of `vjp`."""
+        """Return the tangent of the state after the steps, given the tangents of the state before and of parameters
+        (forward mode). The forms are those of `vjp`."""
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
         looked_at, rows = self._rows.split(parameter_dots, "direction")
         along = space.checked(looked_at, "direction")
@@ -325,7 +324,7 @@ class Stepper:
         rows: Mapping[str, wp.array],
         varied: Iterable[str] = (),
     ) -> HostStates:
-        """Set the first state and parameters of the rollout, and return the interface to where the state is."""
+        """Set the first state and parameters of the rollout; return the host's or the device's interface to states."""
         place = (DeviceStates if isinstance(state, DeviceState) else HostStates)(self._simulation)
         place.begin(self._space, self.rollout, state, values, set(varied))
         self._rows.write(rows, self.rollout.parameters)
@@ -335,7 +334,7 @@ class Stepper:
         return self._space.checked({} if parameters is None else parameters)
 
     def _given(self, parameters: Values | None) -> tuple[Arrays, dict[str, wp.array]]:
-        """Return the checked parameters, with NaN in place of those on the device, and the latter."""
+        """Return two tables: the checked parameters, with NaN where one is on the device, and those on the device."""
         looked_at, rows = self._rows.split(parameters)
         return self._space.checked(looked_at) | self._rows.stand_ins(rows), rows
 
@@ -348,7 +347,7 @@ class Stepper:
 
 
 class Stepping:
-    """The methods of a simulation that take, give and differentiate states, such as `step`, `vjp` and `jvp`."""
+    """The methods of a simulation that take steps and differentiate them, such as `step`, `vjp` and `jvp`."""
 
     @property
     def turn(self) -> Turn:
@@ -356,30 +355,30 @@ class Stepping:
         raise NotImplementedError
 
     def state(self, parameters: Values | None = None) -> States:
-        """Return the state before the first step, from which `step` and ``Simulation.run(state=...)`` go on; of a batch
-        a tuple with one for each scene.
+        """Return the state before the first step, from which `step` and ``Simulation.run(state=...)`` can start; for a
+        batch a tuple with one state for each scene.
 
-        ``parameters`` are any of those of `Problem` that a first state depends on, such as ``initial_velocities``.
-        Raises `InputError` for those that do not fit.
+        ``parameters`` may be any parameters of `Problem` on which the first state depends, such as
+        ``initial_velocities``. Raises `InputError` for parameters that do not fit.
         """
         return self.stepper(0).first(parameters)
 
     def on_device(
         self, state: Given | DeviceState = None, fields: Values | None = None, parameters: Values | None = None
     ) -> DeviceState:
-        """Return a state, the first one if left out, in arrays on the device, which other programs take by DLPack;
-        steps from it stay on the device.
+        """Return a state, by default the first one, in arrays on the device, which other programs read by DLPack. Steps
+        from this state stay on the device.
 
-        ``fields`` are arrays that speak DLPack and replace fields of the state, in the precision of the simulation and
-        on its device: vectors (n, 3), fractions (n, phases), numbers (n,), in a batch (batch, n, ...). Such a state is
-        judged as one from a file is, which reads it on the host, once. ``parameters`` are those of the run that the
-        state is of. Raises `InputError` for what does not fit.
+        ``fields`` are arrays with the DLPack interface that replace fields of the state, in the precision of the
+        simulation and on its device: vectors (n, 3), fractions (n, phases), numbers (n,), in a batch (batch, n, ...).
+        Such a state is checked like one from a file, by one read on the host. ``parameters`` are those of the run to
+        which the state belongs. Raises `InputError` for input that does not fit.
         """
         return self.stepper(0).on_device(state, fields or {}, parameters)
 
     def on_host(self, state: DeviceState) -> States:
-        """Return a state on the device as NumPy arrays, which files, other processes and ``Simulation.run`` take.
-        Raises `InputError` for a state of another simulation."""
+        """Return a state on the device as NumPy arrays, for files, other processes and ``Simulation.run``. Raises
+        `InputError` for a state of another simulation."""
         return self.stepper(0).on_host(state)
 
     @overload
@@ -390,12 +389,12 @@ class Stepping:
 
     def step(self, state: Any, parameters: Values | None = None, steps: int = 1) -> Any:
         """Return the state after ``steps`` steps from ``state``, with the bits of ``run(steps, parameters,
-        state=state)``; of a batch a tuple with one for each scene, with NaN in that of a scene that is lost.
+        state=state)``; for a batch a tuple with one state for each scene, NaN for a lost scene.
 
-        ``parameters`` are any of those of `Problem` but first values, which ``state`` has; one over time has a row for
-        each of these steps. Nothing is recorded on the way. From a `DeviceState` it gives another one. From the
-        second call on with as many steps, on a CPU from the third, no array of the device is allocated but those of a
-        `DeviceState`, and no graph is captured. Warns and raises as `Simulation.run` does.
+        ``parameters`` may be any of `Problem` except first values, which ``state`` contains; a parameter over time has
+        a row for each of these steps. Nothing is recorded between. For a `DeviceState` the result is another one. From
+        the second call with the same number of steps on (third on a CPU), no graph is captured, and only the arrays of
+        a `DeviceState` are allocated. Warns and raises as `Simulation.run` does.
         """
         return self.stepper(check_steps(steps)).advance(state, parameters)
 
@@ -407,8 +406,8 @@ class Stepping:
         steps: int = 1,
         gradient: ReverseEstimator | None = None,
     ) -> tuple[dict[str, Any], Arrays]:
-        """Return the adjoints of ``state`` and of ``parameters`` from ``state_bar``, that of the state after ``steps``
-        steps, by the estimator ``gradient`` (reverse mode); see `Stepper.vjp`, which takes the steps once for several
+        """Return the adjoints of ``state`` and of ``parameters``, given the adjoint ``state_bar`` of the state after
+        ``steps`` steps, by the estimator ``gradient`` (reverse mode). `Stepper.vjp` takes the steps once for several
         adjoints."""
         stepper = self.stepper(check_steps(steps))
         return stepper.vjp(stepper.step(state, parameters)[1], state_bar, gradient)
@@ -421,15 +420,15 @@ class Stepping:
         parameter_dots: Values | None = None,
         steps: int = 1,
     ) -> dict[str, Any]:
-        """Return the tangent of the state after ``steps`` steps, given ``state_dot`` and ``parameter_dots``, those of
-        ``state`` and of any ``parameters`` (forward mode); see `Stepper.jvp`."""
+        """Return the tangent of the state after ``steps`` steps, given the tangents ``state_dot`` of ``state`` and
+        ``parameter_dots`` of any ``parameters`` (forward mode); see `Stepper.jvp`."""
         stepper = self.stepper(check_steps(steps))
         residual = stepper.step(state, parameters, along=parameter_dots or ())[1]
         return stepper.jvp(residual, state_dot, parameter_dots)
 
     @in_turn
     def stepper(self, steps: int) -> Stepper:
-        """Return the `Stepper` for this number of steps; those of the last few numbers are kept."""
+        """Return the `Stepper` for this number of steps; the last few steppers are cached."""
         steppers: dict[int, Stepper] = self.__dict__.setdefault("_steppers", {})
         found = steppers.pop(steps, None) or Stepper(cast(Steppable, self), check_steps(steps, least=0))
         steppers[steps] = found  # the last one
