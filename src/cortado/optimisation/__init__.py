@@ -1,4 +1,4 @@
-"""Optimisers, what they work on, in which coordinates, and how a search is resumed."""
+"""Optimisers, the problems and coordinates that they search in, fits, and replay logs to resume a search from."""
 
 from typing import TYPE_CHECKING
 

@@ -35,14 +35,14 @@ from cortado.optimisation.search import MemoryLog, Optimiser, ParameterLayout, R
 from cortado.scene.parameter_values import Values
 
 LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
-"""Parameters by name -> the loss, and its gradient by the same names."""
+"""A function from parameters by name to the loss and its gradient, a table with the same names."""
 MOST_ITERATIONS = 10_000_000
-"""Most updates of a search, in tasks too; more are taken for a mistake."""
+"""Greatest number of updates of a search, also in task files."""
 
 
 @dataclass(frozen=True)
 class Function:
-    """A problem made of a function that returns the loss of the parameters and its own gradient: an `Optimisable`."""
+    """An `Optimisable` problem made from a function that returns the loss and its gradient."""
 
     function: LossFunction
 
@@ -53,14 +53,15 @@ class Function:
         return str(getattr(self.function, "__qualname__", kind.__qualname__))
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
-        """Return the function's result; raise `InputError` for an estimator, as the gradient is the function's own."""
+        """Return the function's result; raise `InputError` if an estimator is given, because the function computes its
+        own gradient."""
         if gradient is not None:
             raise InputError("gradient is given, but must be left out where a function makes its own.")
         return self.function(parameters)
 
 
 def as_differentiable(problem: Any) -> Optimisable:
-    """Return the problem itself, or a function made into one; raise `InputError` for anything else."""
+    """Return the problem itself, or wrap a function in a problem; raise `InputError` for anything else."""
     if isinstance(problem, type):
         raise InputError(f"What is optimised is the class {problem.__name__}, but must be an object made of it.")
     if hasattr(problem, "value_and_gradient"):
@@ -84,28 +85,29 @@ class Result:
     last_parameters: Parameters
     """The optimiser's last iterate."""
     history: tuple[Record, ...]
-    """One per evaluation, in order."""
+    """Records of all evaluations, in order."""
     updates: int
     """Updates by the optimiser, with those replayed from the checkpoint."""
     evaluations: int
     """Number of evaluations in the history, with those replayed from the checkpoint."""
     message: str
-    """How it ended, a sentence."""
+    """A sentence that says how the search ended."""
     converged: bool
-    """True where the optimiser's own test was met, and the gradient agreed with the steps; only L-BFGS has a test."""
+    """True if the optimiser's convergence test was met and the gradient agreed with the steps; only L-BFGS has a
+    test."""
     refused: int = 0
-    """Evaluations without a run, as it diverged or a parameter was out of its range, so that the steps to them were
-    refused; they are not in the history."""
+    """Number of refused steps: the run at their end diverged, or a parameter was out of its range. They are not in the
+    history."""
     left_out: int = 0
-    """Runs that averages over ensembles left out, for those reasons too; replayed evaluations do not count."""
+    """Number of runs that ensemble averages left out for the same reasons, without replayed evaluations."""
     misled: bool = False
-    """True where the gradient disagreed with the steps, as beyond the horizon of `cortado.certify`, so that the search
-    cannot be trusted; `message` says what to try."""
+    """True if the gradient disagreed with the change of the loss, as beyond the horizon of `cortado.certify`. Then do
+    not trust the search; `message` gives advice."""
     stays: bool = False
-    """True where the loss stayed at a good part of the first one, as in a wrong valley."""
+    """True if the loss stayed a large part of the first loss, as in a wrong local minimum."""
     problem: Any = field(default=None, repr=False)
-    """The `Problem` that was solved, or one in other coordinates, whose runs a notebook shows; None for other problems,
-    and in a result that was pickled."""
+    """The solved `Problem`, or one in other coordinates, whose runs a notebook shows; None for other problems and in
+    pickled results."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "problem": None}
@@ -116,7 +118,8 @@ class Result:
         return f"Result({sized(self.parameters)}: {found}; {end})"
 
     def _repr_html_(self) -> str:
-        """Show in a notebook the ends of the first and the best run beside the target, parameters, and losses."""
+        """Show in a notebook the last states of the first and the best run, the target, the parameters and the
+        losses."""
         losses, start = [record.loss for record in self.history], self.history[0].parameters
         page: str = on_top("result_page")(self, self.message, self.problem, start, self.parameters, losses)
         return page
@@ -154,7 +157,7 @@ def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayou
 
 
 def _checked_pair(name: str, pair: tuple[Any, Any], shape: tuple[int, ...]) -> tuple[Vector, Vector]:
-    """Return the lower and upper bound of one parameter, each of its shape, infinite where there is none."""
+    """Return the lower and upper bound of one parameter, each of its shape, infinite if there is no bound."""
     try:
         lower, upper = pair
         low = as_numbers(f"The lower bound of '{name}'", -np.inf if lower is None else lower)
@@ -171,7 +174,7 @@ def _checked_pair(name: str, pair: tuple[Any, Any], shape: tuple[int, ...]) -> t
 
 
 def require_within(vector: Vector, lower: Vector, upper: Vector, layout: ParameterLayout) -> None:
-    """Raise `InputError` if the start is outside of the bounds."""
+    """Raise `InputError` if the start is outside the bounds."""
     outside = layout.unravel(((vector < lower) | (vector > upper)).astype(np.float64))
     for name, marks in outside.items():
         if marks.any():
@@ -197,22 +200,20 @@ def evaluate(
     loss_if_diverged: float | None = None,
     on_result: OnResult | None = None,
 ) -> list[Estimate]:
-    """Return the losses of a problem at many points, in their order, bit for bit equal wherever they are computed.
+    """Return the losses of a problem at many points, in order, with the same bits for every executor.
 
     Parameters:
-        problem: a `Problem`, or one in other coordinates (`cortado.optimisation.transforms.Transformed`).
-        points: the parameters of each point, by name. They are taken as they are needed.
-        gradient: how the gradient is computed at each point, such as `gradients.Exact()`; left out, the ``gradient`` of
-            each `Estimate` is empty, and points are run forward only.
-        executor: where they are computed, see `cortado.executors`; one after the other in this process if left out.
-        loss_if_diverged: the loss of a point that has no run, as it diverges or a parameter is out of its range, such
-            as infinity for a search that leaves it aside. Left out, it is NaN, and a `CortadoWarning` says how many
-            such points there are, and what became of the first of them. The gradient of such a point is NaN, and its
-            `Estimate.diverged` has the error.
-        on_result: called with the number of a point and its `Estimate` as they arrive, in whatever order.
+        problem: a `Problem`, or one in other coordinates (`cortado.optimisation.transforms.Transformed`). points: the
+        parameters of each point, by name. An iterator is read only as far as needed. gradient: estimator of the
+        gradient, such as `gradients.Exact()`. Without it, points are run forward only and the ``gradient`` of each
+        `Estimate` is empty. executor: where the points are computed, see `cortado.executors`; by default one after the
+        other in this process. loss_if_diverged: the loss, such as infinity, of a failed point: its run diverges or a
+        parameter is out of range. By default it is NaN, and a `CortadoWarning` gives the number of failed points and
+        the first one's error. A failed point's gradient is NaN, and its `Estimate.diverged` is the error. on_result:
+        called with a point's number and its `Estimate` as soon as it is computed, in any order.
 
-    Raises the error of the first point that has another one; and that of the first point where no point has a run,
-    unless they are given a loss.
+    Any other error of a point is raised. If all points fail, the first one's error is raised, unless
+    ``loss_if_diverged`` is given.
 
     Example::
 
@@ -259,35 +260,32 @@ def optimise(
     on_iteration: Callable[[Record], None] | None = None,
     **settings: Any,
 ) -> Result:
-    """Lower the loss of a problem, from a start; `cortado.optimize` is the same.
+    """Lower the loss of a problem, beginning at given parameters; `cortado.optimize` is the same function.
 
     Parameters:
         problem: a `Problem`, or any object with `value_and_gradient`, or a function that takes the parameters by name
             and returns the loss and its gradient, `{"gravity": array of the parameter's shape}`.
-        start: numbers or arrays of any shape by name; they are optimised together, in float64.
-        optimiser: such as `cortado.optimisers.Adam(learning_rate=0.1)`; or "adam", "gradient_descent", "lbfgs" or
-            "line_search", with its settings as keywords:
-            `optimise(problem, start, "adam", learning_rate=0.1, iterations=50)`.
-        iterations: greatest number of updates. Adam and gradient descent evaluate once more, to judge the
-            last iterate.
-        bounds: by name, (lower, upper), each a number, an array of the parameter's shape, or None.
-        gradient: how the problem is differentiated, handed to it as it is.
-        checkpoint: folder for the replay log, in which each evaluation is on the disk before the next begins.
-        resume: go on with the run in `checkpoint`, bit for bit as if it had not been interrupted; begin it if
-            there is none. `iterations` may then be another number.
-        on_iteration: called with the `Record` of every evaluation, also of each one read from the checkpoint.
-            The line search of L-BFGS may evaluate several times an iteration; all of them are recorded. The losses
-            that `LineSearch` tries are in the checkpoint alone.
+        start: first parameters by name, numbers or arrays of any shape; they are optimised together, in float64.
+        optimiser: an object such as `cortado.optimisers.Adam(learning_rate=0.1)`, or "adam", "gradient_descent",
+        "lbfgs" or "line_search" with its settings as keywords: `optimise(problem, start, "adam", learning_rate=0.1,
+        iterations=50)`. iterations: greatest number of updates. Adam and gradient descent then evaluate the last
+        iterate too. bounds: by name, (lower, upper), each a number, an array of the parameter's shape, or None.
+        gradient: gradient estimator, passed on to the problem. checkpoint: folder for the replay log. Each evaluation
+        is written to disk before the next begins. resume: continue the run in `checkpoint`, bit for bit as if it had
+        not been interrupted; begin a new one if there is none. `iterations` may differ from the first call's.
+        on_iteration: called with the `Record` of every evaluation, including those read from the checkpoint. L-BFGS may
+        evaluate several times per iteration; all evaluations are recorded. The trial losses of `LineSearch` are in the
+        checkpoint alone.
 
-    Where the run of an evaluation diverges, or a parameter is out of its range, the step there is refused. Adam and
-    gradient descent go half of the way instead, or a quarter, and so on, and keep to shorter steps from then on. The
-    line searches take shorter trials. `Result.refused` counts such evaluations, `Result.message` says so, and the
-    checkpoint has them. `Result.left_out` counts runs that averages over ensembles left out for the same reasons, of
-    which the first time alone is warned.
+    If the run after a step diverges, or a parameter is out of its range, the step is refused. Adam and gradient descent
+    then try half of the step, a quarter and so on, and take shorter steps from then on. The line searches take shorter
+    trials. `Result.refused` counts refused steps, `Result.message` mentions them, and the checkpoint contains them.
+    `Result.left_out` counts runs that ensemble averages left out for the same reasons; only the first time warns.
 
-    Raises InputError for a start, bounds or settings that do not fit, and for a checkpoint of another run. Raises
-    DivergedError if the start diverges, or a step that was halved ten times. Raises ComputationError where such a step
-    has a parameter out of range, or if the loss or gradient is not finite. What came before is in the checkpoint.
+    Raises InputError for unsuitable ``start``, ``bounds`` or settings, and for a checkpoint of another run. Raises
+    DivergedError if the run at the start diverges, or after a step halved ten times. Raises ComputationError if a
+    parameter is out of range after ten halvings, or if the loss or gradient is not finite. Earlier evaluations stay in
+    the checkpoint.
 
     Example::
 
@@ -354,12 +352,12 @@ optimize = optimise
 
 
 def _description(setting: object) -> str:
-    """Return the repr of a setting, without the address that a plain object shows in it."""
+    """Return the repr of a setting, without the memory address in the default repr of objects."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(setting))
 
 
 def _without_runs_in_words(refused: int, left_out: int) -> str:
-    """Return the sentence about refused steps and left-out runs that a search's message ends with."""
+    """Return the sentence about refused steps and left-out runs at the end of a search's message."""
     why = ["refused " + counted(refused, "step")] * bool(refused)
     why += [f"left {counted(left_out, 'run')} out of its averages"] * bool(left_out)
     return f" It {' and '.join(why)}, as runs diverged or parameters were out of their range." if why else ""

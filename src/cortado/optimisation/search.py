@@ -1,9 +1,9 @@
-"""What an optimiser sees of a search, one vector and what is computed of it, and the replay log of that.
+"""The interface between optimisers and problems, in which all parameters are one vector, and the replay log of
+evaluations.
 
-An optimiser is deterministic: given the losses and gradients of a former run, it takes the same steps. The replay log
-keeps every evaluation of the loss and its gradient, and so it is a complete checkpoint of any optimiser: a run is
-resumed by replaying the optimiser against the log. It is a file that only grows, as a database of sqlite3 needs locks,
-which file systems of clusters may lack.
+An optimiser is deterministic: with the losses and gradients of an earlier run it takes the same steps. So the replay
+log, which stores every evaluation, is a complete checkpoint of any optimiser: resuming replays the log. The log is an
+append-only file, because sqlite3 databases need locks, which file systems of clusters may lack.
 """
 
 import json
@@ -27,15 +27,15 @@ from cortado.runs.run_folder import REPLAY_LOG
 Vector = npt.NDArray[np.float64]
 FORMAT = "cortado replay log 1"
 LONGEST_HEADER = 2**20
-"""Most bytes of the first line of a log."""
+"""Greatest length of the first line of a log [byte]."""
 PerParameter = float | Mapping[str, float]
 HALVINGS = 10
-"""Most halvings of one step before the search ends."""
+"""Greatest number of halvings of one step before the search ends."""
 
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """The order and the shapes of named parameters in the one vector that an optimiser sees."""
+    """The order and shapes of named parameters within the optimiser's vector."""
 
     names: tuple[str, ...]
     # in the order in which they follow each other in the vector
@@ -70,14 +70,14 @@ class ParameterLayout:
         }
 
     def spread(self, values: float | Mapping[str, float]) -> Vector:
-        """Return a number for every component (size,), from one number or from one number per parameter."""
+        """Expand one number, or one number per parameter, to a vector (size,) with a number for every component."""
         by_name = values if isinstance(values, Mapping) else dict.fromkeys(self.names, values)
         return np.repeat([float(by_name[name]) for name in self.names], self.sizes)
 
 
 @dataclass(frozen=True, eq=False)
 class LoggedEvaluation:
-    """One evaluation of the loss and its gradient, as a replay log keeps it."""
+    """One evaluation of the loss and its gradient in a replay log."""
 
     parameters: Vector
     # (size,), each component in its parameter's unit
@@ -86,11 +86,11 @@ class LoggedEvaluation:
 
 
 class Log(Protocol):
-    """A replay log of evaluations, as an optimisation needs it."""
+    """Protocol of a replay log of evaluations."""
 
     @property
     def fate(self) -> str:
-        """Return the end of the sentence "the evaluations ..." that says what becomes of them."""
+        """Return the rest of a sentence that begins "the evaluations ..." and says if they are kept."""
 
     def __len__(self) -> int: ...
 
@@ -101,11 +101,11 @@ class Log(Protocol):
         """Append one more evaluation."""
 
     def close(self) -> None:
-        """Free what the log holds open."""
+        """Close the log's file, if there is one."""
 
 
 class MemoryLog(list[LoggedEvaluation]):
-    """A replay log that lives as long as the process."""
+    """A replay log in memory, which is lost when the process ends."""
 
     fate = "were not kept, as there is no checkpoint"
 
@@ -131,13 +131,12 @@ class ReplayLog:
         """Open the log of `folder`, or begin one there.
 
         Parameters:
-            folder: made if it is not there.
-            layout: names and shapes of the parameters.
-            settings: what else must be the same when the run is resumed, as text by name.
-            resume: go on with the evaluations in the folder, if there are any.
+            folder: path of the folder, which is made if it does not exist. layout: names and shapes of the parameters.
+            settings: texts by name that must be equal when the run is resumed. resume: continue with the evaluations in
+            the folder, if there are any.
 
-        Raises InputError if the folder holds evaluations and `resume` is false, if they belong to other
-        settings, or if the file is damaged elsewhere than at its end.
+        Raises InputError if the folder contains evaluations and `resume` is false, if they have other settings, or if
+        the file is damaged anywhere but at its end.
         """
         self._layout = layout
         self._path = Path(folder) / REPLAY_LOG
@@ -163,7 +162,7 @@ class ReplayLog:
 
     @property
     def fate(self) -> str:
-        """Return the end of the sentence "the evaluations ..." that says where they are."""
+        """Return the rest of a sentence that begins "the evaluations ..." and says where they are stored."""
         return f"are in '{self._path}'"
 
     def __len__(self) -> int:
@@ -177,7 +176,7 @@ class ReplayLog:
         return LoggedEvaluation(values[1 : 1 + size], float(values[0]), values[1 + size :])
 
     def append(self, evaluation: LoggedEvaluation) -> None:
-        """Write one more evaluation; it is on the disk on return. Raises `ComputationError` if the disk refuses."""
+        """Write one more evaluation; it is on the disk on return. Raises `ComputationError` if writing fails."""
         values = np.concatenate([[evaluation.loss], evaluation.parameters, evaluation.gradient])
         content = struct.pack("<Q", self._count) + values.astype("<f8").tobytes()
         try:
@@ -196,7 +195,8 @@ class ReplayLog:
         self._file.close()
 
     def _count_whole(self) -> int:
-        """Return the number of whole records, without a torn last one; raise `InputError` if another one is damaged."""
+        """Return the number of complete records, without an incomplete last one; raise `InputError` if any other record
+        is damaged."""
         end = self._file.seek(0, os.SEEK_END)
         complete, whole = (end - self._first_record) // self._record_size, 0
         self._file.seek(self._first_record)
@@ -211,7 +211,7 @@ class ReplayLog:
 
 
 def _require_unused(path: Path) -> None:
-    """Raise `InputError` if there is a log with anything after its first line."""
+    """Raise `InputError` if there is a log with evaluations in it."""
     if not path.exists():
         return
     with open(path, "rb") as file:
@@ -245,7 +245,8 @@ def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
 
 
 def _differing(former: str, given: str) -> tuple[str, str]:
-    """Return those parts of two texts that differ, where both have equally many, separated by semicolons."""
+    """Return the parts, separated by semicolons, in which two texts differ; the whole texts if their numbers of parts
+    differ."""
     formers, givens = former.split("; "), given.split("; ")
     if len(formers) != len(givens):
         return former, given
@@ -263,24 +264,25 @@ def _is_whole(record: bytes, index: int, size: int) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """The problem that an optimiser is given, as a function of one vector."""
+    """The problem for an optimiser, as a function of one vector."""
 
     evaluate: Callable[[Vector], tuple[float, Vector]]
-    """Vector (size,) -> loss, gradient (size,); raises an error where there is no run, which ends the search."""
+    """Function from a vector (size,) to the loss and the gradient (size,). If the run fails, its error ends the
+    search."""
     attempt: Callable[[Vector], tuple[float, Vector] | None]
-    """Vector (size,) -> loss, gradient (size,), or None where there is no run, as it diverges or a parameter is out of
-    its range; the search goes on, and counts it."""
+    """Function from a vector (size,) to the loss and the gradient (size,), or to None if the run diverges or a
+    parameter is out of range. The search counts this and continues."""
     losses: Callable[[Sequence[Vector]], list[float]]
-    """Vectors (size,) -> the loss of each, infinite where there can be no run, as it diverges or parameters
-    are out of range; cheaper than so many evaluations."""
+    """Function from several vectors (size,) to their losses, infinite if the run diverges or parameters are out of
+    range. It is cheaper than evaluations with gradients."""
     layout: ParameterLayout
-    """Which components of the vectors belong to which parameter."""
+    """Assignment of the vector's components to parameters."""
     start: Vector
-    """(size,), within the bounds."""
+    """First vector (size,), within the bounds."""
     lower: Vector
-    """(size,), -inf where there is no bound."""
+    """Lower bounds (size,); -inf without a bound."""
     upper: Vector
-    """(size,), +inf where there is no bound."""
+    """Upper bounds (size,); +inf without a bound."""
     iterations: int
     """Greatest number of updates."""
     updated: Callable[[], None] = lambda: None
@@ -296,9 +298,9 @@ class Outcome:
     """The result of an optimiser: its last iterate, and how the search ended."""
 
     last: Vector
-    """(size,), the last iterate, which has been evaluated."""
+    """The last iterate (size,), which has been evaluated."""
     converged: bool
-    """True where the optimiser's own test was met."""
+    """True if the optimiser's convergence test was met."""
     message: str
     """A sentence about the end of the search."""
 
@@ -330,7 +332,7 @@ def require_fraction(name: str, value: float) -> None:
 
 
 def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> None:
-    """Raise `InputError` if a setting is given by name for others than these parameters."""
+    """Raise `InputError` if a setting by name has a name that is no parameter."""
     if isinstance(values, Mapping) and set(values) != set(layout.names):
         raise InputError(
             f"{name} is given for {quoted(values)}, but the optimised parameters are "
@@ -339,15 +341,15 @@ def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> N
 
 
 class Iterate:
-    """An iterate of an optimiser: a point that has been evaluated, and moves to the next."""
+    """The current iterate of an optimiser: an evaluated point that can move to the next one."""
 
     def __init__(self, search: Search):
         self._search, self.x = search, search.start
         self.loss, self.gradient = search.evaluate(search.start)
 
     def move(self, target: Vector) -> float:
-        """Go to a vector (size,), or, where it has no run, half of the way there, or a quarter, and so on, which is one
-        update. Returns the part of the way gone; raises the error of the last part where it has no run either."""
+        """Move to a vector (size,), as one update. If the run there fails, try half of the way, a quarter and so on.
+        Returns the fraction of the way taken; if even the shortest try fails, raises its error."""
         self._search.updated()
         part, tried = 1.0, target
         found = self._search.attempt(tried)

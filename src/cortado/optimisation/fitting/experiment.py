@@ -1,4 +1,4 @@
-"""An experiment: a simulation of it, and what was measured."""
+"""The class `Experiment`: a simulation together with measurements."""
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,12 +23,12 @@ from cortado.simulation import Simulation
 OF_THE_SCHEME = ("viscosity", "rest_density", "time_step")
 """Parameters that decide whether viscosity acts on the velocities at the start of a step or at its end."""
 ROOM = 16
-"""Number of steps by which a run grows at once where a clock is late."""
+"""Number of steps added to a run at a time when a calibrated clock is late."""
 
 
 @fixed
 class Experiment:
-    """A simulation of an experiment, and what was measured of it, by names of one's own.
+    """A simulation of an experiment and its measurements, by names that you choose.
 
     Example::
 
@@ -43,8 +43,8 @@ class Experiment:
         steps: int | None = None,
         state: RestartState | None = None,
     ):
-        """Take ``observations`` such as ``{"camera": measured.Video(...)}``; ``steps`` up to the last frame if left
-        out; ``state`` where the run begins, as that of a `Problem`."""
+        """Store ``observations`` such as ``{"camera": measured.Video(...)}``. ``steps``: by default up to the last
+        frame. ``state``: the first state, as in `Problem`."""
         require_table("observations", observations, "{'camera': measured.Video(...)}")
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
@@ -75,19 +75,19 @@ class Experiment:
 
     @property
     def start(self) -> dict[str, np.ndarray]:
-        """Return the observations' own parameters, such as "camera.rotation", as a fit starts."""
+        """Return first values of the observations' own parameters, such as "camera.rotation"."""
         return {f"{name}.{key}": v for name, one in self.observations.items() for key, v in one.start.items()}
 
     @property
     def unseen(self) -> dict[str, np.ndarray]:
-        """Return masks by the names of `start`, true for numbers that no measurement depends on; an observation need
-        not have any."""
+        """Return masks by the names of `start`, true for numbers on which no measurement depends. Observations may have
+        no such masks."""
         each = self.observations.items()
         return {f"{name}.{key}": mask for name, one in each for key, mask in getattr(one, "unseen", {}).items()}
 
     @property
     def clocks(self) -> dict[str, tuple[float, float]]:
-        """Return the bounds [s] of each clock that is calibrated: half the length of the record to both sides."""
+        """Return the bounds [s] of each calibrated clock: half the record's length to both sides."""
         found = {}
         for name, one in self.observations.items():
             if CLOCK in one.start:
@@ -100,14 +100,14 @@ class Experiment:
         return Experiment(simulation, self.observations, self.problem.steps, self._state)
 
     def measured_again(self, measured: Mapping[str, np.ndarray]) -> "Experiment":
-        """Return this experiment, in its arrays, with other numbers measured, (frames, m) by name."""
+        """Return this experiment, sharing its arrays, with other measured numbers (frames, m) by name."""
         found = object.__new__(Experiment)
         again = {n: Again(one, measured[n]) if n in measured else one for n, one in self.observations.items()}
         found.__dict__ |= {**self.__dict__, "observations": FixedDict(again)}
         return found
 
     def predicted(self, parameters: Values) -> dict[str, np.ndarray]:
-        """Return what the simulation predicts for each observation, (frames, m) by name."""
+        """Return the simulation's predictions for each observation, (frames, m) by name."""
         frames, values = self._frames(parameters), self._shared(parameters)
         wanted = self._wanted(frames)
         return self._read(self._problem(values, wanted).states(values, wanted), frames, parameters)
@@ -115,7 +115,7 @@ class Experiment:
     def linearised(
         self, parameters: Values, directions: Sequence[Values]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return predictions (frames, m) and derivatives along directions (frames, m, directions), by tangents."""
+        """Return predictions (frames, m) and derivatives along directions (frames, m, directions), by forward mode."""
         values, moves = self._shared(parameters), [self._shared(direction) for direction in directions]
         frames = self._frames(parameters)
         wanted = self._wanted(frames)
@@ -148,7 +148,7 @@ class Experiment:
         return self._read(ends, frames, parameters), found
 
     def _frames(self, parameters: Values) -> dict[str, Frames]:
-        """Return the frames of each observation by its clock; a frame before the run shows the first state."""
+        """Return the frames of each observation according to its clock; frames before the run show the first state."""
         found = {}
         for name, one in self.observations.items():
             begun = one.start.get(CLOCK, 0.0)
@@ -158,7 +158,7 @@ class Experiment:
         return found
 
     def _wanted(self, frames: Mapping[str, Frames]) -> list[int]:
-        """Return the numbers of steps before the states that observations read."""
+        """Return the step numbers of the states that observations read."""
         clocks = (own.around for name, own in frames.items() if CLOCK in self.observations[name].start)
         return sorted(set().union(*(own.needed for own in frames.values()), *clocks))
 
@@ -207,12 +207,12 @@ class Experiment:
         return found
 
     def _shared(self, values: Values) -> dict[str, Any]:
-        """Return the values that are parameters of the simulation, and not of one observation alone."""
+        """Return the values of the simulation's parameters, without those of observations."""
         own = self.start
         return {name: value for name, value in values.items() if name not in own}
 
     def _own(self, observation: str, values: Values) -> dict[str, np.ndarray]:
-        """Return the values of an observation's own parameters, by its names for them."""
+        """Return the values of one observation's own parameters, by the observation's names for them."""
         return {
             key: np.asarray(values[f"{observation}.{key}"], dtype=np.float64)
             for key in self.observations[observation].start

@@ -1,4 +1,5 @@
-"""Pictures of a fit, and what a notebook shows of it: numbers, residuals, profiles, videos beside what was found."""
+"""Pictures of a fit, and its HTML page for notebooks: numbers, residuals, profiles, and videos compared with the
+simulation."""
 
 from collections.abc import Sequence
 from html import escape
@@ -13,9 +14,9 @@ from cortado.pictures.pages import Figures, picture, table
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, images
 
 GREATEST_SERIES = 4
-"""Most numbers of a frame that are drawn one by one; of more, their root mean square and their mean."""
+"""Greatest number of series drawn one by one; for more, their root mean square and mean are drawn."""
 AGREE = 0.2
-"""Light of a pixel that shows that two pictures agree there: a middle grey."""
+"""Brightness of pixels at which two pictures agree: a middle grey."""
 HEAD = ("parameter", "unit", "start", "found", "95 %, from", "to")
 
 
@@ -45,7 +46,7 @@ def _residuals(axes: object, part: FittedPart) -> None:
 
 
 def profile_figure(profiles: Sequence[Profile], path: Path) -> Figures:
-    """Draw the profile of each number, beside the parabola that its interval stands for."""
+    """Draw the profile of each number, together with the parabola from which its interval is computed."""
     if not profiles:
         return []
     columns = min(len(profiles), 3)

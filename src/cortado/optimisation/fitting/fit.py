@@ -21,13 +21,13 @@ from cortado.scene.parameter_values import UNITS
 from cortado.scene.parameters import Range
 
 ALIKE = 0.9
-"""Two numbers whose estimates are correlated by more are not told apart."""
+"""Two numbers whose estimates have a greater correlation cannot be distinguished."""
 NOISE_ALONE = (
     "The bars are of noise alone and leave out what the spacing and the time step have wrong: a fit with another "
     "discretisation.spacing shows how much that is."
 )
 NEARLY = 0.01
-"""In squared standard errors: a point of a profile ends where a step lowers the sum of squares by less."""
+"""Least decrease of the sum of squares per step [squared standard errors] while a point of a profile is searched."""
 OF_VIEWS = {
     "translation": "m",
     "rotation": "rad",
@@ -38,28 +38,28 @@ OF_VIEWS = {
 }
 POSITIVE = (Range.POSITIVE, Range.NOT_NEGATIVE)
 OTHERS = 3
-"""Starts besides the one that was given, for a fit that ends in doubt."""
+"""Number of additional starts for a fit that ends in doubt."""
 ROUGHLY = 1e-3
-"""Of the sum of squares: the search of weights ends where a step lowers it by less, relative to itself."""
+"""The search for weights ends when a step lowers the sum of squares by a smaller relative amount."""
 FAR = 3.0
-"""Standard errors: searches that end further apart ended in different valleys."""
+"""Searches whose ends are further apart than this many standard errors ended in different local minima."""
 SAME = 1e-3
-"""Of a number: ends that are nearer are the same, however small the bars are."""
+"""Ends with a smaller relative difference than this count as equal, however small the error bars are."""
 NO_LESS_LIKELY = 9.0
-"""Of twice the logarithm of how much likelier one of two valleys is: three standard errors."""
+"""Threshold for twice the logarithm of the likelihood ratio of two local minima: three standard errors."""
 
 
 @dataclass(frozen=True)
 class Profile:
-    """The least sum of squares with one number held, over values of that number."""
+    """The least sum of squares as a function of one number, with all other numbers fitted."""
 
     label: str
     values: np.ndarray
-    """(points,) of the number, in its unit."""
+    """Values (points,) of the number, in its unit."""
     deviance: np.ndarray
-    """(points,) excess of the sum of squares over the least one, in squared standard errors."""
+    """Sum of squares (points,) minus the least one, in squared standard errors."""
     expected: np.ndarray
-    """(points,) deviance of a linear model, from which the intervals come."""
+    """The same (points,) for the linear model from which the intervals are computed."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +82,14 @@ class FittedNumber:
 
 @dataclass(frozen=True)
 class Tried:
-    """A start of a fit, and where the search from it ended."""
+    """A start of a fit, and the end of the search from this start."""
 
     start: np.ndarray
     """(free,) coordinates."""
     end: np.ndarray
     """(free,) coordinates."""
     misfit: float
-    """Logarithm of the size of the residuals at the end, averaged over all numbers that were measured."""
+    """Logarithm of the size of the residuals at the end, averaged over all measured numbers."""
 
 
 @public
@@ -105,32 +105,33 @@ class Fit:
 
     coordinates: Coordinates = field(repr=False)
     u: np.ndarray = field(repr=False)
-    """(free,) coordinates: numbers, or their logarithms."""
+    """Fitted coordinates (free,): numbers, or logarithms of positive numbers."""
     coordinate_covariance: np.ndarray = field(repr=False)
-    """(free, free) of the coordinates."""
+    """Covariance (free, free) of the coordinates."""
     naive_covariance: np.ndarray = field(repr=False)
-    """(free, free) covariance if all numbers were independent: far too small, kept for comparison."""
+    """Covariance (free, free) if all measured numbers were independent. It is far too small, and given for
+    comparison."""
     degrees_of_freedom: np.ndarray = field(repr=False)
-    """(free,) of Student's distribution."""
+    """Degrees of freedom (free,) of Student's t-distribution."""
     parts: tuple[FittedPart, ...] = field(repr=False)
-    """One for each observation."""
+    """Residuals and their scatter, for each observation."""
     doubts: tuple[str, ...] = field(repr=False)
-    """Sentences about where the residuals do not look like noise, so that the model is wrong by more than the bars."""
+    """Sentences about residuals that do not look like noise, so that the model's error exceeds the error bars."""
     converged: bool = True
-    """True where it ended at a minimum of the sum of squares, and not after the last iteration."""
+    """True if the search ended at a minimum of the sum of squares; False if it used up its iterations."""
     tried: tuple[Tried, ...] = field(default=(), repr=False)
-    """The starts, and where the searches from them ended, this fit among them."""
+    """All starts with the ends of their searches, including this fit's."""
     runs: int = 0
-    """Forward runs, each of one experiment."""
+    """Number of forward runs, each of one experiment."""
     tangents: int = 0
-    """Runs along a tangent, each of one experiment."""
+    """Number of forward-mode runs, each of one experiment along one tangent."""
     refused: int = 0
-    """Number of points that were tried and whose runs diverged, about which the fit knows nothing."""
+    """Number of trial points whose runs diverged, so that the fit did not use them."""
     sum_of_squares: float = field(default=0.0, repr=False)
     hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     problem: LeastSquares | None = field(default=None, repr=False)
     at: Linearised | None = field(default=None, repr=False)
-    """The end of the search, with the Jacobian that the bars come from; neither is pickled."""
+    """The end of the search with the Jacobian from which the error bars are computed; it is not pickled."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "problem": None, "at": None}
@@ -183,9 +184,9 @@ class Fit:
         return {name: (lower[name], upper[name]) for name in lower}
 
     def profile(self, label: str, points: int = 7, reach: float = 2.5) -> Profile:
-        """Compute the sum of squares over ``points`` values of the number ``label``, all others fitted anew at each;
-        where it is no parabola, the intervals are only rough. ``reach`` in standard errors to both sides. Raises
-        `InputError`."""
+        """Compute the least sum of squares at ``points`` values of the number ``label``, fitting all others at each
+        value. If it is no parabola, the intervals are rough. The values reach ``reach`` standard errors to both sides.
+        Raises `InputError`."""
         if label not in self.labels or self.problem is None or self.at is None:
             raise InputError(f"label is {shown(label)}, but must be one of {', '.join(self.labels)}.")
         k, weights = self.labels.index(label), [part.weighting for part in self.parts]
@@ -204,17 +205,17 @@ class Fit:
         return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])
 
     def log_posterior(self, u: Any) -> float:
-        """Return the logarithm of the posterior density, but for a constant, at coordinates (free,), for samplers; it
-        takes a forward run.
+        """Return the logarithm of the posterior density, up to a constant, at coordinates (free,), for samplers. Each
+        call takes a forward run.
 
-        The prior is flat in the coordinates, which are logarithms of positive numbers, within the bounds; outside, and
-        where the run diverges, it is -inf. Near the estimate ``u`` it is the normal distribution of the error bars.
-        `Fit.coordinates.values` makes parameters of coordinates. Raises `InputError`.
+        The prior is flat in the coordinates (logarithms of positive numbers) within the bounds. Outside, and if the run
+        diverges, the result is -inf. Near the estimate ``u`` it is the normal distribution of the error bars.
+        `Fit.coordinates.values` converts coordinates to parameters. Raises `InputError`.
 
-        It is minus half of the weighted sum of squares, beyond its least. Correlated noise makes bars longer than the
-        curvature N of the sum of squares has them. Distances from the estimate are therefore shortened by the matrix W
-        with W^T N W = V^-1, the inverse of the covariance of the bars: the curvature adjustment of Ribatet, Cooley and
-        Davison (2012).
+        The result is minus half of the weighted sum of squares, relative to its minimum. With correlated noise the
+        error bars are longer than the curvature N of the sum of squares gives. Distances from the estimate are
+        therefore shortened by the matrix W with W^T N W = V^-1, the inverse of the covariance of the bars: the
+        curvature adjustment of Ribatet, Cooley and Davison (2012).
         """
         point = as_numbers("u", u)
         if point.shape != self.u.shape:
@@ -237,7 +238,7 @@ class Fit:
         return -0.5 * (squares - self.sum_of_squares)
 
     def numbers(self, confidence: float = 0.95) -> list["FittedNumber"]:
-        """Return the numbers that were searched, with the `intervals` of a ``confidence``."""
+        """Return the fitted numbers, with the `intervals` of a ``confidence``."""
         ends = self.intervals(confidence)
         free = self.coordinates.free
         lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
@@ -271,7 +272,7 @@ class Fit:
 
     @property
     def cautions(self) -> list[str]:
-        """Return sentences about numbers not told apart, an early end, refused points, and doubts."""
+        """Return sentences about numbers that cannot be distinguished, an early end, refused points, and doubts."""
         apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})." for a, b, c in self.not_told_apart]
         ended = [] if self.converged else ["The fit has not converged: give it more iterations."]
         lost = f"The runs at {counted(self.refused, 'point')} that the fit tried diverged, and it knows nothing of them"
@@ -280,12 +281,12 @@ class Fit:
 
 
 def _plain(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return arrays by name, with numbers in place of arrays of shape ()."""
+    """Return arrays by name; arrays of shape () become numbers."""
     return {name: array if array.shape else float(array) for name, array in arrays.items()}
 
 
 def with_error(value: float, error: float) -> str:
-    """Write a value and its standard error, with two digits of the error where it begins with 1 to 3, else one."""
+    """Format a value and its standard error, with two digits of the error if its first digit is 1 to 3, else one."""
     if not np.isfinite(error) or error <= 0.0:
         return f"{value:.6g} ± {error:.2g}"
     power = int(np.floor(np.log10(error)))
@@ -312,28 +313,24 @@ def fit(
 ) -> Fit:
     """Fit parameters to measured experiments by least squares, and say how certain they are.
 
-    Each residual is what a simulation predicts less what was measured. The search estimates the Jacobian by a forward
-    run for each number; at its end forward-mode tangents give it. The first fit takes residuals as they are. Their
-    scatter and correlation then weight the second one, from whose residuals the error bars come (see
+    A residual is a simulation's prediction minus the measured number. The search estimates the Jacobian by a forward
+    run for each fitted number; at its end the Jacobian is computed by forward mode. The first fit weights all residuals
+    equally. Their scatter and correlation give the weights of a second fit, whose residuals give the error bars (see
     `cortado.optimisation.fitting.certainty`).
 
     Args:
-        experiments: one `measured.Experiment`, or several that have these parameters in common.
-        start: parameters by name, as the fit starts. Positive ones, such as a viscosity, are searched by their
-            logarithm. What videos calibrate is added by itself, as the cameras were aimed.
-        bounds: by name, (lower, upper), each a number, an array of the parameter's shape, or None. A number whose
-            bounds are the same is not searched.
-        iterations: greatest number of trial points of each of the two fits.
-        on_trial: called after each trial point.
-        starts: from how many starts to search; all but the first are chosen by forward runs over the bounds, or over
-            two decades to both sides of a positive number. If left out, the fit searches from `start` alone, and from
-            three others where that ends in doubt. The fit with the least residuals is returned, and where all of the
-            searches ended is its ``tried``.
+        experiments: one `measured.Experiment`, or several with the same parameters. start: first values of the fitted
+        parameters, by name. Positive ones, such as a viscosity, are searched by their logarithm. Parameters that videos
+        calibrate are added automatically, with the cameras' given aim. bounds: by name, (lower, upper), each a number,
+        an array of the parameter's shape, or None. A number with two equal bounds is not searched. iterations: greatest
+        number of trial points of each of the two fits. on_trial: called after each trial point. starts: number of
+        starts. All but the first are chosen by forward runs within the bounds, or within two decades to both sides of a
+        positive number. By default the fit begins at `start` alone, and at three others if that fit ends in doubt. The
+        fit with the least residuals is returned; its ``tried`` lists the ends of all searches.
 
     Raises:
-        InputError: a start, bounds or experiments that do not fit.
-        DivergedError: the run at the start diverges.
-        ComputationError: what was measured does not tell some of the parameters.
+        InputError: the start, bounds or experiments are unsuitable. DivergedError: the run at the start diverges.
+        ComputationError: the measurements do not determine all parameters.
 
     Example::
 
@@ -370,8 +367,8 @@ def fit(
 
 
 def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
-    """Fit from one start: a first search with residuals as they are, and a second one with weights by these residuals.
-    The fit has its covariance and doubts about noise and model."""
+    """Fit from one start: a first search with equal weights, and a second one with weights from its residuals. The
+    result has its covariance and its doubts about noise and model."""
     at = problem.estimated(start)
     sizes = [part.observation.noise or spread(r) or 1.0 for part, r in zip(problem.parts, at.residuals, strict=True)]
     weights = [Weighting(size) for size in sizes]
@@ -401,8 +398,8 @@ def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
 
 
 def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None) -> Fit:
-    """Return the fit with the least residuals among this one and fits from other starts. Without a number of ``starts``
-    the search for others ends with a fit without doubt, or one that ends where all others did."""
+    """Return the fit with the least residuals among this one and fits from other starts. If ``starts`` is None, no
+    further start is tried after a fit without doubts, or one with the same end as all others."""
     tried = list(found.tried)
     for start in other_starts(problem, OTHERS if starts is None else starts - 1):
         try:
@@ -420,7 +417,7 @@ def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None
 
 
 def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
-    """Return the searches that ended in other valleys, the lowest one first."""
+    """Return the searches that ended in other local minima, the lowest first."""
     bars = np.sqrt(np.diag(found.coordinate_covariance))
     near = SAME * np.where(found.coordinates.by_logarithm, 1.0, np.abs(found.u))
     others = [one for one in tried if (np.abs(one.end - found.u) > np.maximum(FAR * bars, near)).any()]
@@ -428,7 +425,7 @@ def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
 
 
 def other_valleys(found: Fit, tried: Sequence[Tried]) -> list[str]:
-    """Return a sentence about the lowest of the other valleys, if its residuals are hardly larger."""
+    """Return a sentence about the lowest other local minimum, if its residuals are hardly larger."""
     others, bars = elsewhere(found, tried), np.sqrt(np.diag(found.coordinate_covariance))
     if not others:
         return []
