@@ -1,8 +1,8 @@
-"""How certain a least-squares estimate is whose residuals are correlated within a frame and from frame to frame.
+"""Standard errors of a least-squares estimate with residuals correlated within a frame and from frame to frame.
 
 Near the estimate the residuals are r = e - J t, with the noise e (frames, m), the Jacobian J (frames, m, parameters)
-and the error t of the estimate. A count of pixels takes the m numbers of a frame for independent; as neighbouring
-pixels, and the light of a whole frame, vary together, its error bars are several times too small. Here instead
+and the error t of the estimate. Counting pixels treats the m numbers of a frame as independent. Neighbouring pixels,
+and the light of a whole frame, vary together, so such error bars are several times too small. Here instead
 
 1. noise fades from frame to frame by exp(-dt / T), with the correlation time T. It is chosen so that the residuals left
    by the fit would have the correlation between neighbouring frames that they have (`correlation_time`). The frames are
@@ -31,13 +31,13 @@ from cortado.errors import ComputationError
 from cortado.optimisation.fitting.least_squares import Linearised, Part, Weighting, weighted
 
 MOST_TAKEN = 0.9
-"""Greatest part of the score's covariance that a fit may have taken; beyond it there are too few frames."""
+"""Greatest part of the score's covariance that the fit may have absorbed; more means that there are too few frames."""
 LONGEST = 3.0
 """Greatest correlation time, relative to the length of the record."""
 SHORTEST = 0.05
 """Correlation times below this, relative to the time between two frames, count as none."""
 SINGULAR = 1e-10
-"""Relative eigenvalue of the Hessian below which a combination of parameters cannot be told."""
+"""Relative eigenvalue of the Hessian below which a combination of parameters is undetermined."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class ScoreCovariance:
     """(p, p) covariance"""
     products: Products
     lost: float
-    """Part of B that the fit took on average."""
+    """Part of B that the fit absorbed on average."""
     samples: float
     """Number of independent numbers in a frame."""
     frames: float
@@ -78,15 +78,15 @@ class ScoreCovariance:
     def degrees_of_freedom(self, inverse: np.ndarray, direction: np.ndarray) -> float:
         """Return the degrees of freedom of Student's distribution for the error of a combination of parameters
         (Satterthwaite 1946), with coefficients ``direction`` (p,), given N^-1. They are at most the number of
-        independent numbers from which the correlation time was told."""
+        independent numbers from which the correlation time was estimated."""
         F, a = len(self.products.gram), inverse @ direction
         total, spread = _moments(np.einsum("p,fgpq,q->fg", a, self.products.S, a, optimize=True), F)
         return max(min(F * total / spread * (1.0 - self.lost), self.frames * self.samples), 1.0)
 
 
 def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: np.ndarray) -> float:
-    """Estimate the correlation time T [s] of the noise, 0 where neighbouring frames are not correlated; ``inverse``:
-    N^-1 of the fit with these residuals."""
+    """Estimate the correlation time T [s] of the noise, 0 if neighbouring frames are not correlated. ``inverse``: N^-1
+    of the fit with these residuals."""
     from scipy.optimize import brentq
 
     products, gap = Products.of(J, r), float(np.median(np.diff(times)))
@@ -112,7 +112,8 @@ def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: n
 
 
 def independent_frames(times: np.ndarray, correlation_time: float) -> float:
-    """Return how many uncorrelated frames tell a mean equally well: F (1 - c) / (1 + c), c from frame to frame."""
+    """Return the number of uncorrelated frames that give a mean with equal accuracy: F (1 - c) / (1 + c), with
+    correlation c from frame to frame."""
     kept = np.exp(-np.median(np.diff(times)) / correlation_time) if correlation_time else 0.0
     return float(len(times) * (1.0 - kept) / (1.0 + kept))
 
@@ -153,12 +154,12 @@ def _moments(gram: np.ndarray, F: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class FittedPart:
-    """The fit to one observation: its residuals and how they scatter."""
+    """The fit to one observation: its residuals and their scatter."""
 
     part: Part
     weighting: Weighting
     residuals: np.ndarray
-    """(frames, m) predicted less measured, in the unit of the observation; 0 for numbers that do not count."""
+    """Predicted minus measured numbers (frames, m), in the unit of the observation; 0 for ignored numbers."""
     spread: float
     """Root mean square of the residuals."""
     inflation: float
@@ -170,7 +171,7 @@ class FittedPart:
 
     @property
     def label(self) -> str:
-        """Return the observation's name, with the experiment's number where there are several."""
+        """Return the observation's name, with the experiment's number if there are several experiments."""
         return self.part.label
 
     @property
@@ -180,7 +181,8 @@ class FittedPart:
 
 
 class Fitted(Protocol):
-    """A least-squares problem whose certainty can be told: a `LeastSquares`, or an object with its parts and labels."""
+    """Protocol of least-squares problems for `certainty`: a `LeastSquares`, or an object with the same parts and
+    labels."""
 
     @property
     def parts(self) -> list[Part]:
@@ -188,26 +190,26 @@ class Fitted(Protocol):
 
     @property
     def labels(self) -> list[str]:
-        """Return the labels (free,) of the numbers that are searched."""
+        """Return the labels (free,) of the fitted numbers."""
 
 
 @dataclass(frozen=True)
 class Certainty:
-    """The certainty of an estimate, from the scatter of its residuals: Hessian, covariance and degrees of freedom."""
+    """Hessian, covariance and degrees of freedom of an estimate, from the scatter of its residuals."""
 
     hessian: np.ndarray
     """(free, free) N = J^T J of weighted Jacobians."""
     covariance: np.ndarray
-    """(free, free) of the coordinates."""
+    """Covariance (free, free) of the coordinates."""
     degrees_of_freedom: np.ndarray
-    """(free,) of Student's distribution."""
+    """Degrees of freedom (free,) of Student's t-distribution."""
     scores: tuple[ScoreCovariance, ...]
     """Score covariance of each part."""
     parts: tuple[FittedPart, ...]
 
     @classmethod
     def of(cls, problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> "Certainty":
-        """Compute the certainty at a point; raise `ComputationError` if a combination of parameters cannot be told."""
+        """Compute the certainty at a point; raise `ComputationError` if a combination of parameters is undetermined."""
         N = hessian(problem, at, weights)
         N_inverse = inverse(problem, N)
         scores, parts = list[ScoreCovariance](), list[FittedPart]()
@@ -223,7 +225,8 @@ class Certainty:
 
 
 def noise_of(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> list[Weighting]:
-    """Return weights by the residuals of a first fit: correlated numbers weigh less, as they tell less."""
+    """Return weights from the residuals of a first fit: correlated numbers have less weight, because they contain less
+    information."""
     N_inverse = inverse(problem, hessian(problem, at, weights))
     found = []
     for part, r, J, weight in zip(problem.parts, at.residuals, at.jacobians, weights, strict=True):
@@ -247,7 +250,7 @@ def hessian(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> np
 
 
 def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
-    """Return N^-1 of a problem's Hessian; raise `ComputationError` where a combination of parameters cannot be told."""
+    """Return N^-1 of a problem's Hessian; raise `ComputationError` if a combination of parameters is undetermined."""
     labels, size = problem.labels, np.sqrt(np.diag(N))
     if not np.isfinite(N).all():
         raise ComputationError("The derivatives are not finite: try fewer steps, or float64.")
@@ -265,7 +268,7 @@ def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
 
 
 def spread(r: np.ndarray) -> float:
-    """Return the root mean square of the residuals that count, which are not 0."""
+    """Return the root mean square of the residuals that are not 0; ignored numbers have residual 0."""
     count = np.count_nonzero(r)
     return float(np.sqrt((r**2).sum() / max(count, 1)))
 

@@ -1,7 +1,7 @@
-"""What residuals say against the model: sentences about where it is wrong, by more than the noise, and about causes.
+"""Sentences of doubt about a fitted model: residuals larger than the noise, and their possible causes.
 
-A cause is a trend, a clock that is late, another density, or walls that slip. Each is a direction in which predictions
-would change; it is fitted together with the parameters, and has an error of its own by the same rules.
+A cause is a trend, a late clock, another density, or slipping walls. Each is a direction in which predictions would
+change. It is fitted together with the parameters, and gets an error bar in the same way.
 """
 
 import warnings
@@ -18,44 +18,46 @@ from cortado.optimisation.fitting.observations import CLOCK
 from cortado.scene.parameter_values import Arrays
 
 TOO_LARGE = 1.3
-"""Ratio of residuals to the given noise above which they are doubted."""
+"""Ratio of residuals to the given noise above which a sentence warns of them."""
 STILL = 0.01
-"""Of the greatest change over the frames: numbers whose predicted change is less count as still."""
+"""Numbers count as still if their predicted change over the frames is less than this part of the greatest one."""
 FEW_STILL = 20
-"""Fewest still numbers from which anything is said."""
+"""Least number of still numbers for a sentence about them."""
 TOO_LARGE_IN_MOTION = 2.0
-"""Ratio of the residuals of moving numbers to those of still ones above which they are doubted."""
+"""Ratio of the residuals of moving numbers to those of still numbers above which a sentence warns of them."""
 EXACT = 1e-4
-"""Of the largest number measured: smaller residuals are those of a simulated measurement, and never doubted."""
+"""Residuals smaller than this part of the largest measured number come from simulated measurements, and never cause
+doubt."""
 ROUNDING = 0.002
-"""Of the largest number measured: half a step of 8 bits, below which residuals say nothing."""
+"""Residuals below this part of the largest measured number, half a step of 8 bits, are rounding."""
 TOO_SLOW = 0.35
-"""Correlation time of residuals, over the length of the record."""
+"""Ratio of the residuals' correlation time to the record's length above which a sentence warns."""
 VAGUE = 1.0
-"""Standard error of a logarithm above which a number is hardly told."""
+"""Standard error of a logarithm above which a number is hardly determined."""
 GREATEST = 20.0
-"""Greatest standard error of a logarithm that a sentence tells."""
+"""Greatest standard error of a logarithm that a sentence prints."""
 AT_BOUND = 1e-6
-"""Distance from a bound at which an estimate is at it, relative to the coordinate, or to 1 if that is more."""
+"""Distance from a bound up to which an estimate counts as at the bound, relative to the coordinate or to 1, whichever
+is larger."""
 TOO_FAR = 3.0
-"""Distance between the estimates of two halves of a record, over its error, above which they are doubted."""
+"""Difference between the estimates from two halves of a record, in standard errors, above which a sentence warns."""
 SERIES = 4
-"""Most numbers of a frame whose trends are looked at one by one."""
+"""Greatest number of numbers in a frame for which trends are tested one by one."""
 SPARE = 3
-"""Fewest frames beyond the number of fitted numbers with which a cause is looked for."""
+"""A cause is tested only if frames exceed the number of fitted numbers by at least this."""
 MOST_KEPT = 0.6
-"""Correlation of noise from frame to frame above which it looks like any trend."""
+"""Correlation of noise from frame to frame above which noise cannot be told from a trend."""
 BY_CHANCE = 1e-3
-"""Probability of such an effect by noise alone, below which it is said."""
+"""An effect is reported if its probability by noise alone is below this."""
 LITTLE, MUCH = 0.05, 0.5
-"""Of the squares of residuals: what explains less is not said, and of residuals that are doubted already a density or a
-slip that explains less."""
+"""A cause is reported only if it explains at least the first part of the sum of squares; a density or a slip, for
+residuals already in doubt, at least the second part."""
 
 
 def doubts_of(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], certainty: Certainty
 ) -> tuple[str, ...]:
-    """Return sentences of doubt about a fit; none where the residuals look like noise and tell the parameters."""
+    """Return sentences of doubt about a fit; empty if the residuals look like noise and determine the parameters."""
     found, is_exact = list[str](), True
     for part, r, weight in zip(problem.parts, at.residuals, weights, strict=True):
         times, noise, size = part.observation.times, part.observation.noise, spread(r)
@@ -88,9 +90,9 @@ def doubts_of(
 
 
 def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]:
-    """Return root mean squares of the residuals (frames, m) of two kinds of numbers. The first are predicted not to
-    change, as a video's background, and show the noise alone, the second are all others; infinite and 0 where few are
-    still."""
+    """Return root mean squares of the residuals (frames, m) of two kinds of numbers. The first kind is predicted to be
+    still, such as a video's background, and shows the noise alone; the second kind is the rest. With few still numbers
+    the result is infinite and 0."""
     change = np.ptp(measured + r, axis=0)
     counted = ~np.isnan(change)
     still = counted & (change <= STILL * np.max(change[counted], initial=0.0))
@@ -101,7 +103,7 @@ def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]
 
 
 def _at_bounds(problem: LeastSquares, at: Linearised) -> list[str]:
-    """Return sentences about numbers that are held by their bounds."""
+    """Return sentences about numbers whose estimates are at a bound."""
     found = []
     for which, ends in zip(("lower", "upper"), problem.coordinates.bounds, strict=True):
         for label, u, end, value in zip(problem.labels, at.u, ends, problem.coordinates.numbers(at.u), strict=True):
@@ -114,7 +116,7 @@ def _at_bounds(problem: LeastSquares, at: Linearised) -> list[str]:
 
 
 def _vague(problem: LeastSquares, at: Linearised, certainty: Certainty) -> list[str]:
-    """Return sentences about positive numbers that the residuals tell to no better than a large factor."""
+    """Return sentences about positive numbers that the residuals determine only to within a large factor."""
     coordinates = problem.coordinates
     bars = np.where(coordinates.by_logarithm, np.sqrt(np.diag(certainty.covariance)), 0.0)
     return [
@@ -127,7 +129,8 @@ def _vague(problem: LeastSquares, at: Linearised, certainty: Certainty) -> list[
 def _halves(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], scores: Sequence[ScoreCovariance]
 ) -> list[str]:
-    """Return sentences where the halves of the frames disagree, by one step of Gauss and Newton for each half."""
+    """Return sentences about parameters for which the two halves of the frames disagree, by one Gauss-Newton step for
+    each half."""
     size, steps, variances = len(at.u), [], []
     white, slopes = (weighted(problem.parts, weights, own) for own in (at.residuals, at.jacobians))
     for half in (0, 1):
@@ -153,7 +156,7 @@ def _halves(
 
 @dataclass(frozen=True)
 class Widened:
-    """A least-squares problem whose unknowns include the sizes of causes, as `certainty` takes one."""
+    """A least-squares problem for `certainty` whose unknowns include the sizes of causes."""
 
     parts: list[Part]
     labels: list[str]
@@ -164,7 +167,7 @@ class Explained:
     """The size of a cause that explains residuals by more than noise does, and how much it explains."""
 
     sizes: np.ndarray
-    """(causes,)"""
+    """Sizes (causes,)."""
     share: float
     """Part of the sum of squares that it explains."""
 
@@ -177,8 +180,9 @@ def explained(
     is_doubted: bool = False,
 ) -> Explained | None:
     """Estimate the size of a possible cause of residuals by one Gauss-Newton step; ``columns`` (frames, m, causes): the
-    derivatives of each part's predictions. None where the size is within the noise, or cannot be told from the
-    parameters. With ``is_doubted`` the residuals are no noise: then the part that a cause explains counts."""
+    derivatives of each part's predictions. Return None if the size is within the noise, or cannot be told apart from
+    the parameters. With ``is_doubted`` the residuals are no noise, and the part that a cause explains decides
+    instead."""
     from scipy.stats import f as fisher
 
     count = columns[0].shape[-1]
@@ -205,7 +209,7 @@ def explained(
 
 
 def dear_causes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
-    """Return sentences about the container's density and slip, which take a run, or two, of each experiment."""
+    """Return sentences about the fluid's density and the container's slip, from one or two runs of each experiment."""
     values, found = problem.coordinates.values(at.u), list[str]()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
@@ -236,7 +240,7 @@ def _step(wide: Widened, before: Linearised, weights: Sequence[Weighting]) -> Li
 
 
 def _fades_slowly(wide: Widened, weights: Sequence[Weighting]) -> bool:
-    """Return True if the noise of some part is so correlated from frame to frame that it looks like any trend."""
+    """Return True if noise of some part is so correlated from frame to frame that it cannot be told from a trend."""
     gaps = [float(np.median(np.diff(part.observation.times))) for part in wide.parts]
     each = zip(weights, gaps, strict=True)
     return any(one.correlation_time and np.exp(-gap / one.correlation_time) > MOST_KEPT for one, gap in each)
@@ -268,7 +272,7 @@ def _trends(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting])
 
 
 def _clocks(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
-    """Return sentences about parts whose uncalibrated clock seems late, by the predicted changes in time."""
+    """Return sentences about parts whose uncalibrated clock seems late, from the predictions' rates of change."""
     found = []
     for k, part in enumerate(problem.parts):
         if CLOCK in part.observation.start:
@@ -288,8 +292,8 @@ def _clocks(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting])
 def _by_change(
     problem: LeastSquares, values: Arrays, change: Callable[[Experiment, Arrays], tuple[int, int, Arrays]]
 ) -> list[np.ndarray]:
-    """Return the change of predictions by a change in each experiment, computed by a function that also returns its
-    numbers of runs and tangent runs; 0 where it cannot be told."""
+    """Return the change of predictions, part by part, from a function that computes it for one experiment and counts
+    its runs. It is 0 where it cannot be computed."""
     columns = _nothing(problem, 1)
     for k, experiment in enumerate(problem.experiments):
         try:

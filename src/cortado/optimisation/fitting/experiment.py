@@ -182,7 +182,7 @@ class Experiment:
     def _along(
         self, problem: Problem, steps: Sequence[int], values: Values, moves: Sequence[Values]
     ) -> tuple[dict[int, Any], Iterator[dict[int, Arrays]]]:
-        """Run a problem; return states by the number of steps before them, and their tangents for each direction."""
+        """Run a problem; return states by step number, and their tangents for each direction."""
         wanted, dimension, dots = set(steps), self.simulation.dimension, [dict[int, Arrays]() for _ in moves]
 
         def observe(kept: dict[int, Arrays], step: int, dot: State) -> None:

@@ -1,10 +1,10 @@
-"""The search for the least sum of squares, in few runs: Gauss and Newton's steps, with a Jacobian that runs tell.
+"""Minimise the sum of squares in few runs: Gauss-Newton steps with a Jacobian estimated from earlier runs.
 
-What particles predict is a rough function of a parameter: the height of a surface moves in small jumps, as particles
-pass each other. Its derivative at a point may be many times as steep as what a change by a standard error does, and
-bars from it are as many times too small. So at the end of a search a forward run for each number looks two standard
-errors away (`over_the_bars`). Where that is not what the tangents say, differences over the width of the bars replace
-them, until the bars that follow are those that the differences were taken over.
+Predictions of particles are rough functions of a parameter: a surface's height jumps slightly when particles pass each
+other. The derivative at a point may be many times steeper than the change over a standard error, which makes error bars
+too small. So at the end of a search a forward run for each number checks predictions two standard errors away
+(`over_the_bars`). If the tangents fail this check, differences over the width of the error bars replace them, and are
+repeated until the bars no longer change.
 """
 
 from collections.abc import Sequence
@@ -19,64 +19,69 @@ from cortado.optimisation.fitting.certainty import Certainty, spread
 from cortado.optimisation.fitting.least_squares import TINY, LeastSquares, Linearised, TrialPoints, Weighting
 
 NEAR = 1e-6
-"""A search ends, too, where a step is shorter than this, relative to the size of the coordinates."""
+"""A search also ends when a step is shorter than this, relative to the size of the coordinates."""
 GREATEST_LOGARITHM = 1.0
-"""Of one step: a positive number changes by a factor of e at most."""
+"""Greatest change of a logarithm in one step: a positive number changes by a factor of e at most."""
 FIRST_DAMPING, LEAST_DAMPING = 1e-2, 1e-4
-"""Relative to the Hessian's diagonal."""
+"""First and least damping, relative to the Hessian's diagonal."""
 POOR, GOOD = 0.25, 0.75
-"""Shares of the predicted gain: after a step that gains less, the next one is damped ten times as much; after one that
-gains more, half as much."""
+"""Shares of the predicted gain. After a step that gains less than the first share, damping grows tenfold; after a step
+that gains more than the second, it is halved."""
 MOST_FAILURES = 3
-"""Trial points in succession that are no lower: then the Jacobian is estimated anew, and after as many more it ends."""
+"""Number of failed trial points in succession after which the Jacobian is estimated again; after as many further
+failures the search ends."""
 NEARBY = 9.0
-"""In squared standard errors: where a step is predicted to lower the sum of squares by less, tangents are taken."""
+"""When a step is predicted to lower the sum of squares by less than this [squared standard errors], tangents are
+computed."""
 ENOUGH = 0.01
-"""The same of the end: a tenth of a standard error."""
+"""The search ends when the predicted decrease is less than this [squared standard errors]: a tenth of a standard
+error."""
 AS_NEAR_AS_CAN_BE = 0.1
-"""The same where no step lowers a rough sum of squares any more: three tenths of a standard error."""
+"""The same threshold if no step lowers a rough sum of squares any more: three tenths of a standard error."""
 ONE_BAR = 1.0
-"""The same of the way from where tangents were taken to the end: if it is longer, they are taken again."""
+"""Tangents are computed again if the search ended further from the point of the last ones than this [squared standard
+errors]."""
 MOST_JACOBIANS = 4
-"""By tangents."""
+"""Greatest number of Jacobians computed by tangents."""
 REACH = 2.0
-"""Standard errors, to about the ends of intervals of 95 %: how far away it looks."""
+"""Distance of the checked predictions in standard errors, which is about the end of a 95 % interval."""
 STRAIGHT = 0.3
-"""Of what tangents say of the change up to there: by so much it may be off."""
+"""Greatest accepted error of the change that tangents predict up to there, relative to this change."""
 ROUNDING = 1e-5
-"""Of the largest number measured: bars that change what is predicted by less are not looked at."""
+"""Error bars that change predictions by less than this part of the largest measured number are not checked."""
 MOST_ROUNDS = 8
-"""Of differences, each over the bars of the one before."""
+"""Greatest number of rounds of differences; each round covers the error bars of the previous one."""
 SETTLED = 0.3
-"""Of that distance: a round that moves the estimate by less, and changes no bar by more of itself, is the last."""
+"""A round is the last if it moves the estimate by less than this part of that distance, and changes every bar by less
+than this part of itself."""
 LEAST_SHARE = 0.1
-"""Of that distance: nearer points, as at a bound, tell no difference."""
+"""Points nearer than this part of that distance, for example because of a bound, are not used for differences."""
 ROUND_OFF = 1e-12
-"""Of a variance."""
+"""Round-off relative to a variance."""
 RANGE = np.log(100.0)
-"""To both sides of the start, of positive numbers that have no bounds: two decades."""
+"""Range of further starts for positive numbers without bounds: two decades to both sides of the first start."""
 POINTS, MOST_POINTS = 8, 64
-"""That are looked at: for each number, and in all."""
+"""Numbers of points tried as starts: for each fitted number, and at most in total."""
 APART = 0.2
-"""Of the range of some number: by less no two starts differ."""
+"""Least distance between two starts, relative to the range of some number."""
 
 
 @dataclass(frozen=True)
 class Searched:
-    """The end of a search: its last point, the next step, and the gain that the step promises."""
+    """The end of a search: its last point, the next step, and the predicted gain of this step."""
 
     at: Linearised
     """The last point that was run; its Jacobian is an estimate."""
     next: np.ndarray
-    """(free,) end of the next step, which was not run."""
+    """End of the next step (free,), where nothing was run."""
     gain: float
     """Predicted decrease of the sum of squares by the next step."""
     converged: bool
 
 
 def least(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], trials: int) -> tuple[Linearised, bool]:
-    """Find the least sum of squares: search while the estimated Jacobian serves, take tangents, and search on with
-    these. Return the point with its Jacobian by tangents and True, or the lowest point and False."""
+    """Find the least sum of squares: search with the estimated Jacobian as long as it helps, then with tangents. Return
+    the minimum with its Jacobian by tangents and True, or the lowest point and False."""
     for _ in range(MOST_JACOBIANS):
         squares = max(problem.sum_of_squares(at.residuals, weights), TINY)
         found = search(problem, at, weights, trials, NEARBY / squares)
@@ -106,9 +111,9 @@ def search(
     """Lower the sum of the squared residuals, until a step is predicted to lower it by a share of at most ``enough``.
     The Jacobian at the first point may be an estimate, and the coordinates of some numbers stay ``fixed``.
 
-    A trial point takes one forward run, also one that is no lower, and the Jacobian follows from all of them, see
-    `TrialPoints`. After one that is no lower, or where the run diverges, steps are damped (Levenberg 1944, Marquardt
-    1963); after several the Jacobian is estimated anew.
+    Each trial point takes one forward run, and the Jacobian is estimated from all trial points, see `TrialPoints`.
+    After a point that is not lower, or whose run diverges, steps are damped (Levenberg 1944, Marquardt 1963). After
+    several such points the Jacobian is estimated again.
     """
     points, base = TrialPoints(problem, weights, at), 0
     failures, damping, lowest = 0, 0.0, problem.sum_of_squares(at.residuals, weights)
@@ -149,7 +154,8 @@ def next_point(
     damping: float = 0.0,
     fixed: Sequence[int] = (),
 ) -> tuple[np.ndarray, float]:
-    """Return the minimum of the linear model's sum of squares within the bounds, and how much lower it is there."""
+    """Return the minimum of the linear model's sum of squares within the bounds, and the decrease from the present
+    value."""
     from scipy.optimize import lsq_linear
 
     free = np.setdiff1d(np.arange(len(at.u)), fixed)
@@ -171,8 +177,8 @@ def next_point(
 def over_the_bars(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]
 ) -> tuple[Linearised, bool | None]:
-    """Return the end of a search with slopes that hold over the width of the bars, and whether they settled; None where
-    the tangents do hold."""
+    """Return the end of a search with differences over the width of the error bars, and whether they converged. Return
+    None if the tangents pass the check."""
     axes = _axes(problem, at, weights)
     if all(_is_straight(problem, at, weights, axis) for axis in axes.T):
         return at, None
@@ -192,7 +198,8 @@ def over_the_bars(
 
 
 def _axes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
-    """Return columns (free, free) of independent moves by `REACH` standard errors, none longer than a search's step."""
+    """Return columns (free, free) of independent moves by `REACH` standard errors, each at most as long as a search
+    step."""
     covariance = Certainty.of(problem, at, weights).covariance
     axes = REACH * np.linalg.cholesky(covariance + (ROUND_OFF * np.trace(covariance) + TINY) * np.eye(len(covariance)))
     logarithmic = problem.coordinates.by_logarithm
@@ -201,7 +208,8 @@ def _axes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -
 
 
 def _is_straight(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axis: np.ndarray) -> bool:
-    """Test whether residuals at the end of an axis are as the tangents say, on the side where the search was not."""
+    """Test whether the tangents predict the residuals at the end of an axis, on the side that the search did not come
+    from."""
     each = zip(problem.parts, at.jacobians, strict=True)
     if all(np.abs(J @ axis).max() <= ROUNDING * np.nanmax(np.abs(part.observation.measured)) for part, J in each):
         return True
@@ -218,10 +226,10 @@ def _is_straight(problem: LeastSquares, at: Linearised, weights: Sequence[Weight
 def _differences(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axes: np.ndarray
 ) -> tuple[Linearised, list[Linearised]]:
-    """Return a point with differences along the axes as its Jacobian, and the points that were run for them.
+    """Return the point with a Jacobian made of differences along the axes, and the points that were run for it.
 
-    Of the differences to both sides and of that across the one in which least changes is taken. The point itself may
-    lie on a kink, or in a hole that is far narrower than the bars."""
+    Among the two one-sided differences and the central one, the smallest is used. The point itself may lie on a kink,
+    or in a minimum far narrower than the error bars."""
     tried, columns = list[Linearised](), list[list[np.ndarray]]()
     for axis in axes.T:
         ends = [*_moved(problem, at, axis), *_moved(problem, at, -axis)]
@@ -240,7 +248,7 @@ def _differences(
 
 
 def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Linearised]:
-    """Return the point ``shift`` away, within the bounds, with this one's Jacobian; none where its run diverges."""
+    """Return the point ``shift`` away, within the bounds, with this point's Jacobian; None if its run diverges."""
     point = np.clip(at.u + shift, *problem.coordinates.bounds)
     try:
         return [Linearised(point, problem.residuals(point), at.jacobians)] if (point != at.u).any() else []
@@ -249,8 +257,8 @@ def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Lin
 
 
 def misfit(problem: LeastSquares, residuals: list[np.ndarray]) -> float:
-    """Return the logarithm of the residuals' size, averaged over all measured numbers: for Gaussian noise of unknown
-    size, the least is the likeliest."""
+    """Return the logarithm of the residuals' size, averaged over all measured numbers. For Gaussian noise of unknown
+    size, the smallest value is the most likely."""
     counts = [np.count_nonzero(~np.isnan(part.observation.measured)) for part in problem.parts]
     return float(np.average([np.log(max(spread(r), TINY)) for r in residuals], weights=counts))
 

@@ -1,10 +1,9 @@
 """The least-squares problem of several experiments, as a function of one vector, and its Jacobians.
 
-The vector has the numbers that a fit searches, positive ones by their logarithm. A search knows the Jacobian where it
-begins, and then, at its trial points, which only run forward, the residuals. Kriging interpolates them all (Sacks,
-Welch, Mitchell and Wynn 1989): a linear function, and noise of the covariance of Matérn with index 7/2 that goes
-through what it leaves. The slopes of the interpolant are the estimate of the Jacobian. Near points tell the slopes
-between them, far ones the curvature, as far as the residuals are smooth, which their likelihood says.
+The vector has the fitted numbers, positive ones as logarithms. The Jacobian is computed at the first point only; trial
+points run forward and give residuals. Kriging interpolates the residuals (Sacks, Welch, Mitchell and Wynn 1989): a
+linear function plus a random function with Matérn covariance of index 7/2. Slopes of the interpolant estimate the
+Jacobian. Near points determine slopes, far points curvature; the likelihood chooses how smooth the residuals are.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,31 +18,31 @@ from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.observations import Observation
 
 MOST_NUMBERS = 100
-"""Most numbers that a fit searches: each costs a run along its tangent."""
+"""Greatest number of fitted numbers; each costs a forward-mode run."""
 DIFFERENCE = 0.02
-"""Step of a number's logarithm for the estimate of a derivative by a difference."""
+"""Step of a number's logarithm for estimating a derivative by a difference."""
 HARD_BY = 1e-3
 """Of the size of the residuals: by so much they change up to the points that stand for the first Jacobian."""
 MOST = 5
 """Points for each coefficient of a linear function, at which they become too many."""
 WIDTHS = (0.1, 1.0, 3.0)
-"""Of the covariance, from rough to smooth residuals, relative to the greatest distance between two points."""
+"""Widths of the covariance, for rough to smooth residuals, relative to the greatest distance between two points."""
 ROUND_OFF = 1e-12
-"""Of a variance."""
+"""Round-off relative to a variance."""
 TINY = 1e-300
-"""In the place of 0 below a fraction."""
+"""Smallest denominator of a fraction, against division by 0."""
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Numbers of parameters by name, in their order, with marks for the numbers that are searched."""
+    """All numbers of the parameters, in order, with marks for those that are fitted."""
 
     names: tuple[str, ...]
     shapes: tuple[tuple[int, ...], ...]
     at_start: np.ndarray
-    """(all,) [unit of the parameter]"""
+    """First values (all,) [unit of the parameter]."""
     logarithmic: np.ndarray
-    """(all,) true for numbers that are searched by their logarithm."""
+    """Mask (all,) of numbers that are fitted by their logarithm."""
     lower: np.ndarray
     """(all,)"""
     upper: np.ndarray
@@ -57,8 +56,8 @@ class Coordinates:
         bounds: Mapping[str, tuple[Any, Any]] | None,
         unseen: Mapping[str, np.ndarray] | None = None,
     ) -> "Coordinates":
-        """Make coordinates of a start: ``positive`` parameters are searched by their logarithm where all of their
-        numbers are above 0; numbers that are ``unseen`` are not searched. Raises `InputError` for what does not fit."""
+        """Make coordinates for a start. ``positive`` parameters use their logarithm if all of their numbers are above
+        0; ``unseen`` numbers are not fitted. Raises `InputError` for unsuitable arguments."""
         require_table("start", start, "{'viscosity': 0.5}")
         values = {name: as_numbers(f"start of {name}", value) for name, value in start.items()}
         given = {} if bounds is None else bounds
@@ -175,7 +174,8 @@ def _ends(name: str, value: np.ndarray, pair: Any) -> tuple[np.ndarray, np.ndarr
 
 
 def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> np.ndarray:
-    """Return values (frames, ...) less what the frame before predicts, with unchanged standard deviation."""
+    """Return values (frames, ...) minus their prediction from the previous frame, scaled to unchanged standard
+    deviation."""
     if not correlation_time:
         return values
     kept = np.exp(-np.diff(times) / correlation_time).reshape(-1, *[1] * (values.ndim - 1))
@@ -209,11 +209,11 @@ class Weighting:
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals and Jacobians of all parts at a point, in the units of what was measured."""
+    """Residuals and Jacobians of all parts at a point, in the units of the measurements."""
 
     u: np.ndarray
     residuals: list[np.ndarray]
-    """Residuals of each part, predicted less measured, (frames, m), 0 for numbers that do not count."""
+    """Residuals of each part (frames, m), predicted minus measured; 0 for ignored numbers."""
     jacobians: list[np.ndarray]
     """Jacobians of each part, (frames, m, free)."""
 
@@ -242,7 +242,8 @@ class LeastSquares:
             for name, one in experiment.observations.items()
         ]
         self.runs = self.tangents = self.refused = 0
-        """Forward runs, and passes along a tangent, each of one experiment, and points whose runs diverged."""
+        """Numbers of forward runs and of forward-mode runs, each of one experiment, and of points whose runs
+        diverged."""
 
     @property
     def labels(self) -> list[str]:
@@ -261,8 +262,8 @@ class LeastSquares:
         return self._along(u, range(len(u)))
 
     def estimated(self, u: np.ndarray) -> Linearised:
-        """Return residuals and Jacobians at a point, with derivatives of positive numbers by differences: a forward run
-        costs less than one along a tangent, and this is enough to search. Raises `DivergedError`."""
+        """Return residuals and estimated Jacobians at a point. Derivatives of positive numbers are differences, because
+        a forward run costs less than a forward-mode run. Raises `DivergedError`."""
         positive = self.coordinates.by_logarithm
         at = self._along(u, np.flatnonzero(~positive))
         _, upper = self.coordinates.bounds
@@ -345,7 +346,7 @@ class TrialPoints:
 
     @property
     def are_many(self) -> bool:
-        """Return True where the search should begin anew from the lowest point, before points take too much memory."""
+        """Return True if the search should restart from the lowest point, before the points need too much memory."""
         return len(self._points) >= MOST * (len(self._points[0]) + 1)
 
     def linearised(self, number: int) -> Linearised:

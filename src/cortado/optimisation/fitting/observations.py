@@ -1,4 +1,4 @@
-"""What was measured of an experiment, and what a simulation says of the same: videos, series of sensors, and tracks."""
+"""Observations of an experiment and their predictions by a simulation: videos, sensor series, and tracks of tracers."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,14 +22,14 @@ from cortado.scene.parameter_values import Arrays
 from cortado.simulation import Simulation
 
 CLOCK = "start"
-"""The name of an observation's parameter that says when its frames are."""
+"""Name of an observation's clock parameter, which shifts the times of its frames."""
 LEAST_FRAMES = 4
-"""Fewest frames of an observation: error bars are made of the scatter from frame to frame."""
+"""Least number of frames of an observation, because error bars are computed from the scatter between frames."""
 
 
 @dataclass(frozen=True)
 class Direction:
-    """A direction of a derivative, as an observation of one state sees it."""
+    """The direction of a directional derivative at one state, for an observation."""
 
     fields: Arrays
     """The tangent of the state, by fields: vectors (n, d), fractions (n, phases)."""
@@ -42,21 +42,22 @@ class Direction:
 
 
 class Observation(Protocol):
-    """Numbers that were measured at several times, which are called frames, and how a state predicts them."""
+    """Protocol of an observation: numbers measured at several times, called frames, and their prediction from a
+    state."""
 
     times: np.ndarray
-    """(frames,) [s] after the start of the run, rising."""
+    """Increasing times (frames,) [s] after the start of the run."""
     measured: np.ndarray
-    """(frames, m); NaN for a number that does not count."""
+    """Measured numbers (frames, m); NaN for numbers to ignore."""
     noise: float | None
-    """Standard deviation of a number, as far as it is known; None leaves it to the residuals."""
+    """Standard deviation of a number, if known; None estimates it from the residuals."""
     unit: str
     """Unit of the numbers."""
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """Return the observation's own parameters, such as those of a camera, as the fit starts. One that is called
-        "start" is a clock [s]: frames are later by as much as it grows, which an `Experiment` sees to."""
+        """Return first values of the observation's own parameters, such as those of a camera. A parameter called
+        "start" is a clock [s]: `Experiment` shifts the frames to later times as it grows."""
 
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the numbers (m,) that a state predicts, given values of the observation's own parameters."""
@@ -82,8 +83,8 @@ class Again:
 
 @dataclass(frozen=True)
 class Frames:
-    """The places of an observation's frames between the steps of a run; predictions of two states are interpolated
-    linearly."""
+    """The positions of an observation's frames between the steps of a run; predictions are interpolated linearly
+    between two states."""
 
     steps: np.ndarray
     """(frames,) number of steps before each frame."""
@@ -104,7 +105,7 @@ class Frames:
 
     @property
     def needed(self) -> set[int]:
-        """Return the numbers of steps before the states that frames read."""
+        """Return the step numbers of the states that frames read."""
         return {int(k) for k in self.steps} | {int(k) + 1 for k in self.steps[self.shares > 0.0]}
 
     @property
@@ -126,12 +127,12 @@ class Frames:
 
 
 def clock_of(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray]:
-    """Return the parameter of a calibrated clock, which shows ``start`` [s] of the run where it should show 0."""
+    """Return the parameter of a calibrated clock, whose time 0 is the time ``start`` [s] of the run."""
     return {CLOCK: np.array(as_one_number("clock", start))} if CLOCK in calibrate else {}
 
 
 def only_a_clock(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray]:
-    """Return the parameter of a calibrated clock; raise `InputError` where anything else is calibrated."""
+    """Return the parameter of a calibrated clock; raise `InputError` if anything else is calibrated."""
     for name in calibrate:
         if name != CLOCK:
             raise InputError(f"calibrate has {shown(name)}, but must be made of {CLOCK}.")
@@ -182,12 +183,11 @@ class Video:
         calibrate: tuple[str, ...] | list[str] = (),
         clock: float = 0.0,
     ):
-        """Take a ``renderer`` such as `Simulation.renderer` makes, with the camera where it was aimed. ``times``
-        (frames,) [s] after the start of the run; ``frames`` (frames, rows, columns, 3) linear light from 0 to 1, as
-        `cortado.pictures.read_picture` reads it. ``mask`` (rows, columns), true where pixels count; ``noise``, standard
-        deviation of a number of a frame, if it is known. ``calibrate``, what of the view is searched beside the
-        parameters: "translation", "rotation", "field_of_view" or "width", "extinction", and "start", the ``clock`` [s]
-        that is added to the times."""
+        """Store a ``renderer`` from `Simulation.renderer` with the camera's measured place. ``times`` (frames,) [s]
+        count from the start of the run. ``frames`` (frames, rows, columns, 3): linear light from 0 to 1, see
+        `cortado.pictures.read_picture`. ``mask`` (rows, columns): true for pixels to use. ``noise``: standard deviation
+        of a number, if known. ``calibrate``: view parameters to fit too: "translation", "rotation", "field_of_view" or
+        "width", "extinction", and "start", the ``clock`` [s] added to the times."""
         require_methods("renderer", renderer, ("render", "tangent", "seen_by"), "a renderer such as of a Simulation")
         pictures = as_numbers("frames", frames)
         if pictures.shape[1:] != renderer.shape:
@@ -205,12 +205,12 @@ class Video:
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """Return the camera as it was aimed, and its clock, as far as they are calibrated."""
+        """Return first values of the calibrated parameters: of the given camera and of its clock."""
         return {**self.calibration.start, **self._clock}
 
     @property
     def unseen(self) -> Mapping[str, np.ndarray]:
-        """Return masks by name, true for the numbers of the camera that no picture shows."""
+        """Return masks by name, true for numbers of the camera that do not affect the picture."""
         return self.calibration.unseen
 
     def picture(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -257,11 +257,10 @@ class SensorSeries:
         calibrate: Sequence[str] = (),
         clock: float = 0.0,
     ):
-        """Take a ``sensor`` of `cortado.sensors`; ``times`` (frames,) [s] after the start of the run; ``values``
-        (frames,) or (frames, k) in the sensor's units, NaN for what does not count. ``dimension`` of the scene;
-        ``columns``, the names of the k numbers of the sensor that were measured, all of them if left out. ``noise``,
-        their standard deviation, if it is known; ``clock`` [s], what is added to the times, which
-        ``calibrate=["start"]`` searches."""
+        """Store a ``sensor`` of `cortado.sensors` and its readings ``values`` (frames,) or (frames, k) in the sensor's
+        units, NaN to ignore one, at ``times`` (frames,) [s] after the start of the run. ``dimension``: of the scene.
+        ``columns``: names of the k measured columns, by default all. ``noise``: standard deviation, if known. ``clock``
+        [s] is added to the times; ``calibrate=["start"]`` fits it."""
         self.start = only_a_clock(calibrate, clock)
         self.sensor = checked_sensor(sensor)
         known = dict(sensor.columns(dimension))
@@ -284,7 +283,8 @@ class SensorSeries:
         return value_of(self.sensor, at)[self._picked]
 
     def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
-        """Return the derivatives along directions, by the adjoint of each number, which is all that sensors have."""
+        """Return the derivatives along directions. They are computed from adjoints of the numbers, because sensors have
+        no forward mode."""
         rows = [self.sensor.adjoint(at, np.eye(self._width)[k]) for k in self._picked]
         others = [name for name in rows[0] if along and name not in along[0].fields]
         found = np.zeros((len(rows), len(along)))
@@ -296,13 +296,14 @@ class SensorSeries:
 
 @fixed
 class Tracks:
-    """An observation of a fit: tracers' places over time. A tracer moves as the particles around its first place do:
+    """An observation of a fit: tracers' positions over time. A tracer moves with the particles around its first
+    position:
 
     X(t) = X(0) + sum_i w_i (x_i(t) - x_i(0)),
 
-    with the weights of Wendland (1995) at the start, which add up to 1 within the support radius. Along a periodic axis
-    images of particles count like themselves at the start, and paths go on beyond the end of the period: a tracer that
-    has gone around once is a period further.
+    with Wendland's weights (1995) at the start, normalised to sum 1 within the support radius. Along periodic axes,
+    images of particles count at the start, and paths are not wrapped: a tracer that went around once is one period
+    further.
 
     Example: ``tracks = cortado.measured.Tracks(simulation, first, times, positions, noise=0.001)``
     """
@@ -319,10 +320,10 @@ class Tracks:
         calibrate: Sequence[str] = (),
         clock: float = 0.0,
     ):
-        """Set the tracers' ``first`` places (tracers, d) [m] at the start of the run, and ``positions`` (frames,
-        tracers, d) [m] at ``times`` (frames,) [s] after it, NaN where a tracer was not seen. ``noise``, if known, is
-        the standard deviation of a coordinate [m]; ``clock`` [s] is added to the times, and ``calibrate=["start"]``
-        searches it. Raises `InputError` for a tracer that has no fluid around it."""
+        """Set the tracers' ``first`` positions (tracers, d) [m], and ``positions`` (frames, tracers, d) [m] at
+        ``times`` (frames,) [s] after the start of the run, with NaN for unseen tracers. ``noise``: standard deviation
+        of a coordinate [m], if known. ``clock`` [s] is added to the times; ``calibrate=["start"]`` fits it. Raises
+        `InputError` for a tracer without fluid around it."""
         self.start = only_a_clock(calibrate, clock)
         begun, places = as_numbers("first", first), as_numbers("positions", positions)
         tracers, d = begun.shape if begun.ndim == 2 else (0, 0)
