@@ -1,4 +1,4 @@
-"""The functions of a simulation that are layers: steps, the loss of a problem, what sensors read, and pictures."""
+"""The layers of a simulation: steps, the loss of a problem, sensor readings, and pictures."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -43,18 +43,18 @@ from cortado.scene.parameters import QUANTITIES, check_quantity
 from cortado.simulation import Simulation
 
 LOSS, READING, PICTURE = "loss", "reading", "picture"
-"""The names of what layers return that return one array."""
+"""Names of the result in layers that return one array."""
 
 
 class OfSimulation(Layer):
-    """A layer whose arrays are a state of a simulation, and its parameters over a number of steps."""
+    """A base class of layers whose arrays are a state of a simulation, and parameters over a number of steps."""
 
     def __init__(self, simulation: Simulation, steps: int, each: bool = False):
         """Prepare a layer over ``steps`` steps; ``each`` is explained in `LayerParameters`."""
         super().__init__()
         self._simulation, self._each = simulation, each
         self.states = named_states(simulation)
-        """What makes states of named arrays."""
+        """The converter between states and named arrays."""
         self._parameters = LayerParameters(simulation, steps, each)
         self.real, self.device = simulation.precision.numpy, simulation.device
         self.on_device = frozenset(STATE + name for name in self.states.fields)
@@ -71,7 +71,7 @@ class OfSimulation(Layer):
         self._parameters.check(given, with_state=True)
 
     def _last_step(self) -> dict[str, Array]:
-        """Return a zero adjoint for the last step's length, where a scene has it: it has no derivative."""
+        """Return a zero adjoint for the last step's length if the state has this array, which has no derivative."""
         return {LAST_STEP: np.zeros(self.states.shapes[LAST_STEP])} if LAST_STEP in self.states.shapes else {}
 
 
@@ -81,7 +81,7 @@ class Steps(OfSimulation):
     def __init__(
         self, simulation: Simulation, steps: int, gradient: AdjointEstimator | None = None, each: bool = False
     ):
-        """Prepare the layer; reverse mode goes by the estimator ``gradient``, exactly if it is left out."""
+        """Prepare the layer; reverse mode uses the estimator ``gradient``, by default the exact adjoint."""
         self._steps, self._gradient = check_steps(steps), gradient
         super().__init__(simulation, steps, each)
         self.kept_bytes = min(steps * self._state_size, MEMORY_BUDGET)
@@ -134,7 +134,7 @@ class Steps(OfSimulation):
 
 
 class Evaluation:
-    """A forward run of a problem, whose derivatives are computed when they are asked for."""
+    """A forward run of a problem; its derivatives are computed when they are first needed."""
 
     def __init__(self, problem: Problem, values: Arrays, estimator: GradientEstimator, with_state: bool):
         self._problem, self.values, self._estimator, self._with_state = problem, values, estimator, with_state
@@ -147,7 +147,8 @@ class Evaluation:
 
     @property
     def gradient(self) -> Arrays:
-        """Return the loss's derivatives by names of arrays, in float64, of a batch with a first axis."""
+        """Return the loss's derivatives by names of arrays, in float64; for a batch with a first axis for the
+        scenes."""
         if self._found is None:
             assert self._run is not None and isinstance(self._estimator, AdjointEstimator)
             if self._with_state:
@@ -160,7 +161,7 @@ class Evaluation:
         return self._found
 
     def along(self, dots: Named) -> Any:
-        """Return the derivative of the loss along tangents: by forward mode, unless an estimator was asked for."""
+        """Return the derivative of the loss along tangents, by forward mode unless an estimator was given."""
         if isinstance(self._estimator, Exact) and not self._with_state and self._found is None:
             return self._problem.tangent(self.values, part(dots, PARAMETER))
         terms = [self.gradient[name] * dot for name, dot in dots.items()]
@@ -168,11 +169,11 @@ class Evaluation:
 
 
 class Value(OfSimulation):
-    """A layer whose result is a problem's loss. Its arrays are parameters, and a state's if the problem begins
-    there."""
+    """A layer whose result is a problem's loss. Its arrays are parameters, and the fields of a state at which the
+    problem begins, if one is given."""
 
     def __init__(self, problem: Problem, gradient: GradientEstimator | None = None, each: bool = False):
-        """Prepare the layer; reverse mode goes by the estimator ``gradient``, `gradients.Exact` by default."""
+        """Prepare the layer; reverse mode uses the estimator ``gradient``, by default `gradients.Exact`."""
         if not isinstance(problem, Problem):
             raise InputError(f"problem is {shown(problem)}, but must be a cortado.Problem.")
         super().__init__(problem.simulation, problem.steps, each)
@@ -247,7 +248,7 @@ def _times(found: np.ndarray, bar: Any) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A state that was read, with all that the reading's derivatives need."""
+    """A state that was read, with everything that derivatives of the reading need."""
 
     snapshot: Snapshot
     step: Residual
@@ -255,8 +256,8 @@ class Look:
 
 
 class Measure(OfSimulation):
-    """A layer that reads a sensor, or by its name a quantity of the particles. Its arrays are those of a state, and
-    parameters of the step after it."""
+    """A layer that reads a sensor, or a quantity of the particles by name. Its arrays are the fields of a state and the
+    parameters of the step that follows."""
 
     def __init__(self, simulation: Simulation, what: Sensor | str):
         if simulation.batch is not None:
@@ -307,7 +308,7 @@ class Measure(OfSimulation):
         return {READING: moment.tangents([name], fields.numpy(self._simulation.dimension), row)[name]}
 
     def _back(self, look: Look, bar: np.ndarray) -> dict[str, Any]:
-        """Turn the adjoint of the reading into those of all arrays, float64."""
+        """Convert the adjoint of the reading to adjoints of all arrays, in float64."""
         snapshot, rollout = look.snapshot, self._rollout
         found = {str(self._name): bar} if self._sensor is None else self._sensor.adjoint(snapshot, bar)
         whole = bar_on_device(found, snapshot).through_quantities(snapshot)
@@ -325,7 +326,7 @@ class Measure(OfSimulation):
 
 
 class Picture(Layer):
-    """A layer that renders pictures. Its arrays are positions (n, d) [m] and, where wanted, mass fractions (n, phases)
+    """A layer that renders pictures. Its arrays are positions (n, d) [m] and, optionally, mass fractions (n, phases)
     and colours (phases, 3). They pass through the host."""
 
     def __init__(self, renderer: Renderer):

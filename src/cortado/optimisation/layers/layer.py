@@ -1,7 +1,7 @@
-"""What a layer is: a function of named arrays, with its derivatives in both modes; and states and parameters as such.
+"""Base classes of layers, which are differentiable functions of named arrays, and converters of states and parameters.
 
-States are whole, as other programs hold them, and judged when they come back. Parameters are the same for all
-evaluations of a layer, or have an entry for each of them.
+Other programs get complete states, and a state is checked when it comes back. Parameters are equal for all evaluations
+of a layer, or have an entry for each.
 """
 
 import warnings
@@ -27,18 +27,18 @@ from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.simulation import Simulation
 
 STATE, PARAMETER = "state ", "parameter "
-"""What the names of fields of a state, and of parameters, begin with among those of a layer's arrays: so they do not
-meet, and sentences begin with them."""
+"""Prefixes of a layer's array names for fields of a state and for parameters, which keep them apart and begin error
+messages."""
 POSITIONS = (STATE + "positions", "positions")
-"""Names of the positions in layers that look at particles."""
+"""Names of the positions in layers whose arrays include particles."""
 LAST_STEP = "time_step"
-"""The length of the step that led to a state, in a scene that chooses its steps [s]."""
+"""Name of the length [s] of the step before a state, in a scene with adaptive time steps."""
 KEPT = 2
-"""Most sizes of batches of a layer that are kept for the next call."""
+"""Greatest number of batch sizes for which a layer is kept for the next call."""
 MOST_KNOWN = 256
-"""Most checksums of states that are remembered."""
+"""Greatest number of stored checksums of states."""
 Array = Any
-"""A Warp array of numbers, or one of NumPy's. Where a shape is (), it may be (1,)."""
+"""A Warp or NumPy array of numbers. An array of shape () may also have shape (1,)."""
 Named = Mapping[str, Array]
 Shapes = Mapping[str, tuple[int, ...]]
 K = TypeVar("K")
@@ -48,26 +48,26 @@ V = TypeVar("V")
 class Layer(ABC):
     """A function of named arrays of one precision, with its derivatives.
 
-    Arrays are read in their memory, on the host or on the layer's device, and none that is given is written to.
+    Arrays are read where they are, on the host or on the layer's device. Given arrays are never written.
     """
 
     real: type
     """The NumPy type of the numbers of all arrays."""
     device: Any
-    """Device of the arrays; parameters, and other small ones, are read on the host wherever they are."""
+    """Device of the arrays; parameters and other small arrays may be anywhere and are read on the host."""
     on_device: frozenset[str] = frozenset()
     """Names of the arrays that must be on the device."""
     kept_bytes: int = 0
-    """About how many bytes a residual holds."""
+    """Approximate size of a residual [byte]."""
     unmapped: str = ""
-    """A name in words for a layer without `many`; else empty."""
+    """A name of the layer for messages, if it has no `many`; else empty."""
 
     def __init__(self) -> None:
         self._batched: dict[int, Layer] = {}
 
     @abstractmethod
     def check(self, given: Shapes) -> None:
-        """Raise `InputError`, in a sentence, for arrays of other names or shapes than the layer takes."""
+        """Raise `InputError`, in a sentence, for arrays with wrong names or shapes."""
 
     @abstractmethod
     def outputs(self) -> dict[str, tuple[int, ...]]:
@@ -75,18 +75,18 @@ class Layer(ABC):
 
     @abstractmethod
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        """Return the layer's results, and, to ``keep``, a residual for `pull` and `push`, else None."""
+        """Return the layer's results and, if ``keep``, a residual for `pull` and `push`, else None."""
 
     @abstractmethod
     def pull(self, residual: Any, bars: Named) -> Named:
-        """Pull back (reverse mode): from adjoints of the results, 0 where left out, to those of all given arrays."""
+        """Reverse mode: return adjoints of all given arrays from adjoints of the results; those left out are 0."""
 
     @abstractmethod
     def push(self, residual: Any, dots: Named) -> Named:
-        """Push forward (forward mode): from tangents of given arrays, 0 where left out, to those of the results."""
+        """Forward mode: return tangents of the results from tangents of given arrays; those left out are 0."""
 
     def check_mapped(self) -> None:
-        """Raise `InputError`, in a sentence, where the layer has no `many`."""
+        """Raise `InputError`, in a sentence, if the layer has no `many`."""
         if self.unmapped:
             raise InputError(
                 f"{self.unmapped} cannot be mapped over a further axis: map over one axis, of what has none."
@@ -104,14 +104,14 @@ class Layer(ABC):
 
 @dataclass(frozen=True)
 class Lost:
-    """One of several evaluations of a layer, which has no result, as its run diverged."""
+    """The residual of one of several evaluations of a layer whose run diverged, so that it has no result."""
 
     given: Shapes
     """Shapes of its arguments."""
     why: str
 
     def along(self, of: Named, shapes: Shapes) -> Named:
-        """Return derivatives in these shapes: 0 where all given arrays are 0, else NaN."""
+        """Return derivatives in these shapes: 0 if all given arrays are 0, else NaN."""
         number = np.nan if any(on_host(array).any() for array in of.values()) else 0.0
         return {name: np.full(shape, number) for name, shape in shapes.items()}
 
@@ -141,7 +141,7 @@ class OneByOne(Layer):
         return stacked([one for one, _ in found]), [residual for _, residual in found] if keep else None
 
     def _evaluated(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        """Evaluate one entry, without numbers where its particles have none, or one of them is lost."""
+        """Evaluate one entry; results are NaN if its particles are NaN or one of them is lost."""
         shapes = {name: np.shape(array) for name, array in given.items()}
         positions = next((array for name, array in given.items() if name in POSITIONS), np.zeros(1))
         lost = Lost(shapes, "its particles had been lost in steps before it.")
@@ -168,7 +168,7 @@ class OneByOne(Layer):
 
 
 def kept_or_made(kept: dict[K, V], key: K, make: Callable[[K], V], most: int) -> V:
-    """Return the value kept under a key, or make it now; only the ``most`` that were asked for last are kept."""
+    """Return the value stored under a key, or make it; only the ``most`` last used values are kept."""
     found = kept.pop(key, None) or make(key)
     kept[key] = found  # the last one
     while len(kept) > most:
@@ -182,12 +182,12 @@ def on_host(array: Array) -> np.ndarray:
 
 
 def part(given: Mapping[str, Any], kind: str) -> dict[str, Any]:
-    """Return named arrays of a kind, without the kind in their names."""
+    """Return the arrays whose names begin with a kind, with the kind removed from their names."""
     return {name.removeprefix(kind): array for name, array in given.items() if name.startswith(kind)}
 
 
 def named(kind: str, found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return arrays with a kind in front of their names."""
+    """Return arrays with a kind added in front of their names."""
     return {kind + name: array for name, array in found.items()}
 
 
@@ -224,18 +224,18 @@ def _stack(arrays: list[Array]) -> Array:
 class NamedStates:
     """A converter of one simulation's states from named arrays, and to named arrays.
 
-    They have the names and shapes of the fields of a `RestartState`, of a batch with a first axis for the scenes, and a
-    ``time`` [s]. All are of the simulation's precision.
+    The arrays have the names and shapes of the fields of a `RestartState`, and a ``time`` [s]; for a batch they have a
+    first axis for the scenes. All are of the simulation's precision.
     """
 
     def __init__(self, simulation: Simulation):
         self._simulation, self._place = simulation, DeviceStates(simulation)
         self._space = ParameterSpace(simulation, 0)
         self._known: OrderedDict[bytes, tuple[Origin, ...]] = OrderedDict()
-        """States that were judged, or that steps led to, by checksum: whose particles they are of."""
+        """Origins of the particles of states that were checked or computed by steps, by the state's checksum."""
         constant = (field.name for field in simulation.initial.fields if field.is_constant)
         self._constants: dict[str, tuple[np.ndarray, wp.array] | None] = dict.fromkeys(constant)
-        """Fields that no step changes, with the numbers that were given last."""
+        """Fields that no step changes, with the last given numbers."""
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -251,10 +251,10 @@ class NamedStates:
         return self._simulation.initial.names
 
     def state(self, given: Named, parameters: Arrays) -> DeviceState:
-        """Return a state of the simulation, in arrays of its own. ``parameters`` are those of the steps that follow.
+        """Return a new state of the simulation. ``parameters`` are those of the steps that follow.
 
-        Raises `InputError` for one that does not make sense in this scene. On a GPU, where it would have to be read,
-        it is not looked at, as derivatives are not.
+        Raises `InputError` for a state that is impossible in this scene. On a GPU states and derivatives are not
+        checked, because that would copy them to the host.
         """
         arrays = self.written({name: given[name] for name in self.fields})
         times, sizes = (self._numbers(given, name) for name in (STATE_TIME, LAST_STEP))
@@ -270,7 +270,7 @@ class NamedStates:
         return DeviceState(arrays, scenes)
 
     def arrays(self, state: DeviceState) -> dict[str, Array]:
-        """Return the named arrays of a state that steps led to, as `state` takes them."""
+        """Return the named arrays of a state computed by steps; `state` accepts them again."""
         members = self.shapes[STATE_TIME]
         clocks = [scene.clock for scene in state.scenes]
         found: dict[str, Array] = self.read(state.arrays)
@@ -282,7 +282,7 @@ class NamedStates:
         return found
 
     def written(self, given: Named) -> State:
-        """Copy fields, or derivatives with respect to fields, to a state of Cortado's, 0 where they are left out."""
+        """Copy fields, or derivatives with respect to fields, to a `State`; fields left out are 0."""
         if self._simulation.device.is_cpu:
             like = self._simulation.initial
             own = {name: self._on_host(name, like[name], given.get(name)) for name in like.names}
@@ -297,8 +297,8 @@ class NamedStates:
         return state
 
     def _on_host(self, name: str, like: wp.array, given: Array | None) -> wp.array:
-        """Return a field of the kind of another one, with given numbers or 0, in memory of NumPy; for the last numbers
-        of a field that no step changes the last array."""
+        """Return a field like another one, with given numbers or 0, in NumPy's memory. A field that no step changes
+        keeps its array as long as the numbers are equal."""
         last = self._constants.get(name) if given is not None else None
         if last is not None and np.array_equal(on_host(given), last[0]):
             return last[1]
@@ -312,7 +312,7 @@ class NamedStates:
         return found
 
     def read(self, state: State) -> dict[str, Array]:
-        """Return named arrays of the fields of a state of Cortado's; on a CPU they may share its memory."""
+        """Return the fields of a `State` as named arrays; on a CPU they may share its memory."""
         return self.narrowed({name: state.numbers(name) for name in self.fields})
 
     def narrowed(self, found: Named) -> dict[str, Array]:
@@ -328,19 +328,19 @@ class NamedStates:
         return {field.name: field.entry for field in self._simulation.initial.fields}
 
     def _narrow(self, name: str, whole: Array) -> Array:
-        """Return a view of a field's numbers, of vectors with the scene's components."""
+        """Return a view of a field's numbers; vectors have the scene's number of components."""
         if self._entries[name] is not Entry.VECTOR or self._simulation.dimension == 3:
             return whole
         return whole[:, :, :2] if whole.ndim == 3 else whole[:, :2]
 
     def _numbers(self, given: Named, name: str) -> np.ndarray:
-        """Return a named array as numbers (members,) in float64, 0 where it is left out."""
+        """Return a named array as numbers (members,) in float64; 0 if it is left out."""
         members = self._simulation.batch or 1
         return on_host(given[name]).astype(np.float64).reshape(members) if name in given else np.zeros(members)
 
     def _clock(self, time: float, step: float, last: float) -> Clock:
-        """Return the clock of a state at a time, which may have been rounded. For a whole number of steps it counts
-        them, so that the times of later steps have the bits of one run."""
+        """Return the clock of a state at a time that may have been rounded. If the time is a whole number of steps, the
+        clock counts steps, so that later times have the same bits as in one run."""
         if self._simulation.scene.solver.chooses:
             return Clock(0, time, last)
         steps = round(time / step) if np.isfinite(time) and time >= 0.0 else 0
@@ -370,8 +370,8 @@ class NamedStates:
                 self._known.popitem(last=False)
 
     def _checksum(self, arrays: State) -> bytes:
-        """Return the checksum of the numbers that other programs hold of a state: in 2-D no third component, whose 0
-        may have a sign."""
+        """Return the checksum of a state's numbers in other programs. In 2-D it excludes third components, because
+        their 0 may have a sign."""
         found = blake2b(digest_size=16)
         for name in arrays.names:
             found.update(np.ascontiguousarray(self._narrow(name, arrays.numbers(name).numpy())).data)
@@ -390,17 +390,17 @@ def check_state(given: Shapes, wanted: Shapes) -> None:
 
 
 def named_states(simulation: Simulation) -> NamedStates:
-    """Return the converter of a simulation's states that all of its layers share."""
+    """Return the state converter of a simulation, which all of its layers share."""
     found: NamedStates = simulation.__dict__.get("_named_states") or NamedStates(simulation)
     simulation.__dict__["_named_states"] = found
     return found
 
 
 class LayerParameters:
-    """The parameters of a layer over a number of steps, as its arrays have them and as problems take them.
+    """The parameters of a layer over a number of steps, converted between the layer's arrays and the forms of problems.
 
-    ``each``: whether the simulation is a batch of evaluations of a layer, with an entry for each of them in all arrays;
-    a batch that a user made has parameters in all shapes of `docs/batches.md`.
+    ``each``: True if the simulation is a batch of evaluations of a layer, and all arrays have an entry for each. A
+    batch made by a user has parameters in all shapes of `docs/batches.md`.
     """
 
     def __init__(self, simulation: Simulation, steps: int, each: bool):
@@ -418,19 +418,20 @@ class LayerParameters:
                 raise InputError(f"parameter {name} has shape {shape}, but must be {' or '.join(map(str, shapes))}.")
 
     def values(self, given: Named) -> Arrays:
-        """Return parameters as problems take them, in float64."""
+        """Return parameters in the form of problems, in float64."""
         own = part(given, PARAMETER)
         return {name: self._shaped(name, on_host(array).astype(np.float64)) for name, array in own.items()}
 
     def on_device(self, given: Named) -> dict[str, Array]:
-        """Return parameters as steppers take them: those over time that are on the device stay there."""
+        """Return parameters in the form of steppers; parameters over time that are on the device stay there."""
         own = part(given, PARAMETER)
         stay = {name: array for name, array in own.items() if isinstance(array, wp.array) and self._rows.takes(name)}
         others = {PARAMETER + name: array for name, array in own.items() if name not in stay}
         return {**self.values(others), **{name: self._shaped(name, array) for name, array in stay.items()}}
 
     def _shaped(self, name: str, array: Array) -> Array:
-        """Return a parameter's array with an axis for steps where a batch's evaluations have one value for all."""
+        """Return a parameter's array, with an axis for steps added if each evaluation of a batch has one value for all
+        steps."""
         shapes = self._space.shapes(name)
         if self._each and name in self._simulation.known.over_time and array.ndim == len(shapes[0]) + 1:
             return array.reshape((array.shape[0], 1, *array.shape[1:]))
@@ -438,8 +439,8 @@ class LayerParameters:
         return array.reshape(()) if is_number else array
 
     def adjoints(self, found: Mapping[str, Array], values: Arrays) -> Named:
-        """Return derivatives with respect to values, of a batch with a first axis for the scenes, in the values'
-        shapes; those on the device have them."""
+        """Return derivatives in the shapes of the values; for a batch the given ones have a first axis for the scenes.
+        Derivatives on the device have these shapes already."""
         shared = {}
         for name, bar in found.items():
             if isinstance(bar, np.ndarray):

@@ -1,6 +1,7 @@
 """The functions of a layer, such as `cortado.jax` and `cortado.torch`: states, steps, rollouts and losses of arrays.
 
-Closed loops, such as a policy's, are problems of `cortado.gradients`: their losses and gradients are smoothed.
+`smoothed` treats a closed loop, such as a policy's, as a problem of `cortado.gradients` and smooths its loss and
+gradient.
 """
 
 from abc import ABC, abstractmethod
@@ -30,11 +31,11 @@ Table = Mapping[str, Any]
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 KEPT = 4
-"""Most layers of one simulation, by their numbers of steps, and most compiled losses, by estimator, that are kept."""
+"""Greatest number of layers kept per simulation, by number of steps, and of compiled losses kept, by estimator."""
 
 
 class Bridge(ABC):
-    """The functions of another program, such as JAX or PyTorch, that calls of layers need."""
+    """Base class of the functions of JAX or PyTorch that layers call."""
 
     stack: Callable[[list[Any]], Any]
     """Stacks arrays of the other program along a first axis."""
@@ -45,7 +46,8 @@ class Bridge(ABC):
 
     @abstractmethod
     def array(self, what: str, value: Any, layer: Layer) -> Any:
-        """Return an array of the layer's precision as it is, or numbers as one; raise `InputError` for any other."""
+        """Return an array of the layer's precision unchanged, or convert plain numbers to one; raise `InputError` for
+        anything else."""
 
     @abstractmethod
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
@@ -58,7 +60,7 @@ class Bridge(ABC):
 
     @abstractmethod
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return the value that a function of numbers finds, as one with its gradient in reverse mode."""
+        """Return the value of a function of numbers as the other program's value, with its gradient in reverse mode."""
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
         """Copy an array to the host, in float64; raise `InputError` for anything else."""
@@ -67,8 +69,8 @@ class Bridge(ABC):
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
     ) -> dict[str, Any]:
-        """Return the states to which a step leads again and again, with the next row of each array, and the first one,
-        along a first axis."""
+        """Apply a step repeatedly, with the next row of each array, and return all states, including the first, along a
+        first axis."""
         states = [state]
         for k in range(count):
             states.append(step(states[-1], {name: row[k] for name, row in rows.items()}))
@@ -78,7 +80,7 @@ class Bridge(ABC):
 def bound(
     function: Callable[Concatenate[Bridge, Arguments], Result], bridge: Bridge, module: str
 ) -> Callable[Arguments, Result]:
-    """Return a function below with its ``bridge``, as a public function of a ``module``."""
+    """Return a function of this module, with its ``bridge`` filled in, as a public function of another ``module``."""
 
     def call(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
         return function(bridge, *arguments, **named)
@@ -106,14 +108,14 @@ def steps_layer(simulation: Simulation, steps: int, gradient: AdjointEstimator |
 def state(
     bridge: Bridge, simulation: Simulation, given: Given | DeviceState = None, parameters: Values | None = None
 ) -> dict[str, Any]:
-    """Return a state as arrays: that before the first step, or a ``given`` one, such as ``trajectory.last_state``.
+    """Return a state as arrays: the scene's first state, or a ``given`` one, such as ``trajectory.last_state``.
 
-    ``parameters``, as numbers, are any that a first state depends on, such as ``initial_velocities``; those of the run
-    that a given state is of. Returns positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases),
-    reference_density (n,), time () [s], and what else a solver carries; of a batch with a first axis for the scenes.
-    Raises `InputError` for what does not fit.
+    ``parameters`` are numbers on which the first state depends, such as ``initial_velocities``, or those of the given
+    state's run. Returns positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases), reference_density
+    (n,), time () [s], and further fields of the solver; for a batch with a first axis for the scenes. Raises
+    `InputError` for unsuitable arguments.
 
-    ``simulation`` is whose state it is.
+    ``simulation`` is the simulation to which the state belongs.
 
     Example: ``first = state(simulation)  # first["positions"]: (n, d)``
     """
@@ -126,9 +128,9 @@ def state(
 def restart_state(
     bridge: Bridge, simulation: Simulation, given: Table, parameters: Values | None = None
 ) -> RestartState | tuple[RestartState, ...]:
-    """Return a state of arrays as restart states, which `Simulation.run`, files and other processes take.
+    """Convert a state of arrays to restart states for `Simulation.run`, files and other processes.
 
-    ``simulation`` is whose state ``given`` is; ``parameters`` are those of the run so far, where it depends on them.
+    ``given`` is a state of ``simulation``; ``parameters`` are those of the run so far if the state depends on them.
 
     Example: ``run = simulation.run(100, state=restart_state(simulation, end))``
     """
@@ -152,14 +154,14 @@ def step(
 ) -> dict[str, Any]:
     """Return the state after ``steps`` steps from ``given``: `Simulation.step` as a function of arrays.
 
-    ``parameters`` are any of those of `Problem` but first values, arrays or numbers; one over time has a row for each
-    of these steps. Reverse mode goes back by the estimator ``gradient``, such as `gradients.AdjointViscosity`, exactly
-    if it is left out; forward mode is exact. Exact derivatives of chained steps are of use within the horizon that
-    `cortado gradients check` certifies, some hundred steps; beyond ten e-folds of growth a chain warns. A call costs
-    1.4 ms beside its steps on a CPU, 3.4 with its way back: see `docs/layers.md`. Raises `InputError` for what does not
-    fit, and `DivergedError` when a particle is lost.
+    ``parameters`` are numbers or arrays for any parameters of `Problem` except initial values; parameters over time
+    have a row for each of these steps. Reverse mode uses the estimator ``gradient``, such as
+    `gradients.AdjointViscosity`, by default the exact adjoint; forward mode is exact. Exact derivatives of chained
+    steps are useful up to the horizon that `cortado gradients check` finds, some hundred steps. A chain warns if
+    adjoints grow by more than ten e-folds. A call adds 1.4 ms to its steps on a CPU, 3.4 ms with its backward pass: see
+    `docs/layers.md`. Raises `InputError` for unsuitable arguments, and `DivergedError` when a particle is lost.
 
-    ``simulation`` is whose steps these are.
+    ``simulation`` is the simulation that takes the steps.
 
     Example: ``end = step(simulation, state(simulation), {"viscosity": 0.1}, steps=5)``
     """
@@ -175,10 +177,10 @@ def rollout(
     record_every: int = 1,
     gradient: AdjointEstimator | None = None,
 ) -> dict[str, Any]:
-    """Return the states after every ``record_every`` of ``steps`` steps, the first one included, along a first axis
-    (frames, ...); see `step`.
+    """Take ``steps`` steps and return the first state and the state after every ``record_every`` steps, along a first
+    axis (frames, ...); see `step`.
 
-    The arguments besides are those of `step`: ``simulation``, ``given``, ``parameters`` and ``gradient``.
+    ``simulation``, ``given``, ``parameters`` and ``gradient`` are those of `step`.
 
     Example: ``states = rollout(simulation, state(simulation), steps=20, record_every=5)  # ["positions"]: (5, n, d)``
     """
@@ -207,11 +209,11 @@ def rollout(
 
 
 def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., Any]:
-    """Return the loss of a problem as a function ``loss(parameters, state=None)`` of arrays by name, whose result is an
-    array (), of a batch (batch,).
+    """Return the loss of a problem as a function ``loss(parameters, state=None)`` of arrays by name. Its result is an
+    array (), or (batch,) for a batch.
 
-    With a state the problem begins there. Reverse mode has the gradient that the estimator ``gradient`` gives,
-    `gradients.Exact` by default, with the bits of `Problem.value_and_gradient`.
+    With a state, the problem begins there. Reverse mode returns the gradient by the estimator ``gradient``, by default
+    `gradients.Exact`, with the same bits as `Problem.value_and_gradient`.
 
     Example::
 
@@ -221,20 +223,20 @@ def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None =
     layer = Value(problem, gradient)
 
     def loss(parameters: Table, given: Table | None = None) -> Any:
-        """Return the loss under these parameters, of the problem that begins at a state if one is given."""
+        """Return the loss for these parameters; if a state is given, the problem begins there."""
         return _applied(bridge, layer, given, parameters)[LOSS]
 
     return loss
 
 
 def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Callable[..., Any]:
-    """Return a sensor, such as one of `cortado.sensors`, or by its name a quantity of the particles, such as
-    "pressure", as a function ``reading(state, parameters=None)`` of arrays.
+    """Return a function ``reading(state, parameters=None)`` of arrays that reads a sensor, such as one of
+    `cortado.sensors`, or a quantity of the particles, such as "pressure".
 
-    It returns (k,), a number for each column of the sensor, or the quantity (n,) or (n, d). Parameters are those of the
-    step that begins at the state: the pressure is that step's. Raises `InputError` for a simulation that is a batch.
+    It returns (k,), a number for each column of the sensor, or the quantity (n,) or (n, d). ``parameters`` are those of
+    the step that begins at the state, in which the pressure is computed. Raises `InputError` for a batch.
 
-    ``what`` is the sensor or the name.
+    ``what`` is the sensor, or the name of the quantity.
 
     Example::
 
@@ -246,7 +248,7 @@ def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Calla
     layer = Measure(simulation, what)
 
     def reading(given: Table, parameters: Table | None = None) -> Any:
-        """Return the reading of a state; a pressure is that of the step that begins there."""
+        """Return the reading of a state; the pressure is computed in the step that begins there."""
         return _applied(bridge, layer, given, parameters)[READING]
 
     return reading
@@ -255,9 +257,9 @@ def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Calla
 def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> Any:
     """Return a picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of arrays.
 
-    ``positions`` (n, d) [m], ``fractions`` (n, phases), which may be left out with one phase, and ``colours``
-    (phases, 3), those of the renderer if left out. It passes through the host, and has derivatives in reverse mode
-    only. Raises `InputError` for what does not fit.
+    ``positions`` (n, d) [m]; ``fractions`` (n, phases), optional with one phase; ``colours`` (phases, 3), by default
+    the renderer's. Arrays pass through the host, and derivatives exist in reverse mode only. Raises `InputError` for
+    unsuitable arguments.
 
     Example: ``image = picture(simulation.renderer(resolution=(64, 48)), end["positions"])  # (48, 64, 3)``
     """
@@ -278,7 +280,7 @@ def _applied(bridge: Bridge, layer: Layer, given: Table | None, parameters: Tabl
 
 
 def table_of(what: str, given: Table | None) -> Table:
-    """Return a given table, an empty one if it was left out; raise `InputError` for anything but a table by names."""
+    """Return a given table, or an empty one for None; raise `InputError` for anything but a table by names."""
     found = {} if given is None else given
     likely = {"parameters": "{'gravity': array}", "weights": "{'bias': array}"}.get(what, "{'positions': array, ...}")
     require_table(what, found, likely)
@@ -289,13 +291,14 @@ def table_of(what: str, given: Table | None) -> Table:
 
 
 DISPLACED = "initial_positions"
-"""Name of the first positions, which ensembles scatter, among the weights of a sample."""
+"""Name of the first positions among the weights of a sample; ensembles perturb them."""
 CHECKPOINTS = 2**30
-"""Most bytes of states kept for the ways back of a batch of loops."""
+"""Greatest number of bytes of states stored for the backward passes of a batch of loops."""
 
 
 class Loop:
-    """A user's loss of weights and of a first state, as estimators know problems: many loops are one mapped call."""
+    """A user's loss of weights and a first state as a problem for estimators; many loops are computed by one mapped
+    call."""
 
     def __init__(
         self, bridge: Bridge, simulation: Simulation, loss: Callable[..., Any], begin: Mapping[str, Any] | None
@@ -315,15 +318,15 @@ class Loop:
         return float(self.at([parameters])[0][0])
 
     def forward_pass(self, parameters: Values) -> "OneLoop":
-        """Return the evaluation of one loop, which goes back by any estimator."""
+        """Return the forward pass of one loop, for a backward pass by any estimator."""
         return OneLoop(self, [parameters])
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """Return the number of loops worth one launch."""
+        """Return the number of loops that one launch should compute."""
         return self.simulation.room(1, CHECKPOINTS if estimator else 0.0)
 
     def together(self, points: Sequence[Values], estimator: AdjointEstimator | None = None) -> list[Estimate]:
-        """Return estimates of several loops in one launch; one whose loss is not finite has its error in it."""
+        """Return estimates of several loops from one launch; an estimate whose loss is not finite contains an error."""
         loops, gradient = LoopPass(self, points), dict[str, Any]()
         if estimator is not None:
             gradient = estimator.back(loops)
@@ -356,7 +359,7 @@ class Loop:
 
 
 class LoopPass:
-    """A forward run of several loops, as `ForwardPass` is one of a problem."""
+    """A forward run of several loops, like `ForwardPass` for a problem."""
 
     def __init__(self, loop: Loop, points: Sequence[Values]):
         self._loop, self._points = loop, points
@@ -364,13 +367,13 @@ class LoopPass:
 
     @property
     def loss(self) -> Any:
-        """Losses (k,), known from a way back if there was one."""
+        """Losses (k,), taken from the backward pass if there was one."""
         if self._losses is None:
             self._losses, _ = self._loop.at(self._points)
         return self._losses
 
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """Return the gradients (k, ...) by name, by an estimator; the loops run anew, as a layer's gradient does."""
+        """Return the gradients (k, ...) by name, by an estimator; the loops run again for this."""
         self._losses, gradient = self._loop.at(self._points, estimator, slope=True)
         return gradient
 
@@ -406,7 +409,8 @@ class Smoothed:
     def estimate(self, weights: Mapping[str, Any]) -> Estimate:
         """Return the loss at the weights and the smoothed gradient with its standard error, in NumPy arrays by name.
 
-        Raises `InputError` for weights that are no numbers, and for a name that ensembles use.
+        Raises `InputError` for weights that are no numbers, and for a weight with the reserved name
+        "initial_positions".
         """
         given = table_of("weights", weights)
         own = {name: self._bridge.numbers(f"weight {name}", array) for name, array in given.items()}
@@ -424,15 +428,15 @@ def smoothed(
 ) -> Smoothed:
     """Return the loss of a closed loop smoothed over an ensemble, as a function of ``weights``, arrays by name.
 
-    Its value is the mean of the loss, and its gradient the smoothed one; its method ``estimate(weights)`` returns both
-    in an `Estimate`, with the standard error. ``loss(weights, state, gradient)`` returns a number, and hands
-    ``gradient`` on to `step` or `rollout`. The ``estimator`` says how to smooth, over which spread of the weights, in
-    their units, and which scatter of first positions. `gradients.EnsembleMean` has the mean gradient of scattered
-    loops, whose sizes `gradients.Guided` corrects by differences of the loss. Loops run as batches, by `jax.vmap` in
-    programs that are compiled, or by `torch.vmap`. They begin at ``state``, the scene's first one if left out. Raises
-    `InputError` for what does not fit, and within a program that is compiled.
+    The function's value is the mean of the loss over the ensemble, its gradient the smoothed gradient. Its method
+    ``estimate(weights)`` returns an `Estimate` of both, with the standard error. You write ``loss(weights, state,
+    gradient)``; it returns a number and passes ``gradient`` on to `step` or `rollout`. The ``estimator`` sets the
+    spread of the weights, in their units, and the scatter of first positions: `gradients.EnsembleMean` averages
+    gradients, and `gradients.Guided` corrects their size by differences of the loss. Loops run in batches by
+    `jax.vmap`, compiled, or by `torch.vmap`. They begin at ``state``, by default the scene's first state. Raises
+    `InputError` for unsuitable arguments, and if called inside a compiled program.
 
-    ``simulation`` is what the loop controls.
+    ``simulation`` is the simulation that the loop controls.
 
     Example::
 

@@ -1,12 +1,11 @@
-"""Layers as functions of JAX's arrays: primitives with rules for both modes, for `jax.vmap` and for compiled programs.
+"""Layers as functions of JAX arrays: primitives with rules for both modes, for `jax.vmap` and for compiled programs.
 
-A layer is one primitive. Its rule of forward mode applies it with the number of its residual as a further result, and
-then a second primitive, the tangent, which is linear in tangents. The transpose of the tangent is a third primitive,
-the adjoint. So `jax.jvp` and `jax.grad` come from the same rules, and both are linear functions that JAX may transpose
-again.
+A layer is one primitive. Its forward-mode rule calls the layer, which then also returns its residual's number, and a
+second primitive, the tangent, which is linear in tangents. The tangent's transpose is a third primitive, the adjoint.
+So `jax.jvp` and `jax.grad` use the same rules, and JAX can transpose both again.
 
-As a program of JAX holds arrays alone, the residual itself waits in `RESIDUALS`, to be found by a ticket, which is one.
-Compiled programs call Python by Warp's foreign functions: on the memory of the program and, on a GPU, in its stream.
+JAX programs contain arrays only, so the residual is stored in `RESIDUALS` and found by a ticket, which is an array.
+Compiled programs call Python by Warp's foreign functions, which use the program's memory and, on a GPU, its stream.
 """
 
 import inspect
@@ -42,19 +41,19 @@ except ModuleNotFoundError as error:
 
 SECOND = "A second derivative is asked for, but there are first ones only: differentiate once."
 MOST_KEPT = 2**30
-"""Most bytes of residuals that wait for a derivative; older ones are computed again when they are needed."""
+"""Greatest number of bytes of stored residuals; older residuals are computed again when they are needed."""
 TICKET = 2
-"""Whole numbers of a ticket: the number of the residual, and that of an entry, where a layer is mapped over several."""
+"""Number of integers in a ticket: the residual's number, and the entry's number if the layer is mapped."""
 LONGER = 64
-"""Most foreign functions that are kept although their programs are gone."""
+"""Greatest number of foreign functions kept after their programs have ended."""
 Kept = tuple[Layer, int | None, Any]
-"""A layer, over how many entries it is mapped, None if it is not, and its residual."""
+"""A layer, its number of mapped entries (None if it is not mapped), and its residual."""
 Names = tuple[str, ...]
 Sizes = tuple[int, ...]
-"""Over how many entries a layer is mapped, along one axis after the other."""
+"""Numbers of entries over which a layer is mapped, axis by axis."""
 Arrays = Sequence[Any]
 Way = Literal["push", "pull"]
-"""The methods of a layer that are its derivatives, in forward and in reverse mode."""
+"""Names of the methods of a layer for its derivatives, in forward and in reverse mode."""
 
 
 class Residuals:
@@ -77,7 +76,7 @@ class Residuals:
             return number
 
     def get(self, number: int, last: bool) -> Kept | None:
-        """Return a residual by its number, and forget it for the ``last`` caller; None if it is gone."""
+        """Return a residual by its number, or None if it was discarded; remove it if this is the ``last`` call."""
         with self._lock:
             return self._kept.pop(number, None) if last else self._kept.get(number)
 
@@ -98,11 +97,11 @@ def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tup
 def derivative(
     way: Way, layer: Layer, entries: int | None, tickets: NDArray[np.int32], given: Named, others: Named
 ) -> Named:
-    """Push tangents ``others`` of the arrays ``given`` to a layer forward, or pull adjoints of its results back, with
-    the residual that the tickets stand for.
+    """Compute a layer's derivative: push tangents ``others`` of the arrays ``given`` forward, or pull adjoints of its
+    results back. The tickets name the residual.
 
-    JAX may have mapped the derivative over ``entries`` entries. If it mapped the layer over fewer or none, there are
-    several derivatives of each application, such as directions."""
+    JAX may have mapped the derivative over ``entries`` entries. If it mapped the layer over fewer entries, or not at
+    all, several derivatives belong to each call of the layer, such as several directions."""
     numbers, places = tickets.reshape(-1, TICKET).T
     last = way == "pull"
     kept = RESIDUALS.get(int(numbers[0]), last) if (numbers == numbers[0]).all() else None
@@ -144,13 +143,13 @@ def _results(*avals: Any, layer: Layer, sizes: Sizes, keep: bool = False, **othe
 
 
 def _of_given(number: Any, *avals: Any, names: Names, along: Names, **others: Any) -> list[Any]:
-    """Return the shapes and types, as JAX traces them, of those given arrays that ``along`` names."""
+    """Return the traced shapes and types of the given arrays that ``along`` names."""
     each = dict(zip(names, avals, strict=False))
     return [jax.core.ShapedArray(each[name].shape, each[name].dtype) for name in along]
 
 
 def _primitive(name: str, run: Callable[..., list[Array]], results: Callable[..., list[Any]]) -> Any:
-    """Make a JAX primitive that runs a function of arrays, with one axis for all mapped ones."""
+    """Make a JAX primitive that runs a function of arrays; all mapped arrays have one mapped axis."""
     made = Primitive(f"cortado_{name}")
     made.multiple_results = True
     made.def_abstract_eval(results)
@@ -209,14 +208,14 @@ def _evaluate_forward(arrays: Arrays, dots: Arrays, *, keep: bool, **options: An
 def _transposed(
     transpose: Any, bars: Arrays, number: Any, *given: Any, names: Names, along: Names, **options: Any
 ) -> list[Any]:
-    """Apply the rule of reverse mode of a linear primitive, whose first arrays have no derivative: its transpose."""
+    """Apply the reverse-mode rule, the transpose, of a linear primitive whose first arrays have no derivative."""
     own = [ad.instantiate_zeros(bar) for bar in bars]
     found = transpose.bind(number, *given[: len(names)], *own, names=names, along=along, **options)
     return [None] * (1 + len(names)) + list(found)
 
 
 def _linear_forward(primitive: Any, given: Arrays, dots: Arrays, *, names: Names, **options: Any) -> tuple[Any, Any]:
-    """Apply the rule of forward mode of a linear primitive, whose first arrays have no derivative."""
+    """Apply the forward-mode rule of a linear primitive whose first arrays have no derivative."""
     fixed = 1 + len(names)
     if any(type(dot) is not ad.Zero for dot in dots[1:fixed]):
         raise InputError(SECOND)
@@ -234,7 +233,7 @@ for _one, _other in ((push_p, pull_p), (pull_p, push_p)):
 
 
 class JaxBridge(Bridge):
-    """The functions of JAX that calls of layers need."""
+    """The functions of JAX that layers call."""
 
     stack = staticmethod(jnp.stack)
 
@@ -276,11 +275,11 @@ class JaxBridge(Bridge):
         return {name: jnp.concatenate([state[name][None], own]) for name, own in found.items()}
 
     def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
-        """Map the loss, or it with its gradient, by `jax.vmap` in a compiled program."""
+        """Map the loss, or the loss and its gradient, by `jax.vmap` in a compiled program."""
         return jax.jit(jax.vmap(jax.value_and_grad(loss) if slope else lambda *given: (loss(*given), {})))
 
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return the value with the gradient, by a rule of JAX; outside of compiled programs alone."""
+        """Return the value with a given gradient, by a custom JAX rule; only outside compiled programs."""
 
         def forward(given: Any) -> tuple[Any, Any]:
             if any(isinstance(array, jax.core.Tracer) for array in given.values()):
@@ -294,7 +293,7 @@ class JaxBridge(Bridge):
 
 
 def _array(array: Any) -> Array:
-    """Return a JAX array as a NumPy or Warp array in its memory."""
+    """Return a JAX array as a NumPy or Warp array that shares its memory."""
     if not isinstance(array, jax.Array) or next(iter(array.devices())).platform == "cpu":
         return np.asarray(array)
     return wp.from_dlpack(array.reshape(array.shape or (1,)))
@@ -309,8 +308,8 @@ def _jax_array(found: Array, wanted: Any) -> Any:
 
 
 class ForeignFunction:
-    """A Python function of arrays that a compiled program calls. It lives some time longer than the program: JAX lets
-    go of a program that still runs."""
+    """A Python function of arrays that a compiled program calls. It is kept for some time after the program, because
+    JAX may release a program that is still running."""
 
     def __init__(self, function: Callable[[list[Array]], Sequence[Array]]):
         self._number = next(_NUMBERS)
@@ -319,8 +318,8 @@ class ForeignFunction:
 
     @WARP
     def __call__(self, *arrays: Any, shapes: Sequence[Sizes], results: Sequence[Any]) -> list[Any]:
-        """Call the function within a function that JAX traces; ``shapes`` are those of its results, ``results`` have
-        the shapes and types in which JAX is to have them."""
+        """Call the function within a function that JAX traces. ``shapes`` are its results' shapes; ``results`` are the
+        shapes and types that JAX receives."""
         given = [array.reshape(array.shape or (1,)) for array in arrays]
         dims = {f"out_{k}": shape or (1,) for k, shape in enumerate(shapes)}
         kinds = tuple((array.ndim, str(array.dtype)) for array in given)
@@ -372,14 +371,14 @@ def _callable(given: tuple[tuple[int, str], ...], made: tuple[tuple[int, str], .
 
 
 def _print(*words: Any, **options: Any) -> None:
-    """Print for Warp's foreign functions the traceback of each error, but for errors of ours: JAX raises them with
-    their sentence, and their traceback says nothing more. Warp has no setting for it."""
+    """Replace Warp's printing of tracebacks in foreign functions: Cortado's errors are not printed, because JAX raises
+    them with their sentence. Warp has no setting for this."""
     if not isinstance(sys.exc_info()[1], CortadoError):
         print(*words, **options)
 
 
 def _in_order(device: Any) -> AbstractContextManager[Any]:
-    """Return a context in a GPU stream of ours, after and before the work of the program's stream."""
+    """Return a context that runs in our own GPU stream, after earlier and before later work of the program's stream."""
     return nullcontext() if device.is_cpu else wp.ScopedStream(_stream(device.alias), sync_enter=True, sync_exit=True)
 
 

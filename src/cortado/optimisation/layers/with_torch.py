@@ -1,4 +1,4 @@
-"""Layers as functions of PyTorch's tensors: both modes of its automatic differentiation, and `torch.vmap`."""
+"""Layers as functions of PyTorch tensors, with forward and reverse mode and `torch.vmap`."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -34,10 +34,10 @@ class Call:
     names: tuple[str, ...]
     """Names of its tensors, in their order."""
     keep: bool
-    """True where derivatives are likely to be asked for."""
+    """True if derivatives are likely to be needed."""
     residual: Any = None
     many: "Call | None" = field(default=None, repr=False)
-    """The mapped application to several of each tensor that `torch.vmap` has made."""
+    """The application to several tensors of each name, made by `torch.vmap`."""
 
     def evaluate(self, tensors: Tensors, keep: bool) -> Tensors:
         """Evaluate the layer, and return its results as tensors."""
@@ -46,7 +46,7 @@ class Call:
             return _tensors(self.layer, found, self.layer.outputs())
 
     def kept(self, tensors: Tensors) -> Any:
-        """Return the residual for derivatives, which is computed now if nobody asked for it before."""
+        """Return the residual for derivatives; it is computed on the first call."""
         if self.residual is None:
             self.evaluate(tensors, keep=True)
         return self.residual
@@ -103,8 +103,8 @@ class Evaluate(torch.autograd.Function):
 
 
 class _Linear(torch.autograd.Function):
-    """A derivative of a layer as a function of PyTorch, without derivatives of its own. It is given the layer's
-    tensors, followed by adjoints or tangents."""
+    """A derivative of a layer as a PyTorch function without second derivatives. Its inputs are the layer's tensors,
+    followed by adjoints or tangents."""
 
     @staticmethod
     def of(call: Call, tensors: Tensors, given: Tensors) -> Tensors:
@@ -162,7 +162,7 @@ for _one in (Pull, Push):
 
 
 class TorchBridge(Bridge):
-    """The functions of PyTorch that calls of layers need."""
+    """The functions of PyTorch that layers call."""
 
     stack = staticmethod(torch.stack)
 
@@ -193,14 +193,14 @@ class TorchBridge(Bridge):
         return {name: own.clone() for name, own in zip(shapes, _tensors(layer, found, shapes), strict=True)}
 
     def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
-        """Map the loss, or it with its gradient, by `torch.vmap`."""
+        """Map the loss, or the loss and its gradient, by `torch.vmap`."""
         if not slope:
             return torch.vmap(lambda *given: (loss(*given), {}))
         mapped = torch.vmap(torch.func.grad_and_value(loss))
         return lambda *given: mapped(*given)[::-1]
 
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return the value with the gradient, by terms that are 0."""
+        """Return the value with a given gradient, by adding terms that are 0 and have this gradient."""
         value, gradient = found(weights)
         own = {name: array for name, array in weights.items() if isinstance(array, torch.Tensor)}
         moved = (((array - array.detach()) * array.new_tensor(gradient[name])).sum() for name, array in own.items())
@@ -233,7 +233,7 @@ def _in_order(device: Any) -> Iterator[None]:
 
 
 def _arrays(names: Any, tensors: Tensors) -> dict[str, Array]:
-    """Return tensors, but those that are left out, as arrays in their memory, by name."""
+    """Return tensors by name as arrays that share their memory, without the tensors left out."""
     each = zip(names, tensors, strict=True)
     return {name: _array(tensor) for name, tensor in each if tensor is not None}
 
@@ -244,7 +244,7 @@ def _array(tensor: Any) -> Array:
 
 
 def _tensors(layer: Layer, found: Named, shapes: dict[str, tuple[int, ...]]) -> Tensors:
-    """Return a layer's results as tensors; arrays that may be elsewhere than on its device go to the host."""
+    """Return a layer's results as tensors; arrays that need not be on its device are copied to the host."""
     real, device = _dtype(layer), _device(layer)
     each = ((found[name], shape, device if name in layer.on_device else "cpu") for name, shape in shapes.items())
     return tuple(_tensor(array, shape, real, place) for array, shape, place in each)
@@ -258,7 +258,7 @@ def _tensor(array: Array, shape: Sequence[int], dtype: Any, device: Any) -> Any:
 
 
 def _in_front(tensors: Tensors, dims: Sequence[int | None], size: int) -> Tensors:
-    """Return tensors with the axis that they are mapped over in front."""
+    """Return tensors with the mapped axis moved to the front."""
     each = zip(tensors, dims, strict=True)
     return tuple(
         None if tensor is None else tensor.movedim(dim, 0) if dim is not None else tensor.expand(size, *tensor.shape)
