@@ -1,4 +1,4 @@
-"""The files of a data set: single runs while it is made or grows, then one file for each purpose, and the metadata."""
+"""The files of a data set: one file per run while runs are added, then one file for each purpose, and the metadata."""
 
 import io
 import json
@@ -19,18 +19,19 @@ from cortado.scene.scene import Scene
 from cortado.version import __version__
 
 METADATA, PARTS, PURPOSES = "metadata.json", "runs", ("train", "valid", "test")
-"""Names of the file that is written last, of the folder that has new runs until then, and of the purposes."""
+"""Names of the metadata file, which is written last, of the folder with new runs until then, and of the purposes."""
 REACH = 1.6
-"""In spacings: the connectivity radius of a learned simulator. Fluid at rest is up to 1.5 from the wall beside it."""
+"""Connectivity radius of a learned simulator [spacings]. Fluid at rest is up to 1.5 spacings from the nearest wall
+particle."""
 SPARE = 1.02
-"""Free space on the disk that is asked for, relative to the size of the runs that are put together."""
+"""Free disk space needed to assemble runs, relative to the size of these runs."""
 NO_SPREAD = 1e-7
-"""Standard deviation [m] below which LagrangeBench takes values for all the same."""
+"""Standard deviation [m] below which LagrangeBench treats all values as equal."""
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run that is in a file: its group there, and its statistics."""
+    """A run stored in a file: its group in the file, and its statistics."""
 
     file: Path
     group: str
@@ -38,13 +39,14 @@ class FinishedRun:
 
 
 class DatasetFolder:
-    """The folder of a data set, and what of it was there when it was first asked for."""
+    """The folder of a data set; the content of its files is read once and kept."""
 
     def __init__(self, out: Path):
         self.out, self.parts = out, out / PARTS
 
     def save(self, number: int, run: OneRun) -> None:
-        """Write a run to a file of its own, whole or not at all; HDF5 does it in memory, as a full disk may kill it."""
+        """Write a run to its own file, completely or not at all. HDF5 writes to memory first, because a full disk may
+        crash it."""
         import h5py
 
         content = io.BytesIO()
@@ -55,7 +57,7 @@ class DatasetFolder:
         self._write(f"{number:05d}.h5", content.getvalue())
 
     def save_failure(self, number: int, why: str) -> None:
-        """Note that a run failed, and why."""
+        """Store the reason why a run failed."""
         self._write(f"{number:05d}.json", json.dumps({"failure": why}))
 
     def _write(self, name: str, content: str | bytes) -> None:
@@ -69,7 +71,7 @@ class DatasetFolder:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """The metadata; empty where they are damaged or not written yet."""
+        """The metadata; empty if they are damaged or not written yet."""
         try:
             return dict(parsed_json((self.out / METADATA).read_bytes()))
         except (OSError, ValueError, TypeError):
@@ -77,7 +79,7 @@ class DatasetFolder:
 
     @property
     def runs(self) -> dict[int, FinishedRun]:
-        """The finished runs by their numbers. Of one that is in two files, the second is that for its purpose."""
+        """The finished runs by number. For a run in two files, the file for its purpose counts."""
         return self._read[0]
 
     @property
@@ -111,14 +113,14 @@ class DatasetFolder:
 
     @property
     def size(self) -> int:
-        """Return how many runs the files for all purposes were made of, failed ones too."""
+        """Return the number of runs from which the files for all purposes were made, including failed runs."""
         numbers = [number for number, run in self.runs.items() if run.file.parent == self.out]
         return max([int(self.metadata.get("runs", 0)), *(number + 1 for number in numbers)])
 
     def assemble(self, split: Mapping[str, Sequence[int]]) -> None:
-        """Write the files of those purposes of ``split`` that lack a run of its numbers, in their order. Runs that were
-        there are copied, byte for byte. All files are written before one is replaced. Raises `ComputationError` where
-        the disk has no room, and leaves all as it was."""
+        """Write the file of each purpose in ``split`` whose runs are not exactly the wanted ones, in order. Existing
+        runs are copied byte for byte. All new files are complete before the first old one is replaced. If the disk is
+        full, raises `ComputationError` and changes nothing."""
         stale = {purpose: numbers for purpose, numbers in split.items() if not self._has(purpose, numbers)}
         sources = {self.runs[number].file for numbers in stale.values() for number in numbers}
         temporaries = {self.path(purpose): unfinished(self.path(purpose)) for purpose in stale}
@@ -139,7 +141,7 @@ class DatasetFolder:
                     temporary.unlink(missing_ok=True)
 
     def _has(self, purpose: str, numbers: Sequence[int]) -> bool:
-        """Test whether the file for a purpose has the runs of these numbers alone, in their order."""
+        """Test whether the file for a purpose contains exactly the runs with these numbers, in order."""
         path = self.path(purpose)
         there = {number: run.group for number, run in self.runs.items() if run.file == path}
         whole = path.exists() and path not in self.damaged
@@ -161,7 +163,8 @@ class DatasetFolder:
             ) from problem
 
     def write_metadata(self, content: Mapping[str, Any]) -> None:
-        """Write the metadata, which mark a data set as complete, and remove single runs that are in its files."""
+        """Write the metadata, which mark a data set as complete, and remove the single files of runs that its files
+        contain."""
         write_atomically(self.out / METADATA, json.dumps(content, indent=2) + "\n")
         shutil.rmtree(self.parts, ignore_errors=True)
 
@@ -169,8 +172,8 @@ class DatasetFolder:
 def metadata(
     scene: Scene, table: DatasetTable, split: Mapping[str, Sequence[int]], folder: DatasetFolder, runs: int
 ) -> dict[str, Any]:
-    """Return the metadata that LagrangeBench reads of a data set, its origin, and which of its runs failed; ``split``
-    has the others for each purpose."""
+    """Return the metadata of a data set for LagrangeBench, with its origin and its failed runs; ``split`` has the other
+    runs for each purpose."""
     frames, (origin, size, periods) = table.steps // table.write_every + 1, bounds_of(scene)
     every = [folder.runs[number].statistics for own in split.values() for number in own]
     train = [folder.runs[number].statistics for number in split["train"]]
@@ -204,8 +207,8 @@ def metadata(
 
 
 def _moments(train: Sequence[Mapping[str, Any]], name: str) -> dict[str, list[float]]:
-    """Return the mean and the standard deviation (d,) of a statistic over all training runs; it is divided by, so 1
-    stands where it is 0, as in LagrangeBench."""
+    """Return the mean and the standard deviation (d,) of a statistic over all training runs. A standard deviation of 0
+    is replaced by 1, as in LagrangeBench, because it is a divisor."""
     counts, sums, squares = (np.sum([np.asarray(one[name][k]) for one in train], axis=0) for k in range(3))
     mean = sums / np.maximum(counts, 1)
     std = np.sqrt(np.maximum(squares / np.maximum(counts, 1) - mean**2, 0.0))

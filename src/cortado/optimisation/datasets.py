@@ -1,4 +1,5 @@
-"""Data sets of runs with varied scenes, for learned simulators: the table [dataset], one run, and the files of all."""
+"""Data sets of runs with varied scenes, for learned simulators: the table [dataset], the random values and the arrays
+of one run."""
 
 import json
 from collections.abc import Mapping
@@ -25,7 +26,7 @@ PAIR = "a lower and an upper end of the same shape, each a number or a list of n
 
 
 def _ranges(given: Any) -> Any:
-    """Check ranges by the names of values, and return the lower and upper ends of each as lists of floats."""
+    """Check ranges by key, and return the lower and upper end of each as lists of floats."""
     if not isinstance(given, Mapping):
         raise field_error((), given, "a table of ranges by the keys of values")
     found = {}
@@ -96,8 +97,8 @@ class DatasetTable(Table):
         return self
 
     def split(self, runs: int) -> dict[str, list[int]]:
-        """Return the numbers of the runs for each purpose. The first runs go one to each purpose, and every further one
-        to that which lacks most, so that the purpose of a run does not depend on how many there are."""
+        """Return the numbers of the runs for each purpose. The first runs go to one purpose each, and every further run
+        to the purpose with the greatest shortage. So the purpose of a run does not depend on the number of runs."""
         parts = {"train": 1.0 - self.valid - self.test, "valid": self.valid, "test": self.test}
         found: dict[str, list[int]] = {purpose: [] for purpose in parts}
         for number in range(runs):
@@ -111,21 +112,21 @@ class DatasetTable(Table):
 
 
 class DatasetTables(Table):
-    """The table [dataset] that a file of a data set has besides those of its scene."""
+    """The table [dataset] of a data set's file; all other tables are the scene's."""
 
     dataset: DatasetTable
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Random values for one run of a data set, drawn from the seed of its table and the number of the run alone."""
+    """Random values for one run of a data set; they depend on the table's seed and the run's number alone."""
 
     table: DatasetTable
     number: int
 
     @cached_property
     def values(self) -> dict[str, Any]:
-        """Return random values of the scene's keys that are varied, in the order of the table."""
+        """Return random values of the varied scene keys, in the order of the table."""
         random = self._random(0)
         found = {}
         for key, (lower, upper) in self.table.vary.items():
@@ -143,7 +144,7 @@ class Sample:
         return [f"{key}={json.dumps(value)}" for key, value in self.values.items()]
 
     def start(self, positions: np.ndarray, velocities: np.ndarray, spacing: float) -> dict[str, np.ndarray]:
-        """Return noisy first positions [m] and velocities [m/s] (n, d) by name; one without noise is left out."""
+        """Return noisy first positions [m] and velocities [m/s] (n, d) by name; an array without noise is left out."""
         random, found = self._random(1), {}
         for name, array, size in (
             ("initial_positions", positions, self.table.position_noise * spacing),
@@ -155,7 +156,7 @@ class Sample:
         return found
 
     def direction(self, which: int, shape: tuple[int, ...], sizes: tuple[float, float]) -> dict[str, np.ndarray]:
-        """Return a random direction of the first state by name: normal numbers times a size of positions [m] and of
+        """Return a random direction of the first state by name: normal numbers times a size for positions [m] and for
         velocities [m/s]."""
         random = self._random(2, which)
         names = ("initial_positions", "initial_velocities")
@@ -166,27 +167,28 @@ class Sample:
 
 
 FLUID, WALL, MOVING_WALL, BODY, MORE_FLUID, KINDS = 0, 1, 2, 3, 4, 9
-"""Types of particles in LagrangeBench: fluid, walls, walls with a given motion, and bodies that move freely; the first
-number that it leaves free, for further phases; and how many types it has."""
+"""Particle types of LagrangeBench: fluid, walls, walls with a given motion, free bodies. Then the first unused number,
+for further phases, and the number of types."""
 MARGIN = 3
-"""Spacings from the closed sides of the container to the bounds, as in LagrangeBench's own sets. No wall particle is as
-deep, and none sees one on the other side of the bounds, which LagrangeBench takes as periodic if one axis is."""
+"""Distance from the container's closed sides to the bounds [spacings], as in LagrangeBench's own sets. All wall
+particles lie within the bounds. If one axis is periodic, LagrangeBench treats all as periodic; the margin keeps
+opposite walls from interacting."""
 
 
 @dataclass(frozen=True)
 class OneRun:
-    """The arrays and statistics of a run that a data set keeps."""
+    """The arrays and statistics of one run in a data set."""
 
     arrays: dict[str, np.ndarray]
     """Arrays by their names in the file."""
     statistics: dict[str, Any]
-    """Statistics of the fluid: count, sum and sum of squares of each component of velocities and accelerations, in
-    metres a frame; the upper ends of all positions; and the number of particles with walls."""
+    """Statistics of the fluid: count, sum and sum of squares of each component of velocities and accelerations [m per
+    frame]. Also the upper ends of all positions, and the number of particles including walls."""
 
 
 def one_run(simulation: Simulation, sample: Sample) -> OneRun:
-    """Run a simulation from a sample's start, and differentiate it along random directions; raises `DivergedError` or
-    `InputError`."""
+    """Run a simulation from a sample's start and compute its derivatives along random directions; raises
+    `DivergedError` or `InputError`."""
     table, scene = sample.table, simulation.scene
     start = sample.start(simulation.positions, simulation.velocities, scene.discretisation.spacing)
     trajectory = simulation.run(table.steps, start, record_every=table.write_every)
@@ -211,9 +213,9 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
 
 
 def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where the bounds of a data set begin in the scene, how long they are, and the periods of its axes, 0 of
-    those without one, each (d,) [m]. Walls are within; raises `InputError` without a container, and where particles
-    rest far outside of it before they come in or once they are out."""
+    """Return the lower corner of a data set's bounds, their lengths, and the periods of its axes (0 if not periodic),
+    each (d,) [m]. Walls lie within the bounds. Raises `InputError` without a container, and if particles wait far
+    outside it before they enter or after they leave."""
     ends, (_, periods) = scene.container.extent(), scene.periods
     if ends is None:
         raise InputError("container.shape is 'none', but must be 'box' or 'cylinder', as a data set has bounds.")
@@ -231,7 +233,7 @@ def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions (frames, b, d) [m] of wall particles and their types (b,), both empty for no frames."""
+    """Return the positions (frames, b, d) [m] of wall particles and their types (b,); both are empty without frames."""
     places = np.repeat(np.asarray(simulation.walls, dtype=np.float64)[None], frames, axis=0)
     kinds = np.full(len(simulation.walls) if frames else 0, WALL)
     numbers = wall_numbers(simulation.scene.solid)
@@ -246,8 +248,8 @@ def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: i
 
 
 def _ends(places: np.ndarray) -> dict[str, list[float]]:
-    """Return the upper ends (d,) [m] of positions within the bounds (frames, n, d); raise `InputError` if one is below
-    their lower ends."""
+    """Return the upper ends (d,) [m] of positions (frames, n, d) relative to the bounds; raise `InputError` if a
+    position is below the lower bounds."""
     if places.min() < 0.0:
         frame, particle, axis = np.unravel_index(places.argmin(), places.shape)
         raise InputError(
@@ -258,7 +260,8 @@ def _ends(places: np.ndarray) -> dict[str, list[float]]:
 
 
 def _statistics(positions: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
-    """Return statistics of differences of positions (frames, n, d), the shorter way around, for LagrangeBench."""
+    """Return statistics for LagrangeBench of differences of positions (frames, n, d), between nearest periodic
+    images."""
     moved = np.diff(positions, axis=0)
     moved -= periods * np.round(moved / np.where(periods > 0.0, periods, 1.0))
     found: dict[str, Any] = {}

@@ -1,6 +1,7 @@
-"""The problem of a search as the function of one vector that an optimiser sees, and what gradients promised of steps.
+"""The problem of a search as a function of the optimiser's vector, and a test if gradients predict the change of the
+loss.
 
-It replays the log of a former run, and then computes.
+The function first replays the log of an earlier run, and then computes.
 """
 
 import math
@@ -25,36 +26,37 @@ from cortado.scene.parameter_values import Values
 Parameters = dict[str, Any]
 """Parameters by name: a float where the user gave a number, otherwise a float64 array of the given shape."""
 GREATEST_GRADIENT = 1e150
-"""Components beyond it are refused like infinite ones: their squares, which optimisers take, overflow."""
+"""Larger gradient components raise the error for infinite ones, because their squares, which optimisers compute,
+overflow."""
 MOST_NAMED = 6
-"""Numbers of all parameters that a sentence names at most."""
+"""Greatest number of parameter values in a sentence."""
 REFUSED = (DivergedError, InputError)
-"""A trial with one of these is infinitely bad: the start had none, so the search has gone too far."""
+"""Errors after which a trial has an infinite loss. The start raised no error, so the trial step was too long."""
 WRONG = 10.0
-"""A step contradicts its gradients if it changed the loss by less than the smaller promise of both its ends over this,
-or by more than the greater one times this."""
+"""A step contradicts its gradients if the loss changed by less than the smaller prediction of its two ends divided by
+this, or by more than the greater one times this."""
 FELT = 0.01
-"""Of the range of all losses: smaller promises tell little, if the loss has not changed by more."""
+"""A step with both predictions and change below this part of the range of all losses is not tested."""
 ROUND_OFF = 1e-5
-"""Of the greatest loss: smaller promises tell nothing, as losses of runs in float32 are not as precise."""
+"""Predictions below this part of the greatest loss are not tested, because float32 losses are not precise enough."""
 MISLED = 0.25
-"""Share of the telling steps that must contradict, and at least `FEW` of them must. In searches of 30 to 400 steps of a
-splash the share was 0 within the horizon, and 0.3 to 0.9 beyond it."""
+"""A search is misled if at least this share of the tested steps, and at least `FEW` of them, contradict their
+gradients. In searches of 30 to 400 steps of a splash the share was 0 within the horizon, and 0.3 to 0.9 beyond it."""
 FEW = 2
 STAYED = 1.0 / 3.0
-"""Share of the evaluations, the last ones, by which the loss has fallen by less than `FELT` where it stays."""
+"""The loss stays if it falls by less than `FELT` over this last share of the evaluations."""
 LEAST = 8
-"""Evaluations from which on a loss may be said to stay."""
+"""Least number of evaluations after which a loss may count as staying."""
 
 
 class Optimisable(Protocol):
     """A problem that can be optimised. It may have an attribute `fingerprint`, a text that identifies it.
 
-    The fingerprint is kept in the checkpoint, so that the run of one problem is not resumed with another.
+    The checkpoint stores the fingerprint, so that a search cannot be resumed with another problem.
     """
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
-        """Return the loss, and its gradient by the names and in the shapes of the parameters."""
+        """Return the loss and its gradient, a table with the parameters' names and shapes."""
 
 
 def loss_and_gradient(returned: Any) -> tuple[Any, Mapping[str, Any]]:
@@ -80,19 +82,19 @@ class Record:
     iteration: int
     """Index of the evaluation, from 0; with Adam and gradient descent also the number of updates before it."""
     updates: int
-    """Number of updates before it; fewer than the evaluations where a line search evaluates several times an update."""
+    """Number of updates before this evaluation; a line search may evaluate several times per update."""
     loss: float
     gradient_norm: float
     """Euclidean norm of the gradient over all parameters."""
     parameters: Parameters
     """Parameters at which the loss was evaluated."""
     replayed: bool
-    """True where it was read from the checkpoint."""
+    """True if the evaluation was read from the checkpoint."""
     refused: int = 0
-    """Evaluations before it that have no run, as it diverged or a parameter was out of its range; the steps to them
-    were refused."""
+    """Number of refused steps before this evaluation: the run at their end diverged, or a parameter was out of its
+    range."""
     left_out: int = 0
-    """Runs that averages over ensembles have left out so far, for the same reasons; replayed ones are not known."""
+    """Number of runs that ensemble averages left out so far for the same reasons, without replayed evaluations."""
 
     def __repr__(self) -> str:
         return f"Record(iteration {self.iteration}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g})"
@@ -100,16 +102,17 @@ class Record:
 
 @dataclass
 class Promises:
-    """A test of a search's gradients against its steps, from each evaluation and the step to it from the one before.
+    """A test of a search's gradients: compares the predicted with the real change of the loss, from each evaluation to
+    the next.
 
-    The slopes of the loss along a step, at both of its ends, bound its change unless the slope has an extremum in
-    between. A loss that is as smooth as the steps are long keeps near to them. Steps along which the slope changes its
-    sign tell nothing, as they may cross a valley.
+    The slopes at both ends of a step bound the loss's change, unless the slope has an extremum in between. The change
+    of a loss that is smooth over a step's length is near these bounds. Steps along which the slope changes sign are not
+    tested, because they may cross a minimum.
     """
 
     losses: list[float] = field(default_factory=list)
     steps: list[tuple[float, float, float]] = field(default_factory=list, repr=False)
-    """Of each step the change of the loss by the slope at its first end, by that at its last, and the change."""
+    """For each step: the change predicted by the slope at its start, that predicted at its end, and the real change."""
     _last: LoggedEvaluation | None = field(default=None, repr=False)
     _best: LoggedEvaluation | None = field(default=None, repr=False)
 
@@ -126,7 +129,7 @@ class Promises:
             self._best = evaluation
 
     def held(self, lower: Vector, upper: Vector, layout: ParameterLayout) -> str:
-        """Return a sentence that names parameters whose bounds keep the loss from falling further; else empty."""
+        """Return a sentence that names parameters at bounds that prevent a lower loss; empty if there are none."""
         if self._best is None:
             return ""
         best, gradient = self._best.parameters, self._best.gradient
@@ -137,7 +140,7 @@ class Promises:
 
     @property
     def kept(self) -> tuple[int, int]:
-        """Return the numbers of steps that contradict their gradients, and of steps that tell anything."""
+        """Return the number of steps that contradict their gradients, and the number of tested steps."""
         first, last, change = np.array(self.steps or np.zeros((0, 3))).T
         least, most = np.minimum(np.abs(first), np.abs(last)), np.maximum(np.abs(first), np.abs(last))
         felt = max(FELT * (max(self.losses) - min(self.losses)), ROUND_OFF * max(map(abs, self.losses)))
@@ -153,7 +156,7 @@ class Promises:
         return broken >= max(FEW, MISLED * told)
 
     def stays(self, converged: bool) -> bool:
-        """Return True if the loss has stopped to fall while it is still a good part of the first one."""
+        """Return True if the loss has stopped falling while it is still a large part of the first one."""
         best, before = min(self.losses), min(self.losses[: -max(int(STAYED * len(self.losses)), 1)], default=np.inf)
         stopped = len(self.losses) >= LEAST and before - best < FELT * abs(best)
         return best > FELT * self.losses[0] and (converged or stopped)
@@ -189,27 +192,27 @@ class Promises:
 
 @dataclass(frozen=True)
 class Doubt:
-    """A judgement on a search, with sentences about why its result may not be trusted."""
+    """The verdict on a search, with sentences about reasons not to trust its result."""
 
     misled: bool
-    """True where its gradient disagreed with its steps, and the search did not go by the gradient's direction alone."""
+    """True if the gradient disagreed with the steps, and the search used more than the gradient's direction."""
     stays: bool
-    """True where its loss has stopped to fall while it is still a good part of the first one."""
+    """True if the loss has stopped falling while it is still a large part of the first one."""
     words: str
     """Sentences of doubt with advice; empty without doubts."""
 
 
 @dataclass
 class CountedEnsemble:
-    """An `Ensemble` for a search that asks for one gradient after another: it counts the runs that averages leave out,
-    and warns the first time alone."""
+    """An `Ensemble` for the many gradients of a search: it counts the runs that averages leave out, and warns only the
+    first time."""
 
     ensemble: Any
     left_out: int = 0
     """Number of runs left out over all estimates."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the estimate of the ensemble, and count the runs that it left out."""
+        """Return the estimate of the ensemble, and count the runs left out of it."""
         with warnings.catch_warnings():
             if self.left_out:
                 warnings.simplefilter("ignore", LeftOutWarning)
@@ -220,7 +223,7 @@ class CountedEnsemble:
 
 @dataclass
 class Evaluator:
-    """The function of one vector that an optimiser sees; it replays the log, then computes and adds to the log."""
+    """The optimiser's function of one vector: it replays the log, then computes and appends to the log."""
 
     problem: Optimisable
     estimator: Any
@@ -232,11 +235,11 @@ class Evaluator:
     updates: int = 0
     """Number of updates by the optimiser so far."""
     refused: int = 0
-    """Number of evaluations so far that have no run, after which the search went on."""
+    """Number of failed evaluations so far after which the search continued."""
     promises: Promises = field(default_factory=Promises)
-    """Of the gradients so far, and whether the loss kept them."""
+    """Predictions of the gradients so far, and the real changes of the loss."""
     logged: int = 0
-    """Entries of the log that this run has come to: evaluations, and losses that were tried."""
+    """Number of log entries used so far: evaluations and trial losses."""
 
     def __post_init__(self) -> None:
         if isinstance(self.estimator, Ensemble):
@@ -244,7 +247,7 @@ class Evaluator:
 
     @property
     def left_out(self) -> int:
-        """Return how many runs averages over ensembles have left out, in evaluations that were not replayed."""
+        """Return the number of runs that ensemble averages left out, in evaluations that were not replayed."""
         return self.estimator.left_out if isinstance(self.estimator, CountedEnsemble) else 0
 
     def count_update(self) -> None:
@@ -258,7 +261,8 @@ class Evaluator:
         return self._noted(self._kept(self._compute(vector)), replayed=False)
 
     def attempt(self, vector: Vector) -> tuple[float, Vector] | None:
-        """Return loss and gradient at a vector, None where there is no run: its log has an infinite loss and 0."""
+        """Return loss and gradient at a vector, or None if the run fails; the log then has an infinite loss and a
+        gradient of 0."""
         replayed = self.logged < len(self.log)
         if replayed:
             evaluation = self._replay(vector)
@@ -299,7 +303,7 @@ class Evaluator:
 
     def losses(self, vectors: Sequence[Vector]) -> list[float]:
         """Return the losses at vectors (size,), computed in one launch if the problem can; infinite for a run that
-        diverges, and for impossible parameters. The log gets them with a gradient of 0, the history does not."""
+        diverges and for impossible parameters. They enter the log with a gradient of 0, but not the history."""
         known = [self._replay(vector, k).loss for k, vector in enumerate(vectors[: len(self.log) - self.logged])]
         left = vectors[len(known) :]
         found: list[float] = []
@@ -324,11 +328,11 @@ class Evaluator:
         return [loss if math.isfinite(loss) else math.inf for loss in (*known, *found)]
 
     def _evaluated(self, parameters: dict[str, Any]) -> tuple[Any, Mapping[str, Any]]:
-        """Return the loss and its gradient as the problem returns them."""
+        """Return the loss and its gradient in the form that the problem returns."""
         return loss_and_gradient(self.problem.value_and_gradient(parameters, gradient=self.estimator))
 
     def _replay(self, vector: Vector, ahead: int = 0) -> LoggedEvaluation:
-        """Return the logged evaluation, or the one ``ahead`` entries later, if it is the one asked for."""
+        """Return the logged evaluation, ``ahead`` entries further on, if it belongs to this vector."""
         evaluation = self.log.read(self.logged + ahead)
         changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
         if changed.any():
@@ -343,7 +347,7 @@ class Evaluator:
     def _compute(self, vector: Vector) -> LoggedEvaluation:
         """Evaluate the problem, and return the evaluation if it is finite.
 
-        A first evaluation that is refused has a wrong start; later ones, parameters to which the search has come.
+        The error of a first evaluation is about the start; later errors are about parameters that the search chose.
         """
         try:
             return self._computed(vector)
@@ -370,7 +374,8 @@ class Evaluator:
         return evaluation
 
     def _shorter(self, advice: str, vector: Vector) -> str:
-        """Extend the advice of a run that diverged during a search by the point of the search and the best before."""
+        """Extend the advice of a run that diverged during a search: add the point of the search and the best point
+        before."""
         best = min(self.history, key=lambda record: record.loss)
         told = [f"{advice}, a smaller learning rate or scale, or bounds on the parameters"]
         least = f"the least loss before is {best.loss:.4g}"
@@ -424,7 +429,7 @@ def _in_words(parameters: Parameters) -> str:
 
 
 def as_given(parameters: Mapping[str, Vector], start: Mapping[str, Any]) -> Parameters:
-    """Return parameters with a float wherever the user's start has a number."""
+    """Return parameters; those given as a number at the start become floats."""
     return {
         name: float(value) if value.ndim == 0 and not isinstance(start[name], np.ndarray) else value
         for name, value in parameters.items()

@@ -1,8 +1,8 @@
-"""The optimisers: each an object that holds its settings and its algorithm.
+"""The optimisers; each object contains the settings and the algorithm.
 
-An optimiser is deterministic: the points at which it evaluates depend on its settings and on the losses and gradients
-before, and on nothing else. Resuming (`cortado.optimisation.optimise`) rests on this; an optimiser with random numbers
-must draw them from a seed of its own.
+An optimiser is deterministic: the points that it evaluates depend only on its settings and on earlier losses and
+gradients. Resuming (`cortado.optimisation.optimise`) relies on this. An optimiser with random numbers must draw them
+from its own seed.
 """
 
 from collections.abc import Mapping
@@ -29,13 +29,13 @@ from cortado.optimisation.search import (
 )
 
 MOST_TRIALS = 1_000
-"""Most trials of an update; more are taken for a mistake, as each is a run."""
+"""Greatest number of trials of an update; each trial is a run."""
 GROWTH = 3.0
-"""How much longer than the best length the longest one may be at the next update."""
+"""Longest trial of the next update, relative to the best length of this one."""
 SMALL = 0.01
-"""Part of the first gradient above which the end of L-BFGS is no optimum."""
+"""If the last gradient exceeds this part of the first, L-BFGS has not ended at an optimum."""
 MOST_MEMORY = 1_000
-"""Most past updates that L-BFGS keeps; more are taken for a mistake, as some ten suffice."""
+"""Greatest number of past updates that L-BFGS keeps; about ten suffice."""
 
 __all__ = ["LBFGS", "Adam", "GradientDescent", "LineSearch", "Optimiser", "Outcome", "Search"]
 
@@ -44,16 +44,16 @@ __all__ = ["LBFGS", "Adam", "GradientDescent", "LineSearch", "Optimiser", "Outco
 class Adam:
     """Adam: steps along the mean of recent gradients, divided by the root of the mean of their squares.
 
-    A step changes a component by at most about its learning rate, whatever the size of the gradient. Bounds
-    are kept by projection after each update. Where a step leads to a run that diverges, it is halved until it does not,
-    at most 10 times, and the learning rate with it for all that follow. The means begin anew, as they would lead there
-    again. There is no test of convergence: all the iterations are made.
+    A step changes a component by at most about its learning rate, whatever the size of the gradient. Each update ends
+    with a projection onto the bounds. If the run after a step diverges, the step is halved until a run does not
+    diverge, at most 10 times; the learning rate is halved with it, and the means restart from 0. There is no
+    convergence test: all iterations are made.
 
     Source: D. P. Kingma and J. Ba, "Adam: a method for stochastic optimization", ICLR 2015, Algorithm 1.
     Raises InputError for settings out of range.
 
-    ``learning_rate``: by name or for all, in the units of the parameters; ``beta1`` and ``beta2``: memory of the two
-    means; ``epsilon``: added to the root.
+    ``learning_rate``: for all parameters or by name, in the parameters' units; ``beta1`` and ``beta2``: decay of the
+    two means; ``epsilon``: added to the root.
 
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.Adam(0.1), iterations=50)``
     """
@@ -65,7 +65,8 @@ class Adam:
     beta2: float = 0.999
     """Decay of the mean squared gradient, in [0, 1) [-]."""
     epsilon: float = 1e-8
-    """Covers the division where the gradient has always been 0, the step is then 0 [unit of the gradient]."""
+    """Added to the root against division by 0; with a gradient that has always been 0 the step is 0 [unit of the
+    gradient]."""
 
     def __post_init__(self) -> None:
         require_positive("learning_rate", self.learning_rate)
@@ -100,9 +101,9 @@ class Adam:
 class GradientDescent:
     """Gradient descent with a heavy ball: x_{k+1} = P(x_k - learning_rate g_k + momentum (x_k - x_{k-1})).
 
-    P projects onto the bounds. Where a step leads to a run that diverges, it is halved until it does not, at most 10
-    times, and the learning rate with it for all that follow; the ball stops. There is no test of convergence: all the
-    iterations are made.
+    P projects onto the bounds. If the run after a step diverges, the step is halved until a run does not diverge, at
+    most 10 times. The learning rate is halved with it, and the momentum term restarts from 0. There is no convergence
+    test: all iterations are made.
 
     Source: B. T. Polyak, "Some methods of speeding up the convergence of iteration methods", USSR
     Computational Mathematics and Mathematical Physics 4(5), 1964; plain gradient descent with momentum 0.
@@ -114,7 +115,7 @@ class GradientDescent:
     learning_rate: PerParameter
     """One number, or one per parameter by name [unit of the parameter^2 / unit of the loss]."""
     momentum: float = 0.0
-    """In [0, 1) [-]."""
+    """Factor of the previous step, in [0, 1) [-]."""
 
     def __post_init__(self) -> None:
         require_positive("learning_rate", self.learning_rate)
@@ -140,33 +141,34 @@ class GradientDescent:
 class LBFGS:
     """L-BFGS-B: a quasi-Newton method with bounds and a line search of one or more evaluations an iteration.
 
-    For smooth losses; it reaches tight optima in few evaluations, and stops early where the gradient is
-    noisy. It works on (x - start) / scale, and divides the loss by the greatest component of its first
-    gradient in these coordinates. So the first trial step is at most about `scale` long, whatever the unit of the loss.
+    Use it for smooth losses: it finds accurate optima in few evaluations, but stops early if the gradient is noisy. It
+    works on (x - start) / scale, and divides the loss by the greatest component of its first gradient in these
+    coordinates. So the first trial step is at most about `scale` long, whatever the unit of the loss.
 
-    Where a trial leads to a run that diverges, the line search gets the loss and the slope of a parabola there. This
-    parabola has the loss and the slope of the last iterate, and rises where its slope promised to fall. The next trial
-    is then about a quarter as long, and the approximate Hessian knows nothing of it.
+    If the run of a trial diverges, the line search gets values of a parabola instead. This parabola has the loss and
+    slope of the last iterate, and its minimum at a quarter of the step. So the next trial is about a quarter as long.
+    The trial does not enter the approximate Hessian.
 
-    Its sums over components are BLAS's: beyond some 10^4 components their last bits, and with them resuming
-    bit for bit, depend on the number of BLAS threads. A resumed run with other bits is refused.
+    Sums over components use BLAS. With more than about 10^4 components their last bits depend on the number of BLAS
+    threads, so resuming needs the same number of threads. Resuming a run with different bits raises an error.
 
     Source: R. H. Byrd, P. Lu, J. Nocedal and C. Zhu, SIAM Journal on Scientific Computing 16(5), 1995, as in
     `scipy.optimize.minimize(method="L-BFGS-B")`.
     Raises InputError for settings out of range.
 
-    ``memory``: of how many updates the curvature is estimated; ``tolerance``: of the greatest component of the scaled
-    gradient, below which the search has converged.
+    ``memory``: number of past updates used for the curvature; ``tolerance``: convergence threshold for the greatest
+    component of the gradient, relative to the first one.
 
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.LBFGS(scale=0.5), iterations=20)``
     """
 
     memory: int = 10
-    """Number of past updates that make up the approximate Hessian, at most 1,000."""
+    """Number of past updates in the approximate Hessian, at most 1,000."""
     tolerance: float = 0.0
-    """Converged when the greatest component of the projected gradient is this fraction of the first one [-]."""
+    """The search has converged when the greatest component of the projected gradient is this fraction of the first one
+    [-]."""
     scale: PerParameter = 1.0
-    """A change worth trying, one number or one per parameter by name [unit of the parameter]."""
+    """Typical change of a parameter: one number, or one per parameter by name [unit of the parameter]."""
 
     def __post_init__(self) -> None:
         if not is_whole(self.memory) or self.memory < 1:
@@ -235,20 +237,20 @@ class LBFGS:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A point of L-BFGS's coordinates (size,), with its loss and its gradient (size,)."""
+    """A point in L-BFGS's coordinates (size,), with loss and gradient (size,)."""
 
     y: Vector
     loss: float
     gradient: Vector
 
     def rising(self, y: Vector) -> tuple[float, Vector]:
-        """Return a loss and a gradient at y, where the run diverged. Along the way from here they follow a parabola
-        f + s t - 2 s t^2 to t = 1, with its minimum at t = 1 / 4. The loss here is f, and s < 0 is its slope."""
+        """Return a substitute loss and gradient at y, whose run diverged. From this point (t = 0) to y (t = 1) they
+        follow the parabola f + s t - 2 s t^2, with this point's loss f and slope s < 0; its minimum is at t = 1 / 4."""
         return self.loss - float(self.gradient @ (y - self.y)), -3.0 * self.gradient
 
 
 def _lbfgs_in_words(status: int, iterations: int, left: float) -> str:
-    """Say how L-BFGS ended, by scipy's status, and by the part of the first gradient that is left."""
+    """Return a sentence on the end of L-BFGS, from scipy's status and the last gradient relative to the first."""
     share = f"the gradient is {left:.2g} of the first one"
     if status == 1:
         return f"L-BFGS made all its {iterations} iterations without converging: {share}. More may lower the loss."
@@ -263,7 +265,7 @@ def _lbfgs_in_words(status: int, iterations: int, left: float) -> str:
 
 
 def _scaled_bounds(search: Search, scale: Vector) -> list[tuple[float, float]] | None:
-    """Return the bounds on (x - start) / scale as scipy takes them; None if there are none at all."""
+    """Return the bounds on (x - start) / scale in scipy's form; None if no component has a bound."""
     if np.isinf(search.lower).all() and np.isinf(search.upper).all():
         return None
     lower, upper = (search.lower - search.start) / scale, (search.upper - search.start) / scale
@@ -278,23 +280,22 @@ def _greatest_projected(search: Search, x: Vector, gradient: Vector, scale: Vect
 
 @dataclass(frozen=True)
 class LineSearch:
-    """Descent along the gradient, as far as the best of several lengths that are tried in one launch.
+    """Gradient descent whose step is the best of several lengths tried in one launch.
 
-    For losses that are rough, and for gradients that have the right direction and not the right size, such as those of
-    long runs. A search steps over dents that are narrower than its trials, and never to where the run diverges or
-    parameters are out of their range. A trial is a run without a gradient, and all trials of an update are one batch.
+    Use it for rough losses, and for gradients with the right direction but a wrong size, such as those of long runs.
+    The search steps over local minima narrower than its trials. It never steps to a point whose run diverges or whose
+    parameters are out of range. A trial is a run without a gradient; all trials of an update are one batch.
 
     Formula: with g the gradient times the scale, and unit(a) = a over its root mean square,
 
         d_k = unit(momentum d_{k-1} - unit(g_k)),   x_{k+1} = the best of P(x_k + r_k s scale d_k),
 
     over lengths s at even ratios from ``shortest`` to 1. P projects onto the bounds. The reach r is 1 at first, and
-    then `GROWTH` times the length that was best, at most 1. Where no trial lowers the loss, at the bottom of a dent or
-    of the valley, an update still takes the best one and sets the reach to 1, so that the search leaves dents. So the
-    last iterate need not be the best. Where every trial diverges, x stays, the momentum is dropped, and the reach
-    is ``shortest`` times what it was. Where the gradient of the best one diverges, as that of an ensemble may, x moves
-    a part of the way, and the reach is that part of what it would be. There is no test of convergence: all the
-    iterations are made.
+    then `GROWTH` times the best length, at most 1. If no trial lowers the loss, the update still takes the best trial
+    and sets the reach to 1, so that the search leaves narrow local minima. So the last iterate need not be the best. If
+    every trial diverges, x stays, the momentum is set to 0, and the reach is multiplied by ``shortest``. If the
+    gradient at the best trial diverges, as an ensemble's may, x moves only a part of the way, and the reach is
+    shortened in proportion. There is no convergence test: all iterations are made.
 
     Raises InputError for settings out of range.
 
@@ -302,13 +303,13 @@ class LineSearch:
     """
 
     scale: PerParameter = 1.0
-    """The longest change worth trying, one number or one per parameter by name [unit of the parameter]."""
+    """Longest change of a parameter in a trial: one number, or one per parameter by name [unit of the parameter]."""
     trials: int = 5
-    """Lengths that are tried at a time, at most 1,000."""
+    """Number of lengths tried in one update, at most 1,000."""
     shortest: float = 1.0 / 64.0
-    """Shortest of these lengths, over the longest."""
+    """Ratio of the shortest to the longest of these lengths."""
     momentum: float = 0.5
-    """How much of the direction before is kept, in [0, 1) [-]."""
+    """Factor of the previous direction in the new one, in [0, 1) [-]."""
 
     def __post_init__(self) -> None:
         require_positive("scale", self.scale)
@@ -355,11 +356,12 @@ def unit(vector: Vector) -> Vector:
 
 
 BY_NAME: dict[str, Any] = {"adam": Adam, "gradient_descent": GradientDescent, "lbfgs": LBFGS, "line_search": LineSearch}
-"""The optimisers by the names that `cortado.optimise` takes."""
+"""Optimiser classes by the names that `cortado.optimise` accepts."""
 
 
 def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
-    """Return an optimiser by its name and its settings, or the object itself; raise `InputError` for anything else."""
+    """Return an optimiser from a name and settings, or a given optimiser unchanged; raise `InputError` for anything
+    else."""
     if isinstance(optimiser, str):
         return _named(optimiser, settings)
     if isinstance(optimiser, type) or not isinstance(optimiser, Optimiser):
@@ -376,7 +378,7 @@ def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
 
 
 def _named(name: str, settings: Mapping[str, Any]) -> Optimiser:
-    """Make the optimiser of a name, with settings that must be its own and complete."""
+    """Make the optimiser with this name; raise `InputError` for missing or unknown settings."""
     if name not in BY_NAME:
         raise InputError(f"The optimiser is {shown(name)}, but must be one of {quoted(BY_NAME)}, or an object.")
     known = {field.name: field.default is MISSING for field in fields(BY_NAME[name])}

@@ -1,5 +1,5 @@
-"""What a solved task shows: knots in time, plots, shaded pictures and films; and what ``cortado fit`` reads: a scene
-with the tables [problem], of measured data, and [fit], and that data."""
+"""Results of a solved task (knots in time, plots, pictures, films), and the input of ``cortado fit``: a scene with the
+tables [problem] and [fit], and measured data."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -47,12 +47,12 @@ from cortado.scene.tables import MISSING, Table
 from cortado.simulation import Simulation
 
 MOST_CURVES = 12
-"""Most components of a parameter that gets a picture of its own."""
+"""Greatest number of components for which a parameter gets its own picture."""
 TITLES = ("first guess", "found", "target")
 IMAGES = 6
 """Number of images that show the course of the optimisation."""
 EVALUATIONS = (1, 5, 20, 100)
-"""Evaluations whose runs are shown, as far as the search went; 0 is the first guess."""
+"""Numbers of the evaluations whose runs are shown, if the search reached them; 0 is the start."""
 Run = Mapping[int, Snapshot]
 """States by the number of steps before them."""
 
@@ -62,13 +62,13 @@ class TaskFigures:
     """Pictures and films of a solved task, with (caption, path) of each."""
 
     found: Figures = field(default_factory=list)
-    """The run with the found parameters, in motion."""
+    """Films of the run with the found parameters."""
     compared: Figures = field(default_factory=list)
-    """Before, found and target."""
+    """Pictures that compare the start, the result and the target."""
     parameters: Figures = field(default_factory=list)
-    """Found parameters against the hidden ones."""
+    """Plots of the found and the true parameters."""
     search: Figures = field(default_factory=list)
-    """How the search went."""
+    """Plots and pictures of the course of the search."""
 
     def __add__(self, other: "TaskFigures") -> "TaskFigures":
         """Return these figures followed by another task's."""
@@ -80,23 +80,23 @@ class KnotValues:
     """The values of one parameter at knots in time, between which it changes along a straight line."""
 
     times: np.ndarray
-    """(k,) [s] A step has the value of its middle, so the first knot is half a step after the start of the run; that of
-    where something is is a step after it."""
+    """(k,) [s] A step has the value at its middle, so the first knot is half a step after the start of the run. For
+    positions it is one step after the start."""
     start: np.ndarray
-    """(k, d), or (k,) of numbers, in the unit of the parameter, as the search started."""
+    """Values at the start of the search (k, d), or (k,) for numbers, in the unit of the parameter."""
     estimate: np.ndarray
-    """(k, d) in the unit of the parameter."""
+    """Found values (k, d), in the unit of the parameter."""
     true: np.ndarray | None
-    """(k, d) the course with these knots that is nearest to the true one; None where a picture is the target."""
+    """Values (k, d) at these knots nearest to the true course; None if the target is a picture."""
 
     def for_machines(self) -> dict[str, np.ndarray]:
-        """Return the arrays by name; without the true values where there are none."""
+        """Return the arrays by name, without the true values if they are None."""
         known = {} if self.true is None else {"true": self.true}
         return {"times": self.times, "estimate": self.estimate, **known}
 
 
 def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndarray]) -> dict[str, KnotValues]:
-    """Return by name the parameters that were searched as values at knots in time, which ``coordinates`` has."""
+    """Return, by name, the searched parameters that ``coordinates`` interpolates between knots in time."""
     step = float(estimate.get("time_step", made.task.scene.solver.time_step))
     found = {}
     for name, bijector in made.search.coordinates.items():
@@ -112,7 +112,7 @@ def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndar
 
 
 def _without_round_off(values: np.ndarray) -> np.ndarray:
-    """Round values to twelve digits of the largest: a user's numbers come back from the course as they were written."""
+    """Round values to twelve digits of the largest, so that a user's numbers are printed as they were written."""
     largest = np.abs(values).max()
     return np.round(values, 11 - int(np.floor(np.log10(largest)))) + 0.0 if largest > 0.0 else values  # no -0
 
@@ -157,7 +157,7 @@ def _images(made: Setup, result: Result, folder: Path) -> TaskFigures:
 
 
 def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
-    """Draw the estimate of a parameter over the evaluations, or the last estimate of one that changes over time."""
+    """Plot the estimate of a parameter over the evaluations; for a parameter over time, plot the last estimate."""
     estimate, true = made.search.parameters(result.parameters)[name], made.true_parameter(name)
     path, first = folder / f"{name}.png", np.asarray(made.search.parameters(made.start)[name])
     names = component_names(made.task, name, estimate)
@@ -179,7 +179,7 @@ def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
 
 
 def component_names(task: Task, name: str, value: np.ndarray) -> list[str]:
-    """Name the components of a parameter, of one over time those of a row: its axes, its phases, or numbers."""
+    """Name the components of a parameter, or of a row of a parameter over time: axes, phases, or numbers."""
     scene, parameter, last = task.scene, task.known[name], np.shape(value)[-1:]
     count = int(np.prod(np.shape(value))) if parameter.axis is not Axis.STEP else int(np.prod(last))
     label = name.replace("_", " ")
@@ -197,7 +197,7 @@ def component_names(task: Task, name: str, value: np.ndarray) -> list[str]:
 
 
 def begin_shaded(made: Setup) -> None:
-    """Compile the renderer of shaded pictures while the search goes on, which leaves a core to spare."""
+    """Compile the renderer of shaded pictures during the search, which leaves one core free."""
     simulation = made.problem.simulation
     artist = painter(made.task.scene, simulation.positions, simulation.device)
     compile_meanwhile(artist, simulation.device)
@@ -240,7 +240,7 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
 
 
 def step_pace(scene: Scene, steps: Sequence[int]) -> Pace:
-    """Return the pace of films whose frames are the states after these numbers of steps."""
+    """Return the pace of films with one frame for each of these numbers of steps."""
     if scene.solver.chooses:
         return Pace.unknown(len(steps))
     pace = pace_of(float(scene.solver.time_step) * np.asarray(steps), scene.picture or Picture())
@@ -287,7 +287,8 @@ class MeasuredScene:
     problem: ProblemTable
 
     def experiment(self, device: str, precision: str) -> Experiment:
-        """Make the experiment on a device; raise `InputError` or `SceneError` for data that do not fit or open."""
+        """Make the experiment on a device; raise `InputError` or `SceneError` for data that do not fit or cannot be
+        opened."""
         simulation, folder = Simulation(self.scene, device, precision), Path(self.file).parent
         last = self.problem.steps * float(self.scene.solver.time_step)
         found = {}
@@ -301,7 +302,7 @@ class MeasuredScene:
 
 @dataclass(frozen=True)
 class FitTask:
-    """A task of `cortado fit`: measured experiments, and the parameters that are fitted to them."""
+    """A task of `cortado fit`: measured experiments, and the parameters to fit to them."""
 
     experiments: tuple[MeasuredScene, ...]
     fit: FitTable
@@ -326,7 +327,7 @@ def load_fit(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Fit
 
 
 def _also(path: Path) -> MeasuredScene:
-    """Read one more experiment from its file, which may have a table [fit] of its own that is ignored."""
+    """Read a further experiment from its file; a table [fit] in this file is ignored."""
     found, _ = _read(read_toml(path), os.fspath(path), ExperimentTables)
     if found.problem.also:
         raise SceneError(
@@ -412,7 +413,8 @@ def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> 
 
 
 def _instants(times: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times that are further apart than ``apart``, in order, and each given time's index among them."""
+    """Merge times that differ by at most ``apart``; return the remaining ones in order, and the index of each given
+    time among them."""
     each, which = np.unique(times, return_inverse=True)
     begins = np.diff(each, prepend=-np.inf) > apart
     return each[begins], np.cumsum(begins)[which] - 1

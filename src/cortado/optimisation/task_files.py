@@ -1,4 +1,5 @@
-"""A task: what ``cortado optimise`` reads, a scene with the tables [problem] and [optimise]; in words; on a device."""
+"""Read a task of ``cortado optimise`` (a scene with the tables [problem] and [optimise]), describe it in words, and set
+it up on a device."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -44,9 +45,9 @@ class Task:
     problem: ProblemTable
     optimise: OptimiseTable
     true_parameters: Arrays
-    """Parameters of the run that made the target; none where the target is a picture."""
+    """Parameters of the run that made the target; empty if the target is a picture."""
     start: dict[str, Any]
-    """Parameters with which the search starts; arrays, or the word "random"."""
+    """First values of the search by parameter: arrays, or the word "random"."""
     known: Known
     """The parameters of the scene."""
     folder: Path = Path()
@@ -102,7 +103,7 @@ def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Ta
 
 
 def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, known: Known) -> dict[str, Any]:
-    """Return values with a row for each step where they change over time; raise `SceneError` for a wrong shape."""
+    """Return values; those that change over time get a row for each step. Raise `SceneError` for a wrong shape."""
     found = {}
     for name, array in values.items():
         field, parameter = f"{table}.{name}", known[name]
@@ -140,7 +141,7 @@ def _check_range(parameter: Parameter, field: str, array: np.ndarray) -> None:
 
 
 def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any], known: Known) -> None:
-    """Raise `SceneError` for an option that does not fit the others, so that none is silently ignored."""
+    """Raise `SceneError` for an option that contradicts others, so that no option is silently ignored."""
     over_time = [name for name in known.over_time if name in start and known.has_rows(name, start[name])]
     if optimise.knots is not None and not over_time:
         raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")
@@ -206,8 +207,8 @@ def _check_bounds(
 
 
 def _shapes(parameter: Parameter, scene: Scene, steps: int) -> list[tuple[int, ...]]:
-    """Return the shapes that a parameter may have; () is a number. The scene is cut into particles, which may take a
-    second, only where the parameter has a value for each of them."""
+    """Return the shapes that a parameter may have; () is a number. Only if the parameter has a value for each particle,
+    the scene is filled with particles, which may take a second."""
     particles = len(fluid_particles(scene).positions) if parameter.axis is Axis.PARTICLE else 0
     return parameter.shapes(steps, len(scene.phase), (particles, scene.dimension))
 
@@ -217,7 +218,7 @@ def _in_words(shapes: Sequence[tuple[int, ...]]) -> str:
 
 
 def task_in_words(task: Task) -> list[str]:
-    """Describe what a task searches, what it shall reach, and how, in a paragraph each."""
+    """Describe a task in three paragraphs: the searched parameters, the target, and the algorithm."""
     problem, settings = task.problem, task.optimise
     seconds = problem.steps * task.scene.solver.time_step
     compared = "images" if problem.loss == "image" else "positions of all particles"
@@ -244,7 +245,7 @@ def _listed(names: object) -> str:
 
 
 def _asked(task: Task) -> str:
-    """Write in words what the check of a task asks for; empty where it asks for nothing."""
+    """Return the conditions of a task's check in words; empty if there are none."""
     check = task.optimise.check
     words = {
         "loss_reduction": f"a loss {check.loss_reduction:g} times smaller than at the start",
@@ -262,19 +263,20 @@ class Setup:
     task: Task
     problem: Problem
     searches: tuple[Transformed, ...]
-    """One for each entry of the extinction schedule, in the same coordinates; the last is the scene's own."""
+    """One problem for each entry of the extinction schedule, in the same coordinates; the last has the scene's
+    extinction."""
     start: Arrays
-    """Coordinates with which the search starts."""
+    """First coordinates of the search."""
     bounds: dict[str, tuple[Any, Any]]
     """Lower and upper bounds of coordinates."""
     renderer: Renderer | None
-    """None where positions are compared."""
+    """Renderer of the compared pictures; None if positions are compared."""
     targets: dict[int, np.ndarray]
-    """Images (rows, columns, 3) or positions (n, d) [m] by the number of steps before them."""
+    """Target images (rows, columns, 3) or positions (n, d) [m] by number of steps."""
 
     @property
     def search(self) -> Transformed:
-        """Return the last of the searches, that of the task itself."""
+        """Return the last of the searches, which is that of the task itself."""
         return self.searches[-1]
 
     def image(self, end: Snapshot) -> np.ndarray:
@@ -283,7 +285,7 @@ class Setup:
         return _image(self.renderer, end)
 
     def true_parameter(self, name: str) -> np.ndarray | None:
-        """Return a parameter's value in the run that made the target; None where a picture is the target."""
+        """Return a parameter's value in the run that made the target; None if the target is a picture."""
         return self.task.true_parameters.get(name)
 
 
@@ -382,8 +384,8 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
 def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
     """Return bounds of coordinates by name.
 
-    Those of a parameter over time hold for its knots, and so for what is interpolated between them; those of a
-    logarithmic parameter are logarithms. A parameter that cannot be negative has 0 as a lower bound.
+    Bounds of a parameter over time apply to its knots, and so to the values interpolated between them. Bounds of a
+    logarithmic parameter are logarithms. A parameter that cannot be negative has the lower bound 0.
     """
     with_zero = [name for name in task.start if task.known[name].range is Range.NOT_NEGATIVE]
     free = [name for name in with_zero if name not in task.optimise.logarithmic]

@@ -1,7 +1,8 @@
-"""Transforms of parameters: coordinates u of a parameter p(u) in which an optimiser may step freely; fixed ones.
+"""Transforms of parameters: coordinates u without constraints for a parameter p(u). Also problems with fixed
+parameters.
 
-Whatever u is, p(u) is a parameter that can be: fractions that add up to 1, a number that stays positive, a parameter
-over time that changes slowly.
+For every u, p(u) is a valid parameter: fractions that sum to 1, a positive number, or a parameter over time that
+changes slowly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from cortado.rollout.rollout import Observer
 from cortado.scene.parameter_values import Arrays, Values, check_known, require_points
 
 SMALLEST = 1e-4
-"""Smaller fractions are replaced by this one where their coordinates are computed: that of 0 is minus infinity."""
+"""Smaller fractions are replaced by this one to compute coordinates, because the coordinate of 0 is minus infinity."""
 
 
 class Bijector(Protocol):
@@ -31,10 +32,10 @@ class Bijector(Protocol):
         """Return the parameter p(u) at coordinates u."""
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        """Return the u for which p(u) is ``parameter``, or nearest to it."""
+        """Return the u for which p(u) is ``parameter``, or as near to it as possible."""
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
-        """Return the derivative of a loss with respect to u, given ``bar``, that with respect to p(u)."""
+        """Return the derivative of a loss with respect to u from ``bar``, its derivative with respect to p(u)."""
 
 
 @dataclass(frozen=True)
@@ -84,12 +85,12 @@ class TimeInterpolation:
 
     @property
     def places(self) -> np.ndarray:
-        """Return the steps (k,) at which the knots are, counted from 0; in between where the numbers do not fit."""
+        """Return the positions (k,) of the knots in steps, counted from 0; they may lie between steps."""
         return np.linspace(0.0, self.steps - 1.0, self.knots)
 
     @property
     def _weights(self) -> np.ndarray:
-        """Return the weights (steps, knots) of knots in the values of steps."""
+        """Return the weights (steps, knots) with which knots enter the values of steps."""
         places = np.linspace(0.0, self.knots - 1.0, self.steps)
         return np.maximum(1.0 - np.abs(places[:, None] - np.arange(self.knots)), 0.0)
 
@@ -105,26 +106,26 @@ class TimeInterpolation:
 
 @fixed
 class Affine:
-    """The transform p = base + matrix u, such as accelerations after which a tank always stands where it shall, or a
-    nozzle that follows commands with a lag."""
+    """The transform p = base + matrix u. Examples are accelerations of a tank with a fixed end position, and a nozzle
+    that follows commands with a lag."""
 
     def __init__(self, base: Any, matrix: Any):
-        """Take a ``base`` of the parameter's shape and unit, and a ``matrix`` of that shape followed by the shape of
-        u."""
+        """Store a ``base`` with the parameter's shape and unit, and a ``matrix`` whose shape is the parameter's
+        followed by that of u."""
         self.base, self.matrix = read_only("base", base), read_only("matrix", matrix)
         if self.matrix.shape[: self.base.ndim] != self.base.shape or self.matrix.ndim == self.base.ndim:
             wanted = f"{self.base.shape}, the shape of base, followed by the shape of the coordinates"
             raise InputError(f"matrix has shape {self.matrix.shape}, but must have {wanted}.")
 
     def __repr__(self) -> str:
-        """Show a checksum of the numbers, by which a search that is resumed knows the transform."""
+        """Return a text with a checksum of the numbers; a resumed search compares it."""
         return f"Affine({sha256(self.base.tobytes() + self.matrix.tobytes()).hexdigest()[:16]})"
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         return self.base + np.tensordot(self.matrix, _shaped("coordinates", u, self._shape), len(self._shape))
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        """Return the least of all u for which p(u) comes nearest to ``parameter``."""
+        """Return the shortest vector u among those for which p(u) is nearest to ``parameter``."""
         offset = _shaped("values", parameter, self.base.shape) - self.base
         matrix = self.matrix.reshape(self.base.size, -1)
         return np.linalg.lstsq(matrix, offset.ravel(), rcond=None)[0].reshape(self._shape)
@@ -139,16 +140,16 @@ class Affine:
 
 
 class OtherParameters:
-    """A problem as a function of other parameters than its own."""
+    """A base class of problems as functions of other parameters than their own."""
 
     problem: Problem
 
     def parameters(self, u: Values) -> Values:
-        """Return the parameters of the problem that is transformed, by name."""
+        """Return the parameters of the original problem by name."""
         raise NotImplementedError
 
     def value(self, u: Values) -> Any:
-        """Return the loss at coordinates u, by a run forward only."""
+        """Return the loss at coordinates u by a forward run."""
         return self.problem.value(self.parameters(u))
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
@@ -165,10 +166,12 @@ class OtherParameters:
 
 @fixed
 class Transformed(OtherParameters):
-    """A problem as a function of coordinates: those of the given bijectors, and all other parameters as they are."""
+    """A problem as a function of coordinates of some parameters, given by bijectors, and of all other parameters
+    unchanged."""
 
     def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
-        """Take a problem and bijectors by name; raise `InputError` for a parameter that the scene does not have."""
+        """Store a problem and bijectors by parameter name; raise `InputError` for a parameter that the scene does not
+        have."""
         require_methods("problem", problem, ("value", "forward_pass"), "a cortado.Problem")
         require_table("coordinates", coordinates, "{'viscosity': Logarithm()}")
         for name, bijector in coordinates.items():
@@ -206,11 +209,11 @@ class Transformed(OtherParameters):
     def estimate(
         self, u: Mapping[str, Any], gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """Estimate loss and gradient at coordinates u; the spread of an ensemble is one of coordinates."""
+        """Estimate loss and gradient at coordinates u; an ensemble's spread is in units of the coordinates."""
         return estimate(self, u, gradient, observe)
 
     def forward_pass(self, u: Mapping[str, Any]) -> "TransformedPass":
-        """Run the problem forward at coordinates u, so that estimators can go back through the run."""
+        """Run the problem forward at coordinates u, for backward passes by estimators."""
         return TransformedPass(self.problem.forward_pass(self.parameters(u)), self.coordinates, u)
 
     def together(
@@ -225,14 +228,14 @@ class Transformed(OtherParameters):
 
 
 class TransformedPass:
-    """A forward run of a problem, and the reverse pass to coordinates."""
+    """A forward run of a problem, whose backward pass returns derivatives with respect to coordinates."""
 
     def __init__(self, forward_pass: ForwardPass, coordinates: Mapping[str, Bijector], u: Mapping[str, Any]):
         self._pass, self._coordinates, self._u = forward_pass, coordinates, u
         self.loss = forward_pass.loss
 
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """Go back through the run, and return the gradient with respect to the coordinates."""
+        """Make the backward pass and return the gradient with respect to the coordinates."""
         gradient = self._pass.back(estimator, observe)
         return gradient | by_coordinates(self._coordinates, self._u, gradient)
 
@@ -265,11 +268,11 @@ def by_coordinates(coordinates: Mapping[str, Bijector], u: Mapping[str, Any], gr
 
 
 class FixedParameters(OtherParameters):
-    """A problem some of whose parameters, first positions among them, replace those of its scene, as a function of the
-    others alone. Ensembles vary the first positions around those that are fixed."""
+    """A problem with some parameters fixed, including first positions, as a function of the other parameters. Ensembles
+    vary the first positions around the fixed ones."""
 
     def __init__(self, problem: Problem, fixed: Arrays):
-        """Take a problem and ``fixed`` parameters by name, with ``initial_positions`` (n, d) [m]."""
+        """Store a problem and ``fixed`` parameters by name, including ``initial_positions`` (n, d) [m]."""
         self.problem, self._fixed = problem, fixed
         self.simulation = _Simulation(problem, fixed["initial_positions"])
 
@@ -279,7 +282,7 @@ class FixedParameters(OtherParameters):
 
     @property
     def fingerprint(self) -> str:
-        """Return a text that identifies the problem; it does not tell the fixed values apart."""
+        """Return a text that identifies the problem; it does not depend on the fixed values."""
         return f"{self.problem.fingerprint}; fixed {', '.join(self._fixed)}"
 
     def parameters(self, u: Values) -> Values:
@@ -287,12 +290,12 @@ class FixedParameters(OtherParameters):
         return {**self._fixed, **u}
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
-        """Run the problem forward, so that estimators can go back through the run."""
+        """Run the problem forward, for backward passes by estimators."""
         return self.problem.forward_pass(self.parameters(parameters))
 
 
 class _Simulation:
-    """A simulation with other first positions, as ensembles look at it."""
+    """The attributes of a simulation that ensembles use, with other first positions."""
 
     batch = None
 
