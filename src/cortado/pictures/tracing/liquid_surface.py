@@ -1,4 +1,5 @@
-"""Surfaces of fluid as triangles: around all particles together, found on the device, or a sphere around each."""
+"""Triangle surfaces of fluid: one surface around all particles, computed on the device, or a sphere around each
+particle."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -25,10 +26,10 @@ from cortado.pictures.tracing.near_particles import (
 from cortado.pictures.tracing.surface_net import level_blocks, net_of, normals_of, smoothed, triangles_of
 
 NEIGHBOURS = 24
-"""Number of particles from which a point of the surface has its colour."""
+"""Number of particles over which the colour of a surface point is averaged."""
 
 ROUND = 10_000
-"""Most spheres that have 128 triangles each; beyond they have 32."""
+"""Greatest number of spheres drawn with 128 triangles each; more spheres have 32."""
 
 
 @dataclass(frozen=True)
@@ -105,9 +106,9 @@ CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
 WeightedLook = wp.types.vector(6, wp.float32)
 """A `Look` times a weight, and the weight."""
 MOST_CELLS = 1 << 26
-"""Most cells, one spacing wide, in which particles are looked for."""
+"""Greatest number of cells, one spacing wide, in which particles are searched."""
 CLEAREST = wp.constant(wp.float32(1.0e-3))
-"""Scattering and absorption [1/m] that cannot be seen."""
+"""Scattering and absorption [1/m] too small to be visible."""
 WITHIN, ASIDE = wp.constant(wp.float32(10.62)), wp.constant(wp.float32(1.93))
 """Sum of the bumps of all particles around one within a lattice. On a side, an edge or a corner of the lattice it is
 less by exp(-1.93 a²), where the mean place of these particles is a spacings aside."""
@@ -118,7 +119,7 @@ FILLED = wp.constant(wp.vec3(0.45, 0.6, 0.85))
 """Three filled parts of space. Up to the first, the level goes from the level of a drop to the level of a sheet. From
 the second to the third it goes on to the level within fluid."""
 FULL = wp.constant(wp.float32(2.84))
-"""Sum of the bumps of others near a particle from which on it is not in a thin sheet."""
+"""Sum of the bumps of other particles near a particle above which the particle is not in a thin sheet."""
 
 
 @dataclass(frozen=True)
@@ -209,8 +210,8 @@ Level = tuple[Any, wp.array]
 
 
 def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0) -> tuple[Level, Any]:
-    """Return the level of particles' fluid, in which drops, sheets and spray have about the volume of their particles,
-    and the `NearParticles` that it is made of. Cubes are at least ``least`` spacings wide."""
+    """Return the level of the particles' fluid and the `NearParticles` from which it is computed. Drops, sheets and
+    spray get about the volume of their particles. Cubes are at least ``least`` spacings wide."""
     reach, ends = REACH * spacing, _shown(particles, spacing, launch)
     cube = max(next(width for most, width in CUBE_WIDTHS if len(particles) <= most), least)
     s = near_particles(particles, ends, spacing, reach, launch)
@@ -226,11 +227,11 @@ def liquid_surface(
     particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0, level: Level | None = None
 ) -> LiquidSurface:
     """Make the surface of particles' fluid: a level of their density, smoothed by weights that keep thin sheets
-    (Löschner et al. 2023), with the looks of the nearest particles. ``level``: that of `liquid_level` if left out, or a
-    similar one.
+    (Löschner et al. 2023), with the looks of the nearest particles. ``level``: if left out, the result of
+    `liquid_level`.
 
     Raises:
-        ComputationError: there is none.
+        ComputationError: the particles have no surface.
     """
     device, reach = launch.device, REACH * spacing
     if level is None:

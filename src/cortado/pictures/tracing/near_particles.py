@@ -1,4 +1,4 @@
-"""Particles on the device that draws them, which of them are marked, and sums over those near a place."""
+"""Particles on the device that draws them, selection of marked particles, and sums over the particles near a place."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,7 +32,8 @@ OPAQUE = (1e6, 0.0)
 PARTS = 4096
 """Number of parts of the particles, whose ends are found one by one."""
 AT_ONCE = 8000
-"""Particles whose values are mixed at a time: of more, BLAS waits longer for its threads than they save."""
+"""Number of particles whose values are mixed at a time: for more, BLAS loses more time by waiting for threads than it
+saves."""
 
 
 def mixed(fractions: Points, values: Points) -> Points:
@@ -158,8 +159,8 @@ def bump_at(q: float) -> float:
 
 @cache
 def sum_near(term: Callable[..., Any], number: Any) -> Any:
-    """Make the Warp function ``(s, p, reach)`` that adds up ``term(s, j)``, a ``number`` of Warp's, over the particles
-    j around p, each times the bump of that reach [m]."""
+    """Make the Warp function ``(s, p, reach)`` that sums ``term(s, j)``, of Warp type ``number``, over particles j
+    around p, each times the bump with this reach [m]."""
 
     @wp.func
     def summed(s: NearParticles, p: wp.vec3, reach: wp.float32):

@@ -275,7 +275,7 @@ class SolidSurfaces:
         return not all(clear), any(clear)
 
     def cast(self, shadow: FloorShadow, solids: Sequence[ShownSolid]) -> None:
-        """Add the shadows of ``solids``, which are those of the stage, in poses."""
+        """Add the shadows of ``solids``: the stage's solids at their present poses."""
         for one, mesh in self._placed(solids):
             if not one.is_tank:
                 shadow.of_solid(one, mesh)

@@ -126,7 +126,8 @@ def find_ways(first, own, others, width, touching, indices, ways):
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def find_shares(first, touching, ways, bodies, before, window, limits, shares):
-    """Find the shares of other frames in each block, by the root mean square of ways there and in blocks beside it."""
+    """Compute the weights of other frames in each block, from the root mean square displacement there and in adjacent
+    blocks."""
     n = first + wp.tid()
     left = bodies[n]
     for j in range(ways.shape[1]):

@@ -96,7 +96,8 @@ def entry_of(b: Blocks, node: wp.vec3i):
 
 @wp.func
 def level_at(b: Blocks, node: wp.vec3i):
-    """Return the level at a node; where it is unknown, that of its block's corner, on the same side of the surface."""
+    """Return the level at a node. If it was not computed, return that of its block's corner, which is on the same side
+    of the surface."""
     entry = entry_of(b, node)
     if entry < 0:
         return b.corners[node[0] / WIDTH, node[1] / WIDTH, node[2] / WIDTH]
@@ -327,7 +328,7 @@ def sum_beside(beside: Neighbours, values: Vec3s):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def smooth(first: wp.int32, neighbours: wp.array(dtype=Neighbours), weights: Floats, values: Vec3s, found: Vec3s):
-    """Move values towards the mean of neighbours, by weights."""
+    """Move values towards the mean of their neighbours, by a fraction ``weights``."""
     v = first + wp.tid()
     total, count = sum_beside(neighbours[v], values)
     found[v] = wp.lerp(values[v], total / wp.max(count, 1.0), wp.where(count > 0.0, weights[v], 0.0))
@@ -377,7 +378,7 @@ class SurfaceNet:
     points: wp.array
     """(corners,) of vec3 [m]"""
     signs: wp.array
-    """(corners,) the bits of their cubes"""
+    """(corners,) `cube_signs` of each corner's cube"""
     neighbours: wp.array
     """(corners,)"""
     sides: int
