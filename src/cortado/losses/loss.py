@@ -154,7 +154,7 @@ class SnapshotAdjoint:
 ADJOINT_FIELDS = ("positions", "velocities", "mass_fractions")
 """Names of the fields to which the arrays of an adjoint tuple belong, in order."""
 Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...] | Mapping[str, np.ndarray]
-"""Derivatives of a loss in one of three forms: a tuple of arrays for positions and velocities (n, d) and, optionally,
+"""Derivatives of a loss in one of three forms: a tuple of arrays for positions and velocities (n, d) and, if wanted,
 mass fractions (n, phases); a `State` of Warp arrays; or a table by state field and quantity. In a table, names left out
 mean 0."""
 

@@ -245,7 +245,8 @@ class _Trial:
 
     def rising(self, y: Vector) -> tuple[float, Vector]:
         """Return a substitute loss and gradient at y, whose run diverged. From this point (t = 0) to y (t = 1) they
-        follow the parabola f + s t - 2 s t^2, with this point's loss f and slope s < 0; its minimum is at t = 1 / 4."""
+        follow the parabola f + s t - 2 s t^2. This point's loss is f and its slope s < 0; the minimum is at t = 1 /
+        4."""
         return self.loss - float(self.gradient @ (y - self.y)), -3.0 * self.gradient
 
 

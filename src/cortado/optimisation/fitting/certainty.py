@@ -45,11 +45,11 @@ class Products:
     """Products of Jacobians and residuals, summed over the numbers of a frame, for all pairs of frames."""
 
     S: np.ndarray
-    """(F, F, p, p) J_f^T C J_g"""
+    """Products J_f^T C J_g (F, F, p, p)."""
     K: np.ndarray
-    """(F, F, p, p) J_f^T J_g"""
+    """Products J_f^T J_g (F, F, p, p)."""
     gram: np.ndarray
-    """(F, F) r_f . r_g"""
+    """Products r_f . r_g (F, F)."""
 
     @classmethod
     def of(cls, J: np.ndarray, r: np.ndarray) -> "Products":
@@ -66,7 +66,7 @@ class ScoreCovariance:
     """The covariance of the score J^T e of one observation, with the numbers of independent samples behind it."""
 
     B: np.ndarray
-    """(p, p) covariance"""
+    """Covariance (p, p) of the score."""
     products: Products
     lost: float
     """Part of B that the fit absorbed on average."""

@@ -163,7 +163,8 @@ class Experiment:
         return sorted(set().union(*(own.needed for own in frames.values()), *clocks))
 
     def _problem(self, values: Values, wanted: Sequence[int]) -> Problem:
-        """Return a problem of at least these steps, whose viscosity acts as in a run of a scene with these values."""
+        """Return a problem of at least these steps, with the viscosity scheme that a scene with these values would
+        use."""
         scene, steps = self.simulation.scene, self.problem.steps
         if wanted[-1] > steps:
             steps += -(-(wanted[-1] - steps) // ROOM) * ROOM

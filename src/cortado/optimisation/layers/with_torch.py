@@ -32,7 +32,7 @@ class Call:
 
     layer: Layer
     names: tuple[str, ...]
-    """Names of its tensors, in their order."""
+    """Names of the layer's tensors, in order."""
     keep: bool
     """True if derivatives are likely to be needed."""
     residual: Any = None
