@@ -124,6 +124,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
     def look(
         particles: int,
         period: vector,
+        axes: vector,
         mesh: wp.uint64,
         origin: vector,
         inner: vector,
@@ -137,7 +138,9 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         of: bundle(face=vector, plane=real, shift=vector, depth=real),
     ):
         """Find the face. The mesh is about ``origin`` of a solid at rest, and about ``inner`` in the frame of one that
-        moves; ``period`` is 0 along an axis without one."""
+        moves; ``period`` is 0 along an axis without one. ``axes`` is 1 along the axes of space. In the plane it
+        is 0 along z, where a GPU's fused products would leave the normal some 1e-18, and fluid would leave the
+        plane."""
         j = wp.tid()
         b = j // particles
         way = after[b] + turns[b] * own[j] - other_after[b] - origin
@@ -151,7 +154,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         first = vec(corners.points[corners.indices[3 * found.face]])
         second = vec(corners.points[corners.indices[3 * found.face + 1]])
         third = vec(corners.points[corners.indices[3 * found.face + 2]])
-        n = side * wp.normalize(wp.cross(second - first, third - first))
+        n = side * wp.normalize(wp.cw_mul(axes, wp.cross(second - first, third - first)))
         d = other_scales[b] * wp.dot(n, first - y)
         if d > of.depth[j]:
             of.face[j] = n

@@ -110,7 +110,8 @@ class Contacts:
         self.part, self.layout, self.kernels = part, layout, contact_kernels(layout.precision)
         self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
         self._poses = [contact.poses(part.made_of.walls.each) for contact in self.contacts]
-        self._period = layout.precision.vector(*padded(periods[None])[0])
+        vector = layout.precision.vector
+        self._period, self._axes = (vector(*padded(one[None])[0]) for one in (periods, np.ones_like(periods)))
         self._shares = [Totals(contact, share_kinds(layout)) for contact in self.contacts]
         self._sums: list[Arrays] = [{} for _ in self.contacts]
         unsaid = {"friction": 0.0, "restitution": RESTITUTION}
@@ -137,6 +138,7 @@ class Contacts:
         constants: dict[str, Any] = {
             "particles": contact.count,
             "period": self._period,
+            "axes": self._axes,
             "is_free": contact.touching.other >= 0,
             "volumes": pair(own.table.mass.volume, other.table.mass.volume),
             "greatest": pair(own.table.bounds["greatest"], other.table.bounds["greatest"]),
