@@ -101,7 +101,7 @@ def test_two_processes_start_cold_at_once(tmp_path):
 
 FORK = """
 child = os.fork()
-print(float(simulation.run(2)[-1].positions.sum()).hex(), flush=True)
+print(float(simulation.run(2)[-1].positions.sum()).hex() + "\\n", end="", flush=True)  # in one write
 if child == 0:
     raise SystemExit
 assert os.waitpid(child, 0)[1] == 0
