@@ -260,7 +260,7 @@ class Resolved:
         self.mass = float(masses.sum()) * float(self.scene["discretisation"]["spacing"]) ** last.dimension
         """Mass of all fluid [kg], in 2-D of a layer 1 m thick."""
         numbers = {f"{kind} energy": ("J", float(result["energy"]["last"][kind])) for kind in ("kinetic", "potential")}
-        if self.scene.get("emitter") or self.scene.get("drain"):  # what is in none of them counts
+        if self.scene.get("emitter") or self.scene.get("drain"):  # in which particles rest far from the fluid
             masses = masses * is_out(folder.read_scene(), last[0].others, len(masses))
         centre = masses @ last.positions[0].astype(np.float64) / (masses.sum() or np.nan)
         numbers |= {f"centre of mass, {axis}": ("m", float(x)) for axis, x in zip("xyz", centre, strict=False)}

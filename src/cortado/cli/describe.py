@@ -139,18 +139,17 @@ def describe_scene(
     count = sum(body.count(scene.discretisation.spacing) for body in (*scene.fluid, *scene.emitter))
     with timed_note(f"About {count:,.0f} particles are made") if count > MANY else nullcontext():
         simulation = Simulation(scene, device, precision)
-    drawn = None
+    drawn = {}
     if picture is not None:
         make_folder(picture.parent)
-        drawn = _drawn(simulation, picture)
+        drawn = {"picture": str(_drawn(simulation, picture).absolute())}
     note("Some steps and pictures are timed.")
     found = _described(simulation, length := RunLength(simulation, steps, time, frames))
     for quality in ("traced", "quick")[: 0 if length.film is None else scene.dimension - 1]:
         found[f"{quality}_picture_seconds".removeprefix("traced_")] = seconds_of_picture(simulation, quality)
     if "optimise" in read_toml(scene_file):
         found["search"] = task_in_words(load_task(scene_file, overrides))
-    if drawn is not None:
-        found["picture"] = str(drawn.absolute())
+    found |= drawn
     return json.dumps(found, indent=2) if as_json else _as_text(found, length)
 
 
