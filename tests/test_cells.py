@@ -11,7 +11,7 @@ from cortado.device.grid import Grid
 from cortado.device.launching import launch
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.discretise.shapes import pairs_within
-from cortado.sph.moment_functions import matrix_type, moment_functions
+from cortado.sph.moment_functions import moment_functions
 
 CPU = wp.get_device("cpu")
 REACH = 0.1
@@ -158,7 +158,7 @@ LEAST = 1e-3
 
 def fullness(precision, dimension, moments):
     """H of moments (n, 3, 3), as kernels find it."""
-    function, matrix = moment_functions(precision, dimension).fullness, matrix_type(precision)
+    function, matrix = moment_functions(precision, dimension).fullness, precision.matrix
 
     @wp.kernel(module="unique")
     def find(M: wp.array(dtype=matrix), H: wp.array(dtype=precision.real)):

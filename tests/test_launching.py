@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from cortado import InputError, Problem, Simulation, losses
-from cortado.device.launching import Bundles, KernelLauncher, bound, launch, launch_together, watched
+from cortado.device.launching import KernelLauncher, bound, launch, launch_together, watched
 from cortado.device.precision import BY_SIZE, FLOAT32, FLOAT64, lanes_for, lanes_of
 from cortado.device.reduction import SHARED, add, sum_and_maximum, sum_and_maximum_kernel, sum_kernel, sum_of
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C4
@@ -36,12 +36,12 @@ NAMES = ("particles", "time_step", "x", "v", "acceleration", "x_star", "v_star")
 
 def test_arguments_come_in_the_order_of_the_kernel_and_of_groups_and_a_misspelt_one_is_named():
     given = {name: name.upper() for name in reversed(NAMES)}
-    assert bound(PREDICT, (), given, Bundles()) == [name.upper() for name in NAMES]
+    assert bound(PREDICT, (), given) == [name.upper() for name in NAMES]
     first, second = {"x": 1, "v": 2, "other": 0}, {"x": 10, "v": 20, "time_step": 30, "x_star": 40, "v_star": 50}
-    found = bound(PREDICT, (first, second), {"v": 3, "acceleration": 4, "particles": 60}, Bundles())
+    found = bound(PREDICT, (first, second), {"v": 3, "acceleration": 4, "particles": 60})
     assert found == [60, 30, 1, 3, 4, 40, 50]
     with pytest.raises(TypeError, match="has no argument 'xstar'; it has particles, time_step, x, v, acc"):
-        bound(PREDICT, (), {**dict.fromkeys(NAMES, 0), "xstar": 0}, Bundles())
+        bound(PREDICT, (), {**dict.fromkeys(NAMES, 0), "xstar": 0})
 
 
 @pytest.mark.parametrize("missing", NAMES)
@@ -49,11 +49,11 @@ def test_a_missing_argument_is_named(missing):
     given = {name: 0 for name in NAMES if name != missing}
     told = f"argument '{missing}' of kernel .*predict.* is missing; it has particles, time"
     with pytest.raises(TypeError, match=told):
-        bound(PREDICT, (), given, Bundles())
+        bound(PREDICT, (), given)
     groups = dict.fromkeys(("particles", "time_step", "x", "v", "xstar"), 0), {"x": 1, "acceleration": 2}
     told = r"'x_star' of .* is missing; .*; known are v_star, particles, time_step, x, v, xstar, acc"
     with pytest.raises(TypeError, match=told):
-        bound(PREDICT, groups, {"v_star": 0}, Bundles())
+        bound(PREDICT, groups, {"v_star": 0})
 
 
 @pytest.mark.parametrize("by", ["launch", "launcher"])
@@ -256,7 +256,7 @@ TYPES = {
     "numbers": lambda precision: precision.real,
     "vectors": lambda precision: precision.vector,
     "four fractions": lambda precision: precision.fractions(4),
-    "matrices": lambda precision: wp.types.matrix(shape=(3, 3), dtype=precision.real),
+    "matrices": lambda precision: precision.matrix,
 }
 types = pytest.mark.parametrize("type_of", TYPES.values(), ids=TYPES)
 

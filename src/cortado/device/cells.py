@@ -1,7 +1,7 @@
-"""Particles sorted by cell, scene after scene of a batch.
+"""A counting sort of particles by the cells of a grid, scene after scene of a batch.
 
-The grid of cells wraps around in every direction, so that no position lies outside of it. Along a periodic axis the
-cells divide the period; elsewhere the distance test tells apart cells that share a number.
+The grid wraps around in every direction, so that every position has a cell. Along a periodic axis the cells divide the
+period; along other axes a distance test rejects particles of cells that wrapping identifies.
 """
 
 from functools import cache, partial
@@ -16,12 +16,12 @@ from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import Precision, TypesByName
 
 FURTHEST = 2.0**24
-"""Greatest distance from the grid, in cells: a position further away counts as lost."""
+"""Greatest distance of a position from the grid [cells]; particles further away count as lost."""
 
 
 @cache
 def cell_grid_type(precision: Precision) -> Any:
-    """Return the Warp struct of a grid with the particles of each cell."""
+    """Return the Warp struct of a grid and of the first particle in each cell."""
     vector = precision.vector
 
     class CellGrid:
@@ -30,7 +30,7 @@ def cell_grid_type(precision: Precision) -> Any:
         """1 / edge length of a cell [1 / m]."""
         shape: wp.vec3i
         starts: wp.array(dtype=wp.int32)
-        """(members cells + 1,): first sorted particle of each cell; each scene of a batch has cells of its own."""
+        """(members cells + 1,): first sorted particle of each cell, scene after scene."""
 
     CellGrid.__name__ = CellGrid.__qualname__ = f"CellGrid_{precision.name}"
     return wp.struct(CellGrid)
@@ -38,8 +38,8 @@ def cell_grid_type(precision: Precision) -> Any:
 
 @cache
 def cell_functions(precision: Precision) -> SimpleNamespace:
-    """Build the Warp functions of a grid of cells: ``wrap`` and ``cell_of``, and ``below`` and ``above``, the limits of
-    the relative cells to visit along an axis."""
+    """Build the Warp functions ``wrap`` and ``cell_of``. Also build ``below`` and ``above``, the range of relative
+    cells to visit along an axis of n cells, none of them twice."""
     vector = precision.vector
     grid_type = cell_grid_type(precision)
 
@@ -61,12 +61,10 @@ def cell_functions(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def below(n: int) -> int:
-        """Return the first cell to visit along an axis of n cells, relative to one's own: no cell is visited twice."""
         return wp.where(n > 2, -1, 0)
 
     @wp.func
     def above(n: int) -> int:
-        """Return the relative cell after the last one to visit along an axis of n cells."""
         return wp.where(n > 1, 2, 1)
 
     return by_name(wrap, cell_of, below, above)
@@ -74,9 +72,8 @@ def cell_functions(precision: Precision) -> SimpleNamespace:
 
 @cache
 def cell_kernels(precision: Precision) -> SimpleNamespace:
-    """Build the kernels ``count``, ``place`` and ``rank`` of a counting sort. Atomic additions count each cell's
-    particles and assign places, in an order that differs from run to run. So each particle then counts the particles of
-    its cell before it in the given order, and takes the place of that number."""
+    """Build the kernels ``count``, ``place`` and ``rank`` of a counting sort. Atomic additions run in an order that
+    differs between runs, so ``rank`` restores the given order within each cell."""
     vector, real = precision.vector, precision.real
     grid_type = cell_grid_type(precision)
     cell_of = cell_functions(precision).cell_of
@@ -85,7 +82,6 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def is_astray(x: vector, grid: grid_type) -> bool:
-        """Test if a position is further from the grid than `FURTHEST` cells, or is not a number."""
         s = wp.cw_mul(x - grid.origin, grid.frequency)
         furthest = real(wp.static(FURTHEST))
         return not (wp.abs(s[0]) < furthest and wp.abs(s[1]) < furthest and wp.abs(s[2]) < furthest)
@@ -93,7 +89,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def count(grid, particles: int, x, counts, arrivals):
-        """Write to ``arrivals`` each particle's cell and its number of earlier arrivals; ``counts`` begins at 0."""
+        """Write to ``arrivals`` each particle's cell and its number of earlier arrivals; ``counts`` starts at 0."""
         i = wp.tid()
         member = i // particles
         cells = grid.shape[0] * grid.shape[1] * grid.shape[2]
@@ -107,7 +103,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def place(arrivals, starts, counts, placed, before):
-        """Write to ``placed`` the particle at each place, and to ``before`` the number of its cell's before it; clear
+        """Write the particle at each place, and to ``before`` the number of earlier arrivals in its cell; reset
         ``counts``."""
         i = wp.tid()
         arrival = arrivals[i]
@@ -119,7 +115,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def rank(placed, before, order):
-        """Sort the particles of each cell by given order; ``before`` is -1 behind the last cell."""
+        """Sort the particles of each cell by index; ``before`` is -1 after the last cell."""
         p = wp.tid()
         i = placed[p]
         first = p - before[p]
@@ -135,15 +131,11 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
 
 
 class CellSort:
-    """A sort of a fixed number of particles by scene and by cell, on one device and without a host read.
-
-    On a GPU the work grows with the square of the number of particles in one cell. Filling the neighbour lists compares
-    the same pairs and more, so it takes even longer. Particles too far away to be neighbours, perhaps all of an
-    exploded scene, are spread over all cells. A CPU counts particles in the given order, so they need no rank.
-    """
+    """A sort of particles by scene and cell on one device, without reads by the host. Particles too far away to be
+    neighbours are spread over all cells, because work on a GPU grows with the square of the particles in a cell. A CPU
+    counts particles in the given order, so it needs no ranking."""
 
     def __init__(self, grid: Grid, particles: int, precision: Precision, device: Any, members: int = 1):
-        """Allocate for ``particles`` in each of ``members`` scenes."""
         self._particles, self._all, self._device = particles, members * particles, device
         self._kernels = cell_kernels(precision)
         cells = members * grid.cells
@@ -151,10 +143,9 @@ class CellSort:
         self._arrivals = wp.empty(self._all, dtype=wp.vec2i, device=device)
         self._before = wp.full(self._all + 1, -1, dtype=wp.int32, device=device)
         self.order = wp.empty(self._all, dtype=wp.int32, device=device)
-        """(n,): given index of each sorted particle."""
+        """(n,): index, before sorting, of each sorted particle."""
         self._placed = self.order if device.is_cpu else wp.empty_like(self.order)
         self.grid = cell_grid_type(precision)()
-        """The grid struct that kernels use."""
         self.grid.origin = precision.vector(*grid.origin)
         self.grid.frequency = precision.vector(*(1.0 / grid.cell))
         self.grid.shape = wp.vec3i(*grid.shape)

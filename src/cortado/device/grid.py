@@ -1,4 +1,4 @@
-"""A grid of cells over a region, without Warp, because the reference engine uses the grid, too."""
+"""A grid of cells, without Warp because the reference engine uses the grid too."""
 
 from dataclasses import dataclass
 
@@ -7,23 +7,23 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid of cells over a region, each at least as wide as a search reaches."""
+    """A grid of cells over a region; a cell is at least as wide as the search radius."""
 
     origin: np.ndarray
     """Lower corner of cell 0 [m], (3,)."""
     cell: np.ndarray
     """Edge lengths of a cell [m], (3,)."""
     shape: tuple[int, int, int]
-    """Number of cells along each axis; an axis without extent (2-D) has one."""
+    """Number of cells along each axis; 1 along z in 2-D."""
 
     @property
     def cells(self) -> int:
-        """Number of cells."""
         return int(np.prod(self.shape))
 
     @classmethod
     def around(cls, lower: np.ndarray, upper: np.ndarray, period: np.ndarray, reach: float, most: int) -> "Grid":
-        """Make a grid over a region (d,) to (d,) [m]; beyond about ``most`` cells, the region wraps around."""
+        """Make a grid over the region from ``lower`` to ``upper`` (d,) [m] for a search radius ``reach`` [m]. With more
+        than about ``most`` cells the grid wraps around."""
         origin, cell, shape = np.zeros(3), np.full(3, reach), [1, 1, 1]
         for axis in range(len(lower)):
             if period[axis] > 0:

@@ -1,9 +1,7 @@
-"""Launches of kernels with arguments by name: each on a whole device, or cut into parts for the cores of a CPU.
+"""Launches of kernels with arguments by name, on a whole device or in ranges of particles on the cores of a CPU.
 
-Several arrays that a kernel takes as one argument are a bundle, so that its arguments can be read. A launch finds the
-arrays of a bundle by their names, as it finds arguments. In a bundle called ``dot`` or ``bar``, x is the array
-``x_dot`` or ``x_bar``. Kernels with few arrays take them as separate arguments: with a bundle, the density kernel is 6
-% slower on an H200. So do kernels that a tape differentiates.
+A bundle is a Warp struct of arrays that a kernel takes as one argument. A launch fills the bundle with the arrays of
+its fields' names. In a bundle called ``dot`` or ``bar``, the field x stands for the array ``x_dot`` or ``x_bar``.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -19,14 +17,13 @@ from cortado.device.precision import check_lanes, lanes_of
 from cortado.device.threads import MOST_CORES, WARP, in_parallel, usable_cores
 
 MOST_BUNDLES = 4_096
-"""Greatest number of filled bundles kept; at the limit, all are dropped."""
 _FIELDS: dict[Any, tuple[str, ...]] = {}
 """Names of the arrays of each bundle type."""
 
 
 @cache
 def bundle(**entries: Any) -> Any:
-    """Return the Warp struct of arrays with these names, and with entries of these types."""
+    """Return the Warp struct of arrays with these names and entry types."""
     words = (f"{name}_{wp.types.type_size_in_bytes(kind)}" for name, kind in entries.items())
     arrays = {name: wp.array(dtype=kind) for name, kind in entries.items()}
     made = wp.struct(type("_".join(("Bundle", *words)), (), {"__annotations__": arrays, "__module__": __name__}))
@@ -34,16 +31,7 @@ def bundle(**entries: Any) -> Any:
     return made
 
 
-@cache
-def bundles_of(kernel: wp.Kernel) -> dict[str, dict[str, str]]:
-    """Return a kernel's bundle arguments, each with the names of its fields and of the arrays for them."""
-    found = {a.label: _FIELDS[a.type] for a in kernel.adj.args if a.type.__hash__ and a.type in _FIELDS}
-    endings = {label: f"_{label}" if label in ("dot", "bar") else "" for label in found}
-    return {label: {name: name + endings[label] for name in fields} for label, fields in found.items()}
-
-
 def unbundled(arguments: Iterable[Any]) -> Iterator[Any]:
-    """Yield the arguments of a launch, with each bundle replaced by its arrays."""
     for argument in arguments:
         struct = getattr(argument, "_cls", None)
         if struct in _FIELDS:
@@ -52,39 +40,17 @@ def unbundled(arguments: Iterable[Any]) -> Iterator[Any]:
             yield argument
 
 
-class Bundles:
-    """A cache of bundles filled with arrays, as filling one takes longer than a launch."""
-
-    def __init__(self) -> None:
-        self._filled: dict[tuple[Any, ...], Any] = {}
-
-    def clear(self) -> None:
-        """Release all bundles and their arrays."""
-        self._filled.clear()
-
-    def filled(self, struct: Any, arrays: Sequence[wp.array]) -> Any:
-        """Return the bundle of a type with these arrays, in the order of its fields."""
-        key = (struct, *map(id, arrays))  # a bundle holds its arrays, so that their ids stay theirs
-        found = self._filled.get(key)
-        if found is None:
-            if len(self._filled) >= MOST_BUNDLES:
-                self.clear()
-            found = self._filled[key] = struct()
-            for name, array in zip(_FIELDS[struct], arrays, strict=True):
-                setattr(found, name, array)
-        return found
-
-
 Named = Mapping[str, Any]
-"""Arguments of kernels by name, of which a launch takes those that its kernel has."""
+"""Arguments of kernels by name."""
 
 
-def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named, bundles: Bundles) -> list[Any]:
-    """Return a kernel's arguments in its order: from ``given``, all of which it must have, and from the first of the
-    ``groups`` that has each. A bundle is filled with the arrays that it names.
+def bound(
+    kernel: wp.Kernel, groups: Sequence[Named], given: Named, filled: dict[tuple[Any, ...], Any] | None = None
+) -> list[Any]:
+    """Return a kernel's arguments in its order, from ``given`` or from the first of the ``groups`` that contains each.
+    Filled bundles are cached in ``filled``, because filling a bundle takes longer than a launch.
 
-    Kernels take many arrays of one type, and nothing else would notice a mistake: raises `TypeError` for an argument
-    that is missing or that the kernel does not have.
+    Raise `TypeError` for a missing argument, or if the kernel lacks one of the ``given`` arguments.
     """
     names, arguments = _signature(kernel)
     for name in given:
@@ -95,8 +61,22 @@ def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named, bundles: Bun
         if struct is None:
             found.append(_found(name, sources, kernel))
         else:
-            found.append(bundles.filled(struct, [_found(array, sources, kernel) for array in arrays]))
+            found.append(_bundled(struct, [_found(array, sources, kernel) for array in arrays], filled))
     return found
+
+
+def _bundled(struct: Any, arrays: Sequence[wp.array], filled: dict[tuple[Any, ...], Any] | None) -> Any:
+    key = (struct, *map(id, arrays))  # a bundle holds its arrays, so that their ids stay theirs
+    if filled and key in filled:
+        return filled[key]
+    made = struct()
+    for name, array in zip(_FIELDS[struct], arrays, strict=True):
+        setattr(made, name, array)
+    if filled is not None:
+        if len(filled) >= MOST_BUNDLES:
+            filled.clear()
+        filled[key] = made
+    return made
 
 
 def _found(name: str, sources: Sequence[Named], kernel: wp.Kernel) -> Any:
@@ -110,35 +90,35 @@ def _found(name: str, sources: Sequence[Named], kernel: wp.Kernel) -> Any:
 
 
 @cache
-def _signature(kernel: wp.Kernel) -> tuple[dict[str, None], tuple[tuple[str, Any, tuple[str, ...]], ...]]:
-    """Return a kernel's argument names, with bundles as their arrays; and each argument with its bundle."""
-    bundled = bundles_of(kernel)
-    arguments = tuple(
-        (a.label, a.type if a.label in bundled else None, tuple(bundled.get(a.label, {}).values()))
-        for a in kernel.adj.args
-    )
+def _signature(kernel: wp.Kernel) -> tuple[dict[str, None], list[tuple[str, Any, list[str]]]]:
+    """Return the argument names, with arrays in place of bundles, and (name, bundle, arrays) of each argument."""
+    arguments = []
+    for a in kernel.adj.args:
+        struct = a.type if a.type.__hash__ and a.type in _FIELDS else None
+        ending = f"_{a.label}" if a.label in ("dot", "bar") else ""
+        arguments.append((a.label, struct, [name + ending for name in _FIELDS[struct]] if struct else []))
     return dict.fromkeys(name for label, _, arrays in arguments for name in (arrays or (label,))), arguments
 
 
 MOST_PARTS = 32
-"""Greatest number of ranges of particles into which a launch on a CPU is cut."""
+"""Greatest number of ranges of particles in a launch on a CPU."""
 LEAST_PART = 2000
-"""Least number of particles in a range: below, starting it costs more than it saves."""
+"""Least number of particles in a range."""
 PARTS_A_CORE = 4
-"""Greatest number of ranges for each core: a core busy elsewhere leaves some to others."""
+"""Greatest number of ranges per core, so that an idle core can take over the ranges of a busy core."""
 LEAST_SHARED_PART = 10_000
-"""Least number of particles in a range where each core has several."""
+"""Least number of particles in a range if each core has several ranges."""
 
 Watcher = Callable[[str, Any, Sequence[Any], Callable[[], None]], None]
-"""A function called for every launch with its name, threads, arguments and the function that launches, which it must
-call at least once."""
+"""A function that gets a launch's name, threads and arguments, and the function that launches, to call at least
+once."""
 _watchers: list[Watcher] = []
 
 
 @contextmanager
 def watched(watcher: Watcher) -> Iterator[None]:
-    """Pass every launch of this process in the block to a watcher, which times or counts it. Captured graphs are not
-    taken apart: launches within are seen only during capture."""
+    """Pass every launch of this process in the block to a watcher, which times or counts launches. The launches in a
+    captured graph are passed only during capture."""
     _watchers.append(watcher)
     try:
         yield
@@ -162,24 +142,24 @@ def starts_at_first(kernel: wp.Kernel) -> bool:
 def launch(
     kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, block: int | None = None, **arguments: Any
 ) -> None:
-    """Launch a kernel, off any tape, with arguments by name; ``threads``: their number, or a shape; ``block``: threads
-    of a GPU that share memory, if it matters."""
+    """Launch a kernel, off any tape, with arguments by name. ``threads`` is their number or a shape; ``block`` is the
+    number of GPU threads that share memory."""
     announce(kernel, device)
-    inputs, sizes = bound(kernel, groups, arguments, Bundles()), {} if block is None else {"block_dim": block}
+    inputs, sizes = bound(kernel, groups, arguments), {} if block is None else {"block_dim": block}
     work = partial(wp.launch, kernel, threads, inputs=inputs, device=device, record_tape=False, **sizes)
     _perform(kernel.key, threads, inputs, work)
 
 
 def recorded(kernel: wp.Kernel, threads: int, device: Any, **arguments: Any) -> Callable[[], None]:
-    """Return a function that launches a kernel as `launch` does, with fixed arguments, packed once."""
+    """Return a function that launches a kernel with fixed arguments."""
     announce(kernel, device)
-    inputs = bound(kernel, (), arguments, Bundles())
+    inputs = bound(kernel, (), arguments)
     command = wp.launch(kernel, threads, inputs=inputs, device=device, record_tape=False, record_cmd=True)
     return partial(_perform, kernel.key, threads, inputs, command.launch)
 
 
 def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Callable[[], None]) -> None:
-    """Run work that launches several kernels, repeatable only as a whole: watchers see one launch."""
+    """Run work that launches several kernels and is repeatable only as a whole; watchers see a single launch."""
 
     def unwatched() -> None:
         watchers = _watchers.copy()
@@ -193,27 +173,25 @@ def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Cal
 
 
 class KernelLauncher:
-    """A launcher of kernels with one thread a particle on one device, with arguments by name (see `bound`).
+    """A launcher of kernels with a thread for each particle on one device; `bound` finds the arguments.
 
-    On a CPU Warp launches in one thread. So a launch of a kernel whose first argument is the neighbourhood ``s`` is cut
-    into ranges of particles, several for each core if there are many. A core that has finished a range takes the next
-    one. Such a kernel works on particle ``s.first + wp.tid()``. Sums are gathers, so the bits do not depend on the
-    ranges or the cores.
+    On a CPU a kernel with the neighbourhood ``s`` is launched in ranges of particles, which the cores share. The kernel
+    works on particle ``s.first + wp.tid()``. Sums are gathers, so the bits do not depend on ranges or cores.
     """
 
     def __init__(self, particles: int, device: Any, record_tape: bool):
-        """Prepare launches; ``record_tape`` False keeps them off a tape that a user may have open."""
+        """Prepare launches; with ``record_tape`` an open tape of Warp records them."""
         self.particles, self.device, self._record_tape = particles, device, record_tape
         self._cores = min(usable_cores(), MOST_CORES) if device.is_cpu and not record_tape else 1
         each = min(PARTS_A_CORE, MOST_PARTS // self._cores, particles // (self._cores * LEAST_SHARED_PART))
         most = self._cores * max(each, 1) if self._cores > 1 else 1
         self.parts = max(min(most, particles // LEAST_PART), 1)
-        """Number of ranges of particles into which a sum over neighbours is cut."""
+        """Number of ranges of particles in a launch of a sum over neighbours."""
         self._bounds = [particles * part // self.parts for part in range(self.parts + 1)]
         self._side = wp.Stream(device) if device.is_cuda and not record_tape else None
         self._side_is_busy = False
         self._compiled: set[Any] = set()
-        self._bundles = Bundles()
+        self._bundles: dict[tuple[Any, ...], Any] = {}
         self._whole: Any = None
         self._parts: list[Any] = []
 
@@ -244,13 +222,12 @@ class KernelLauncher:
         self._compiled.add(kernel)  # only now: an interrupted launch has compiled nothing
 
     def forget(self) -> None:
-        """Release the arrays of earlier launches, which bundles hold."""
         self._bundles.clear()
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Launch the block in a second stream of a GPU: after earlier launches, and beside later ones until `join`. On
-        a CPU nothing changes."""
+        """Launch the kernels of the block in a second GPU stream, concurrently with later launches until `join`. On a
+        CPU `aside` has no effect."""
         self._side_is_busy = self._side is not None
         with wp.ScopedStream(self._side):
             yield
@@ -272,7 +249,6 @@ class KernelLauncher:
         in_parallel(launch_part, range(self.parts), min(self._cores, self.parts))
 
     def _part(self, neighbourhood: Any, number: int) -> Any:
-        """Return a copy of the neighbourhood struct for one range of particles."""
         part = neighbourhood._cls()
         for name in neighbourhood._cls.vars:
             setattr(part, name, getattr(neighbourhood, name))
@@ -281,11 +257,8 @@ class KernelLauncher:
 
 
 class CapturedGraph:
-    """Work repeated with fixed arrays, as a captured graph from the second call on, or from the first if it is warm.
-
-    The first call loads modules and allocates memory, which is forbidden in a capture; work is warm if this is done. On
-    a CPU a graph saves the packing of arguments: half of the time with a hundred particles.
-    """
+    """Work with fixed arrays, replayed as a captured graph. The first call runs without a graph unless the work
+    ``is_warm``: capture forbids it to load modules and allocate memory."""
 
     def __init__(self, work: Callable[[], None], launch: KernelLauncher, is_warm: bool = False):
         self._work, self._launch = work, launch
@@ -305,14 +278,13 @@ class CapturedGraph:
 
 
 BANDS = 8
-"""Number of bands for each core, as one may take longer than another."""
 LEAST, LEAST_SHARED_OFTEN = 1_000, 50_000
-"""Least number of threads in a band, and in a launch that is cut if it is one of many short launches."""
+"""Least number of threads in a band, and in one of many short launches that is cut into bands."""
 
 
 class BandLauncher:
-    """A launcher of kernels with a number of threads on one device, with arguments by name (see `launch`); on a CPU in
-    bands. A kernel works on thread ``first + wp.tid()``."""
+    """A launcher of kernels with any number of threads on one device, on a CPU in bands. A kernel works on thread
+    ``first + wp.tid()``."""
 
     def __init__(self, device: Any):
         self.device, self._compiled = device, set[Any]()
@@ -335,9 +307,9 @@ class BandLauncher:
     def to_and_fro(
         self, kernel: wp.Kernel, rounds: int, values: wp.array, other: wp.array, **arguments: Any
     ) -> wp.array:
-        """Launch a kernel ``rounds`` times, with a thread for each of the ``values``. It computes ``found`` from
-        ``values``, and the next launch starts from ``found``. Launches write alternately to ``values`` and ``other``;
-        the array of the last launch is returned."""
+        """Launch a kernel ``rounds`` times, with a thread for each value; the kernel computes ``found`` from
+        ``values``. Successive launches swap the arrays ``values`` and ``other``; return the array that the last launch
+        wrote."""
         count, both = len(values), ({"values": values, "found": other}, {"values": other, "found": values})
         if self.device.is_cpu and count > LEAST_SHARED_OFTEN:
             ways: list[Callable[[], None]] = [partial(self, kernel, count, **arguments, **one) for one in both]
@@ -349,14 +321,14 @@ class BandLauncher:
 
 
 class HostCopy:
-    """A reader of a small device array into pinned host memory, which is allocated once."""
+    """A reader of a small device array into pinned host memory."""
 
     def __init__(self, array: wp.array):
         self._array = array
         self._copy: Any = array if array.device.is_cpu else None
 
     def read(self, rows: int | None = None) -> np.ndarray:
-        """Return the array, or its first ``rows``, after the device's work is done; the next call overwrites it."""
+        """Return the array, or its first ``rows``, once the device is done; the next call overwrites the result."""
         if rows == 0:
             return wp.empty((0, *self._array.shape[1:]), dtype=self._array.dtype, device="cpu").numpy()
         if self._copy is None:

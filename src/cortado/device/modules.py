@@ -1,19 +1,8 @@
-"""Start of Warp without its messages, and compilation of a step's Warp modules in parallel before their launch, which
-one line announces.
+"""The start of Warp without messages, and the parallel compilation of Warp modules before their first launch.
 
-On a CPU, LLVM vectorises loops over neighbours, four numbers at a time, if its search depth is large enough. These
-loops process `UNROLL` neighbours at once (`cortado.particles.neighbourhood`). With Warp's depth of 4 a step of the
-projection takes a fifth longer and a step of PCISPH a twentieth, with the same bits. With LLVM's own depth of 12 the
-density takes a fifth longer than with 7.
-
-Warp compiles a module when the first of its kernels is launched, one module after the other. `wp.force_load` of all
-modules, with its own workers, is as fast as the code here. But after Ctrl-C it waits for all modules, and for a few
-modules at a time it takes 1.7 times as long.
-
-Warp's messages are suppressed by default. If the environment variable CORTADO_VERBOSE is 1, they are printed: the
-greeting, a line for every loaded module, and warnings about drivers. A ``warp.config.log_level`` other than Warp's
-default, set before the first simulation is built, is kept. Home folders in containers and clusters are often read-only
-or full.
+LLVM vectorises the loops over `UNROLL` neighbours on a CPU only with a greater search depth than Warp's default. The
+environment variable CORTADO_VERBOSE=1 shows Warp's messages. A ``warp.config.log_level`` that the user has changed is
+respected.
 """
 
 import atexit
@@ -42,15 +31,12 @@ from cortado.errors import ComputationError, InputError, shown
 from cortado.files.terminal import note, say, timed_note
 
 SHALLOW, DEEP = "-slp-recursion-max-depth=4", "-slp-recursion-max-depth=7"
-"""An option of LLVM: Warp's default, and the value for Cortado's modules. Other flags are as Warp's configuration
-has."""
+"""LLVM option for the search depth of vectorisation: Warp's default, and the value for Cortado's modules."""
 UNUSED = "-DWP_NO_BFLOAT16="
-"""Compiler flag that leaves bfloat16 functions out of Warp's headers. Their precompilation then takes 1.0 s instead of
-1.7 s on a 2.5 GHz core."""
 
 
 def kernel_module(name: str, backward: bool = False) -> Any:
-    """Return the Warp module cortado_``name``, whose kernels have Warp's own adjoint only if ``backward``."""
+    """Return the Warp module cortado_``name``; its kernels have Warp's adjoint only if ``backward``."""
     module = wp.get_module(f"cortado_{name}")
     module.options["enable_backward"] = backward
     flags = wp.config.cpu_compiler_flags
@@ -60,13 +46,13 @@ def kernel_module(name: str, backward: bool = False) -> Any:
 
 @dataclass(frozen=True)
 class Kernels:
-    """A Warp kernel, or a Warp function, with its derivatives in both modes."""
+    """A Warp kernel or function with its tangent and its adjoint."""
 
     forward: Any
     tangent: Any
-    """Kernel of forward mode: from tangents of the inputs, ``x_dot`` of an argument ``x``, to those of the outputs."""
+    """Kernel of forward mode: computes output tangents from input tangents ``x_dot``."""
     adjoint: Any
-    """Kernel of reverse mode: from adjoints of the outputs, adds to those of the inputs, ``x_bar``."""
+    """Kernel of reverse mode: adds to input adjoints ``x_bar``, given output adjoints."""
 
 
 def by_name(*made: Any) -> SimpleNamespace:
@@ -75,10 +61,10 @@ def by_name(*made: Any) -> SimpleNamespace:
 
 
 def kind_of(forward: bool, taped: bool) -> str:
-    """Return the part of a Warp module's name that shows the kind of its kernels: "forward", "taped" or "derivative".
+    """Return the part of a Warp module's name for its kind of kernels: "forward", "taped" or "derivative".
 
-    Warp's own adjoint of forward kernels, which `gradients.Tape` needs, takes three times as long to compile as the
-    kernels. So kernels that a tape can differentiate are separate, in modules of their own.
+    Kernels that a tape differentiates have separate modules, because Warp's adjoint of a kernel takes three times as
+    long to compile as the kernel.
     """
     if not forward:
         return "derivative"
@@ -86,42 +72,37 @@ def kind_of(forward: bool, taped: bool) -> str:
 
 
 def is_derivative(module: Any) -> bool:
-    """Test if the kernels of a Warp module are derivatives."""
     return "_derivative_" in module.name or "_tangent_" in module.name
 
 
 _ahead: WeakValueDictionary[int, Any] = WeakValueDictionary()
-"""Objects, by identity, whose kernels were compiled ahead."""
+"""Objects, by identity, whose kernels have been compiled."""
 _begun: dict[Any, Future[None]] = {}
-"""Futures of modules that another thread compiles or has compiled, and for which nobody has waited yet."""
+"""Futures of modules that another thread compiles, until `_compile` waits for them."""
 _looked_at: set[Any] = set()
-"""Modules of kernels that were launched."""
 
 
 class _Said:
-    """A flag of this process that compiling has been announced."""
-
     anything = False
 
 
 def compile_ahead(owner: Any, device: Any) -> None:
-    """Compile the modules of all kernels but derivatives that an object holds, directly or in its parts, before a
-    solver's step launches them. Once for each object; cached modules are loaded at their launch."""
+    """Compile the modules of the kernels of an object and its parts, except derivatives, once per object."""
     if _ahead.get(id(owner)) is not owner:
         _ahead[id(owner)] = owner
         _compile([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)], device)
 
 
 def compile_ahead_adjoint(owner: Any, device: Any) -> None:
-    """Compile an object's kernels and adjoints before a backward step launches them; see `compile_ahead`."""
+    """Compile the modules of the kernels of an object and its parts, except tangents, once per object."""
     if _ahead.get(id(owner)) is not owner:
         _ahead[id(owner)] = owner
         _compile([kernel for kernel in kernels_of(owner) if "_tangent_" not in kernel.module.name], device)
 
 
 def compile_meanwhile(owner: Any, device: Any) -> None:
-    """Begin to compile an object's kernels in another thread, on a CPU with a spare core; `compile_ahead` waits for
-    it."""
+    """Start to compile an object's kernels in another thread of a CPU with a spare core; `compile_ahead` waits for the
+    result."""
     if not device.is_cpu or usable_cores() < 2:
         return
     sizes = _sizes([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)])
@@ -132,7 +113,7 @@ def compile_meanwhile(owner: Any, device: Any) -> None:
 
 
 def announce(kernel: wp.Kernel, device: Any) -> None:
-    """Print once a process on stderr that kernels are compiled, if a kernel about to be launched has to be."""
+    """Print a line on stderr, once per process, if a kernel about to be launched must be compiled."""
     module = kernel.module
     if module not in _looked_at:
         _looked_at.add(module)
@@ -142,7 +123,7 @@ def announce(kernel: wp.Kernel, device: Any) -> None:
 
 
 def kernels_of(owner: Any) -> list[wp.Kernel]:
-    """Return the kernels that an object of Cortado's holds, directly or in its parts."""
+    """Return the kernels of an object of Cortado and of its parts."""
     found: dict[int, Any] = {}
     seen: dict[int, Any] = {}
     waiting = [owner]
@@ -165,7 +146,7 @@ def kernels_of(owner: Any) -> list[wp.Kernel]:
 
 
 def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
-    """Compile and load the kernels' modules that are not in the cache if there are several; a single one is left to its
+    """Compile and load the modules of the kernels that are not in the cache; a single missing module is left to its
     launch."""
     sizes = _sizes(kernels)
     wait([_begun.pop(module) for module in sizes if module in _begun])
@@ -184,8 +165,7 @@ def _compile_all(modules: Sequence[Any], device: Any, cores: int) -> None:
 
 
 def _sizes(kernels: Sequence[wp.Kernel]) -> dict[Any, int]:
-    """Return the kernels' modules, each with a number that grows with its time to compile, which is long for sums over
-    neighbours."""
+    """Return the modules of the kernels, each with an estimate of its relative compile time."""
     found: dict[Any, int] = {}
     for kernel in kernels:
         source = kernel.adj.source
@@ -194,12 +174,10 @@ def _sizes(kernels: Sequence[wp.Kernel]) -> dict[Any, int]:
 
 
 def _missing(sizes: Mapping[Any, int], device: Any) -> list[Any]:
-    """Return the modules that have to be compiled, slowest first."""
     return sorted((module for module in sizes if not _is_compiled(module, device)), key=lambda one: -sizes[one])
 
 
 def _is_compiled(module: Any, device: Any) -> bool:
-    """Test if a module is loaded, or in the cache."""
     block_dim = 1 if device.is_cpu else module.options["block_dim"]
     if (device.context, block_dim) in module.execs:
         return True
@@ -217,8 +195,8 @@ VERBOSE = "CORTADO_VERBOSE"
 
 @contextmanager
 def silenced() -> Iterator[None]:
-    """Keep Warp silent in the block, as it starts; afterwards it prints warnings and errors alone. A log level chosen
-    by the user is kept, and one below Warp's own keeps the start audible."""
+    """Suppress Warp's messages in the block, and afterwards all but warnings and errors. A log level chosen by the user
+    is respected."""
     chosen = wp.config.log_level
     if os.environ.get(VERBOSE, "0") not in ("", "0") or chosen < wp.LOG_INFO:
         yield
@@ -233,8 +211,7 @@ def silenced() -> Iterator[None]:
 
 @contextmanager
 def c_stderr_to(file: int) -> Iterator[None]:
-    """Redirect stderr of C code in the block to an open file: Warp's warnings of a missing CUDA driver, and its
-    compiler's errors."""
+    """Redirect stderr of C code in the block to an open file."""
     try:
         stderr = os.dup(2)
     except OSError:  # there is none
@@ -250,15 +227,15 @@ def c_stderr_to(file: int) -> Iterator[None]:
 
 CACHE_PATH = "WARP_CACHE_PATH"
 _COMPILING = re.compile(r"_p\d+_t\d+$")
-"""Pattern of the end of a folder name in which a thread of a process compiles."""
+"""Pattern for the end of the name of a folder in which a thread is still compiling."""
 ROOM = 16 * 2**20
-"""Free disk space [bytes] needed for kernels; those of one run take a few MiB."""
+"""Free disk space [bytes] that kernels need."""
 
 
 @cache
 def start_warp() -> None:
-    """Start Warp, once a process, without its greeting. If its cache cannot be written, a warning says so, and missing
-    kernels are compiled in a temporary folder. Raises `ComputationError` if there is no temporary folder either."""
+    """Start Warp once per process, without its greeting. If Warp's cache is unusable, warn and compile missing kernels
+    in a temporary folder. Raise `ComputationError` if no temporary folder can be made."""
     reason = _start()
     folder = wp.config.kernel_cache_dir
     reason = reason or _trouble(folder)
@@ -295,7 +272,7 @@ def complaint(error: Exception) -> str | None:
 
 
 def _start() -> str | None:
-    """Start Warp, unless it has started; return the reason if its cache cannot be created, otherwise None."""
+    """Start Warp; return the reason if its cache folder cannot be made, otherwise None."""
     try:
         with silenced():
             wp.init()
@@ -305,7 +282,7 @@ def _start() -> str | None:
 
 
 def _trouble(folder: str) -> str | None:
-    """Return why a folder cannot store kernels: no space, or a damaged kernel in it; None if all is well."""
+    """Return why a folder cannot store kernels, or None if it can."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             free = shutil.disk_usage(folder).free
@@ -318,13 +295,12 @@ def _trouble(folder: str) -> str | None:
 
 
 def _kernels(folder: str) -> Iterator[Path]:
-    """Yield folders of kernels, except those being compiled by a process, which Warp renames in the end."""
     return (kernel for kernel in Path(folder).glob("wp_*") if not _COMPILING.search(kernel.name))
 
 
 def _is_whole(kernel: Path) -> bool:
-    """Test if a kernel's object files end with their table of sections, without which the loader prints at length; True
-    except on Linux."""
+    """Test on Linux if a kernel's object files end with their section table; the loader prints many lines about
+    truncated files."""
     if sys.platform != "linux":
         return True
     for file in kernel.glob("*.o"):
@@ -342,7 +318,7 @@ def _is_whole(kernel: Path) -> bool:
 
 
 def _replacement(folder: str) -> str:
-    """Return a temporary folder for kernels until the process ends, with links to intact ones of the cache."""
+    """Return a temporary folder for kernels, deleted at exit, with links to the intact kernels of the cache."""
     temporary = tempfile.mkdtemp(prefix="cortado-kernels-")
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)
     with suppress(OSError):
@@ -353,12 +329,10 @@ def _replacement(folder: str) -> str:
 
 Version = tuple[int, int]
 VISIBLE = "CUDA_VISIBLE_DEVICES"
-"""Name of the environment variable that says which GPUs a process has."""
 PLACE = "https://nvidia.github.io/warp/stable/user_guide/installation.html"
 
 
 def why_no_gpu() -> str:
-    """Return in words why Warp, which has started, finds no GPU."""
     needed, found = _needed(), installed_driver()
     if needed is None or found is None or found >= needed:
         return "no GPU with a CUDA driver is found"
@@ -369,7 +343,7 @@ def why_no_gpu() -> str:
 
 
 def installed_driver() -> Version | None:
-    """Return the version of CUDA that this machine's driver supports; None without a driver."""
+    """Return the CUDA version that this machine's driver supports; None without a driver."""
     with suppress(OSError, AttributeError):
         library = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
         version = ctypes.c_int()
@@ -379,7 +353,7 @@ def installed_driver() -> Version | None:
 
 
 def _needed() -> Version | None:
-    """Return the version of CUDA that Warp needs; None where unknown, or built without CUDA."""
+    """Return the CUDA version that Warp needs; None if unknown."""
     with suppress(ImportError, AttributeError):  # Warp keeps it for itself, and may move it
         from warp._src.context import runtime
 
@@ -392,7 +366,7 @@ def _shown(version: Version) -> str:
 
 
 def device_named(name: str) -> Any:
-    """Return Warp's device with this name; raises `InputError` if there is no such device."""
+    """Return Warp's device with this name; raise `InputError` if it does not exist."""
     found = ", ".join(str(device) for device in wp.get_devices())
     none = "" if wp.get_cuda_device_count() else f"; {why_no_gpu()}"
     if not isinstance(name, str):
@@ -406,7 +380,7 @@ def device_named(name: str) -> Any:
 
 
 def visible_gpus() -> list[str]:
-    """Return the GPUs that this process may use, as CUDA names them."""
+    """Return the GPUs of this process under their CUDA names."""
     start_warp()
     given = [name.strip() for name in os.environ.get(VISIBLE, "").split(",") if name.strip()]
     present = wp.get_cuda_device_count()

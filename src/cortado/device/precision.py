@@ -1,11 +1,10 @@
-"""The two floating-point precisions: scalar, vector and NumPy types that belong together; roots and reciprocals; and
-types of parameters by their names.
+"""The two floating-point precisions, with Warp functions for roots, reciprocals and lanes; and types of parameters by
+name.
 
-Lanes are several GPU threads that share a particle: each processes some of its neighbours, and their sums are added.
-With one thread per particle, few particles leave a large GPU mostly idle. A kernel for lanes is launched with LANES
-threads per particle, and finds its particle as `wp.tid() // LANES`. A lane processes `UNROLL` neighbours, then the
-group LANES groups further down the list. A butterfly of shuffles adds the lanes' sums, with the same bits in every
-lane; the first lane writes the result. On a CPU, and for Warp's tape, there is one lane.
+Lanes are GPU threads that share a particle: they process different neighbours, and a butterfly of shuffles adds their
+sums with the same bits in every lane. The first lane writes the result. Lanes occupy a large GPU when particles are
+few. A kernel for lanes is launched with LANES threads per particle and computes its particle as `wp.tid() // LANES`. A
+CPU and Warp's tape have a single lane.
 """
 
 import inspect
@@ -25,42 +24,38 @@ from cortado.errors import InputError, shown
 
 @dataclass(frozen=True)
 class Precision:
-    """One floating-point format, in the three spellings that the code needs."""
+    """A floating-point format with its Warp and NumPy types."""
 
     name: str
     real: Any
-    """Warp scalar type."""
     vector: Any
-    """Warp vector type of three components (z is 0 in two dimensions)."""
+    """Warp vector type of three components; z is 0 in 2-D."""
     pair: Any
-    """Warp vector type of two components."""
     numpy: type
-    """NumPy scalar type."""
     tiny: float
     """Positive number far below round-off of 1, with a finite reciprocal."""
     furthest: float
-    """Distance from the origin, in spacings, where positions are rounded to about 0.001 spacings (float32) or less."""
+    """Distance from the origin [spacings] up to which positions are rounded to at most about 0.001 spacings."""
     greatest: float
-    """Greatest size of a parameter, as products of several must stay finite."""
+    """Greatest size of a parameter, so that products of several parameters stay finite."""
 
     @property
     def bytes(self) -> int:
-        """Number of bytes of a number."""
         return np.dtype(self.numpy).itemsize
 
     @property
     def six(self) -> Any:
-        """Warp vector type of six components, for a symmetric matrix."""
-        return _vector_type(self.real, 6)
+        """Warp vector type of six components, for symmetric matrices."""
+        return wp.types.vector(length=6, dtype=self.real)
+
+    @property
+    def matrix(self) -> Any:
+        """Warp type of 3 x 3 matrices."""
+        return wp.types.matrix(shape=(3, 3), dtype=self.real)
 
     def fractions(self, phases: int) -> Any:
-        """Return the Warp vector type of one number for each phase."""
-        return _vector_type(self.real, phases)
-
-
-@cache
-def _vector_type(real: Any, length: int) -> Any:
-    return wp.types.vector(length=length, dtype=real)
+        """Return the Warp vector type with a number for each phase."""
+        return wp.types.vector(length=phases, dtype=self.real)
 
 
 FLOAT32 = Precision("float32", wp.float32, wp.vec3f, wp.vec2f, np.float32, 1e-30, 1e4, 1e12)
@@ -68,7 +63,7 @@ FLOAT64 = Precision("float64", wp.float64, wp.vec3d, wp.vec2d, np.float64, 1e-20
 
 
 def precision_named(name: str) -> Precision:
-    """Return the precision called ``"float32"`` or ``"float64"``; raises `InputError` for any other name."""
+    """Return the precision called ``"float32"`` or ``"float64"``; raise `InputError` for any other name."""
     for precision in (FLOAT32, FLOAT64):
         if isinstance(name, str) and precision.name == name:
             return precision
@@ -76,7 +71,7 @@ def precision_named(name: str) -> Precision:
 
 
 class TypesByName:
-    """The types of parameter names that many Warp functions share, so that each type is given only once.
+    """A decorator that gives Warp types to the parameters of functions by their names.
 
         typed = TypesByName(real, {vector: "x v", neighbourhood: "s"})
 
@@ -84,21 +79,21 @@ class TypesByName:
         @typed
         def spread(x_ij, x_dot_ij, v_ij, m_i, m_j, s) -> vector: ...
 
-    A parameter without a type has that of the longest of these names with which its words begin, as those of x_dot_ij
-    begin with x. One that begins with none of them has the usual type, which is that of numbers as a rule."""
+    A parameter without annotation gets the type of the longest listed name that begins its name, as x begins x_dot_ij.
+    Without such a name the parameter gets the usual type.
+    """
 
     def __init__(self, usual: Any, *names: Mapping[Any, str]):
-        """Set the usual type, and tables with the names of each other type; later tables have priority."""
+        """Set the usual type, and tables from types to names; later tables have priority."""
         self._usual = usual
         self._types = {name: kind for own in names for kind, words in own.items() for name in words.split()}
 
     def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Add types to the parameters of a function."""
         return self._give(function, lambda kind: kind)
 
     def arrays(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Add types to the parameters of a kernel. Those without a type become arrays of entries, or Warp's structs;
-        arrays that a kernel writes must come last."""
+        """Add types to a kernel's parameters: arrays of the types by name, or Warp structs. The arrays that a kernel
+        writes must come last."""
         return self._give(function, lambda kind: wp.array(dtype=kind) if isinstance(kind, type) else kind)
 
     def _give(self, function: Callable[..., Any], whole: Callable[[Any], Any]) -> Callable[..., Any]:
@@ -116,8 +111,8 @@ class TypesByName:
 
 @cache
 def arithmetic(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Build the Warp functions ``root``, ``inverse_root`` and ``reciprocal`` of a positive number that is neither
-    subnormal nor infinite. ``taped`` ones have derivatives, and round as IEEE 754 demands."""
+    """Build the Warp functions ``root``, ``inverse_root`` and ``reciprocal`` of positive normal numbers. Only ``taped``
+    ones have derivatives; they round as IEEE 754 demands."""
     return _of_the_gpu() if precision == FLOAT32 and not taped else _plain(precision)
 
 
@@ -140,7 +135,6 @@ def _plain(precision: Precision) -> SimpleNamespace:
 
 
 def _of_the_gpu() -> SimpleNamespace:
-    """Return CUDA's approximate float32 roots and reciprocal; on a CPU they are the usual functions."""
 
     def native(cuda: str, cpu: str) -> str:
         return f"\n#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{cpu}\n#endif\n"
@@ -160,26 +154,24 @@ def _of_the_gpu() -> SimpleNamespace:
 
 
 BY_SIZE = ((2_000, 16), (16_000, 8), (48_000, 4))
-"""Pairs (greatest number of particles, lanes of a particle) on a GPU; above the last, one lane. Measured on an H200."""
+"""Pairs (greatest number of particles, lanes) on a GPU; above the last, one lane."""
 _OF_MODULES: dict[str, int] = {}
-"""Value of LANES in the kernels of each Warp module, by its name."""
+"""Number of lanes by the name of the Warp module."""
 
 
 def set_lanes(module: Any, lanes: int) -> None:
-    """Register the value of LANES in the kernels of a Warp module."""
     _OF_MODULES[module.name] = lanes
 
 
 @cache
 def lanes_of(kernel: wp.Kernel) -> int:
-    """Return the number of a kernel's threads for each particle: one, unless it divides them by LANES."""
     return _OF_MODULES.get(kernel.module.name, 1) if "wp.tid() // LANES" in kernel.adj.source else 1
 
 
 @cache
 def check_lanes(kernel: wp.Kernel) -> None:
-    """Raise `TypeError` for a kernel that calls a sum shared by lanes without being made for lanes: on a GPU each
-    thread would get part of the sum of a wrong particle."""
+    """Raise `TypeError` for a kernel that calls a sum over lanes but is not made for lanes: on a GPU each thread would
+    get part of the sum of a wrong particle."""
     source = kernel.adj.source
     if "wp.tid() // LANES" in source and "lane()" in source:
         return
@@ -192,7 +184,6 @@ def check_lanes(kernel: wp.Kernel) -> None:
 
 
 def _called(function: Any) -> Iterator[Any]:
-    """Yield the Warp functions that a Python function names, and, recursively, those that they name."""
     known = inspect.getclosurevars(function)
     for value in (*known.nonlocals.values(), *known.globals.values()):
         if isinstance(value, wp.Function) and value.func:
@@ -201,11 +192,10 @@ def _called(function: Any) -> Iterator[Any]:
 
 
 COUNTS = (1, 2, 4, 8, 16)
-"""Numbers of lanes that a particle can have."""
 
 
 def checked_lanes(lanes: Any) -> int | None:
-    """Return the user's argument ``lanes``, or None; raises `InputError` for an impossible number of lanes."""
+    """Return the user's argument ``lanes``, or None; raise `InputError` for an invalid number."""
     if lanes is not None and whole_number("lanes", lanes, 1) not in COUNTS:
         wanted = ", ".join(map(str, COUNTS))
         raise InputError(f"lanes is {shown(lanes)}, but must be one of {wanted}, or be left out.")
@@ -213,8 +203,8 @@ def checked_lanes(lanes: Any) -> int | None:
 
 
 def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
-    """Return the lanes of a particle on a device: on a GPU the number ``wanted``, if given, otherwise a number that
-    suits the particles of one scene."""
+    """Return the number of lanes of a particle on a device: on a GPU ``wanted``, or by default a number that suits the
+    number of particles."""
     if device.is_cpu:
         return 1
     return wanted or next((lanes for most, lanes in BY_SIZE if particles <= most), 1)
@@ -222,17 +212,17 @@ def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
 
 @cache
 def lane_functions(precision: Precision, lanes: int) -> SimpleNamespace:
-    """Build the Warp functions of kernels for a number of lanes, a power of 2 up to 32.
+    """Build the Warp functions for kernels with a number of lanes, a power of 2 up to 32.
 
-    ``lane`` returns the number of a thread's lane, ``add_up`` and ``add_up_vectors`` return sums over the lanes.
-    ``vote`` returns a number whose bit k is set if lane k votes yes; ``ones`` counts the bits of a vote, and ``before``
-    the bits of earlier lanes."""
+    ``lane`` returns the index of a thread's lane; ``add_up`` and ``add_up_vectors`` return sums over the lanes. Bit k
+    of ``vote`` is set if lane k votes yes; ``ones`` counts the set bits, ``before`` those of lower lanes.
+    """
     return _of_one(precision) if lanes == 1 else _of_several(precision, lanes)
 
 
 @cache
 def sum_over_lanes(kind: Any, precision: Precision, lanes: int) -> Any:
-    """Return a Warp function that sums a number, or a vector of any length, of type ``kind`` over the lanes."""
+    """Return a Warp function that sums numbers or vectors of type ``kind`` over the lanes."""
     functions = lane_functions(precision, lanes)
     if kind is precision.real:
         return functions.add_up
@@ -285,7 +275,7 @@ def _of_one(precision: Precision) -> SimpleNamespace:
 
 
 def _of_several(precision: Precision, lanes: int) -> SimpleNamespace:
-    """Return CUDA functions of lanes: threads of a particle are neighbours in one warp, and wait for each other."""
+    """Return CUDA functions of lanes; the threads of a particle are consecutive in one warp."""
     real, vector = precision.real, precision.vector
     first, group = f"(threadIdx.x % 32u / {lanes}u * {lanes}u)", f"{(1 << lanes) - 1}u"
 

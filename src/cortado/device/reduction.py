@@ -1,8 +1,7 @@
-"""Sums over particles in a fixed order, so that the same bits come back every time.
+"""Sums over particles in a fixed order, so that repeated runs give the same bits.
 
-Each scene of a batch has ``count`` values, scene after scene, which are reduced to ``stride`` partial values. On a CPU
-one thread computes a partial value, on a GPU a block of threads, by a tree in shared memory. `wp.tile_sum` adds in
-another order, thus with other bits, and cannot compute the sum and maximum of pairs in one pass.
+A reduction turns the ``count`` values of each scene into ``stride`` partial values. A partial value is computed by a
+thread on a CPU, and by a block of threads on a GPU.
 """
 
 from dataclasses import dataclass
@@ -16,35 +15,31 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 BRANCHES = 32
-"""Number of values that one thread adds up on a CPU."""
+"""Number of values that a CPU thread adds up."""
 BLOCK = 1024
-"""Greatest number of threads of a block on a GPU."""
 EACH = 8
-"""Number of values that each thread of a block adds up before the tree."""
+"""Number of values that a thread of a block adds up before the tree."""
 SHARED = 32 * 1024
-"""Greatest shared memory [bytes] of a block, of the 48 KiB that there are."""
+"""Greatest shared memory of a block [bytes]."""
 
 
 @dataclass(frozen=True)
 class ReductionKernel:
-    """One level of a reduction."""
-
     kernel: Any
     threads: int
     """Number of threads for each partial value."""
     most: int
-    """Greatest number of values that make up a partial one."""
+    """Greatest number of values in a partial value."""
 
 
 def type_name(dtype: Any) -> str:
-    """Return the name of a number, vector or matrix type, for the name of a Warp module."""
+    """Return the name of a Warp type of numbers, vectors or matrices, for the name of a Warp module."""
     shape = getattr(dtype, "_shape_", ())
     return "_".join([getattr(dtype, "_wp_scalar_type_", dtype).__name__, *map(str, shape)])
 
 
 @cache
 def sum_kernel(dtype: Any, is_cpu: bool) -> ReductionKernel:
-    """Return a kernel of partial sums of numbers, vectors or matrices of one type."""
 
     @wp.func
     def plus(a: dtype, b: dtype) -> dtype:
@@ -55,7 +50,6 @@ def sum_kernel(dtype: Any, is_cpu: bool) -> ReductionKernel:
 
 @cache
 def sum_and_maximum_kernel(precision: Precision, is_cpu: bool) -> ReductionKernel:
-    """Return a kernel that sums the first and takes the maximum of the second components of pairs."""
     pair = precision.pair
 
     @wp.func
@@ -68,7 +62,7 @@ def sum_and_maximum_kernel(precision: Precision, is_cpu: bool) -> ReductionKerne
 
 
 def _of_threads(name: str, dtype: Any, combine: Any) -> ReductionKernel:
-    """Return a kernel that combines values t, t + T, t + 2 T, ... of a scene into partial[t]."""
+    """Return a kernel that combines the values t, t + T, t + 2 T, ... of a scene into partial[t]."""
 
     def reduce(count: int, stride: int, values: wp.array(dtype=dtype), partial: wp.array(dtype=dtype)):
         t = wp.tid() % stride
@@ -82,8 +76,8 @@ def _of_threads(name: str, dtype: Any, combine: Any) -> ReductionKernel:
 
 
 def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
-    """Return the kernel of `_of_threads` with a block of threads instead of each thread t. ``combine`` is a C++
-    expression in a and b, of the type T."""
+    """Return the kernel of `_of_threads` with a block of threads in place of each thread. ``combine`` is a C++
+    expression in a and b of type T."""
     threads = BLOCK
     while threads * wp.types.type_size_in_bytes(dtype) > SHARED:
         threads //= 2
@@ -118,7 +112,7 @@ def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
 
 
 def _kernel(name: str, module_name: str, function: Any, **options: Any) -> Any:
-    """Return a named kernel in a module of its own, because modules for a CPU cannot contain code for a GPU only."""
+    """Return a named kernel in a separate module, because CPU modules cannot contain GPU code."""
     module = kernel_module(module_name)
     function.__qualname__ = name
     return wp.kernel(function, module=module, enable_backward=False, **options)
@@ -126,7 +120,6 @@ def _kernel(name: str, module_name: str, function: Any, **options: Any) -> Any:
 
 @cache
 def add_kernel(dtype: Any) -> Any:
-    """Return a kernel that computes total += value, element by element."""
     module = kernel_module(f"add_{type_name(dtype)}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -138,10 +131,9 @@ def add_kernel(dtype: Any) -> Any:
 
 
 class TreeReduction:
-    """A reduction on the device of one value per particle to one per scene, in a fixed order."""
+    """A reduction of (members n,) values to one value per scene, in a fixed order."""
 
     def __init__(self, level: ReductionKernel, dtype: Any, particles: int, device: Any, members: int = 1):
-        """Allocate for ``particles`` in each of ``members`` scenes."""
         self._level, self._device, self._particles = level, device, particles
         self._partials: list[tuple[int, wp.array]] = []
         size = particles
@@ -150,7 +142,7 @@ class TreeReduction:
             self._partials.append((size, wp.zeros(members * size, dtype=dtype, device=device)))
 
     def __call__(self, values: wp.array) -> wp.array:
-        """Return the sums as an array (members,), which the next call overwrites."""
+        """Return the sums (members,), which the next call overwrites."""
         count, level, device = self._particles, self._level, self._device
         for size, sums in self._partials:
             arguments = {"count": count, "stride": size, "values": values, "partial": sums}
@@ -165,11 +157,10 @@ def sum_of(dtype: Any, particles: int, device: Any, members: int = 1) -> TreeRed
 
 
 def sum_and_maximum(particles: int, precision: Precision, device: Any, members: int = 1) -> TreeReduction:
-    """Return a reduction to the sum of first and the maximum of second components of pairs (members n,)."""
+    """Return a reduction of pairs (members n,) to the sum of first and the maximum of second components."""
     level = sum_and_maximum_kernel(precision, device.is_cpu)
     return TreeReduction(level, precision.pair, particles, device, members)
 
 
 def add(values: wp.array, total: wp.array) -> None:
-    """Add values to an array on the device, element by element: total += values."""
     launch(add_kernel(values.dtype), len(values), values.device, value=values, total=total)

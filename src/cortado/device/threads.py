@@ -1,16 +1,10 @@
-"""Cores, threads, processes and memory: the number of cores of launches, the locks on Warp and on simulations (also
-after a fork), calls in worker processes, and the memory that is needed and free.
+"""Cores, threads and processes: the number of usable cores, locks on Warp and on simulations, calls in worker
+processes; and estimates of memory.
 
-Warp keeps one state for a whole process: the graph that is being captured, the tape that is being recorded, the modules
-that are loaded. Two threads in Warp at a time would spoil each other's results, so Cortado lets in only one at a time.
+Warp has one state per process, such as the graph being captured. So only one thread at a time may use Warp.
 
-A worker process caches the last functions that it received, so that a problem is built once in each process and not for
-each evaluation.
-
-Memory is estimated before it is allocated, for a sentence. Estimates count particles with their neighbour lists, wall
-particles, tables and records of every step, the frames that a report reads back, and in a renderer nodes, pixels and
-samples. The bytes of each were measured, and hold to a factor of about 1.5. Checkpoints are not counted, as a rollout
-keeps no more of them than there is room for.
+Memory is estimated before it is allocated, to within a factor of about 1.5, so that a lack of memory is reported as a
+sentence. Estimates leave out checkpoints, because a rollout adapts their number to the free memory.
 """
 
 import os
@@ -37,12 +31,11 @@ from cortado.errors import ComputationError, CortadoError, InputError, shown, wa
 from cortado.version import __version__
 
 CORES = "CORTADO_CORES"
-"""Name of the environment variable that limits the number of cores, for processes that share a machine."""
 
 
 def usable_cores() -> int:
-    """Return the number of cores of this process, or of the machine where the system does not tell, at most
-    CORTADO_CORES (an environment variable). Raises `InputError` where that is no number of cores."""
+    """Return the number of cores that this process may use, at most the environment variable CORTADO_CORES. Raise
+    `InputError` if this variable is not a number of cores."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = os.environ.get(CORES, "").strip()
     if not limit:
@@ -53,19 +46,17 @@ def usable_cores() -> int:
 
 
 MOST_CORES = 16
-"""Greatest number of cores that a launch on a CPU uses."""
+"""Greatest number of cores in a launch on a CPU."""
 
 
 @cache
 def helpers() -> ThreadPoolExecutor:
-    """Return the pool of threads that share the work of the launching one."""
     return ThreadPoolExecutor(MOST_CORES - 1, thread_name_prefix="cortado")
 
 
 def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int) -> None:
-    """Call ``work`` for each item on several cores: this thread and its helpers take item after item. After a failure,
-    which is raised, and after an interruption no further item is started. Returns once all calls have ended, so that no
-    work continues in the background."""
+    """Call ``work`` for each item on several cores, and return when all calls have ended. After an error, which is
+    raised, or an interruption, no further item is started."""
     waiting = iter(items)
 
     def take() -> None:
@@ -85,12 +76,11 @@ def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int)
 
 
 class WarpLock(ContextDecorator, threading.local):
-    """The lock that a thread holds while it uses Warp; a context or a decorator of functions. A thread may enter it
+    """The lock that a thread holds while it uses Warp; a context or a decorator, which a thread may enter
     repeatedly."""
 
     _lock = threading.RLock()
     _entries = 0
-    """Number of times that this thread has entered the lock."""
 
     def __enter__(self) -> None:
         if not self._entries:
@@ -104,7 +94,8 @@ class WarpLock(ContextDecorator, threading.local):
 
     @contextmanager
     def lent(self) -> Iterator[None]:
-        """Release the lock in the block, around work that uses none of Warp's state, or waits for another thread."""
+        """Release the lock in the block, around work that does not use Warp's state or that waits for another
+        thread."""
         entries = self._entries
         if entries:
             self._let_go()
@@ -123,14 +114,13 @@ class WarpLock(ContextDecorator, threading.local):
 
 
 WARP = WarpLock()
-"""Lock of this process on Warp."""
 
 
 class Turn:
-    """The lock that a thread holds while it uses a simulation. Other threads wait for it; those with other simulations
-    may use Warp where a captured graph is replayed.
+    """The lock that a thread holds while it uses a simulation. Threads with other simulations may use Warp while a
+    captured graph is replayed.
 
-    ``with simulation.turn:`` makes one piece of several calls.
+    ``with simulation.turn:`` makes several calls one uninterrupted unit.
     """
 
     def __init__(self, device: Any):
@@ -158,7 +148,7 @@ class Turn:
         self._lock.release()
 
     def forked(self) -> None:
-        """Replace the lock in the child of a fork, where only the forking thread still exists."""
+        """Replace the lock in the child of a fork, in which only the forking thread exists."""
         if self._lock.acquire(blocking=False):
             self._lock.release()
         else:
@@ -180,7 +170,7 @@ Self = TypeVar("Self", bound=_HasTurn)
 
 
 def in_turn(method: Callable[Concatenate[Self, P], R]) -> Callable[Concatenate[Self, P], R]:
-    """Make a method hold the lock ``turn`` of its object while it runs; the arguments of a call are checked before."""
+    """Make a method hold its object's lock ``turn`` while it runs."""
 
     @wraps(method)
     def held(self: Self, *args: P.args, **options: P.kwargs) -> R:
@@ -203,53 +193,48 @@ if hasattr(os, "register_at_fork"):
 
 
 KEPT = 2
-"""Number of functions that a worker process keeps, the last ones used. Each may hold a problem with all its memory."""
+"""Greatest number of functions that a worker process caches; each may hold a problem with all its memory."""
 _functions: OrderedDict[str, Callable[[Any], Any]] = OrderedDict()
 _one_at_a_time = threading.RLock()
 
 
 @dataclass(frozen=True)
 class Payload:
-    """A function on its way to a worker process."""
-
     digest: str
-    """A checksum of the pickled function."""
     versions: str
-    """The `versions` of the process that pickled the function."""
     content: bytes | None
-    """The pickled function; None where a worker should have it."""
+    """The pickled function; None if the worker should have cached the function."""
 
     @classmethod
     def of(cls, function: Callable[[Any], Any]) -> "Payload":
-        """Pickle a function into a payload; raises `InputError` where that is impossible."""
+        """Pickle a function into a payload; raise `InputError` if that is impossible."""
         content = pickled(function, "The function")
         return cls(sha256(content).hexdigest(), versions(), content)
 
     @property
     def mention(self) -> "Payload":
-        """Payload without its content."""
         return replace(self, content=None)
 
 
 @dataclass(frozen=True)
 class Lacking:
-    """The answer of a worker that does not have the called function yet and was not sent it."""
+    """A worker's answer if it has not cached the function of a payload without content."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The result of a call in a worker process, or its error."""
+    """The result or the error of a call in a worker process."""
 
     content: bytes = b""
-    """The result, pickled in the worker, so that a result that cannot be pickled is an error of the call."""
+    """The result, pickled in the worker so that a failure to pickle is an error of the call."""
     error: BaseException | None = None
     traceback: str = ""
-    """The traceback of an error that is none of Cortado's own."""
+    """The traceback of an error that is not Cortado's."""
     warnings: tuple[tuple[str, type[Warning]], ...] = ()
     """(text, category) of each warning."""
 
     def result(self) -> Any:
-        """Return the function's result, with its warnings given here; raises its error."""
+        """Return the function's result, after repeating its warnings; raise its error."""
         for text, category in self.warnings:
             warn(text, category)
         if self.error is None:
@@ -260,8 +245,8 @@ class Answer:
 
 
 def pickled(value: Any, what: str) -> bytes:
-    """Pickle a value with the code of classes and functions of the main module; raises `InputError` where that is
-    impossible, in a sentence that begins with ``what``."""
+    """Pickle a value, including code of the main module. Raise `InputError` if that is impossible, in a sentence that
+    begins with ``what``."""
     import cloudpickle
 
     try:
@@ -272,13 +257,13 @@ def pickled(value: Any, what: str) -> bytes:
 
 @cache
 def versions() -> str:
-    """Return the versions that determine the bits of a result, in words."""
+    """Return in words the versions that determine the bits of a result."""
     return f"Cortado {__version__}, Warp {metadata.version('warp-lang')} and NumPy {metadata.version('numpy')}"
 
 
 def call(payload: Payload, item: bytes) -> Answer | Lacking:
-    """Call the payload's function for an item, in a worker process, one call at a time. Its exceptions become part of
-    the answer, to be raised again by the caller, also one that would end the process."""
+    """Call the payload's function for an item in a worker process, one call at a time. The answer contains any
+    exception, even one that would end the process."""
     with _one_at_a_time, warnings.catch_warnings(record=True) as caught:
         if payload.content is None and payload.digest not in _functions:
             return Lacking()
@@ -296,7 +281,6 @@ def call(payload: Payload, item: bytes) -> Answer | Lacking:
 
 
 def _function(payload: Payload) -> Callable[[Any], Any]:
-    """Return the function of a payload, unpickled unless it is kept."""
     if payload.versions != versions():
         raise InputError(
             f"A worker has {versions()}, but must have {payload.versions}, as the process that asks it has: else bits "
@@ -324,7 +308,6 @@ def _unpickled(content: bytes) -> Any:
 
 
 def _sendable(error: Exception) -> BaseException:
-    """Return an error, or one with equal words if it cannot be pickled."""
     try:
         again = pickle.loads(pickle.dumps(error))
         if type(again) is type(error) and str(again) == str(error):
@@ -343,22 +326,22 @@ def in_words(error: BaseException) -> str:
 _PARTICLE, _WALL, _STEP, _FRAME, _PIXEL = 56.0, 110.0, 50.0, 150.0, 110.0
 """[bytes]"""
 _WEIGHING = 1600.0
-"""Bytes of a wall particle while its weight is computed."""
+"""Bytes per wall particle while its weight is computed."""
 _REALS_OF_PARTICLE, _REALS_OF_WALL, _REALS_OF_STEP, _REALS_OF_PIXEL = 90.0, 12.0, 8.0, 12.0
 _REALS_BACKWARD, _REALS_OF_ITERATION = 40.0, 8.0
 """[numbers]"""
 _CGROUP = Path("/sys/fs/cgroup")
 _LIMITS = (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"))
+"""Files of a control group, of version 2 or 1, for the memory limit and use [bytes]. The functions below return memory
+[bytes] by purpose; ``real`` is the size of a number [bytes]."""
 
 
 def sampling_parts(particles: float, walls: float) -> dict[str, float]:
-    """Return the memory [bytes] for cutting a scene into particles, by a phrase for each part."""
     of_walls = (_WALL + _WEIGHING) * walls
     return {f"{particles:.3g} particles of fluid": 100.0 * particles, f"{walls:.3g} wall particles": of_walls}
 
 
 def simulation_parts(particles: int, walls: int, neighbours: int, real: int) -> dict[str, float]:
-    """Return the memory [bytes] of a simulation, given the length of neighbour lists and the bytes of a number."""
     return {
         f"{particles:.3g} particles of fluid": particles * (_PARTICLE + 4.0 * neighbours + _REALS_OF_PARTICLE * real),
         f"{walls:.3g} wall particles": walls * (_WALL + _REALS_OF_WALL * real),
@@ -366,45 +349,39 @@ def simulation_parts(particles: int, walls: int, neighbours: int, real: int) -> 
 
 
 def step_parts(steps: int, real: int) -> dict[str, float]:
-    """Return the memory [bytes] of the tables and records of a run's steps."""
     return {f"what is kept of {steps:.3g} steps": steps * (_STEP + _REALS_OF_STEP * real)}
 
 
 def frame_parts(frames: int, numbers: int, real: int) -> dict[str, float]:
-    """Return the memory [bytes] of ``frames`` frames with ``numbers`` numbers each."""
     return {f"{frames:.3g} frames": frames * (_FRAME + float(numbers) * real)}
 
 
 def gradient_parts(particles: int, iterations: int, real: int) -> dict[str, float]:
-    """Return the memory [bytes] of a gradient, given the pressure iterations of a step."""
     of_particle = real * (_REALS_BACKWARD + _REALS_OF_ITERATION * iterations)
     return {f"the gradient of {particles:.3g} particles": particles * of_particle}
 
 
 def field_parts(nodes: float, real: int) -> dict[str, float]:
-    """Return the memory [bytes] of a colour field, or of its adjoint."""
     return {f"{nodes:.3g} nodes of the field of colours": 4.0 * nodes * real}
 
 
 def picture_parts(pixels: int, real: int) -> dict[str, float]:
-    """Return the memory [bytes] of a picture, and of showing it in a report."""
     return {f"{pixels:.3g} pixels": pixels * (_PIXEL + _REALS_OF_PIXEL * real)}
 
 
 def sample_parts(samples: int, pixels: int, real: int) -> dict[str, float]:
-    """Return the memory [bytes] of the adjoints of all samples along the rays of all pixels."""
     return {f"{samples} samples behind each of {pixels:.3g} pixels": 4.0 * samples * pixels * real}
 
 
 def require(parts: Mapping[str, float], advice: str, device: Any = None) -> None:
-    """Raise `InputError` if memory [bytes], by its purpose, exceeds the free memory; ``device`` is Warp's."""
+    """Raise `InputError` if memory [bytes] by purpose exceeds the free memory of a Warp ``device``."""
     lack = shortage(parts, device)
     if lack:
         raise InputError(f"This needs {lack}; {advice}.")
 
 
 def shortage(parts: Mapping[str, float], device: Any = None) -> str:
-    """Return the needed and the free memory in words; empty if it suffices."""
+    """Return the needed and the free memory in words; empty if the free memory suffices."""
     needed, free = sum(parts.values()), available(device)
     if needed <= free:
         return ""
@@ -414,19 +391,20 @@ def shortage(parts: Mapping[str, float], device: Any = None) -> str:
 
 
 def within(budget: float, device: Any = None) -> int:
-    """Return a memory budget [bytes] for data that can be recomputed: at most half of the free memory."""
+    """Return a memory budget [bytes] for recomputable data: at most half of the free memory."""
     return int(min(budget, 0.5 * available(device)))
 
 
 def available(device: Any = None) -> float:
-    """Return the free memory [bytes] of a Warp device, or of this process on a CPU; infinite where unknown."""
+    """Return the free memory [bytes] of a Warp device, or of this process on a CPU; infinite if unknown."""
     if device is not None and not device.is_cpu:
         return float(device.free_memory)
     return max(min(float(psutil.virtual_memory().available), _of_container(), _of_process()), 0.0)
 
 
 def _of_container() -> float:
-    """Return the control group's memory limit less its use [bytes], with cached files as free; infinite without one."""
+    """Return the control group's memory limit minus its use [bytes], with cached files as free; infinite without a
+    limit."""
     for limit, used in _LIMITS:
         with suppress(OSError, ValueError):
             stat = (_CGROUP / used).with_name("memory.stat").read_text().split()
@@ -436,7 +414,7 @@ def _of_container() -> float:
 
 
 def _of_process() -> float:
-    """Return the limit of the address space (``ulimit -v``) less its use [bytes]; infinite without one."""
+    """Return the limit of the address space (``ulimit -v``) minus its use [bytes]; infinite without a limit."""
     with suppress(ImportError, OSError, ValueError):
         import resource
 

@@ -180,7 +180,7 @@ def _without(precision: Precision, neighbourhood: Any, container: SimpleNamespac
 
 
 def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNamespace) -> tuple[Any, ...]:
-    real, vector, matrix = precision.real, precision.vector, wp.types.matrix(shape=(3, 3), dtype=precision.real)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     near_mirrors, before_mirrors, reflects = container.near_mirrors, container.before_mirrors, container.reflects
     side_reflection = container.side_reflection
 

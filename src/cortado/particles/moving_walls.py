@@ -51,7 +51,7 @@ def pose_arrays(members: int, solids: int, precision: Precision, device: Any) ->
     """Make arrays (members, solids) of the poses of solids before and after a step, with tangents, by kernels' names:
     positions of their middles [m], rotations from the frame of a solid to space, and scales. The tangent of a rotation
     is the rotation vector by which the solid turns further, per unit of the change."""
-    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     kinds = {"before": vector, "turns_before": matrix, "after": vector, "turns": matrix}
     kinds |= dict.fromkeys(("before_dot", "turned_before_dot", "after_dot", "turned_dot"), vector)
     kinds |= {"scales": real, "scales_dot": real}
@@ -64,21 +64,15 @@ def resting_pose(layout: Layout) -> dict[str, wp.array]:
     """Make the arrays (members,) of `pose_arrays` for a solid that rests at the origin and is not turned."""
     made = pose_arrays(layout.members, 1, layout.precision, layout.device)
     for name in ("turns", "turns_before"):
-        made[name].fill_(matrix_of(layout.precision)(*np.eye(3).ravel()))
+        made[name].fill_(layout.precision.matrix(*np.eye(3).ravel()))
     return {name: array[:, 0] for name, array in made.items()}
-
-
-@cache
-def matrix_of(precision: Precision) -> Any:
-    """Return the Warp type of 3 x 3 matrices in a precision."""
-    return wp.types.matrix(shape=(3, 3), dtype=precision.real)
 
 
 @cache
 def turn_functions(precision: Precision) -> tuple[Any, Any]:
     """Make two Warp functions of a rotation R: the adjoint of a further turn of it, given that of its entries; and, in
     reverse, an adjoint of R's entries that has a given adjoint of the further turn."""
-    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     @wp.func
     def turning(R: matrix, bar: matrix) -> vector:
@@ -112,7 +106,7 @@ def sizes_type(precision: Precision) -> Any:
 def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
     """Make kernels that place wall particles, write them in the order of their cells, say where cells begin, and write
     tangents."""
-    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     module = kernel_module(f"moving_walls_{precision.name}")
     vectors = {f"wall_{name}": vector for name in ("positions", "feet", "velocities")}
     own_vectors = dict.fromkeys(("own", "own_feet", "own_slides"), vector)

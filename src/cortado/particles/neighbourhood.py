@@ -135,7 +135,7 @@ class Discretisation:
 @cache
 def neighbourhood_type(precision: Precision) -> Any:
     """Make the Warp struct of a neighbourhood; arrays are sorted by cell, lists are [neighbour, particle]."""
-    real, vector, matrix = precision.real, precision.vector, wp.types.matrix(shape=(3, 3), dtype=precision.real)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     class Neighbourhood:
         first: wp.int32

@@ -25,7 +25,6 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.sheet import Sheet
 from cortado.discretise.tree_kernels import face_functions, faces_on, faces_type
 from cortado.particles.mirrors import CONTAINER, reflections
-from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout
@@ -63,7 +62,7 @@ def sheet_functions(precision: Precision) -> tuple[Any, Any]:
     about its middle and divided by its scale, for solids with the poses ``middles`` and ``turns``."""
     real, vector, sheets_of = precision.real, precision.vector, sheets_type(precision)
     neighbourhood, poses = neighbourhood_type(precision), wp.array2d(dtype=vector)
-    turnings = wp.array2d(dtype=matrix_of(precision))
+    turnings = wp.array2d(dtype=precision.matrix)
 
     @wp.func
     def scale_of(k: int, member: int, s: neighbourhood, sheets: sheets_of) -> real:

@@ -36,7 +36,7 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import add
 from cortado.particles.made_derivatives import dot_of
 from cortado.particles.mirrors import ALL_WALLS
-from cortado.particles.moving_walls import MovingWalls, matrix_of
+from cortado.particles.moving_walls import MovingWalls
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import ALL, FOOT, GROWTH, MOVING, PLACE, RUBBING, TURN, Term, scope_of
 from cortado.particles.particle_kernels import MADE, made_kernel
@@ -110,7 +110,7 @@ class _Loop:
         """Return the values of the names in the text, in a Warp module."""
         return {
             **scope_of(self.d),
-            **{"_matrix": matrix_of(self.d.precision), "_pair": self.d.precision.pair},
+            **{"_matrix": self.d.precision.matrix, "_pair": self.d.precision.pair},
             "_ALL": wp.constant(ALL_WALLS),
             "_work": wp.func(self.term.function, module=module),
             "wp": wp,
@@ -285,7 +285,7 @@ def solid_kernel(
     """
     d = replace(discretisation, lanes=1, taped=True)
     precision, term = d.precision, Term.of(make(d))
-    real, vector, matrix, pair = precision.real, precision.vector, matrix_of(precision), precision.pair
+    real, vector, matrix, pair = precision.real, precision.vector, precision.matrix, precision.pair
     seen, module = bundle(**term.arrays), replace(d, taped=False).module(False, f"{topic}_{term.name}_solids")
     shares = _share(_Loop(term, d, rubs), seen, module)
     neighbourhood = neighbourhood_type(precision)

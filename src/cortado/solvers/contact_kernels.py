@@ -36,7 +36,6 @@ import warp as wp
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
-from cortado.particles.moving_walls import matrix_of
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.sph.moving_solids import free_module, hold_type
 
@@ -72,7 +71,7 @@ class ContactKernels:
 @cache
 def contact_kernels(precision: Precision) -> ContactKernels:
     """Make the kernels of contacts between bodies and solids in a precision."""
-    real, vector, matrix, pair = precision.real, precision.vector, matrix_of(precision), precision.pair
+    real, vector, matrix, pair = precision.real, precision.vector, precision.matrix, precision.pair
     modules, stiffness = [free_module(precision, "contacts")] * 3, wp.constant(real(STIFFNESS))
 
     @wp.func

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import Named
 from cortado.device.reduction import add, sum_of
-from cortado.particles.moving_walls import matrix_of, resting_pose
+from cortado.particles.moving_walls import resting_pose
 from cortado.particles.state import Layout, Parameters, padded, zeros
 from cortado.scene.motions import RESTITUTION, friction_name, restitution_name
 from cortado.solvers.contact_kernels import NUMBERS, OWN, SHARES, contact_kernels
@@ -90,7 +90,7 @@ class Totals:
 
 def share_kinds(layout: Layout) -> dict[str, Any]:
     """Return the types of `SHARES` by name."""
-    matrix = matrix_of(layout.precision)
+    matrix = layout.precision.matrix
     return dict(zip(SHARES, (matrix, matrix, layout.precision.six), strict=True))
 
 

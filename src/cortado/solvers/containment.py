@@ -16,7 +16,7 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.room import TOLERANCE
 from cortado.discretise.shapes import Points
-from cortado.particles.moving_walls import MovingWalls, matrix_of, pose_arrays
+from cortado.particles.moving_walls import MovingWalls, pose_arrays
 from cortado.particles.state import Layout, State, padded
 from cortado.solvers.obstacles import FURTHEST, Obstacle, Walled, middle_of, obstacle_mesh
 
@@ -49,7 +49,7 @@ def bounds_type(precision: Precision) -> Any:
 @cache
 def solids_type(precision: Precision) -> Any:
     """Make the Warp struct of the solids that particles must not enter, as meshes about their middles."""
-    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     class Solids:
         meshes: wp.array(dtype=wp.uint64)
@@ -84,7 +84,7 @@ def solids_type(precision: Precision) -> Any:
 def lost_kernel(precision: Precision) -> Any:
     """Make the kernel that looks for particles that were lost in a step."""
     real, vector = precision.real, precision.vector
-    bounds_struct, solids_struct, matrix = bounds_type(precision), solids_type(precision), matrix_of(precision)
+    bounds_struct, solids_struct, matrix = bounds_type(precision), solids_type(precision), precision.matrix
     module = kernel_module(f"containment_{precision.name}")
 
     @wp.func

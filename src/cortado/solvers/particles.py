@@ -18,7 +18,6 @@ from cortado.device.threads import Turn, gradient_parts
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SKIN
 from cortado.errors import MissingDerivativeError
-from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.sheets import Sheets
@@ -333,7 +332,7 @@ def _neighbourhood(system: ParticleSystem) -> Any:
     s.self_weight, s.volume, s.response_scale = lattice.self_weight, lattice.volume, lattice.response**-0.5
     s.laplacian_correction = lattice.laplacian_correction
     s.mirror_lower, s.mirror_upper = (precision.vector(*ends) for ends in system.mirrors)
-    faces, kinds = system.faces, {"places": precision.vector, "frames": matrix_of(precision), "sizes": precision.vector}
+    faces, kinds = system.faces, {"places": precision.vector, "frames": precision.matrix, "sizes": precision.vector}
     s.faces = len(faces.solids)
     for name, kind in {"solids": wp.int32, **kinds}.items():
         setattr(s, f"face_{name}", wp.array(getattr(faces, name), dtype=kind, device=system.layout.device))

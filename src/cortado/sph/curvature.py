@@ -46,7 +46,7 @@ from cortado.discretise.smoothing import SmoothingKernel, lattice_offsets, rest_
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
-from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions
+from cortado.sph.moment_functions import cross_terms_function, moment_functions
 
 DEEP, EXCESS, ACTS = 1.05, 0.6, 0.75
 """In spacings, see above."""
@@ -107,7 +107,7 @@ Such surfaces are bubbles with a radius below 3 delta."""
 @cache
 def curvature_functions(precision: Precision, dimension: int, module: Any) -> SimpleNamespace:
     """Make the Warp functions of one particle for the normal and the curvature of a surface, in 2 or 3 dimensions."""
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     smoothstep = moment_functions(precision, dimension).smoothstep
     faint, clear = wp.constant(real(FAINT)), wp.constant(real(CLEAR))
     singular, lone, hollow = wp.constant(real(SINGULAR[dimension])), wp.constant(real(LONE)), wp.constant(real(HOLLOW))
@@ -162,7 +162,7 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
     V sum W_ij c_j and V sum W_ij w_j."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
-    neighbourhood, matrix = neighbourhood_type(precision), matrix_type(precision)
+    neighbourhood, matrix = neighbourhood_type(precision), precision.matrix
     pair, cross_terms = pair_functions(discretisation), cross_terms_function(precision)
     weight, slope, gradient, hessian_product = pair.weight, pair.slope, pair.gradient, pair.hessian_product
 
@@ -265,7 +265,7 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 def entries(precision: Precision) -> dict[str, Any]:
     """Return names and types of the arrays of particles in surface tension by curvature; c is w kappa."""
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     vectors, matrices, numbers = dict.fromkeys("gqe", vector), dict.fromkeys("BD", matrix), dict.fromkeys("zwcab", real)
     return {**vectors, **matrices, **numbers}
 
@@ -276,7 +276,7 @@ def curvature_kernels(discretisation: Discretisation, dimension: int) -> SimpleN
     its tangent and its adjoint. Adjoints run in reverse order; the adjoint of ``mean`` has a first part without
     neighbours. ``depth`` is delta and ``per_width`` 1 / J."""
     precision, (real, vector, _) = discretisation.precision, discretisation.types
-    matrix, sums, typed = matrix_type(precision), curvature_sums(discretisation), types_of(discretisation)
+    matrix, sums, typed = precision.matrix, curvature_sums(discretisation), types_of(discretisation)
     moments = moment_functions(precision, dimension)
     whole, even = moments.whole, moments.change
     topic = f"surface_curvature_{dimension}d"
@@ -324,7 +324,7 @@ def types_of(discretisation: Discretisation) -> TypesByName:
     """Return the Warp types, by name, of the variables in kernels of tension by curvature."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     vectors = "q g r x e diagonal others turned mixed acceleration"
-    return TypesByName(real, {vector: vectors, matrix_type(precision): "B D", neighbourhood: "s"})
+    return TypesByName(real, {vector: vectors, precision.matrix: "B D", neighbourhood: "s"})
 
 
 @cache
@@ -394,7 +394,7 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
 def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: str) -> tuple[Any, ...]:
     """Make the adjoints of the four curvature kernels; the last has two adjoints, the first one without neighbours."""
     precision, (real, vector, _) = discretisation.precision, discretisation.types
-    matrix, sums, typed = matrix_type(precision), curvature_sums(discretisation), types_of(discretisation)
+    matrix, sums, typed = precision.matrix, curvature_sums(discretisation), types_of(discretisation)
     module = discretisation.module(False, topic)
     own = curvature_functions(precision, dimension, module)
     normal_work, curvature_of, outermost = own.normal_work, own.curvature, own.outermost

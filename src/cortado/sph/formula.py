@@ -34,7 +34,6 @@ from cortado.sph.function_meaning import (
     meanings,
 )
 from cortado.sph.function_text import DerivativeCheck, Frozen, SizesWritten, check_names, check_returns, definition
-from cortado.sph.moment_functions import matrix_type
 from cortado.sph.own_arrays import MOST_NUMBERS, WIDTH, Numbers, reading, table_type
 from cortado.sph.parts import Adjoints, StepContext
 
@@ -171,7 +170,7 @@ class Formula:
 
     def takes(self, precision: Precision) -> dict[str, Any]:
         """Return the types of the formula's `fields` by name."""
-        kinds = {"velocity_gradient": matrix_type(precision), FRACTIONS: self.fractions(precision)}
+        kinds = {"velocity_gradient": precision.matrix, FRACTIONS: self.fractions(precision)}
         return {name: kinds.get(name, precision.real) for name in self.fields}
 
     def reads(self, precision: Precision) -> dict[str, Any]:

@@ -24,7 +24,6 @@ import warp as wp
 from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.particles.mirrors import ALL_WALLS
-from cortado.particles.moving_walls import matrix_of
 from cortado.particles.state import Layout, zeros
 from cortado.scene.motions import free
 from cortado.sph.free_solids import Changes, FreeBody
@@ -51,7 +50,7 @@ class BodyFriction:
         precision = layout.precision
         real, vector, six = precision.real, precision.vector, precision.six
         self.suffix = suffix
-        self.known = layout.arrays(suffix, H=real, Y=vector, N=matrix_of(precision), arm=vector)
+        self.known = layout.arrays(suffix, H=real, Y=vector, N=precision.matrix, arm=vector)
         self.found = layout.arrays(suffix, rub=vector, couple=vector)
         self.load = layout.arrays(suffix, load=six)
         self._sum = layout.sum_of(six)

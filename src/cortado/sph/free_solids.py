@@ -29,7 +29,7 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import add
 from cortado.discretise.solid import Mass
 from cortado.errors import MissingDerivativeError
-from cortado.particles.moving_walls import MovingWalls, matrix_of
+from cortado.particles.moving_walls import MovingWalls
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Layout, State, StateField
@@ -45,7 +45,7 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
     """Make the kernels of a free body in 2 or 3 dimensions, with a thread for each scene. The first kernels compute the
     pose of its walls, with V, W and L; the second compute the state after the step from V_1, W_1 and L_1. The adjoint
     of the state before the step overwrites the adjoint of this state."""
-    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     flat, rotation, hold = rotations(precision, dimension), rotations(precision, 3).rotation, hold_functions(precision)
     rate, freed, spin, held = hold.rate, hold.freed, hold.spin, hold.kind
     angle, begun_rotation, modules = flat.angle, flat.rotation, [free_module(precision, f"bodies_{dimension}d")] * 3
@@ -265,7 +265,7 @@ class FreeBody:
         self.fields = (*begun, *(StateField(self.names[label], "", Entry.VECTOR, Axis.SCALAR) for label in AXES))
         self.begun = layout.state(self.fields)
         """Values at the start of the step."""
-        matrix = matrix_of(layout.precision)
+        matrix = layout.precision.matrix
         inertia, inverse = table.inertia, np.linalg.pinv(table.inertia)
         self.constants: dict[str, Any] = {**poses, "inertia": matrix(*inertia.ravel())}
         """Constants of the body, and its poses, which a step overwrites."""

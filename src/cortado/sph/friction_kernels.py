@@ -27,7 +27,6 @@ import warp as wp
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels, by_name
 from cortado.device.precision import Precision, TypesByName
-from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
@@ -41,7 +40,7 @@ from cortado.sph.stress_kernels import fluidity_function, traction_function
 def friction_functions(precision: Precision) -> SimpleNamespace:
     """Make three Warp functions: ``lean``, a body's term in A; ``rub``, acceleration and couple of a particle; and
     ``bear``, which turns these two into force and torque on the body, six numbers."""
-    real, vector, matrix, six = precision.real, precision.vector, matrix_of(precision), precision.six
+    real, vector, matrix, six = precision.real, precision.vector, precision.matrix, precision.six
     typed = TypesByName(real, {vector: "v arm Y V W rub couple", matrix: "T N"})
 
     @typed
@@ -71,7 +70,7 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     ``bear`` apply `friction_functions`. ``pull`` adds to A and T of given velocities. In a solve ``push`` adds to B v
     of the implicit viscosity and to the particles' shares in the product with v, and writes the load of the body."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
-    matrix, six, known = matrix_of(precision), precision.six, moment_functions(precision, dimension)
+    matrix, six, known = precision.matrix, precision.six, moment_functions(precision, dimension)
     contact, cross_terms = contact_functions(discretisation), cross_terms_function(precision)
     fall, fall_change, hold_weight, hold_gradient = (
         contact.fall,
@@ -226,7 +225,7 @@ def row_kernels(precision: Precision) -> SimpleNamespace:
     ``heed`` writes the residual r that they leave. ``answer`` adds the velocities of the solution, and adds to the
     adjoint of the time step.
     """
-    real, vector, matrix, six = precision.real, precision.vector, matrix_of(precision), precision.six
+    real, vector, matrix, six = precision.real, precision.vector, precision.matrix, precision.six
     module, hold = free_module(precision, "rows"), hold_functions(precision)
     spin = hold.spin
     kinds = {vector: "V W pushed twisted", matrix: "turns", wp.int32: "going", hold.kind: "hold"}

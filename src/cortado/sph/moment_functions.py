@@ -30,12 +30,6 @@ ROUNDING = 64.0
 
 
 @cache
-def matrix_type(precision: Precision) -> Any:
-    """Return the Warp type of 3 x 3 matrices in a precision."""
-    return wp.types.matrix(shape=(3, 3), dtype=precision.real)
-
-
-@cache
 def cross_terms_function(precision: Precision) -> Any:
     """Make the Warp function of the entries yz, xz and xy of a b^T, given a and b."""
     vector = precision.vector
@@ -51,7 +45,7 @@ def cross_terms_function(precision: Precision) -> Any:
 def symmetric(precision: Precision) -> SimpleNamespace:
     """Make types and functions for symmetric matrices stored as six numbers: diagonal and entries yz, xz and xy.
     ``kind`` is the Warp type, ``pack`` converts a 3 x 3 matrix to it, ``times`` is the product with a vector."""
-    vector, matrix, six = precision.vector, matrix_type(precision), precision.six
+    vector, matrix, six = precision.vector, precision.matrix, precision.six
 
     @wp.func
     def pack(M: matrix) -> six:
@@ -71,7 +65,7 @@ def symmetric(precision: Precision) -> SimpleNamespace:
 @cache
 def moment_functions(precision: Precision, dimension: int) -> SimpleNamespace:
     """Make the Warp functions of a particle's moment matrix, in a precision and in 2 or 3 dimensions."""
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     plane, tiny = wp.constant(real(float(dimension == 2))), wp.constant(real(1e-12))
     rounding = wp.constant(real(ROUNDING * float(np.finfo(precision.numpy).eps) * (dimension == 3)))
 

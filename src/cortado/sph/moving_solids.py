@@ -34,7 +34,7 @@ import warp as wp
 from cortado.device.modules import Kernels, kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.errors import MissingDerivativeError
-from cortado.particles.moving_walls import MovingWalls, matrix_of, turn_functions
+from cortado.particles.moving_walls import MovingWalls, turn_functions
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Layout, Parameters, State, StateField
@@ -76,7 +76,7 @@ def hold_numbers(hold: Hold, precision: Precision) -> Any:
 def hold_functions(precision: Precision) -> SimpleNamespace:
     """Make the Warp functions of a hold h: ``freed``, the part of an angular velocity w along free axes; ``rate``, R A
     R^T w of matrices R and A; ``spin``, G L; and ``root``, S T with S^T S = G, by a square root of I^-1."""
-    vector, matrix, hold = precision.vector, matrix_of(precision), hold_type(precision)
+    vector, matrix, hold = precision.vector, precision.matrix, hold_type(precision)
 
     @wp.func
     def rate(R: matrix, A: matrix, w: vector) -> vector:
@@ -132,7 +132,7 @@ def move_kernels(precision: Precision) -> Kernels:
     """Make the kernels of V, L and W of a body by gravity and by the sums of momenta that it gets, with a thread for
     each scene. They also compute the velocity changes V - V_0 and W - W_0, ``faster`` and ``turned_faster``. Adjoints
     of the sums are written."""
-    real, vector, matrix, hold = precision.real, precision.vector, matrix_of(precision), hold_functions(precision)
+    real, vector, matrix, hold = precision.real, precision.vector, precision.matrix, hold_functions(precision)
     spin, vectors = hold.spin, "gravity V W L pulled twisted"
 
     @TypesByName(real, {vector: vectors, matrix: "inertia inverse turns", hold.kind: "hold"})
@@ -178,7 +178,7 @@ SMALL = 1e-3
 def rotations(precision: Precision, dimension: int) -> SimpleNamespace:
     """Make the type ``angle`` of angles, numbers in 2 dimensions and vectors in 3, and the Warp function ``rotation``,
     R(w), whose derivative Warp takes from J."""
-    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     @wp.func
     def about_z(turn: real) -> matrix:
@@ -225,7 +225,7 @@ FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_nam
 def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
     """Make kernels of one moving solid in 2 or 3 dimensions, with a thread for each scene: one computes its poses
     before and after a step, the other its state at the end. Adjoints of the two states share their arrays."""
-    real, vector, matrix, of = precision.real, precision.vector, matrix_of(precision), rotations(precision, dimension)
+    real, vector, matrix, of = precision.real, precision.vector, precision.matrix, rotations(precision, dimension)
     angle, rotation = of.angle, of.rotation
 
     typed = TypesByName(angle, {vector: "position place displacements", real: "scale"})

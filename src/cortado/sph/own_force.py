@@ -40,7 +40,6 @@ from cortado.scene.parameters import Axis, Parameter, Source
 from cortado.scene.scene import Scene
 from cortado.sph.formula import Formula, Packed, applied, compiled, formula, theta_of
 from cortado.sph.function_text import keep_source, plain_function, source_of
-from cortado.sph.moment_functions import matrix_type
 from cortado.sph.own_arrays import READ_AS, Tables
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import Law, check_law
@@ -264,7 +263,7 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
     precision, modules = discretisation.precision, discretisation.modules(topic("body", text, ranks, dimension))
     gradient, rate = gradient_functions(precision, dimension)
     types: dict[str, Any] = {"x_i": precision.vector, "v_i": precision.vector, "theta": theta_of(precision, ranks)}
-    kinds = dict.fromkeys(("M_i", "A_i"), matrix_type(precision)) | {"fractions_i": text.fractions(precision)}
+    kinds = dict.fromkeys(("M_i", "A_i"), precision.matrix) | {"fractions_i": text.fractions(precision)}
     given = [*types]
     for name in text.fields:
         value, entries = FIELDS[name]

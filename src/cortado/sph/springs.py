@@ -30,7 +30,7 @@ import warp as wp
 from cortado.device.launching import Named
 from cortado.device.modules import Kernels, kernel_module
 from cortado.device.precision import Precision, TypesByName
-from cortado.particles.moving_walls import matrix_of, resting_pose
+from cortado.particles.moving_walls import resting_pose
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout, Parameters, padded
 from cortado.scene.hinges import Joint
@@ -49,7 +49,7 @@ TURNING = ("stiffness", "rest_angle", "damping", "torque", "speed")
 def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
     """Make the kernels of springs and hinges, with a thread for each scene. They compute the momenta by a spring, its
     force and length as the first two components of a vector, and the angular momentum by a hinge."""
-    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     taut, tiny, no, one = (wp.constant(real(value)) for value in (TAUT, precision.tiny, 0.0, 1.0))
     places = "before after other_before other_after own anchor"
     typed = TypesByName(real, {vector: places, matrix: "turns other_turns", bool: "slack is_free"})
@@ -205,7 +205,7 @@ class Springs:
 
     def known(self, of: Joint) -> tuple[Named, ...]:
         """Return kernel arguments about a body that is turned about a hinge."""
-        matrix, body = matrix_of(self.layout.precision), self.part.bodies[of.body]
+        matrix, body = self.layout.precision.matrix, self.part.bodies[of.body]
         begun, other_begun = (matrix(*one.turn.ravel()) for one in of.begun)
         constants = {"axis": self.layout.precision.vector(*of.axis), "begun": begun, "other_begun": other_begun}
         return self.ends(of), constants, {"is_free": of.other >= 0}, body.before

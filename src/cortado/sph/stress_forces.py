@@ -34,7 +34,6 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, 
 from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.sph.formula import Formula, applied, formula, theta_of
 from cortado.sph.function_text import plain_function
-from cortado.sph.moment_functions import matrix_type
 
 
 @cache
@@ -98,7 +97,7 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
     hold, hold_gradient = contact.hold, contact.hold_gradient
     summed = rubbing_sum(discretisation, sticks)
-    matrix = matrix_type(precision)
+    matrix = precision.matrix
 
     typed = TypesByName(real, {vector: "x v foot turn bar", matrix: "T", neighbourhood: "s"})
 
@@ -188,7 +187,7 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
 
 def work_types(precision: Precision) -> TypesByName:
     """Return the Warp types, by name, of the variables in the work functions of viscous stress on solids."""
-    kinds = {precision.vector: "x v foot acceleration couple", matrix_type(precision): "T M A"}
+    kinds = {precision.vector: "x v foot acceleration couple", precision.matrix: "T M A"}
     return TypesByName(precision.real, {**kinds, precision.pair: "constants", neighbourhood_type(precision): "s"})
 
 

@@ -52,7 +52,7 @@ from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernel
 from cortado.particles.wall_terms import solid_kernel
 from cortado.sph.formula import theta_of
-from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions
+from cortado.sph.moment_functions import cross_terms_function, moment_functions
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import Law, contact_functions, newtonian_law, stress_sums, stress_work, work_types
 
@@ -81,7 +81,7 @@ def fluidity_function(precision: Precision) -> Any:
 @cache
 def part_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
     """Make the Warp functions of S, a particle's part in the stress, and of M where S is not 0."""
-    real, matrix, moments = precision.real, matrix_type(precision), moment_functions(precision, dimension)
+    real, matrix, moments = precision.real, precision.matrix, moment_functions(precision, dimension)
     fullness, smoothstep = moments.fullness, moments.smoothstep
     empty, full = wp.constant(real(EMPTY)), wp.constant(real(FULL))
 
@@ -104,7 +104,7 @@ def part_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
 @cache
 def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
     """Make the Warp function of the traction T by M, A, mu and C, in a Warp module."""
-    real, matrix, regular = precision.real, matrix_type(precision), part_functions(precision, dimension)[1]
+    real, matrix, regular = precision.real, precision.matrix, part_functions(precision, dimension)[1]
     inverse = moment_functions(precision, dimension).inverse
 
     @wp.func(module=module)
@@ -119,7 +119,7 @@ def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
 def stress_of_particle(precision: Precision, dimension: int, law: Law, module: Any) -> Callable[..., Any]:
     """Make the function of T and mu of a particle, in 2 or 3 dimensions, with a law of viscosity. mu follows from A,
     and T from ``A_u``, the sum A of the resisted velocities; ``control`` is C."""
-    real, matrix, fluidity = precision.real, matrix_type(precision), fluidity_function(precision)
+    real, matrix, fluidity = precision.real, precision.matrix, fluidity_function(precision)
     part, regular = part_functions(precision, dimension)
     inverse, traction = moment_functions(precision, dimension).inverse, traction_function(precision, dimension, module)
     plane = wp.constant(real(float(dimension == 2)))
@@ -151,7 +151,7 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
     hold, hold_gradient = contact.hold, contact.hold_gradient
     summed = rubbing_sum(discretisation, sticks)
-    fluidity, matrix = fluidity_function(precision), matrix_type(precision)
+    fluidity, matrix = fluidity_function(precision), precision.matrix
     cross_terms = cross_terms_function(precision)
 
     typed = TypesByName(real, {vector: "x v foot turn", neighbourhood: "s", matrix: "M A"})
@@ -255,7 +255,7 @@ def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sti
     because ``mu`` in a step is the viscosity of the fluid.
     """
     precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     modules = discretisation.modules(f"viscous_stress_{law.topic}{dimension}d" + "_no_slip" * sticks)
     sums, forces = moment_sums(discretisation, sticks), stress_sums(discretisation, sticks)
     known = moment_functions(precision, dimension)
@@ -305,7 +305,7 @@ def stress_solid_kernels(discretisation: Discretisation) -> list[Callable[[], An
 def gradient_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
     """Make the Warp functions of a particle's velocity gradient [1/s] and shear rate [1/s]. The functions take sums
     over the particle's neighbours, M = sum s_ij x_ij x_ij^T and A = sum s_ij v_ij x_ij^T."""
-    real, matrix = precision.real, matrix_type(precision)
+    real, matrix = precision.real, precision.matrix
     part, regular = part_functions(precision, dimension)
     inverse, slowest = moment_functions(precision, dimension).inverse, wp.constant(real(SLOWEST**2))
 
@@ -358,5 +358,5 @@ class VelocityGradients:
         return self._arrays("_bar")
 
     def _arrays(self, suffix: str, requires_grad: bool = False) -> dict[str, wp.array]:
-        layout, matrix = self._setting.layout, matrix_type(self._setting.layout.precision)
+        layout, matrix = self._setting.layout, self._setting.layout.precision.matrix
         return layout.arrays(suffix, requires_grad, M=matrix, A=matrix, R=layout.precision.real)

@@ -40,7 +40,7 @@ from cortado.scene.stability import is_implicit
 from cortado.sph.density import WallSums
 from cortado.sph.formula import Packed, compiled
 from cortado.sph.free_friction import FreeFriction
-from cortado.sph.moment_functions import ConjugateGradients, matrix_type, round_off
+from cortado.sph.moment_functions import ConjugateGradients, round_off
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import Law, newtonian_law, stress_couple_work, stress_sums, stress_work
 from cortado.sph.stress_kernels import moment_sums, stress_kernels, stress_solid_kernels, traction_function
@@ -79,7 +79,7 @@ class ViscousStress:
     def arrays(self, *names: str, taped: bool = False) -> dict[str, wp.array]:
         """Make arrays (n,) of particles by name, all 0: R and eta are numbers, and all others matrices."""
         precision = self._layout.precision
-        kinds = {name: precision.real if name in ("R", "eta") else matrix_type(precision) for name in names}
+        kinds = {name: precision.real if name in ("R", "eta") else precision.matrix for name in names}
         return self._layout.arrays(requires_grad=taped, **kinds)
 
     def compile(self, what: str) -> None:
@@ -228,7 +228,7 @@ def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, s
     """Make the kernel of the stress T for given velocities with fixed M and mu, and the kernel of the implicit operator
     B."""
     precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     module = discretisation.module(False, f"implicit_viscosity_{law.topic}{dimension}d" + "_no_slip" * sticks)
     traction = traction_function(precision, dimension, module)
     moments, force = moment_sums(discretisation, sticks).forward, stress_sums(discretisation, sticks).force

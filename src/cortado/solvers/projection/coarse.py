@@ -33,7 +33,7 @@ from cortado.solvers.projection.coarse_push import coarse_push_kernels, residual
 from cortado.solvers.projection.lattice import SPACING
 from cortado.solvers.projection.sums import velocity_kernels
 from cortado.solvers.projection.wall_sums import FaceShares
-from cortado.sph.moment_functions import matrix_type, round_off, symmetric
+from cortado.sph.moment_functions import round_off, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 LEAST = 1e-5
@@ -84,7 +84,7 @@ class Coarse:
         """The spacing by the name of its kernel argument."""
         self.grid = {"grid": self._sort.grid, "order": self._sort.order, "eps": LEAST * energy / touched}
         """The grid's data by the names of kernel arguments."""
-        self.pushed = layout.arrays(h=vector, N=matrix_type(precision), T=symmetric(precision).kind)
+        self.pushed = layout.arrays(h=vector, N=precision.matrix, T=symmetric(precision).kind)
         """h, N and c L of the sorted particles."""
         self.sums, self.parts = layout.sum_of(precision.pair), layout.arrays(parts=precision.pair)
         """Both sums whose ratio is alpha, and each particle's terms in them."""
@@ -180,7 +180,7 @@ class CoarseTangent:
         if coarse.bodies is not None and bodies is not None:
             self._bodies = CoarseBodiesTangent(coarse.bodies, bodies, dot)
         self._unmoved = {**coarse.unmoved, "carried_dot": coarse.unmoved["carried"]}
-        kinds = {"h": vector, "N": matrix_type(precision), "r": real, "change": real, "thrust": vector}
+        kinds = {"h": vector, "N": precision.matrix, "r": real, "change": real, "thrust": vector}
         self._change = layout.arrays("_dot", **kinds, T=six, u=vector)
         self._T = layout.arrays(T=six)
 
@@ -226,7 +226,7 @@ class CoarseAdjoint:
         self._bodies = None
         if coarse.bodies is not None and bodies is not None:
             self._bodies = CoarseBodiesAdjoint(coarse.bodies, bodies, bar)
-        self._bars = layout.arrays("_bar", h=vector, N=matrix_type(precision))
+        self._bars = layout.arrays("_bar", h=vector, N=precision.matrix)
         self._steps = layout.arrays("_bar", r=real, change=real, carried=real, thrust=vector, sums=precision.pair)
         self._through = layout.arrays(T=six, f=vector, kick_bar=vector, v_bar=vector)
         self._sum = layout.sum_of(precision.pair)

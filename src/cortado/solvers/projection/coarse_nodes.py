@@ -17,7 +17,6 @@ from cortado.device.cells import cell_functions, cell_grid_type
 from cortado.device.launching import bundle
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision, TypesByName
-from cortado.sph.moment_functions import matrix_type
 
 ALONE = 0.01
 """The factor of h^2 in the regularisation of the nodes around a particle."""
@@ -201,7 +200,7 @@ class NodeKernels:
 @cache
 def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
     """Make the kernels that sum over the particles around nodes, in 2 or 3 dimensions."""
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     grid_type, own = cell_grid_type(precision), hat_functions(precision, dimension)
     source = bundle(s_value=real, s_slope=vector, s_bent=vector, s_own=real)
     hat, held, among = own.hat, own.held, node_functions(dimension)

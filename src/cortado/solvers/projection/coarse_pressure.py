@@ -52,7 +52,7 @@ from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTange
 from cortado.solvers.projection.coarse_nodes import ALONE, hat_functions, node_functions
 from cortado.solvers.projection.pressure import clamp_functions
 from cortado.solvers.projection.wall_sums import types_by_name, weights_type
-from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
+from cortado.sph.moment_functions import cross_terms_function, symmetric
 from cortado.sph.moving_solids import hold_functions
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
@@ -75,7 +75,7 @@ class CoarsePressureKernels:
 @cache
 def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePressureKernels:
     """Make the kernels of the pressure change by the coarse grid, in 2 or 3 dimensions."""
-    real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
+    real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     grid_type, hats = cell_grid_type(precision), hat_functions(precision, dimension)
     at, products, bend, held, alone = hats.at, hats.products, hats.bend, hats.held, wp.constant(real(2.0 * ALONE))
     packed, cross_terms = symmetric(precision), cross_terms_function(precision)
@@ -274,7 +274,7 @@ class CoarseBodyKernels:
 @cache
 def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKernels:
     """Make the kernels of free bodies on the coarse grid, in 2 or 3 dimensions."""
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     grid_type, hats, among = cell_grid_type(precision), hat_functions(precision, dimension), node_functions(dimension)
     hat, at, beside, corner_step = hats.hat, hats.at, among.beside, among.corner_step
     module, holds = kernel_module(f"coarse_bodies_{dimension}d_{precision.name}"), hold_functions(precision)
@@ -359,7 +359,7 @@ class CoarseBodies:
 
     def __init__(self, bodies: Bodies, layout: Layout, dimension: int):
         """Prepare rows for a solver's bodies, given the ``layout`` of its particles."""
-        precision, matrix = layout.precision, matrix_type(layout.precision)
+        precision, matrix = layout.precision, layout.precision.matrix
         self.bodies, self.kernels = bodies.at_rest(), coarse_body_kernels(precision, dimension)
         self._each = 3 * dimension - 3
         self._roots = [matrix(*_root(held.body.table.inertia).ravel()) for held in bodies.held]

@@ -26,7 +26,7 @@ from cortado.solvers.projection.effects import image_sums
 from cortado.solvers.projection.pressure import clamp_functions
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.wall_sums import types_by_name, weights_type
-from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions, symmetric
+from cortado.sph.moment_functions import cross_terms_function, moment_functions, symmetric
 
 
 @cache
@@ -124,7 +124,7 @@ def coarse_image_sums(discretisation: Discretisation) -> Kernels:
 def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     """Make the kernels of h and N, which give the force of a coarse pressure on particles, in 2 or 3 dimensions."""
     precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     sums, mirrors, packed = coarse_sums(discretisation), coarse_image_sums(discretisation), symmetric(precision)
     six, pack, times = packed.kind, packed.pack, packed.times
     whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
@@ -204,7 +204,7 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     dimensions. The adjoint turns the adjoint of r into d_bar, the adjoint of D u, and S = d_bar L, which the adjoint of
     the pressure's update uses."""
     precision = discretisation.precision
-    real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
+    real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     sums = projection_sums(discretisation)
     spread, spread_tangent = image_sums(discretisation).spread.forward, image_sums(discretisation).spread.tangent
     gradient, gradient_tangent = sums.velocity_gradient.forward, sums.velocity_gradient.tangent

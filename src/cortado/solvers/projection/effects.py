@@ -47,7 +47,7 @@ from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import image_sum, mirror_sum
 from cortado.solvers.projection.wall_sums import DIRECTION, normal_part, types_by_name, weights_type
-from cortado.sph.moment_functions import matrix_type, moment_functions
+from cortado.sph.moment_functions import moment_functions
 
 TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95)
 """For each weight, the fullness below which it is 0 and the fullness above which it is 1."""
@@ -110,7 +110,7 @@ class EffectFunctions:
 @cache
 def effect_functions(precision: Precision, dimension: int, module: Any) -> EffectFunctions:
     """Make the functions of a particle's weights and corrections in 2 or 3 dimensions, in a Warp module."""
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     own = moment_functions(precision, dimension)
     fullness, invert, smoothstep = own.fullness, own.inverse, own.smoothstep
     weights4 = weights_type(precision)

@@ -27,7 +27,6 @@ import warp as wp
 
 from cortado.device.modules import Kernels, by_name, kernel_module
 from cortado.device.precision import Precision, TypesByName
-from cortado.particles.moving_walls import matrix_of
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.sph.moving_solids import hold_functions
 
@@ -46,7 +45,7 @@ def joint_kernels(precision: Precision) -> SimpleNamespace:
     velocities. For whole systems ``factor`` eliminates, ``solve`` computes lambda = - K^-1 b, also with the transpose
     of K, ``lengthen`` adds K' lambda to a tangent of b, and ``spread`` the outer product of the adjoint of b and lambda
     to the adjoint of K."""
-    real, vector, matrix, holds = precision.real, precision.vector, matrix_of(precision), hold_functions(precision)
+    real, vector, matrix, holds = precision.real, precision.vector, precision.matrix, hold_functions(precision)
     spin, held = holds.spin, holds.kind
     module = kernel_module(f"joints_derivative_{precision.name}")
     no, one = wp.constant(real(0.0)), wp.constant(real(1.0))

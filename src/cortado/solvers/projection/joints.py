@@ -11,7 +11,6 @@ import warp as wp
 
 from cortado.device.launching import Named
 from cortado.device.modules import Kernels
-from cortado.particles.moving_walls import matrix_of
 from cortado.particles.state import Layout, zeros
 from cortado.scene.hinges import Joint
 from cortado.solvers.projection.joint_kernels import ROW, joint_kernels
@@ -30,7 +29,7 @@ class JointArrays:
     """The arrays of the hinges of one solver in a step, or tangents or adjoints with names that end in ``suffix``."""
 
     def __init__(self, rows: int, layout: Layout, suffix: str = ""):
-        matrix, vector, self._suffix = matrix_of(layout.precision), layout.precision.vector, suffix
+        matrix, vector, self._suffix = layout.precision.matrix, layout.precision.vector, suffix
         kinds = {**dict.fromkeys(ROW, matrix), "apart": vector}
         sizes = {f"{name}{suffix}": (layout.members, kind) for name, kind in kinds.items()}
         self.rows = [zeros(sizes, layout.device) for _ in range(rows)]
@@ -104,7 +103,7 @@ class Joints:
             for straight in (False, True)
             if not straight or (space and joint.axis is not None)
         ]
-        count, matrix = len(self.rows), matrix_of(layout.precision)
+        count, matrix = len(self.rows), layout.precision.matrix
         self.own = JointArrays(count, layout)
         kinds = {"factors": ((count * count, layout.members), matrix), "inverses": ((count, layout.members), matrix)}
         self.factors = zeros(kinds, layout.device)
@@ -129,7 +128,7 @@ class Joints:
         known: dict[str, Any] = {} if joint.axis is None else {"axis": self.layout.precision.vector(*joint.axis)}
         for way, begun in zip(("", "other_"), joint.begun, strict=True):
             known[f"{way}middle"] = self.layout.precision.vector(*begun.middle)
-            known[f"{way}begun"] = matrix_of(self.layout.precision)(*begun.turn.ravel())
+            known[f"{way}begun"] = self.layout.precision.matrix(*begun.turn.ravel())
         return named, known
 
     def number(self, row: Row) -> int:

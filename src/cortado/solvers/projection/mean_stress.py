@@ -44,7 +44,7 @@ from cortado.particles.wall_terms import ALL_WALLS, WallTerm
 from cortado.solvers.projection.surroundings import Surroundings, SurroundingsAdjoint, SurroundingsTangent
 from cortado.solvers.projection.wall_sums import FaceShares, normal_part, types_by_name
 from cortado.sph.density import WallSums
-from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
+from cortado.sph.moment_functions import moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents, integration_module
 
 TOPIC = "mean_stress"
@@ -107,7 +107,7 @@ def spread_term(d: Discretisation) -> Any:
 def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     """Make the kernels of dt p, given r as the first component of the sum of the arrays ``reach`` and ``mirrors``."""
     precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     neighbourhood, (six, pack) = neighbourhood_type(precision), (symmetric(precision).kind, symmetric(precision).pack)
     whole, per = moment_functions(precision, dimension).change, wp.constant(real(1.0 / dimension))
     topic = f"{TOPIC}_{dimension}d"

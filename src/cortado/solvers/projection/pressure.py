@@ -47,7 +47,7 @@ from cortado.solvers.projection.effects import image_sums
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
 from cortado.solvers.projection.wall_sums import types_by_name, weights_type
-from cortado.sph.moment_functions import matrix_type, symmetric
+from cortado.sph.moment_functions import symmetric
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     """Make the kernels of one pressure iteration, in 2 or 3 dimensions."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, sums = precision.pair, projection_sums(discretisation)
-    packed, matrix = symmetric(precision), matrix_type(precision)
+    packed, matrix = symmetric(precision), precision.matrix
     six, pack = packed.kind, packed.pack
     mirrors = image_sums(discretisation)
     spread, spread_tangent = mirrors.spread.forward, mirrors.spread.tangent

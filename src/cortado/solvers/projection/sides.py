@@ -22,7 +22,6 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels, kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.tree_kernels import face_functions
-from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbourhood import neighbourhood_type
 from cortado.particles.sheets import Sheets, sheet_functions, sheets_type
 from cortado.particles.state import Layout
@@ -40,7 +39,7 @@ NONE = -1
 @cache
 def side_kernels(precision: Precision) -> Kernels:
     """Make the kernels that keep particles on their side of sheet k, where ``least`` is e."""
-    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     neighbourhood, sheets_of = neighbourhood_type(precision), sheets_type(precision)
     (scale_of, seen_from), (query, meets, goes_through) = sheet_functions(precision), face_functions(precision)
     bars = bundle(**share_kinds(precision), x=vector)

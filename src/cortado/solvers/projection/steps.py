@@ -60,7 +60,7 @@ from cortado.solvers.projection.surroundings import Surroundings
 from cortado.solvers.projection.wall_sums import ProjectionPush, types_by_name
 from cortado.solvers.solver import Counts
 from cortado.sph.free_solids import FreeSolidsPart
-from cortado.sph.moment_functions import matrix_type, symmetric
+from cortado.sph.moment_functions import symmetric
 from cortado.sph.parts import Carried, StepContext, integration_module
 
 RATE = 20.0
@@ -115,7 +115,7 @@ def following_kernels(d: Discretisation, dimension: int) -> Kernels:
     """Make the kernels of velocities v' that follow the shift and the repairs; the adjoint of v overwrites the adjoint
     of v'."""
     precision, modules = d.precision, d.modules(f"projection_following_{dimension}d")
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     inverse = effect_functions(precision, dimension, modules[0]).inverse
 
     def follow(time_step: real, x_i: vector, M_i: matrix, A_i: matrix, x_now_i: vector, v_new_i: vector) -> vector:
@@ -202,7 +202,7 @@ class ProjectionSteps(ParticleSolver):
         real, vector = precision.real, precision.vector
         self.pull = self.layout.arrays(T=symmetric(precision).kind)["T"]
         """y L of the present iteration."""
-        kinds = {"u": vector, "A": matrix_type(precision), "d": real, "y": real, "k": real}
+        kinds = {"u": vector, "A": precision.matrix, "d": real, "y": real, "k": real}
         self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real, "held": real}
         self.iterates = [self.layout.arrays(**self._iterate_kinds)]
         """u, A and the divergence of u, y and k before each iteration; the last slot has u and y = k after all

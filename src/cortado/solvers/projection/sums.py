@@ -18,7 +18,7 @@ from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.solvers.projection.effects import image_sums
 from cortado.solvers.projection.wall_sums import types_by_name
-from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions, symmetric
+from cortado.sph.moment_functions import cross_terms_function, moment_functions, symmetric
 
 CROWDED = 0.25
 """R: the greatest additional weight of close pairs in a shift (Monaghan 2000). Without a bound the derivative of the
@@ -261,7 +261,7 @@ class VelocityKernels:
 def velocity_kernels(discretisation: Discretisation, dimension: int) -> VelocityKernels:
     """Make the kernels of the velocity after applying pressures, in 2 or 3 dimensions."""
     precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     sums, mirrors, packed = projection_sums(discretisation), image_sums(discretisation), symmetric(precision)
     six, pack, times = packed.kind, packed.pack, packed.times
     whole = moment_functions(precision, dimension).change

@@ -23,13 +23,13 @@ from cortado.solvers.projection.wall_sums import (
     weights_type,
 )
 from cortado.sph.density import Density, DensityAdjoint, DensityTangent
-from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
+from cortado.sph.moment_functions import moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 
 def entries(precision: Precision) -> dict[str, Any]:
     """Return names and types of the entries of a particle's surroundings."""
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
     own |= {"normal": vector, "whole": vector, "normal_drift": real, "whole_drift": real, "edge": real}
     own |= {"beside": vector, "mirror": vector, "behind": real, "images": real, "image": real, "sweep": real}
@@ -48,7 +48,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     """Make the kernels of n, of the moments of neighbours, and of L, a and the weights computed from these. Between the
     adjoint's two kernels the adjoints of M and Q are six numbers each, M_pull and Q_pull."""
     precision = discretisation.precision
-    real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
+    real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
     moments, moments_tangent, moments_back = sums.moments.forward, sums.moments.tangent, sums.moments.adjoint
     walls = beside_sums(discretisation)

@@ -42,7 +42,7 @@ from cortado.device.launching import Named, bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.mirrors import FACES, reflections
-from cortado.particles.moving_walls import matrix_of, turn_functions
+from cortado.particles.moving_walls import turn_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import wall_sum
 from cortado.particles.particle_kernels import pointwise_kernels
@@ -50,7 +50,7 @@ from cortado.particles.state import Layout
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm, share_kinds, solid_kernel
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.sph.density import WallSums, wall_slope_term
-from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
+from cortado.sph.moment_functions import moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 EDGED = (0.1, 0.4)
@@ -270,7 +270,7 @@ def face_share_kernel(discretisation: Discretisation) -> Any:
     ``swept``."""
     d = replace(discretisation, lanes=1, taped=True)
     precision = d.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
     pair, neighbourhood, turning = pair_functions(d), neighbourhood_type(precision), turn_functions(precision)[0]
     weight, gradient, separation = pair.weight, pair.gradient, pair.separation
     neighbour, mirrors_by = pair.neighbour, pair.mirrors_by
@@ -370,7 +370,7 @@ class FaceShares:
     def __init__(self, discretisation: Discretisation, layout: Layout, faces: int):
         """Prepare the adjoint of images in so many ``faces``; without any, nothing is added."""
         self._kernel, self._faces = partial(face_share_kernel, discretisation), faces
-        own = {"u": layout.precision.vector, "slope": matrix_of(layout.precision)}
+        own = {"u": layout.precision.vector, "slope": layout.precision.matrix}
         self._nothing = layout.arrays(**own, **dict.fromkeys(NUMBERS, layout.precision.real)) if faces else {}
 
     def add(
@@ -396,7 +396,7 @@ def types_by_name(precision: Precision, more: Mapping[Any, str] | None = None) -
         neighbourhood_type(precision): "s",
         precision.vector: "x v u g f h gamma beside mirror normal whole crowd apart arm kick thrust delta foot turn "
         "total lifted row lift direct diagonal others",
-        matrix_type(precision): "A L M N Q",
+        precision.matrix: "A L M N Q",
         symmetric(precision).kind: "S T",
         weights_type(precision): "weights",
         precision.pair: "error sums sizes",
