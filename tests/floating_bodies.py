@@ -184,7 +184,9 @@ def settling_disc(across: int, step: float, duration: float, device: str = "cpu"
     return sinking(scene, (density - 1000.0) * 9.81 * radius**2 * part / (4.0 * viscosity), duration, device)
 
 
-def settling_ball(across: int, wide: float, step: float, duration: float, device: str = "cpu") -> dict[str, float]:
+def settling_ball(
+    across: int, wide: float, step: float, duration: float, device: str = "cpu", settling: float | None = None
+) -> dict[str, float]:
     """A ball without slip, so many particles across and three times as heavy as syrup, that sinks along the axis of a
     tube ``wide`` times its size: as `settling_disc`, over the speed of Haberman and Sayre (1958)."""
     radius, viscosity, density = 0.05, 100.0, 3000.0
@@ -205,16 +207,19 @@ def settling_ball(across: int, wide: float, step: float, duration: float, device
     )
     slower = (1.0 - 0.75857 * k**5) / (1.0 - 2.105 * k + 2.0865 * k**3 - 1.7068 * k**5 + 0.72603 * k**6)
     exact = 2.0 / 9.0 * (density - 1000.0) * 9.81 * radius**2 / (viscosity * slower)
-    return sinking(scene, exact, duration, device)
+    return sinking(scene, exact, duration, device, settling)
 
 
-def sinking(scene: Scene, exact: float, duration: float, device: str) -> dict[str, float]:
+def sinking(
+    scene: Scene, exact: float, duration: float, device: str, settling: float | None = None
+) -> dict[str, float]:
     """How fast the free body of a scene, 0.1 m across in syrup of 0.1 m2/s, sinks in the last quarter of a run, over an
     ``exact`` speed [m/s], and by how much of that it swings about its course. Before that the body is as heavy as the
-    syrup for as long: where a surface cuts the lattice there is room, and in syrup particles take their time to it."""
+    syrup for ``settling`` [s], or as long: where a surface cuts the lattice there is room, and in syrup particles take their time to it."""
     name, density = next((solid.name, solid.density) for solid in scene.solid if solid.motion == "free")
     simulation, steps = Simulation(scene, device, precision="float64"), round(duration / scene.solver.time_step)
-    settled = simulation.run(steps, {f"{name}.density": 1000.0}, record_every=steps)
+    first = steps if settling is None else round(settling / scene.solver.time_step)
+    settled = simulation.run(first, {f"{name}.density": 1000.0}, record_every=first)
     run = simulation.run(
         steps,
         {f"{name}.density": density},
