@@ -215,7 +215,8 @@ def sinking(
 ) -> dict[str, float]:
     """How fast the free body of a scene, 0.1 m across in syrup of 0.1 m2/s, sinks in the last quarter of a run, over an
     ``exact`` speed [m/s], and by how much of that it swings about its course. Before that the body is as heavy as the
-    syrup for ``settling`` [s], or as long: where a surface cuts the lattice there is room, and in syrup particles take their time to it."""
+    syrup, for ``settling`` [s] or as long as the run: where a surface cuts the lattice there is room, and particles of
+    syrup fill it slowly."""
     name, density = next((solid.name, solid.density) for solid in scene.solid if solid.motion == "free")
     simulation, steps = Simulation(scene, device, precision="float64"), round(duration / scene.solver.time_step)
     first = steps if settling is None else round(settling / scene.solver.time_step)
