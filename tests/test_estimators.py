@@ -7,17 +7,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import (
-    ComputationError,
-    CortadoWarning,
-    DivergedError,
-    InputError,
-    Problem,
-    Simulation,
-    evaluate,
-    gradients,
-    losses,
-)
+from cortado import Problem, Simulation, evaluate, gradients, losses
+from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError
 from cortado.gradients import AdjointEstimator, Estimate, Filtered
 from cortado.gradients.reverse_mode import EddyViscosity
 from reference import complex_step
@@ -502,11 +493,8 @@ def test_guided_differences_and_their_directions_draw_other_random_numbers():
     first, spacing = simulation_of("2-D").positions, simulation_of("2-D").scene.discretisation.spacing
     stub, surrogate = Stub(quadratic), slopes_of_quadratic()
     gradients.Guided(0.5, surrogate=surrogate).estimate(stub, POINT)
-    drawn = [
-        (one["initial_positions"] - first).ravel() / spacing
-        for one in (*surrogate.asked, *stub.calls)
-        if "initial_positions" in one
-    ]
+    moved = [one["initial_positions"] for one in (*surrogate.asked, *stub.calls) if "initial_positions" in one]
+    drawn = [(positions - first).ravel() / spacing for positions in moved]
     both = [np.round(abs(array), 9) for array in drawn]
     assert len(drawn) == 4 + 2 * 2 * 3
     assert not np.isin(both[0], both[-1]).any() and np.isin(both[-1], both[-2]).all()
@@ -588,22 +576,18 @@ def test_guided_differences_leave_samples_out_that_diverge():
     np.testing.assert_allclose(found.gradient["gravity"], [[6.0, -0.5], [2.0, 1.4]], rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("made", "calls", "words"),
-    [
-        (gradients.RandomizedSmoothing(0.5, samples=2), range(3, 9), "6 of 20 runs .* 3 of 10 differences"),
-        (gradients.EnsembleMean(0.5, samples=4, estimator=gradients.RandomizedSmoothing(1e-3)), [1], "1 of 4 runs"),
-    ],
-)
-def test_an_average_of_too_few_is_refused(made, calls, words):
-    """The parameters themselves can be run."""
-    if isinstance(made, gradients.EnsembleMean):
-        made, function = replace(made, estimator=Diverging(slopes_of_quadratic(), *calls)), quadratic
-    else:
-        function = Diverging(quadratic, *calls)
-    words = f"^{words}.* cannot be averaged, but at most a quarter may be left out: take .* The first: The simulation"
-    with pytest.raises(DivergedError, match=words):
-        made.estimate(Stub(function), POINT)
+def test_an_average_of_too_few_is_refused():
+    """Also one without the run at the parameters themselves."""
+    few = "cannot be averaged, but at most a quarter may be left out: take .* The first: The simulation"
+    smoothed = gradients.RandomizedSmoothing(0.5, samples=2)
+    averaged = gradients.EnsembleMean(0.5, samples=4, estimator=Diverging(slopes_of_quadratic(), 1))
+    for made, function, words in [
+        (smoothed, Diverging(quadratic, 0), "The simulation diverged in step 3: particle 0"),
+        (smoothed, Diverging(quadratic, *range(3, 9)), f"6 of 20 runs .* 3 of 10 differences.* {few}"),
+        (averaged, quadratic, f"1 of 4 runs.* {few}"),
+    ]:
+        with pytest.raises(DivergedError, match=f"^{words}"):
+            made.estimate(Stub(function), POINT)
 
 
 def test_a_member_with_a_parameter_out_of_its_range_is_left_out_too():
@@ -623,11 +607,6 @@ def test_a_member_with_a_parameter_out_of_its_range_is_left_out_too():
     assert found.gradient["viscosity"] == pytest.approx(np.mean(slopes), rel=1e-12)
     with pytest.raises(InputError, match=r"cannot be averaged, .* logarithm .* The first: parameter viscosity is -4"):
         replace(mean, spread=5.0).estimate(problem, {"viscosity": 0.18})
-
-
-def test_a_run_at_the_parameters_themselves_that_diverges_ends_an_average():
-    with pytest.raises(DivergedError, match=r"^The simulation diverged in step 3: particle 0"):
-        gradients.RandomizedSmoothing(0.5).estimate(Stub(Diverging(quadratic, 0)), POINT)
 
 
 @pytest.mark.parametrize("make", [gradients.RandomizedSmoothing, gradients.EnsembleMean, gradients.Guided])
@@ -664,25 +643,18 @@ def test_an_interval_needs_an_average():
         replace(estimate, standard_error=None).interval()
 
 
-@pytest.mark.parametrize(
-    ("estimator", "point", "precision"),
-    [
-        (gradients.RandomizedSmoothing(0.1, samples=4, position_noise=0.001), {}, "float64"),
-        (
-            gradients.EnsembleMean(
-                {"gravity": 0.1, "initial_positions": 1e-6}, position_noise=0.001, estimator=gradients.Exact()
-            ),
-            {"initial_positions": None},
-            "float64",
-        ),
-        (
-            gradients.Guided(0.1, position_noise=0.001, surrogate=gradients.Exact()),
-            {"gravity": np.tile([0.5, -9.81, 0.0], (60, 1))},
-            "float32",
-        ),
-    ],
-    ids=["smoothing", "mean", "guided"],
-)
+SPREADS = {"gravity": 0.1, "initial_positions": 1e-6}
+SMOOTHED = gradients.RandomizedSmoothing(0.1, samples=4, position_noise=0.001)
+AVERAGED = gradients.EnsembleMean(SPREADS, position_noise=0.001, estimator=gradients.Exact())
+GUIDED = gradients.Guided(0.1, position_noise=0.001, surrogate=gradients.Exact())
+BEFORE_CHAOS = {
+    "smoothing": (SMOOTHED, {}, "float64"),
+    "mean": (AVERAGED, {"initial_positions": None}, "float64"),
+    "guided": (GUIDED, {"gravity": np.tile([0.5, -9.81, 0.0], (60, 1))}, "float32"),
+}
+
+
+@pytest.mark.parametrize(("estimator", "point", "precision"), BEFORE_CHAOS.values(), ids=BEFORE_CHAOS)
 def test_before_chaos_they_agree_with_the_exact_gradient(estimator, point, precision):
     simulation = Simulation(splash(), precision=precision)
     problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))

@@ -24,27 +24,10 @@ TODAY = {path.relative_to(ROOT).as_posix(): path.read_text("utf-8") for path in 
 PROGRAM = re.compile(r"^    python (\S.*)$|`python (\S[^`]*)`", re.MULTILINE)
 PROGRAMS = sorted({(a or b).partition("  #")[0] for text in TODAY.values() for a, b in PROGRAM.findall(text)})
 OF_OTHERS = {"build", "cibuildwheel", "pip", "twine", "venv", "pytest"}
-OPTIONS_OF_OTHERS = {
-    "--editable",
-    "--exclude-editable",
-    "--find-links",
-    "--ignore-requires-python",
-    "--no-deps",
-    "--platform",
-    "--strict",
-}
-COMMANDS = (
-    "compare",
-    "completion",
-    "convergence",
-    "dataset",
-    "describe",
-    "examples",
-    "export",
-    "fit",
-    "gradients check",
-)
-COMMANDS += ("new", "optimise", "picture", "run", "schema", "sweep", "view")
+OPTIONS_OF_OTHERS = {"--editable", "--exclude-editable", "--find-links", "--ignore-requires-python"}
+OPTIONS_OF_OTHERS |= {"--no-deps", "--platform", "--strict"}
+COMMANDS = ("compare", "completion", "convergence", "dataset", "describe", "examples", "export", "fit")
+COMMANDS += ("gradients check", "new", "optimise", "picture", "run", "schema", "sweep", "view")
 
 
 def sources(place: Path) -> str:

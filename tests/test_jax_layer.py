@@ -10,18 +10,7 @@ import cortado
 import layered
 from cortado import InputError, Problem, Simulation, gradients, sensors
 from cortado.optimisation.layers.layer import KEPT
-from layered import (
-    BAD_PARAMETERS,
-    STIFF,
-    assert_refused,
-    matched,
-    same_bits,
-    scheduled,
-    shear,
-    sheared,
-    uses_of_parameters,
-    uses_of_state,
-)
+from layered import BAD_PARAMETERS, STIFF, assert_refused, matched, same_bits, scheduled, shear, sheared
 from scenes import Squares, plane, two_layers
 
 
@@ -325,13 +314,13 @@ BAD_STATES = {
 @pytest.mark.parametrize("name", BAD_STATES)
 def test_a_bad_state_is_refused_in_a_sentence(layer, simulation, problem, name):
     change, words = BAD_STATES[name]
-    assert_refused(words, *uses_of_state(layer, simulation, problem, change(layer.state(simulation))))
+    assert_refused(words, *layered.uses_of_state(layer, simulation, problem, change(layer.state(simulation))))
 
 
 @pytest.mark.parametrize("name", BAD_PARAMETERS)
 def test_bad_parameters_are_refused_in_a_sentence(layer, simulation, problem, name):
     make, words = BAD_PARAMETERS[name]
-    assert_refused(words, *uses_of_parameters(layer, simulation, problem, make))
+    assert_refused(words, *layered.uses_of_parameters(layer, simulation, problem, make))
 
 
 @dataclass

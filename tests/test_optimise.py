@@ -50,9 +50,7 @@ def bits(result: Result) -> list[bytes]:
     return [np.asarray(number).tobytes() for number in numbers]
 
 
-# Convergence
-
-
+# ---- convergence ----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("optimiser", "iterations"),
     [
@@ -122,9 +120,7 @@ def test_updates_are_counted_beside_evaluations(optimiser):
         assert updates == list(range(21))
 
 
-# Against plain twins
-
-
+# ---- against plain twins --------------------------------------------------------------------------------------------
 def test_adam_follows_algorithm_1_of_its_paper():
     alpha, beta_1, beta_2, epsilon = 0.05, 0.8, 0.97, 1e-6
     theta, m, v = [-1.2, 1.0], [0.0, 0.0], [0.0, 0.0]
@@ -160,9 +156,7 @@ def test_learning_rate_by_parameter():
     np.testing.assert_allclose(result.last_parameters["fast"], [0.5, 0.5])
 
 
-# Whether gradients keep what they promise
-
-
+# ---- whether gradients keep what they promise -----------------------------------------------------------------------
 MANY = (Adam(0.1), GradientDescent(0.1), LBFGS(scale=0.1), LineSearch(scale=0.5))
 
 
@@ -269,20 +263,13 @@ def test_the_best_is_not_the_last():
     assert not result.converged
 
 
-# Bounds
-
-
+# ---- bounds ---------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("optimiser", [Adam(0.05), GradientDescent(0.2, momentum=0.5), LBFGS(scale=0.3)])
 def test_bounds_are_kept_and_reached(optimiser):
     problem = Quadratic({"g": np.array([2.0, -2.0, 0.1]), "mu": 0.7})
     lower, upper = np.array([-1.0, -0.5, -1.0]), 1.0
-    result = optimise(
-        problem,
-        {"g": np.zeros(3), "mu": 0.5},
-        optimiser,
-        200,
-        bounds={"g": (lower, upper), "mu": (None, 0.6)},
-    )
+    bounds = {"g": (lower, upper), "mu": (None, 0.6)}
+    result = optimise(problem, {"g": np.zeros(3), "mu": 0.5}, optimiser, 200, bounds)
     for parameters in problem.seen:
         assert (parameters["g"] >= lower).all() and (parameters["g"] <= upper).all()
         assert parameters["mu"] <= 0.6
@@ -303,9 +290,7 @@ def test_a_component_with_equal_bounds_stays():
         assert {record.parameters["g"][1] for record in result.history} == {0.3}
 
 
-# The line search
-
-
+# ---- the line search ------------------------------------------------------------------------------------------------
 class Rough:
     """A bowl with dents of 0.02 everywhere, whose gradient is that of the bowl; some of it cannot be computed."""
 
@@ -387,9 +372,7 @@ def test_the_scale_of_a_line_search_is_its_longest_step():
     np.testing.assert_allclose(steps, [0.125, 0.25, 0.5])
 
 
-# Resuming
-
-
+# ---- resuming -------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("optimiser", OPTIMISERS, ids=lambda optimiser: type(optimiser).__name__)
 @pytest.mark.parametrize("evaluations", [0, 1, 13])
 def test_interrupted_run_resumes_bit_for_bit(optimiser, evaluations, tmp_path):
@@ -536,9 +519,7 @@ def test_a_checkpoint_that_cannot_be_is_refused(tmp_path):
             rosenbrock(Adam(0.05), 3, **options)
 
 
-# Not finite
-
-
+# ---- not finite -----------------------------------------------------------------------------------------------------
 @dataclass
 class Breaks:
     """A quadratic of which one number is broken from the third evaluation on."""
@@ -579,15 +560,8 @@ def test_not_finite_stops_with_advice_and_keeps_the_rest(optimiser, problem, wha
     assert str(tmp_path) in str(caught.value)
     records: list[Record] = []
     with pytest.raises(ComputationError):
-        optimise(
-            replace(problem, evaluations=2),
-            start,
-            optimiser,
-            10,
-            checkpoint=tmp_path,
-            resume=True,
-            on_iteration=records.append,
-        )
+        again = {"checkpoint": tmp_path, "resume": True, "on_iteration": records.append}
+        optimise(replace(problem, evaluations=2), start, optimiser, 10, **again)
     assert [record.replayed for record in records] == [True, True]
 
 
@@ -630,17 +604,10 @@ def test_a_search_that_comes_to_a_run_that_diverges_says_where(tmp_path):
         r"\[1\. 0\.\]\.$"
     )
     records = []
+    options = {"checkpoint": tmp_path, "resume": True, "on_iteration": records.append}
     for _ in range(2):
         with pytest.raises(DivergedError, match=words) as caught:
-            optimise(
-                steep,
-                {"speed": [0.0, 0.0]},
-                GradientDescent(learning_rate=0.25),
-                10,
-                checkpoint=tmp_path,
-                resume=True,
-                on_iteration=records.append,
-            )
+            optimise(steep, {"speed": [0.0, 0.0]}, GradientDescent(learning_rate=0.25), 10, **options)
         assert (caught.value.step, caught.value.particle) == (3, 7)
     assert [record.replayed for record in records] == [False] * 5 + [True] * 5
     with pytest.raises(DivergedError, match=r"try a smaller time step\.$"):
@@ -683,10 +650,8 @@ def test_a_search_goes_on_past_runs_that_diverge(optimiser, tmp_path):
     if not isinstance(optimiser, LineSearch):  # whose trials are no evaluations
         assert found.refused == found.history[-1].refused == whole.lost
         assert found.history[0].refused == 0 and whole.calls == found.evaluations + found.refused
-        assert re.search(
-            rf" It refused {found.refused} steps?, as runs diverged or parameters were out of their range\.$",
-            found.message,
-        )
+        told = rf" It refused {found.refused} steps?, as runs diverged or parameters were out of their range\.$"
+        assert re.search(told, found.message)
     for calls in range(0, whole.calls, 4):
         folder = tmp_path / str(calls)
         with pytest.raises(Interrupted):
@@ -783,9 +748,7 @@ def test_a_search_counts_what_its_averages_leave_out_and_warns_once():
     assert "updates. It left 6 runs out of its averages, as runs diverged or" in found.message
 
 
-# Wrong input
-
-
+# ---- wrong input ----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "make",
     [
@@ -871,9 +834,7 @@ def test_a_gradient_of_another_shape_is_refused():
         optimise(Wrong({"x": np.zeros(2)}), {"x": np.ones(2)}, Adam(0.1), 3)
 
 
-# What is handed on
-
-
+# ---- what is handed on ----------------------------------------------------------------------------------------------
 def test_gradient_and_values_are_handed_on_as_given():
     problem, estimator = Quadratic({"x": 0.0, "y": 0.0, "z": np.zeros(2)}), object()
     start = {"x": 1, "y": np.array(1.0), "z": [1, 2]}
@@ -900,9 +861,7 @@ def test_the_history_is_safe_from_a_problem_that_overwrites_its_arguments():
     np.testing.assert_array_equal(start, np.ones(2))
 
 
-# Names and functions
-
-
+# ---- names and functions --------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("name", "settings", "optimiser"),
     [
@@ -935,26 +894,20 @@ def test_a_plain_function_is_optimised(tmp_path):
         rosenbrock(LBFGS(), problem=other, checkpoint=tmp_path, resume=True)
 
 
-@pytest.mark.parametrize(
-    ("returned", "found"),
-    [
-        (1.5, "1.5"),
-        (None, "None"),
-        ((1.0, {"a": 0.0}, 2), "a tuple of 3"),
-        ((1.0, np.zeros(2)), "a loss and a gradient of type ndarray"),
-    ],
-)
-def test_a_function_that_returns_something_else_is_refused(returned, found):
-    wanted = "two things: the loss, a number, and its gradient, a dictionary with an array for each parameter"
-    with pytest.raises(InputError, match=f"^What is optimised returned {found}, but must return {wanted} by its name"):
-        rosenbrock(LBFGS(), problem=lambda parameters: returned)
+TWO = "but must return two things: the loss, a number, and its gradient, a dictionary with an array for each parameter"
+TWO += " by its name"
+WRONG_PROBLEMS = [
+    (3, {}, r"What is optimised is 3, but must be a cortado\.Problem, an object with"),
+    (Rosenbrock, {}, "What is optimised is the class Rosenbrock, but must be an object"),
+    (lambda p: (0.0, {}), {"gradient": object()}, "gradient is given, but must be left out"),
+    (lambda p: 1.5, {}, f"What is optimised returned 1.5, {TWO}"),
+    (lambda p: None, {}, f"What is optimised returned None, {TWO}"),
+    (lambda p: (1.0, {"a": 0.0}, 2), {}, f"What is optimised returned a tuple of 3, {TWO}"),
+    (lambda p: (1.0, np.zeros(2)), {}, f"What is optimised returned a loss and a gradient of type ndarray, {TWO}"),
+]
 
 
-def test_what_cannot_be_optimised_is_refused():
-    for problem, options, words in [
-        (3, {}, r"^What is optimised is 3, but must be a cortado\.Problem, an object with"),
-        (Rosenbrock, {}, r"^What is optimised is the class Rosenbrock, but must be an object"),
-        (lambda parameters: (0.0, {}), {"gradient": object()}, r"^gradient is given, but must be left out"),
-    ]:
-        with pytest.raises(InputError, match=words):
-            rosenbrock(LBFGS(), problem=problem, **options)
+@pytest.mark.parametrize(("problem", "options", "words"), WRONG_PROBLEMS)
+def test_what_cannot_be_optimised_is_refused(problem, options, words):
+    with pytest.raises(InputError, match=f"^{words}"):
+        rosenbrock(LBFGS(), problem=problem, **options)

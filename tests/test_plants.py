@@ -111,15 +111,8 @@ SOLVER = {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 3, "maximu
 
 def small(viscosity: str, **changes):
     """24 particles in a pool and a few in a nozzle, in the plane."""
-    forces = {"gravity": [1.0, -9.81], "viscosity": viscosity}
-    tables = {
-        "fluid": [POOL],
-        "container": ROOM,
-        "phase": PHASES,
-        "solver": SOLVER,
-        "forces": forces,
-        "discretisation": CUBIC,
-    }
+    tables = {"fluid": [POOL], "container": ROOM, "phase": PHASES, "solver": SOLVER, "discretisation": CUBIC}
+    tables["forces"] = {"gravity": [1.0, -9.81], "viscosity": viscosity}
     return plane(**{**tables, "emitter": [NOZZLE], **changes})
 
 
@@ -136,9 +129,11 @@ VOLUME = scene(
 STRESS = {"gravity": [1.0, -9.81, 0.5], "viscosity": "stress"}
 
 
-def honey(lower, upper):
-    """A body of it, alone."""
-    return {"phase": [HONEY], "fluid": [box(lower, upper, phase="honey")]}
+def touching(make, fluid, room, bodies):
+    """Bodies in honey that float against each other, in the plane or in space."""
+    low, gravity = [0.0] * len(room), [1.0, -9.81, 0.5][: len(room)]
+    tables = {"solver": SHORT, "discretisation": CUBIC, "forces": {"gravity": gravity}, "solid": bodies}
+    return make(phase=[HONEY], fluid=[box(low, fluid, phase="honey")], container=box(low, room), **tables)
 
 
 def block(phase, **tables):
@@ -173,36 +168,15 @@ SCENES = {
     ),
     "a solid that moves": (one("stress", HONEY, solver=PROJECTION, solid=[BALL]), "positions"),
     "a solid that moves in space": (block(HONEY, solid=[PLATE]), "positions"),
-    "free bodies that touch": (
-        plane(
-            **honey([0.0, 0.0], [0.6, 0.4]),
-            container=box([0.0, 0.0], [1.0, 1.0]),
-            forces={"gravity": [1.0, -9.81]},
-            solver=SHORT,
-            discretisation=CUBIC,
-            solid=[RAFT, BUOY, ARM],
-        ),
-        "positions",
-    ),
-    "free bodies that touch in space": (
-        scene(
-            **honey([0.0] * 3, [0.35, 0.3, 0.25]),
-            container=box([0.0] * 3, [0.5, 0.6, 0.25]),
-            forces={"gravity": [1.0, -9.81, 0.5]},
-            solver=SHORT,
-            discretisation=CUBIC,
-            solid=TURNED,
-        ),
-        "positions",
-    ),
+    "free bodies that touch": (touching(plane, [0.6, 0.4], [1.0, 1.0], [RAFT, BUOY, ARM]), "positions"),
+    "free bodies that touch in space": (touching(scene, [0.35, 0.3, 0.25], [0.5, 0.6, 0.25], TURNED), "positions"),
     "implicit": (one("stress", THICK, forces=IMPLICIT), "positions"),
     "a law in space": (block(THICK), "positions"),
     "one phase": (one("pairwise", HONEY), "positions"),
     "surface tension": (small("pairwise", forces={"gravity": [1.0, -9.81], "surface_tension": 3.0}), "everything"),
-    "surface tension by curvature": (
+    "surface tension by curvature": (  # second rows are a part of the surface, not wholly
         open_air(
-            discretisation={"spacing": 0.05, "support": 2.0},  # second rows are a part of the surface, not wholly
-            forces={"gravity": [0.0, 0.0], "surface_tension": 100.0},
+            discretisation={"spacing": 0.05, "support": 2.0}, forces={"gravity": [0.0, 0.0], "surface_tension": 100.0}
         ),
         "positions",
     ),

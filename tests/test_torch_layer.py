@@ -9,15 +9,7 @@ import pytest
 import cortado
 import layered
 from cortado import DivergedError, InputError, Problem, Simulation, gradients, sensors
-from layered import (
-    POINT,
-    assert_refused,
-    matched,
-    same_bits,
-    sheared,
-    uses_of_parameters,
-    uses_of_state,
-)
+from layered import POINT, assert_refused, matched, same_bits, sheared, uses_of_parameters, uses_of_state
 from scenes import Squares, plane, scene, two_layers
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: its CPU wheel is optional", exc_type=ImportError)
