@@ -1,6 +1,4 @@
-"""Losses that measure the distance to a target: of particles, the centre of mass, a solid, a picture, or a sensor's
-readings.
-"""
+"""Losses: distances of particles, centre of mass, a solid, a picture, or a sensor's readings from a target."""
 
 from functools import cache
 from hashlib import sha256
@@ -27,11 +25,10 @@ from cortado.scene.motions import AXES, Pose, matrix, position_name, solids_in
 
 @cache
 def matching_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return the kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of vectors and targets.
-    All scenes of a batch have the same targets."""
+    """Return kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of vectors and targets,
+    which are the same for all scenes of a batch."""
     real, vector = precision.real, precision.vector
     module = kernel_module(f"matching_{precision.name}")
-
     typed = TypesByName(real, {vector: "x target bar", wp.float64: "squares"})
 
     @wp.kernel(module=module, enable_backward=False)
@@ -63,12 +60,10 @@ class FinalPositions:
         if self.target.ndim != 2 or not np.isfinite(self.target).all():
             raise InputError(f"target has shape {self.target.shape}, but must be (particles, dimension) and finite.")
         self.fingerprint = _checksum(self.target)
-        """Tells one target from another, for checkpoints."""
         self._on_device: dict[Any, tuple[wp.array, TreeReduction]] = {}
         """The target and the sum over particles, by device, precision and number of scenes."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle or copy the loss as its target."""
         return FinalPositions, (self.target,)
 
     def value(self, end: Snapshot) -> float:
@@ -118,10 +113,9 @@ class CentreOfMass:
     """
 
     def __init__(self, target: Any, masses: np.ndarray | None = None):
-        """Set the ``target`` (d,) [m], and the particles' ``masses`` (n,) in any unit; None if all are equal."""
+        """Set the ``target`` (d,) [m], and the particles' ``masses`` (n,) in any unit, None for equal masses."""
         self.target, self._weights = _finite("target", target), _weights(masses)
         self.fingerprint = _checksum(self.target, self._weights)
-        """Tells one target from another, for checkpoints."""
 
     def value(self, end: Snapshot) -> float:
         return float((self._miss(end) ** 2).sum())
@@ -147,7 +141,6 @@ class CentreOfMassAlong:
         """Set the ``direction`` (d,) [-], and ``masses`` as in `CentreOfMass`."""
         self.direction, self._weights = _finite("direction", direction), _weights(masses)
         self.fingerprint = _checksum(self.direction, self._weights)
-        """Tells one direction from another, for checkpoints."""
 
     def value(self, end: Snapshot) -> float:
         return float((self._slopes(end) * end.positions).sum())
@@ -162,7 +155,7 @@ class CentreOfMassAlong:
 
 
 def _finite(what: str, value: Any) -> np.ndarray:
-    """Return a read-only vector in float64; raises `InputError` unless it is finite."""
+    """Return a read-only vector in float64; raise `InputError` unless it is finite."""
     array = read_only(what, value)
     if array.ndim != 1 or not np.isfinite(array).all():
         raise InputError(f"{what} has shape {array.shape}, but must have 1 dimension and be finite.")
@@ -179,7 +172,7 @@ def _weights(masses: np.ndarray | None) -> np.ndarray | None:
 
 
 def _shares(weights: np.ndarray | None, end: Snapshot) -> np.ndarray:
-    """Return the shares (n,) of the particles in the total mass."""
+    """Return the particles' masses (n,) divided by the total mass."""
     n = len(end.positions)
     if weights is None:
         return np.full(n, 1.0 / n)
@@ -189,21 +182,20 @@ def _shares(weights: np.ndarray | None, end: Snapshot) -> np.ndarray:
 
 
 def _checksum(*parts: Any) -> str:
-    """Return a checksum of arrays and bytes; None stands for a part left out."""
     return sha256(b" ".join(b"" if one is None else bytes(memoryview(one)) for one in parts)).hexdigest()
 
 
 @fixed
 class SolidPose:
-    """A loss of a moving solid, ``|x - x*|^2 + l^2 (3 - tr R*^T R)`` [m2]. The first term is the squared distance of
-    its middle from a target; the second is, for small angles, l^2 times the squared angle to a target rotation.
+    """A loss of a moving solid, ``|x - x*|^2 + l^2 (3 - tr R*^T R)`` [m2]: the squared distance of the solid's middle
+    from a target, and, for small angles, l^2 times the squared angle to a target rotation.
 
     Example: ``loss = cortado.losses.SolidPose("raft", position=[0.8, 0.3], rotation=0.0)``
     """
 
     def __init__(self, name: str, position: Any = None, rotation: Any = None, length: float = 1.0):
-        """Set the ``name`` of the solid and one or both targets: ``position`` (d,) of its middle [m], and ``rotation``
-        [rad], a number in 2-D and a vector (3,) in 3-D. ``length`` is l [m], greater than 0."""
+        """Set the ``name`` of the solid and at least one target: ``position`` (d,) [m] of the solid's middle, and
+        ``rotation`` [rad], a number in 2-D and a vector (3,) in 3-D. ``length`` is l [m], greater than 0."""
         if not isinstance(name, str):
             raise InputError(f"name is {shown(name)}, but must be the name of a solid.")
         if position is None and rotation is None:
@@ -214,7 +206,6 @@ class SolidPose:
         self.position = None if position is None else read_only("position", position)
         self.rotation = None if rotation is None else read_only("rotation", np.atleast_1d(rotation))
         self.fingerprint = _checksum(name.encode(), self.position, self.rotation, np.float64(length))
-        """Tells one target from another, for checkpoints."""
 
     def value(self, end: Snapshot) -> float:
         return self.value_and_adjoint(end)[0]
@@ -239,7 +230,7 @@ class SolidPose:
         return value, bars
 
     def _turned(self, end: Snapshot) -> tuple[float, dict[str, np.ndarray]]:
-        """Return the part of the loss due to rotation, and the adjoint of this part by field."""
+        """Return the term of rotation, and its adjoint by field."""
         assert self.rotation is not None
         pose = Pose.of(self.name, f"{self.name}.{AXES[0]}" in end.state.names, end)
         R, wanted, weight = pose.rotation, matrix(self.rotation), self.length**2
@@ -248,13 +239,12 @@ class SolidPose:
 
 
 class Pictures(Protocol):
-    """Protocol of a renderer of pictures, such as `cortado.render.renderer.Renderer`."""
-
     def render(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> np.ndarray:
         """Return the picture (rows, columns, 3) of particles."""
 
     def adjoint(self, image_bar: np.ndarray) -> Any:
-        """Return derivatives of a function of the last picture: ``positions``, ``fractions``, ``colours``."""
+        """Return derivatives with ``positions``, ``fractions`` and ``colours``, given the adjoint of the last
+        picture."""
 
 
 @fixed
@@ -268,9 +258,9 @@ class Image:
     """
 
     def __init__(self, renderer: Pictures, target: np.ndarray, distance: ImageLoss | None = None):
-        """Set the ``target`` picture (rows, columns, 3), linear RGB from 0 to 1. ``distance``:
-        `cortado.image_losses.SquaredDifference`, the default, or `Pyramid` for shapes that may not overlap their
-        target. Raises `InputError` for a target of another shape, or with values up to 255."""
+        """Set a ``renderer`` of `Simulation.renderer`, and the ``target`` picture (rows, columns, 3), linear RGB from 0
+        to 1. ``distance``: `cortado.image_losses.SquaredDifference`, the default, or `Pyramid` for shapes that may not
+        overlap their target. Raise `InputError` for a target of another shape, or with values up to 255."""
         require_methods("renderer", renderer, ("render", "adjoint"), "an object such as Simulation.renderer() gives")
         self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
         wanted = "an object such as cortado.image_losses.Pyramid()"
@@ -278,7 +268,6 @@ class Image:
         self.target = _target_image(target, getattr(renderer, "shape", None))
         parts = (self.distance.fingerprint, _checksum(self.target))
         self.fingerprint = " ".join((*parts, getattr(renderer, "fingerprint", "")))
-        """Text that identifies the target and the view; checkpoints store it."""
 
     def image(self, end: Snapshot) -> np.ndarray:
         """Return the picture (rows, columns, 3) of a state."""
@@ -299,8 +288,7 @@ class Image:
 
 
 def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
-    """Return a float64 copy (rows, columns, 3) of a target; raises `InputError` if it is no picture or not of a given
-    ``shape``."""
+    """Return a float64 copy (rows, columns, 3) of a target; raise `InputError` unless it is a picture of ``shape``."""
     image = read_only("target", target)
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"target has shape {image.shape}, but must be a picture (rows, columns, 3).")
@@ -312,10 +300,6 @@ def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray
     if image.min() < 0.0:
         raise InputError(f"target has a value of {image.min():g}, but must be {LIGHT}; clip noise at 0.")
     return image
-
-
-SAME = 1e-6
-"""Relative difference below which time steps count as equal, because one may be rounded to float32."""
 
 
 @fixed
@@ -330,14 +314,13 @@ class SensorMatch:
     """
 
     def __init__(self, sensor: Sensor, target: Any, weight: float = 1.0, scale: Any = 1.0):
-        """Set the ``target`` (k,), a number for each column of the sensor, with NaN for columns to ignore; the
-        ``weight`` of the sum; and the ``scale``, a number or (k,)."""
+        """Set the ``sensor``, the ``weight`` of the sum, and the ``scale``, a number or (k,). ``target`` (k,): a number
+        for each column of the sensor, NaN for columns to ignore."""
         self.sensor, self.weight = checked_sensor(sensor), as_one_number("weight", weight)
         self.target = np.atleast_1d(read_only("target", target))
         self.scale = np.broadcast_to(as_numbers("scale", scale), self.target.shape)
         arrays = self.target.tobytes() + self.scale.tobytes()
         self.fingerprint = sha256(f"{sensor!r} {self.weight!r}".encode() + arrays).hexdigest()
-        """Tells one target from another, for checkpoints."""
 
     def value(self, end: Snapshot) -> float:
         return self.weight * float((self._miss(end) ** 2).sum())
@@ -361,7 +344,7 @@ class Series(Frames):
     """A loss: the mean over steps of the squared difference between a sensor's readings and a measured series, summed
     over columns.
 
-    The series is interpolated linearly to the times of the steps. Steps before its first and after its last time are
+    The series is interpolated linearly to the times of the steps. Steps before its first or after its last time are
     ignored.
 
     Example: ``loss = cortado.losses.Series(gauge, times, heights, time_step=0.002)``
@@ -400,7 +383,7 @@ class Series(Frames):
 
     def check(self, time_steps: np.ndarray) -> None:
         """Raise `InputError` unless the run has the time step given to this loss."""
-        other = time_steps[np.abs(time_steps - self.time_step) > SAME * time_steps]
+        other = time_steps[np.abs(time_steps - self.time_step) > 1e-6 * time_steps]  # rounded to float32
         if len(other):
             found = f"time_step of the series is {self.time_step:g} s"
             raise InputError(f"{found}, but must be that of the run, {other[0]:g} s, which cannot be varied beside it.")

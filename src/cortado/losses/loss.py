@@ -1,5 +1,4 @@
-"""Protocols of losses, for one scene and for a batch; the states they receive, the adjoints they return, and sums of
-losses."""
+"""Protocols of losses for a scene and for a batch, the states that losses read, adjoints, and sums of losses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,22 +22,20 @@ from cortado.sph.function_text import code_words
 
 
 def precision_of(state: State) -> Precision:
-    """Return the precision of a state's arrays."""
     return FLOAT64 if state.positions.dtype == FLOAT64.vector else FLOAT32
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A state of a rollout, usually the last, as NumPy and Warp arrays in the scene's order."""
+    """A state of a rollout, usually the last one, as NumPy and Warp arrays in the scene's order."""
 
     state: State
-    """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-], and further fields that the solver's
-    steps update."""
+    """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-], and further fields of the solver."""
     dimension: int
     colours: np.ndarray
-    """Colours of the phases, (phases, 3): red, green and blue, linear, from 0 to 1."""
+    """Colours (phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
     moment: Moment | None = None
-    """The state with the parameters of the step that follows, from which quantities are computed; None if unknown."""
+    """State and parameters of the next step, from which quantities are computed; None if unknown."""
 
     def __repr__(self) -> str:
         return f"Snapshot({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
@@ -65,7 +62,7 @@ class Snapshot:
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return by name a field of the state ("velocities"), a quantity of its particles ("density", "pressure"), or
-        the load on a solid ("rotor.load"), float64, read-only; see `docs/sensors.md`. Raises `InputError` for any other
+        the load on a solid ("rotor.load"), float64, read-only; see `docs/sensors.md`. Raise `InputError` for any other
         name."""
         if name in ADJOINT_FIELDS:
             return getattr(self, name)
@@ -81,8 +78,8 @@ class Snapshot:
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
-        """Tables of the scene's solids with their initial places; fields of the state have the current place of a
-        moving solid."""
+        """Tables of the scene's solids in their initial positions; fields of the state have the positions of moving
+        solids."""
         return moment_of(self).evaluator().solids
 
     @property
@@ -98,14 +95,13 @@ class Snapshot:
 
 
 def _read_only(values: np.ndarray) -> np.ndarray:
-    """Return a read-only float64 copy, so that a loss cannot change the state by mistake."""
     found = values.astype(np.float64)
     found.flags.writeable = False
     return found
 
 
 def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
-    """Return the state and parameters from which quantities are computed; raises `InputError` if they are unknown."""
+    """Return the state and parameters from which quantities are computed; raise `InputError` if unknown."""
     if end.moment is None:
         raise InputError("a quantity is asked for of a state whose simulation is not known, but must be of a run's.")
     return end.moment
@@ -113,33 +109,29 @@ def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
 
 @dataclass(frozen=True, repr=False)
 class StepBar:
-    """Derivatives of a loss with respect to the parameters of one step."""
+    """Derivatives of a loss with respect to the parameters of a step."""
 
     row: int
-    """Number of the step in the run, counted from 0; the number of steps for the last state (see `row_of` of
-    `cortado.runs.quantity_values`)."""
+    """Number of the step in the run, counted from 0, see `row_of` of `cortado.runs.quantity_values`."""
     parameters: Mapping[str, np.ndarray]
-    """Derivatives by parameter name, for a batch with a first axis for the scenes. A parameter over time has this
-    step's row alone."""
+    """Derivatives by parameter name, in a batch with a first axis for the scenes; parameters over time have one row."""
 
 
 @dataclass(frozen=True, repr=False)
 class SnapshotAdjoint:
-    """Derivatives of a loss with respect to a state, the phases' colours, quantities, and the parameters of one
-    step."""
+    """Derivatives of a loss with respect to a state, the phases' colours, quantities, and the parameters of a step."""
 
     state: State
     """Derivatives with respect to positions, velocities and mass fractions, as Warp arrays."""
     colours: np.ndarray
-    """Derivatives with respect to the phases' colours, (phases, 3)."""
+    """Derivatives (phases, 3) with respect to the phases' colours."""
     quantities: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Derivatives with respect to quantities of the particles, by name."""
     step: StepBar | None = None
-    """Derivatives with respect to the parameters of the step after the state; None before `through_quantities` computes
-    them."""
+    """Derivatives with respect to the parameters of the next step; None before `through_quantities`."""
 
     def through_quantities(self, end: "Snapshot | SnapshotBatch") -> "SnapshotAdjoint":
-        """Apply the chain rule to quantities: return derivatives with respect to the state and the parameters alone."""
+        """Apply the chain rule to quantities: return derivatives with respect to the state and the parameters."""
         if not self.quantities:
             return self
         moment = moment_of(end)
@@ -152,15 +144,13 @@ class SnapshotAdjoint:
 
 
 ADJOINT_FIELDS = ("positions", "velocities", "mass_fractions")
-"""Names of the fields to which the arrays of an adjoint tuple belong, in order."""
 Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...] | Mapping[str, np.ndarray]
-"""Derivatives of a loss in one of three forms: a tuple of arrays for positions and velocities (n, d) and, if wanted,
-mass fractions (n, phases); a `State` of Warp arrays; or a table by state field and quantity. In a table, names left out
-mean 0."""
+"""Derivatives of a loss: a tuple of arrays for positions and velocities (n, d) and, optionally, mass fractions (n,
+phases); a `State` of Warp arrays; or a table by state field and quantity, 0 for missing names."""
 
 
 def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
-    """Return an adjoint as a table of arrays by names of state fields and quantities; vectors are (n, d)."""
+    """Convert an adjoint to a table of arrays by state field and quantity, with vectors (n, d)."""
     if isinstance(bar, Mapping):
         return dict(bar)
     if isinstance(bar, SnapshotAdjoint):
@@ -169,7 +159,7 @@ def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
 
 
 def bar_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
-    """Convert a state's adjoint of any form to Warp arrays for fields, and a table by name for quantities."""
+    """Convert an adjoint to Warp arrays for fields, and a table by name for quantities."""
     if isinstance(bar, SnapshotAdjoint):
         return bar
     no_colours = np.zeros_like(end.colours)
@@ -182,9 +172,8 @@ def bar_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
 
 
 def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...] = ()) -> np.ndarray:
-    """Return the derivative of a loss along tangents, by name, of fields, quantities and ``colours`` (phases, 3);
-    tangents left out are 0. It is a number, or has the shape ``leading``, (batch,), for a batch. Vectors are (n, d), or
-    all (n, 3)."""
+    """Return the derivative of a loss along tangents ``dots`` of fields, quantities and colours, 0 for missing names;
+    of shape ``leading``, which is (batch,) for a batch. Vectors are all (n, d), or all (n, 3)."""
     arrays = by_field(bar, np.shape(dots["positions"])[-1])
     arrays |= {"colours": bar.colours} if isinstance(bar, SnapshotAdjoint) else {}
     products = [
@@ -198,7 +187,7 @@ def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...]
 class Loss(Protocol):
     """Protocol of a loss: a differentiable number computed from the last state of a trajectory.
 
-    Your own loss may have a method ``adjoint(end)``, which returns the derivatives alone, instead of
+    A user-defined loss may have a method ``adjoint(end)``, which returns only the derivatives, instead of
     `value_and_adjoint`.
     """
 
@@ -206,20 +195,20 @@ class Loss(Protocol):
         """Return the value of the loss for the last state of a run."""
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """Return the loss and its derivatives. The derivatives are a tuple of NumPy arrays, a table of arrays by field
-        or quantity, ``{"density": array}``, or a `State` of Warp arrays. ``end.state.like()`` makes such a state of
-        zeros; its ``set({"positions": array})`` fills it."""
+        """Return the loss and its derivatives: a tuple of NumPy arrays, a table of arrays by field or quantity,
+        ``{"density": array}``, or a `State` of Warp arrays. ``end.state.like()`` makes a state of zeros, and the
+        state's ``set({"positions": array})`` fills it."""
 
 
 @fixed
 class Frames:
-    """A sum of losses at several states of a run, each given by its number of steps.
+    """A sum of losses at several states of a run.
 
     Example: ``loss = cortado.losses.Frames({50: cortado.losses.CentreOfMass([0.4, 0.2]), 100: last})``
     """
 
     def __init__(self, losses: Mapping[int, Loss]):
-        """Set ``losses`` {number of steps: loss}; 0 is the first state."""
+        """Set ``losses`` {number of steps: loss}; the first state has number 0."""
         if not isinstance(losses, Mapping) or not losses:
             raise InputError(f"losses is {shown(losses)}, but must be a table with a loss for at least one frame.")
         for step in losses:
@@ -228,7 +217,7 @@ class Frames:
         self.losses = FixedDict(losses)
 
     def check(self, time_steps: np.ndarray) -> None:
-        """Raise `InputError` if a loss does not fit a run with these time steps (scenes,) [s]."""
+        """Raise `InputError` if a loss does not suit a run with time steps (scenes,) [s]."""
 
     @property
     def fingerprint(self) -> str:
@@ -246,22 +235,21 @@ def fingerprint(loss: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class SnapshotBatch(Sequence[Snapshot]):
-    """A state of a batch's rollout: ``end[b]`` is the `Snapshot` of scene b."""
+    """A state of a batch's rollout; ``end[b]`` is the `Snapshot` of scene b."""
 
     state: State
-    """Warp arrays (batch n,), in the scenes' order; `State.numbers` shows them as (batch, n, ...)."""
+    """Warp arrays (batch n,) in the scenes' order; `State.numbers` returns arrays (batch, n, ...)."""
     dimension: int
     colours: np.ndarray
-    """Colours of the phases, (batch, phases, 3): red, green and blue, linear, from 0 to 1."""
+    """Colours (batch, phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
     moment: Moment | None = None
-    """State with the parameters of the step after it; see `Snapshot.moment`."""
+    """State and parameters of the next step; see `Snapshot.moment`."""
 
     def __repr__(self) -> str:
         particles = counted(len(self.state.positions) // len(self), "particle")
         return f"SnapshotBatch({counted(len(self), 'scene')} of {particles})"
 
     def __len__(self) -> int:
-        """Number of scenes."""
         return len(self.colours)
 
     @overload
@@ -305,7 +293,7 @@ class SnapshotBatch(Sequence[Snapshot]):
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class _Member(Snapshot):
-    """A snapshot of one scene of a batch; the arrays of all scenes are copied to the host together."""
+    """A snapshot of a scene of a batch, which copies the arrays of all scenes to the host together."""
 
     batch: SnapshotBatch
     number: int
@@ -319,20 +307,19 @@ class _Member(Snapshot):
 
 @runtime_checkable
 class BatchedLoss(Protocol):
-    """Protocol of a loss that treats all scenes of a batch together, which saves a launch and a host read per scene.
-    The results have the same bits as for single scenes."""
+    """Protocol of a loss that treats all scenes of a batch together, with the same bits as for single scenes."""
 
     def values(self, end: SnapshotBatch) -> np.ndarray:
-        """Return the losses (batch,); values for lost scenes are meaningless."""
+        """Return the losses (batch,), with any value for lost scenes."""
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
         """Return the losses (batch,) and the derivatives with respect to the states, as Warp arrays:
-        ``end.state.like()`` makes a state of zeros, and its ``set({"positions": array})`` fills it from an array
-        (batch, n, d)."""
+        ``end.state.like()`` makes a state of zeros, and the state's ``set({"positions": array})`` fills it from an
+        array (batch, n, d)."""
 
 
 def batch_values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:
-    """Return the losses (batch,), with NaN for scenes that are not in ``members``."""
+    """Return the losses (batch,), NaN for scenes outside ``members``."""
     found = np.full(len(end), np.nan)
     if isinstance(loss, BatchedLoss):
         found[members] = loss.values(end)[members]
@@ -344,7 +331,7 @@ def batch_values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.n
 def batch_values_and_adjoints(
     loss: Loss, end: SnapshotBatch, members: Sequence[int]
 ) -> tuple[np.ndarray, SnapshotAdjoint]:
-    """Return the losses (batch,) and the states' adjoints. Scenes not in ``members`` have NaN and adjoints of 0."""
+    """Return the losses (batch,) and the states' adjoints, NaN and 0 for scenes outside ``members``."""
     found = np.full(len(end), np.nan)
     if isinstance(loss, BatchedLoss):
         all_found, state = loss.values_and_adjoint(end)

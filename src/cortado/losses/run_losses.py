@@ -1,4 +1,4 @@
-"""Check the losses that users give, in any accepted form, and assign each to the state after its number of steps."""
+"""Checks of users' losses, and the assignment of losses to states by number of steps."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -31,16 +31,16 @@ from cortado.sph.function_text import code_words
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
 LAUNCHED = "positions", "velocities", "an array for the loss"
-"""Descriptions of the arguments of a loss that is a function of Warp arrays."""
+"""Descriptions of the arguments of a function of Warp arrays, for messages."""
 
 
 @fixed
 class Recorded:
-    """A loss made of any function of Warp arrays, differentiated by Warp's tape.
+    """A loss made of a function of Warp arrays, differentiated by Warp's tape.
 
     ``function(positions, velocities, loss)`` launches kernels that add to ``loss``, an array (1,) in the precision of
-    the vectors (n,). Warp's rules for loops in kernels apply: put a sum that is used non-linearly into a separate
-    function.
+    the vectors (n,). Put a sum that is used non-linearly into a separate Warp function: Warp's derivatives of loops in
+    kernels would be wrong.
 
     Example::
 
@@ -56,7 +56,7 @@ class Recorded:
 
     @property
     def fingerprint(self) -> str:
-        """Text that identifies the function and its numbers; a resumed search compares it."""
+        """Text that identifies the function and its numbers, which a resumed search compares."""
         return f"{type(self).__qualname__} {code_words(self.function)}"
 
     @WARP
@@ -80,21 +80,19 @@ class Recorded:
 
 
 FORMS = tuple(name.replace("_", " ") for name in ADJOINT_FIELDS)
-"""Words for the fields to which the arrays of an adjoint tuple belong."""
 
 
 class CheckedLoss:
-    """A wrapper of a loss that checks that the value is a number and that the adjoint fits the state."""
+    """A wrapper of a loss that checks values and adjoints, and prefers ``adjoint`` to ``value_and_adjoint``."""
 
     def __init__(self, loss: Any):
-        """Wrap a `Loss`; if the loss has a method ``adjoint``, it is used instead of ``value_and_adjoint``."""
         self._loss = loss
 
     def value(self, end: Snapshot) -> float:
         return as_one_number("the loss's value", self._loss.value(end))
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """Return the loss and its derivatives after checking them; NumPy arrays become float64."""
+        """Return the checked loss and its derivatives, with NumPy arrays in float64."""
         if hasattr(self._loss, "adjoint"):
             return self.value(end), self._checked(self._loss.adjoint(end), end)
         value, bar = self._loss.value_and_adjoint(end)
@@ -120,8 +118,6 @@ class CheckedLoss:
 
 
 class CheckedBatchedLoss(CheckedLoss):
-    """A wrapper of a `BatchedLoss` that checks its results."""
-
     def values(self, end: SnapshotBatch) -> np.ndarray:
         return _checked_array("values", self._loss.values(end), (len(end),))
 
@@ -131,8 +127,7 @@ class CheckedBatchedLoss(CheckedLoss):
 
 
 def as_loss(loss: Any) -> Loss:
-    """Wrap a loss, or a function of Warp arrays, so that its results are checked; raises `InputError` for anything
-    else."""
+    """Wrap a loss, or a function of Warp arrays, with checks of results; raise `InputError` for anything else."""
     if isinstance(loss, type):
         raise InputError(f"loss is the class {loss.__name__}, but must be an object that is made of it.")
     derivative = next((name for name in ("adjoint", "value_and_adjoint") if hasattr(loss, name)), None)
@@ -161,7 +156,6 @@ def _checked_state(bar: Any, end: Snapshot | SnapshotBatch) -> State:
 
 
 def _checked_table(bar: Mapping[str, Any], end: Snapshot) -> dict[str, np.ndarray]:
-    """Check and return adjoints given by names of state fields and quantities."""
     for name in bar:
         check_readable(name, "a name in the loss's adjoint", end.state.names)
     return {name: _checked_share(f"adjoint of {name}", array, end[name].shape) for name, array in bar.items()}
@@ -183,16 +177,15 @@ def _checked_share(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray
 
 
 def _layout(array: wp.array) -> str:
-    """Return a Warp array's type, shape and device in words; arrays must agree in them to be copied."""
     return f"a Warp array of {wp.types.type_repr(array.dtype)} of shape {array.shape} on {array.device}"
 
 
 class LossesByStep(dict[int, Loss]):
-    """The losses of a run, by the number of steps of the state that each is computed from."""
+    """The losses of a run by the number of steps before the state."""
 
     def __init__(self, loss: Any, steps: int, chosen: bool = False):
-        """Take a ``loss`` of the state after all ``steps``, or `Frames`. Raises `InputError` for anything else, for
-        frames beyond ``steps``, and for frames at fixed times if the time steps are ``chosen`` during the run."""
+        """Take a ``loss`` of the state after all ``steps``, or `Frames`. Raise `InputError` for anything else, for
+        frames beyond ``steps``, and for frames at fixed times if time steps are ``chosen`` during the run."""
         if chosen and getattr(loss, "time_step", None) is not None:
             raise InputError(
                 f"loss is a {type(loss).__name__} of steps of {loss.time_step:g} s, but must be one of numbers of "
@@ -205,23 +198,20 @@ class LossesByStep(dict[int, Loss]):
         super().__init__({step: as_loss(one) for step, one in by_step.items()})
         self._sensors = {step: one.sensor for step, one in by_step.items() if hasattr(one, "sensor")}
         self.sensors = {repr(sensor): sensor for sensor in self._sensors.values()}
-        """Sensors that the losses read, by ``repr``."""
         self._frames = loss if isinstance(loss, Frames) else None
 
     def _check(self, ends: Mapping[int, Any]) -> None:
-        """Raise `InputError` if the losses do not fit these states of a run."""
         if self._frames is not None:
             end = next(iter(ends.values()))
             self._frames.check(np.ravel(moment_of(end).parameters["time_step"]))
 
     def quantities(self, scene: Callable[[], SensedScene]) -> dict[int, str]:
-        """Return the particle quantities that Cortado's sensors read, by state number."""
         sums = {step: one.summed(scene()) for step, one in self._sensors.items() if hasattr(one, "summed")}
         return {step: one.quantity for step, one in sums.items() if one.quantity is not None}
 
     def total(self, ends: Mapping[int, Any], going: Sequence[int] | None) -> Any:
-        """Return the sum of the losses, given states by number of steps. For a batch it is (batch,), with NaN for
-        scenes not in ``going``; for a single scene ``going`` is None."""
+        """Return the sum of the losses, given states by number of steps; for a batch (batch,), NaN for scenes outside
+        ``going``, which is None for a single scene."""
         self._check(ends)
         if going is None:
             return sum(loss.value(ends[step]) for step, loss in self.items())
@@ -230,7 +220,7 @@ class LossesByStep(dict[int, Loss]):
     def total_and_adjoints(
         self, ends: Mapping[int, Any], going: Sequence[int] | None
     ) -> tuple[Any, dict[int, SnapshotAdjoint]]:
-        """Return the sum of the losses, as `total` does, and the states' adjoints by number of steps."""
+        """Return the `total` of the losses, and the states' adjoints by number of steps."""
         self._check(ends)
         if going is None:
             one = {step: loss.value_and_adjoint(ends[step]) for step, loss in self.items()}

@@ -1,4 +1,4 @@
-"""The files of a data set: one file per run while runs are added, then one file for each purpose, and the metadata."""
+"""The files of a data set: one file per run while runs are added, later one file per purpose, and the metadata."""
 
 import io
 import json
@@ -19,34 +19,25 @@ from cortado.scene.scene import Scene
 from cortado.version import __version__
 
 METADATA, PARTS, PURPOSES = "metadata.json", "runs", ("train", "valid", "test")
-"""Names of the metadata file, which is written last, of the folder with new runs until then, and of the purposes."""
 REACH = 1.6
-"""Connectivity radius of a learned simulator [spacings]. Fluid at rest is up to 1.5 spacings from the nearest wall
-particle."""
+"""Connectivity radius of a learned simulator [spacings]; fluid at rest is up to 1.5 spacings from a wall particle."""
 SPARE = 1.02
 """Free disk space needed to assemble runs, relative to the size of these runs."""
-NO_SPREAD = 1e-7
-"""Standard deviation [m] below which LagrangeBench treats all values as equal."""
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run stored in a file: its group in the file, and its statistics."""
-
     file: Path
     group: str
     statistics: Mapping[str, Any]
 
 
 class DatasetFolder:
-    """The folder of a data set; the content of its files is read once and kept."""
-
     def __init__(self, out: Path):
         self.out, self.parts = out, out / PARTS
 
     def save(self, number: int, run: OneRun) -> None:
-        """Write a run to its own file, completely or not at all. HDF5 writes to memory first, because a full disk may
-        crash it."""
+        """Write a run to a new file atomically; HDF5 writes to memory first, because a full disk may crash HDF5."""
         import h5py
 
         content = io.BytesIO()
@@ -57,7 +48,6 @@ class DatasetFolder:
         self._write(f"{number:05d}.h5", content.getvalue())
 
     def save_failure(self, number: int, why: str) -> None:
-        """Store the reason why a run failed."""
         self._write(f"{number:05d}.json", json.dumps({"failure": why}))
 
     def _write(self, name: str, content: str | bytes) -> None:
@@ -66,12 +56,11 @@ class DatasetFolder:
         write_atomically(self.parts / name, content)
 
     def path(self, purpose: str) -> Path:
-        """Return the path of the file for a purpose."""
         return self.out / f"{purpose}.h5"
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """The metadata; empty if they are damaged or not written yet."""
+        """The metadata; empty if the file is damaged or missing."""
         try:
             return dict(parsed_json((self.out / METADATA).read_bytes()))
         except (OSError, ValueError, TypeError):
@@ -79,12 +68,11 @@ class DatasetFolder:
 
     @property
     def runs(self) -> dict[int, FinishedRun]:
-        """The finished runs by number. For a run in two files, the file for its purpose counts."""
+        """Finished runs by number; a purpose's file replaces the file of a single run."""
         return self._read[0]
 
     @property
     def damaged(self) -> dict[Path, str]:
-        """The files that cannot be read, with the reason of each."""
         return self._read[1]
 
     @cached_property
@@ -106,21 +94,18 @@ class DatasetFolder:
 
     @cached_property
     def failures(self) -> dict[int, str]:
-        """The reasons why runs failed, by their numbers."""
         old = {int(number): why for number, why in self.metadata.get("failed", {}).items()}
         notes = sorted(self.parts.glob("*.json"))
         return old | {int(path.stem): json.loads(path.read_text())["failure"] for path in notes}
 
     @property
     def size(self) -> int:
-        """Return the number of runs from which the files for all purposes were made, including failed runs."""
         numbers = [number for number, run in self.runs.items() if run.file.parent == self.out]
         return max([int(self.metadata.get("runs", 0)), *(number + 1 for number in numbers)])
 
     def assemble(self, split: Mapping[str, Sequence[int]]) -> None:
-        """Write the file of each purpose in ``split`` whose runs are not exactly the wanted ones, in order. Existing
-        runs are copied byte for byte. All new files are complete before the first old one is replaced. If the disk is
-        full, raises `ComputationError` and changes nothing."""
+        """Write each purpose's file that does not contain exactly the runs in ``split``. All new files are complete
+        before an old file is replaced. Raise `ComputationError` and change nothing if the disk is full."""
         stale = {purpose: numbers for purpose, numbers in split.items() if not self._has(purpose, numbers)}
         sources = {self.runs[number].file for numbers in stale.values() for number in numbers}
         temporaries = {self.path(purpose): unfinished(self.path(purpose)) for purpose in stale}
@@ -141,7 +126,6 @@ class DatasetFolder:
                     temporary.unlink(missing_ok=True)
 
     def _has(self, purpose: str, numbers: Sequence[int]) -> bool:
-        """Test whether the file for a purpose contains exactly the runs with these numbers, in order."""
         path = self.path(purpose)
         there = {number: run.group for number, run in self.runs.items() if run.file == path}
         whole = path.exists() and path not in self.damaged
@@ -163,8 +147,7 @@ class DatasetFolder:
             ) from problem
 
     def write_metadata(self, content: Mapping[str, Any]) -> None:
-        """Write the metadata, which mark a data set as complete, and remove the single files of runs that its files
-        contain."""
+        """Write the metadata, which mark a data set as complete, and remove the files of single runs."""
         write_atomically(self.out / METADATA, json.dumps(content, indent=2) + "\n")
         shutil.rmtree(self.parts, ignore_errors=True)
 
@@ -172,8 +155,7 @@ class DatasetFolder:
 def metadata(
     scene: Scene, table: DatasetTable, split: Mapping[str, Sequence[int]], folder: DatasetFolder, runs: int
 ) -> dict[str, Any]:
-    """Return the metadata of a data set for LagrangeBench, with its origin and its failed runs; ``split`` has the other
-    runs for each purpose."""
+    """Return the metadata of a data set for LagrangeBench, with run numbers by purpose in ``split``."""
     frames, (origin, size, periods) = table.steps // table.write_every + 1, bounds_of(scene)
     every = [folder.runs[number].statistics for own in split.values() for number in own]
     train = [folder.runs[number].statistics for number in split["train"]]
@@ -207,9 +189,8 @@ def metadata(
 
 
 def _moments(train: Sequence[Mapping[str, Any]], name: str) -> dict[str, list[float]]:
-    """Return the mean and the standard deviation (d,) of a statistic over all training runs. A standard deviation of 0
-    is replaced by 1, as in LagrangeBench, because it is a divisor."""
+    """Return the mean and the standard deviation (d,) over training runs, 1 for a deviation of 0, a later divisor."""
     counts, sums, squares = (np.sum([np.asarray(one[name][k]) for one in train], axis=0) for k in range(3))
     mean = sums / np.maximum(counts, 1)
     std = np.sqrt(np.maximum(squares / np.maximum(counts, 1) - mean**2, 0.0))
-    return {"mean": mean.tolist(), "std": np.where(std < NO_SPREAD, 1.0, std).tolist()}
+    return {"mean": mean.tolist(), "std": np.where(std < 1e-7, 1.0, std).tolist()}  # threshold [m] of LagrangeBench

@@ -1,5 +1,4 @@
-"""Data sets of runs with varied scenes, for learned simulators: the table [dataset], the random values and the arrays
-of one run."""
+"""Data sets of runs with varied scenes, for learned simulators: the table [dataset], random values, and arrays."""
 
 import json
 from collections.abc import Mapping
@@ -26,7 +25,6 @@ PAIR = "a lower and an upper end of the same shape, each a number or a list of n
 
 
 def _ranges(given: Any) -> Any:
-    """Check ranges by key, and return the lower and upper end of each as lists of floats."""
     if not isinstance(given, Mapping):
         raise field_error((), given, "a table of ranges by the keys of values")
     found = {}
@@ -51,31 +49,31 @@ Ranges = Annotated[
 
 
 class DatasetTable(Table):
-    """[dataset]: how long the runs of a data set are, how they are varied, and what is kept of each."""
+    """[dataset]: the length and the variations of the runs of a data set, and the stored arrays."""
 
     steps: Annotated[int, count(1, 10_000_000)]
     """Time steps of each run."""
     write_every: Annotated[int, count(1, 10_000_000)] = 1
     """Time steps from one frame to the next; steps is a multiple of it."""
     vary: Ranges = Field(default_factory=dict)
-    """By the key of a value of the scene, in quotes, the ends of its range, as vary."phase.0.viscosity" = [0.1, 1.0]:
-    each run has a value from it, each component for itself."""
+    """Ranges by the key of a scene's value, in quotes, as in vary."phase.0.viscosity" = [0.1, 1.0]. Every component of
+    a value is drawn independently for every run."""
     logarithmic: tuple[Text, ...] = ()
-    """Keys of vary that are drawn evenly by their logarithm."""
+    """Keys of vary whose logarithm is drawn from a uniform distribution."""
     position_noise: Annotated[float, quantity("spacings", ge=0.0, le=0.5)] = 0.0
     """Standard deviation of noise in every coordinate of the first positions [spacings]"""
     velocity_noise: Annotated[float, quantity("m/s", ge=0.0)] = 0.0
     """Standard deviation of noise in every component of the first velocities [m/s]"""
     valid: Annotated[float, quantity(ge=0.0, le=0.9)] = 0.1
-    """The part of the runs that is for validation."""
+    """Fraction of the runs for validation; a fraction above 0 gets at least one run."""
     test: Annotated[float, quantity(ge=0.0, le=0.9)] = 0.1
-    """The part of the runs that is for tests. One run at least is for each purpose that has a part."""
+    """Fraction of the runs for tests; a fraction above 0 gets at least one run."""
     walls: Flag = True
-    """Whether the particles of walls come behind those of fluid."""
+    """Append wall particles to the fluid particles."""
     tangents: Annotated[int, count(0, 1_000)] = 0
-    """Random directions of the first state along which each run is differentiated."""
+    """Number of random directions of the first state along which each run is differentiated."""
     tangent_frames: Literal["last", "all"] = "last"
-    """Frames whose derivatives are kept."""
+    """Frames whose derivatives are stored."""
     seed: Annotated[int, count(0, 2**31)] = 0
     """Seed of all random numbers."""
 
@@ -97,8 +95,7 @@ class DatasetTable(Table):
         return self
 
     def split(self, runs: int) -> dict[str, list[int]]:
-        """Return the numbers of the runs for each purpose. The first runs go to one purpose each, and every further run
-        to the purpose with the greatest shortage. So the purpose of a run does not depend on the number of runs."""
+        """Return run numbers by purpose. The purpose of a run does not depend on the number of runs."""
         parts = {"train": 1.0 - self.valid - self.test, "valid": self.valid, "test": self.test}
         found: dict[str, list[int]] = {purpose: [] for purpose in parts}
         for number in range(runs):
@@ -112,21 +109,18 @@ class DatasetTable(Table):
 
 
 class DatasetTables(Table):
-    """The table [dataset] of a data set's file; all other tables are the scene's."""
-
     dataset: DatasetTable
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Random values for one run of a data set; they depend on the table's seed and the run's number alone."""
+    """Random values for a run of a data set, determined by the table's seed and the run's number."""
 
     table: DatasetTable
     number: int
 
     @cached_property
     def values(self) -> dict[str, Any]:
-        """Return random values of the varied scene keys, in the order of the table."""
         random = self._random(0)
         found = {}
         for key, (lower, upper) in self.table.vary.items():
@@ -140,11 +134,11 @@ class Sample:
 
     @property
     def overrides(self) -> list[str]:
-        """Return the random values as overrides of a scene."""
+        """Return the random values as overrides "key=value" of a scene."""
         return [f"{key}={json.dumps(value)}" for key, value in self.values.items()]
 
     def start(self, positions: np.ndarray, velocities: np.ndarray, spacing: float) -> dict[str, np.ndarray]:
-        """Return noisy first positions [m] and velocities [m/s] (n, d) by name; an array without noise is left out."""
+        """Return noisy first positions [m] and velocities [m/s] (n, d) by name, without arrays that have no noise."""
         random, found = self._random(1), {}
         for name, array, size in (
             ("initial_positions", positions, self.table.position_noise * spacing),
@@ -156,39 +150,32 @@ class Sample:
         return found
 
     def direction(self, which: int, shape: tuple[int, ...], sizes: tuple[float, float]) -> dict[str, np.ndarray]:
-        """Return a random direction of the first state by name: normal numbers times a size for positions [m] and for
-        velocities [m/s]."""
+        """Return a random direction of the first state by name, with standard deviations ``sizes`` [m], [m/s]."""
         random = self._random(2, which)
-        names = ("initial_positions", "initial_velocities")
-        return {name: size * random.standard_normal(shape) for name, size in zip(names, sizes, strict=True)}
+        return {name: size * random.standard_normal(shape) for name, size in zip(FIRST, sizes, strict=True)}
 
     def _random(self, *purpose: int) -> np.random.Generator:
         return np.random.default_rng([self.table.seed, self.number, *purpose])
 
 
+FIRST = ("initial_positions", "initial_velocities")
 FLUID, WALL, MOVING_WALL, BODY, MORE_FLUID, KINDS = 0, 1, 2, 3, 4, 9
-"""Particle types of LagrangeBench: fluid, walls, walls with a given motion, free bodies. Then the first unused number,
-for further phases, and the number of types."""
+"""Particle types of LagrangeBench, the first unused type, for further phases, and the number of types."""
 MARGIN = 3
-"""Distance from the container's closed sides to the bounds [spacings], as in LagrangeBench's own sets. All wall
-particles lie within the bounds. If one axis is periodic, LagrangeBench treats all as periodic; the margin keeps
-opposite walls from interacting."""
+"""Distance from the container's closed sides to the bounds [spacings]. If one axis is periodic, LagrangeBench treats
+all axes as periodic; the margin keeps opposite walls from interacting."""
 
 
 @dataclass(frozen=True)
 class OneRun:
-    """The arrays and statistics of one run in a data set."""
-
     arrays: dict[str, np.ndarray]
-    """Arrays by their names in the file."""
     statistics: dict[str, Any]
-    """Statistics of the fluid: count, sum and sum of squares of each component of velocities and accelerations [m per
-    frame]. Also the upper ends of all positions, and the number of particles including walls."""
+    """Count, sum and sum of squares of the components of velocities and accelerations of fluid [m per frame]; upper
+    ends of all positions [m]; number of all particles."""
 
 
 def one_run(simulation: Simulation, sample: Sample) -> OneRun:
-    """Run a simulation from a sample's start and compute its derivatives along random directions; raises
-    `DivergedError` or `InputError`."""
+    """Run and differentiate a simulation from a sample's start; raise `DivergedError` or `InputError`."""
     table, scene = sample.table, simulation.scene
     start = sample.start(simulation.positions, simulation.velocities, scene.discretisation.spacing)
     trajectory = simulation.run(table.steps, start, record_every=table.write_every)
@@ -213,9 +200,10 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
 
 
 def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lower corner of a data set's bounds, their lengths, and the periods of its axes (0 if not periodic),
-    each (d,) [m]. Walls lie within the bounds. Raises `InputError` without a container, and if particles wait far
-    outside it before they enter or after they leave."""
+    """Return the lower corner, the lengths, and the periods (0 without) of a data set's bounds, each (d,) [m].
+
+    Raise `InputError` without a container, and if particles wait far outside of it.
+    """
     ends, (_, periods) = scene.container.extent(), scene.periods
     if ends is None:
         raise InputError("container.shape is 'none', but must be 'box' or 'cylinder', as a data set has bounds.")
@@ -233,7 +221,7 @@ def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions (frames, b, d) [m] of wall particles and their types (b,); both are empty without frames."""
+    """Return positions (frames, b, d) [m] and types (b,) of wall particles."""
     places = np.repeat(np.asarray(simulation.walls, dtype=np.float64)[None], frames, axis=0)
     kinds = np.full(len(simulation.walls) if frames else 0, WALL)
     numbers = wall_numbers(simulation.scene.solid)
@@ -248,8 +236,7 @@ def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: i
 
 
 def _ends(places: np.ndarray) -> dict[str, list[float]]:
-    """Return the upper ends (d,) [m] of positions (frames, n, d) relative to the bounds; raise `InputError` if a
-    position is below the lower bounds."""
+    """Return the upper ends (d,) [m] of positions relative to the bounds; raise `InputError` if one is negative."""
     if places.min() < 0.0:
         frame, particle, axis = np.unravel_index(places.argmin(), places.shape)
         raise InputError(
@@ -260,8 +247,7 @@ def _ends(places: np.ndarray) -> dict[str, list[float]]:
 
 
 def _statistics(positions: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
-    """Return statistics for LagrangeBench of differences of positions (frames, n, d), between nearest periodic
-    images."""
+    """Return statistics of first and second differences of positions (frames, n, d), by nearest periodic images."""
     moved = np.diff(positions, axis=0)
     moved -= periods * np.round(moved / np.where(periods > 0.0, periods, 1.0))
     found: dict[str, Any] = {}
@@ -272,16 +258,16 @@ def _statistics(positions: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
 
 
 def _tangents(simulation: Simulation, sample: Sample, start: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return Jacobian-vector products of positions and velocities along random directions of the first state."""
     table, d, real = sample.table, simulation.dimension, simulation.precision.numpy
     if not table.tangents:
         return {}
     first = {"initial_positions": simulation.positions, "initial_velocities": simulation.velocities} | start
-    names = ("initial_positions", "initial_velocities")
-    sizes = tuple(float(np.max(BY_NAME[name].change(simulation, first[name]))) for name in names)
+    sizes = tuple(float(np.max(BY_NAME[name].change(simulation, first[name]))) for name in FIRST)
     problem = Problem(simulation, table.steps, FinalPositions(simulation.positions))
     frames = range(0, table.steps + 1, table.write_every) if table.tangent_frames == "all" else [table.steps]
-    found: dict[str, list[Any]] = {name: [] for name in ("position", "velocity", *names)}
+    found: dict[str, list[Any]] = {
+        name: [] for name in ("position", "velocity", "position_direction", "velocity_direction")
+    }
     for which in range(table.tangents):
         direction = sample.direction(which, simulation.positions.shape, (sizes[0], sizes[1]))
         dots: dict[int, Any] = {}
@@ -291,9 +277,7 @@ def _tangents(simulation: Simulation, sample: Sample, start: dict[str, np.ndarra
                 kept[step] = dot.numpy(d)
 
         problem.tangents(first, direction, observe)
-        for key, field in (("position", "positions"), ("velocity", "velocities")):
+        for key, field, first_field in zip(("position", "velocity"), ("positions", "velocities"), FIRST, strict=True):
             found[key].append([dots[step][field] for step in frames])
-        for name in names:
-            found[name].append(direction[name])
-    to = {"initial_positions": "position_direction", "initial_velocities": "velocity_direction"}
-    return {f"tangent/{to.get(name, name)}": np.array(values, dtype=real) for name, values in found.items()}
+            found[f"{key}_direction"].append(direction[first_field])
+    return {f"tangent/{name}": np.array(values, dtype=real) for name, values in found.items()}

@@ -1,8 +1,5 @@
-"""The problem of a search as a function of the optimiser's vector, and a test if gradients predict the change of the
-loss.
-
-The function first replays the log of an earlier run, and then computes.
-"""
+"""The problem of a search as a function of the optimiser's vector, and a test if gradients predict changes of the
+loss."""
 
 import math
 import warnings
@@ -24,43 +21,34 @@ from cortado.rollout.rollout import Observer
 from cortado.scene.parameter_values import Values
 
 Parameters = dict[str, Any]
-"""Parameters by name: a float where the user gave a number, otherwise a float64 array of the given shape."""
+"""Parameters by name: floats for numbers at the start, otherwise float64 arrays."""
 GREATEST_GRADIENT = 1e150
-"""Larger gradient components raise the error for infinite ones, because their squares, which optimisers compute,
-overflow."""
-MOST_NAMED = 6
-"""Greatest number of parameter values in a sentence."""
+"""Greatest gradient component that counts as finite, because optimisers compute squares."""
 REFUSED = (DivergedError, InputError)
-"""Errors after which a trial has an infinite loss. The start raised no error, so the trial step was too long."""
+"""Errors after which a trial has an infinite loss."""
 WRONG = 10.0
-"""A step contradicts its gradients if the loss changed by less than the smaller prediction of its two ends divided by
-this, or by more than the greater one times this."""
+"""Greatest factor between a change of the loss and its predictions by gradients that does not count as a
+contradiction."""
 FELT = 0.01
-"""A step with both predictions and change below this part of the range of all losses is not tested."""
+"""Greatest change of the loss, relative to the range of all losses, that counts as none."""
 ROUND_OFF = 1e-5
 """Predictions below this part of the greatest loss are not tested, because float32 losses are not precise enough."""
-MISLED = 0.25
-"""A search is misled if at least this share of the tested steps, and at least `FEW` of them, contradict their
-gradients. In searches of 30 to 400 steps of a splash the share was 0 within the horizon, and 0.3 to 0.9 beyond it."""
-FEW = 2
-STAYED = 1.0 / 3.0
-"""The loss stays if it falls by less than `FELT` over this last share of the evaluations."""
+MISLED, FEW = 0.25, 2
+"""A search is misled if at least this fraction of the tested steps, and at least this number, contradict their
+gradients."""
 LEAST = 8
-"""Least number of evaluations after which a loss may count as staying."""
+"""Least number of evaluations of a search whose loss has stopped falling."""
 
 
 class Optimisable(Protocol):
-    """A problem that can be optimised. It may have an attribute `fingerprint`, a text that identifies it.
-
-    The checkpoint stores the fingerprint, so that a search cannot be resumed with another problem.
-    """
+    """Protocol of problems for `optimise`. A text `fingerprint` is optional; resuming a search compares it."""
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
-        """Return the loss and its gradient, a table with the parameters' names and shapes."""
+        """Return the loss and its gradient, arrays by parameter name in the parameters' shapes."""
 
 
 def loss_and_gradient(returned: Any) -> tuple[Any, Mapping[str, Any]]:
-    """Split an evaluation's result into loss and gradient; raise `InputError` if it has no such form."""
+    """Return a result unchanged if it consists of a loss and a gradient by name; raise `InputError` otherwise."""
     pair = isinstance(returned, (tuple, list)) and len(returned) == 2
     if pair and isinstance(returned[1], Mapping):
         return returned[0], returned[1]
@@ -77,10 +65,10 @@ def loss_and_gradient(returned: Any) -> tuple[Any, Mapping[str, Any]]:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One evaluation in the history of an optimisation."""
+    """An evaluation in the history of an optimisation."""
 
     iteration: int
-    """Index of the evaluation, from 0; with Adam and gradient descent also the number of updates before it."""
+    """Index of the evaluation, from 0."""
     updates: int
     """Number of updates before this evaluation; a line search may evaluate several times per update."""
     loss: float
@@ -91,10 +79,9 @@ class Record:
     replayed: bool
     """True if the evaluation was read from the checkpoint."""
     refused: int = 0
-    """Number of refused steps before this evaluation: the run at their end diverged, or a parameter was out of its
-    range."""
+    """Number of refused steps before this evaluation, after which runs diverged or parameters were out of range."""
     left_out: int = 0
-    """Number of runs that ensemble averages left out so far for the same reasons, without replayed evaluations."""
+    """Number of runs that ensemble averages left out so far, without replayed evaluations."""
 
     def __repr__(self) -> str:
         return f"Record(iteration {self.iteration}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g})"
@@ -102,22 +89,19 @@ class Record:
 
 @dataclass
 class Promises:
-    """A test of a search's gradients: compares the predicted with the real change of the loss, from each evaluation to
-    the next.
+    """A test of a search's gradients: predicted and real changes of the loss from each evaluation to the next.
 
-    The slopes at both ends of a step bound the loss's change, unless the slope has an extremum in between. The change
-    of a loss that is smooth over a step's length is near these bounds. Steps along which the slope changes sign are not
-    tested, because they may cross a minimum.
+    The change of a smooth loss is near the predictions by the slopes at both ends of a step, or between them. Steps
+    along which the slope changes sign are not tested, because they may cross a minimum.
     """
 
     losses: list[float] = field(default_factory=list)
     steps: list[tuple[float, float, float]] = field(default_factory=list, repr=False)
-    """For each step: the change predicted by the slope at its start, that predicted at its end, and the real change."""
+    """For each step: the change predicted at its start, the change predicted at its end, and the real change."""
     _last: LoggedEvaluation | None = field(default=None, repr=False)
     _best: LoggedEvaluation | None = field(default=None, repr=False)
 
     def note(self, evaluation: LoggedEvaluation) -> None:
-        """Add the next evaluation to the test."""
         if self._last is not None:
             step = evaluation.parameters - self._last.parameters
             with np.errstate(over="ignore", invalid="ignore"):
@@ -129,7 +113,7 @@ class Promises:
             self._best = evaluation
 
     def held(self, lower: Vector, upper: Vector, layout: ParameterLayout) -> str:
-        """Return a sentence that names parameters at bounds that prevent a lower loss; empty if there are none."""
+        """Return a sentence about parameters whose bounds prevent a lower loss, or an empty string."""
         if self._best is None:
             return ""
         best, gradient = self._best.parameters, self._best.gradient
@@ -140,7 +124,7 @@ class Promises:
 
     @property
     def kept(self) -> tuple[int, int]:
-        """Return the number of steps that contradict their gradients, and the number of tested steps."""
+        """Return the number of steps that contradict their gradients, and of all tested steps."""
         first, last, change = np.array(self.steps or np.zeros((0, 3))).T
         least, most = np.minimum(np.abs(first), np.abs(last)), np.maximum(np.abs(first), np.abs(last))
         felt = max(FELT * (max(self.losses) - min(self.losses)), ROUND_OFF * max(map(abs, self.losses)))
@@ -151,20 +135,19 @@ class Promises:
 
     @property
     def misled(self) -> bool:
-        """Return True if the changes of the loss contradict the gradients."""
         broken, told = self.kept
         return broken >= max(FEW, MISLED * told)
 
     def stays(self, converged: bool) -> bool:
-        """Return True if the loss has stopped falling while it is still a large part of the first one."""
-        best, before = min(self.losses), min(self.losses[: -max(int(STAYED * len(self.losses)), 1)], default=np.inf)
+        """Return True if the loss has stopped falling at a large part of the first loss: it fell by less than `FELT`
+        over the last third of the evaluations."""
+        best, before = min(self.losses), min(self.losses[: -max(len(self.losses) // 3, 1)], default=np.inf)
         stopped = len(self.losses) >= LEAST and before - best < FELT * abs(best)
         return best > FELT * self.losses[0] and (converged or stopped)
 
     def doubt(self, estimator: object, optimiser: object, converged: bool, is_run: bool, held: str = "") -> "Doubt":
-        """Judge a search by an ``estimator``, None for that of the problem, and an ``optimiser`` whose own test may be
-        met; ``is_run``: of runs of a simulation; ``held``: what `held` says. A line search bears estimators whose sizes
-        are wrong."""
+        """Judge a search. ``estimator``: None for the problem's gradient; ``converged``: the optimiser's test was met;
+        ``is_run``: the loss is of a simulation's run; ``held``: sentence of `held`."""
         by_direction, is_exact = isinstance(optimiser, LineSearch), estimator is None or isinstance(estimator, Exact)
         misled, stays = self.misled and (is_exact or not by_direction), not held and self.stays(converged)
         to_try = ["another start"]
@@ -192,27 +175,22 @@ class Promises:
 
 @dataclass(frozen=True)
 class Doubt:
-    """The verdict on a search, with sentences about reasons not to trust its result."""
+    """The verdict on a search; ``words``: sentences of doubt with advice, empty without doubts."""
 
     misled: bool
     """True if the gradient disagreed with the steps, and the search used more than the gradient's direction."""
     stays: bool
-    """True if the loss has stopped falling while it is still a large part of the first one."""
     words: str
-    """Sentences of doubt with advice; empty without doubts."""
 
 
 @dataclass
 class CountedEnsemble:
-    """An `Ensemble` for the many gradients of a search: it counts the runs that averages leave out, and warns only the
-    first time."""
+    """An `Ensemble` for a search, which counts the runs that averages leave out, and warns only the first time."""
 
     ensemble: Any
     left_out: int = 0
-    """Number of runs left out over all estimates."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the estimate of the ensemble, and count the runs left out of it."""
         with warnings.catch_warnings():
             if self.left_out:
                 warnings.simplefilter("ignore", LeftOutWarning)
@@ -223,7 +201,7 @@ class CountedEnsemble:
 
 @dataclass
 class Evaluator:
-    """The optimiser's function of one vector: it replays the log, then computes and appends to the log."""
+    """The optimiser's function of a vector, which first replays the log, and later computes and appends to the log."""
 
     problem: Optimisable
     estimator: Any
@@ -233,13 +211,9 @@ class Evaluator:
     on_iteration: Callable[[Record], None] | None
     history: list[Record] = field(default_factory=list)
     updates: int = 0
-    """Number of updates by the optimiser so far."""
     refused: int = 0
-    """Number of failed evaluations so far after which the search continued."""
     promises: Promises = field(default_factory=Promises)
-    """Predictions of the gradients so far, and the real changes of the loss."""
     logged: int = 0
-    """Number of log entries used so far: evaluations and trial losses."""
 
     def __post_init__(self) -> None:
         if isinstance(self.estimator, Ensemble):
@@ -247,11 +221,9 @@ class Evaluator:
 
     @property
     def left_out(self) -> int:
-        """Return the number of runs that ensemble averages left out, in evaluations that were not replayed."""
         return self.estimator.left_out if isinstance(self.estimator, CountedEnsemble) else 0
 
     def count_update(self) -> None:
-        """Count an update; the optimiser calls it after each."""
         self.updates += 1
 
     def __call__(self, vector: Vector) -> tuple[float, Vector]:
@@ -261,8 +233,8 @@ class Evaluator:
         return self._noted(self._kept(self._compute(vector)), replayed=False)
 
     def attempt(self, vector: Vector) -> tuple[float, Vector] | None:
-        """Return loss and gradient at a vector, or None if the run fails; the log then has an infinite loss and a
-        gradient of 0."""
+        """Return loss and gradient at a vector; if the run fails, return None, and log an infinite loss and gradient
+        0."""
         replayed = self.logged < len(self.log)
         if replayed:
             evaluation = self._replay(vector)
@@ -278,12 +250,10 @@ class Evaluator:
         return None
 
     def _kept(self, evaluation: LoggedEvaluation) -> LoggedEvaluation:
-        """Append an evaluation to the log, and return it."""
         self.log.append(evaluation)
         return evaluation
 
     def _noted(self, evaluation: LoggedEvaluation, replayed: bool) -> tuple[float, Vector]:
-        """Add an evaluation to the history, and return its loss and its gradient (size,)."""
         self.logged += 1
         record = Record(
             iteration=len(self.history),
@@ -302,8 +272,8 @@ class Evaluator:
         return evaluation.loss, evaluation.gradient.copy()
 
     def losses(self, vectors: Sequence[Vector]) -> list[float]:
-        """Return the losses at vectors (size,), computed in one launch if the problem can; infinite for a run that
-        diverges and for impossible parameters. They enter the log with a gradient of 0, but not the history."""
+        """Return the losses at vectors (size,), infinite for runs that diverge and parameters out of range. Trial
+        losses enter the log with gradient 0, but not the history."""
         known = [self._replay(vector, k).loss for k, vector in enumerate(vectors[: len(self.log) - self.logged])]
         left = vectors[len(known) :]
         found: list[float] = []
@@ -328,11 +298,11 @@ class Evaluator:
         return [loss if math.isfinite(loss) else math.inf for loss in (*known, *found)]
 
     def _evaluated(self, parameters: dict[str, Any]) -> tuple[Any, Mapping[str, Any]]:
-        """Return the loss and its gradient in the form that the problem returns."""
         return loss_and_gradient(self.problem.value_and_gradient(parameters, gradient=self.estimator))
 
     def _replay(self, vector: Vector, ahead: int = 0) -> LoggedEvaluation:
-        """Return the logged evaluation, ``ahead`` entries further on, if it belongs to this vector."""
+        """Return the next logged evaluation, or an entry further ``ahead``; raise `InputError` if its vector
+        differs."""
         evaluation = self.log.read(self.logged + ahead)
         changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
         if changed.any():
@@ -345,10 +315,7 @@ class Evaluator:
         return evaluation
 
     def _compute(self, vector: Vector) -> LoggedEvaluation:
-        """Evaluate the problem, and return the evaluation if it is finite.
-
-        The error of a first evaluation is about the start; later errors are about parameters that the search chose.
-        """
+        """Evaluate the problem; after the first evaluation, errors get advice about the search."""
         try:
             return self._computed(vector)
         except InputError as error:
@@ -365,7 +332,6 @@ class Evaluator:
             raise error.with_advice(self._shorter(error.advice, vector)) from error
 
     def _computed(self, vector: Vector) -> LoggedEvaluation:
-        """Compute an evaluation and return it if it is finite; raise the problem's error or a `ComputationError`."""
         loss, gradients = self._evaluated(self.layout.unravel(vector))
         evaluation = LoggedEvaluation(
             vector.copy(), as_one_number("The problem's loss", loss), self._ravelled(gradients)
@@ -374,18 +340,16 @@ class Evaluator:
         return evaluation
 
     def _shorter(self, advice: str, vector: Vector) -> str:
-        """Extend the advice of a run that diverged during a search: add the point of the search and the best point
-        before."""
         best = min(self.history, key=lambda record: record.loss)
         told = [f"{advice}, a smaller learning rate or scale, or bounds on the parameters"]
         least = f"the least loss before is {best.loss:.4g}"
-        if vector.size <= MOST_NAMED:
+        if vector.size <= 6:  # else the sentence is too long
             told.append(f"the search had come to {_in_words(self.layout.unravel(vector))}")
             least = f"{least} at {_in_words(best.parameters)}"
         return "; ".join([*told, least])
 
     def _ravelled(self, gradients: Mapping[str, Any]) -> Vector:
-        """Return the gradient as one vector, after a check of its names and shapes."""
+        """Check names and shapes of a gradient, and return it as a vector (size,)."""
         wanted = dict(zip(self.layout.names, self.layout.shapes, strict=True))
         found = {name: np.shape(gradient) for name, gradient in gradients.items()}
         if found != wanted:
@@ -396,7 +360,6 @@ class Evaluator:
         return self.layout.ravel({name: as_numbers(f"The gradient of '{name}'", gradients[name]) for name in wanted})
 
     def _require_finite(self, evaluation: LoggedEvaluation) -> None:
-        """Raise `ComputationError`, with advice, if an evaluation is not finite."""
         broken = ~(np.abs(evaluation.gradient) <= GREATEST_GRADIENT)
         if math.isfinite(evaluation.loss) and not broken.any():
             return
@@ -417,19 +380,16 @@ class Evaluator:
         )
 
     def _names_of(self, components: np.ndarray) -> str:
-        """Name the parameters to which the marked components (size,) of the vector belong, for a message."""
         marked = self.layout.unravel(components.astype(np.float64))
         return ", ".join(f"'{name}'" for name, marks in marked.items() if marks.any())
 
 
 def _in_words(parameters: Parameters) -> str:
-    """Write the names and values of parameters for a message."""
     found = {name: np.array2string(np.asarray(value), precision=4) for name, value in parameters.items()}
     return ", ".join(f"{name} {' '.join(text.split())}" for name, text in found.items())
 
 
 def as_given(parameters: Mapping[str, Vector], start: Mapping[str, Any]) -> Parameters:
-    """Return parameters; those given as a number at the start become floats."""
     return {
         name: float(value) if value.ndim == 0 and not isinstance(start[name], np.ndarray) else value
         for name, value in parameters.items()

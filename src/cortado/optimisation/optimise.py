@@ -1,8 +1,5 @@
-"""`cortado.optimise`: lower the loss of a problem, with a history, bounds, and a checkpoint to resume from.
-
-The optimiser sees one vector; this module ravels the named parameters into it, keeps the replay log, and gives the best
-parameters back. `cortado.evaluate` is for points that do not depend on one another, such as a population of a search.
-"""
+"""`cortado.optimise`: lower the loss of a problem within bounds, with a history and a checkpoint; `cortado.evaluate`:
+compute losses at independent points, such as a population of a search."""
 
 import os
 import re
@@ -35,33 +32,29 @@ from cortado.optimisation.search import MemoryLog, Optimiser, ParameterLayout, R
 from cortado.scene.parameter_values import Values
 
 LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
-"""A function from parameters by name to the loss and its gradient, a table with the same names."""
+"""A function from parameters by name to the loss and its gradient by name."""
 MOST_ITERATIONS = 10_000_000
 """Greatest number of updates of a search, also in task files."""
 
 
 @dataclass(frozen=True)
 class Function:
-    """An `Optimisable` problem made from a function that returns the loss and its gradient."""
-
     function: LossFunction
 
     @property
     def fingerprint(self) -> str:
-        """Return the name of the function."""
         kind = type(self.function)
         return str(getattr(self.function, "__qualname__", kind.__qualname__))
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
-        """Return the function's result; raise `InputError` if an estimator is given, because the function computes its
-        own gradient."""
+        """Return the function's result; raise `InputError` if a gradient estimator is given."""
         if gradient is not None:
             raise InputError("gradient is given, but must be left out where a function makes its own.")
         return self.function(parameters)
 
 
 def as_differentiable(problem: Any) -> Optimisable:
-    """Return the problem itself, or wrap a function in a problem; raise `InputError` for anything else."""
+    """Return a problem unchanged, or wrap a function in a problem; raise `InputError` for anything else."""
     if isinstance(problem, type):
         raise InputError(f"What is optimised is the class {problem.__name__}, but must be an object made of it.")
     if hasattr(problem, "value_and_gradient"):
@@ -87,26 +80,27 @@ class Result:
     history: tuple[Record, ...]
     """Records of all evaluations, in order."""
     updates: int
-    """Updates by the optimiser, with those replayed from the checkpoint."""
+    """Number of updates by the optimiser, including those replayed from the checkpoint."""
     evaluations: int
-    """Number of evaluations in the history, with those replayed from the checkpoint."""
+    """Number of evaluations in the history, including those replayed from the checkpoint."""
     message: str
-    """A sentence that says how the search ended."""
+    """Sentence about the end of the search."""
     converged: bool
     """True if the optimiser's convergence test was met and the gradient agreed with the steps; only L-BFGS has a
     test."""
     refused: int = 0
-    """Number of refused steps: the run at their end diverged, or a parameter was out of its range. They are not in the
-    history."""
+    """Number of refused steps, which are not in the history: the run after the step diverged, or a parameter was out of
+    range."""
     left_out: int = 0
-    """Number of runs that ensemble averages left out for the same reasons, without replayed evaluations."""
+    """Number of runs that ensemble averages left out because they diverged or parameters were out of range, without
+    replayed evaluations."""
     misled: bool = False
-    """True if the gradient disagreed with the change of the loss, as beyond the horizon of `cortado.certify`. Then do
-    not trust the search; `message` gives advice."""
+    """True if the gradient disagreed with the change of the loss, so that the search is not to be trusted; `message`
+    gives advice. Gradients mislead beyond the horizon of `cortado.certify`."""
     stays: bool = False
     """True if the loss stayed a large part of the first loss, as in a wrong local minimum."""
     problem: Any = field(default=None, repr=False)
-    """The solved `Problem`, or one in other coordinates, whose runs a notebook shows; None for other problems and in
+    """The solved `Problem`, also in other coordinates, for pictures in notebooks; None for other problems and in
     pickled results."""
 
     def __getstate__(self) -> dict[str, Any]:
@@ -118,15 +112,14 @@ class Result:
         return f"Result({sized(self.parameters)}: {found}; {end})"
 
     def _repr_html_(self) -> str:
-        """Show in a notebook the last states of the first and the best run, the target, the parameters and the
-        losses."""
+        """Show the last states of the first and the best run, the target, the parameters and the losses."""
         losses, start = [record.loss for record in self.history], self.history[0].parameters
         page: str = on_top("result_page")(self, self.message, self.problem, start, self.parameters, losses)
         return page
 
 
 def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
-    """Return the start as float64 arrays; raise `InputError` for a parameter that cannot be optimised."""
+    """Return the start as float64 arrays; raise `InputError` for unsuitable values."""
     if not isinstance(start, Mapping):
         raise InputError(f"The start is {shown(start)}, but must name its parameters, as {{'gravity': value}} does.")
     if not start:
@@ -141,7 +134,7 @@ def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
 
 
 def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayout) -> tuple[Vector, Vector]:
-    """Return lower and upper bounds as vectors (size,); raise `InputError` if they do not fit the parameters."""
+    """Return lower and upper bounds (size,); raise `InputError` for bounds that do not match the parameters."""
     if not isinstance(bounds, Mapping):
         raise InputError(f"bounds is {shown(bounds)}, but must be by name, as {{'gravity': (lower, upper)}}.")
     unknown = sorted(set(bounds) - set(layout.names), key=str)
@@ -157,7 +150,7 @@ def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayou
 
 
 def _checked_pair(name: str, pair: tuple[Any, Any], shape: tuple[int, ...]) -> tuple[Vector, Vector]:
-    """Return the lower and upper bound of one parameter, each of its shape, infinite if there is no bound."""
+    """Return the lower and upper bound of a parameter in its shape, infinite without a bound."""
     try:
         lower, upper = pair
         low = as_numbers(f"The lower bound of '{name}'", -np.inf if lower is None else lower)
@@ -174,7 +167,6 @@ def _checked_pair(name: str, pair: tuple[Any, Any], shape: tuple[int, ...]) -> t
 
 
 def require_within(vector: Vector, lower: Vector, upper: Vector, layout: ParameterLayout) -> None:
-    """Raise `InputError` if the start is outside the bounds."""
     outside = layout.unravel(((vector < lower) | (vector > upper)).astype(np.float64))
     for name, marks in outside.items():
         if marks.any():
@@ -182,13 +174,6 @@ def require_within(vector: Vector, lower: Vector, upper: Vector, layout: Paramet
                 f"The start of '{name}' is outside of its bounds in {int(marks.sum())} of {marks.size} "
                 "components; start within the bounds, or widen them."
             )
-
-
-def require_count(iterations: int) -> None:
-    """Raise `InputError` unless the number of iterations is a positive integer that a search can make."""
-    if not is_whole(iterations) or not 1 <= iterations <= MOST_ITERATIONS:
-        wanted = f"an integer of at least 1 and at most {MOST_ITERATIONS:,}"
-        raise InputError(f"The number of iterations must be {wanted}, not {shown(iterations)}.")
 
 
 @public
@@ -202,17 +187,16 @@ def evaluate(
 ) -> list[Estimate]:
     """Return the losses of a problem at many points, in order, with the same bits for every executor.
 
-    Parameters:
-        problem: a `Problem`, or one in other coordinates (`cortado.optimisation.transforms.Transformed`). points: the
-        parameters of each point, by name. An iterator is read only as far as needed. gradient: estimator of the
-        gradient, such as `gradients.Exact()`. Without it, points are run forward only and the ``gradient`` of each
-        `Estimate` is empty. executor: where the points are computed, see `cortado.executors`; by default one after the
-        other in this process. loss_if_diverged: the loss, such as infinity, of a failed point: its run diverges or a
-        parameter is out of range. By default it is NaN, and a `CortadoWarning` gives the number of failed points and
-        the first one's error. A failed point's gradient is NaN, and its `Estimate.diverged` is the error. on_result:
-        called with a point's number and its `Estimate` as soon as it is computed, in any order.
+    ``problem``: a `Problem`, also in other coordinates (`cortado.optimisation.transforms.Transformed`). ``points``: the
+    parameters of each point, by name. An iterator is read only as far as needed. ``gradient``: estimator of the
+    gradient, such as `gradients.Exact()`. Without an estimator, points are only run forward, and the gradient of an
+    `Estimate` is empty. ``executor``: see `cortado.executors`; by default points are computed one after the other in
+    this process. ``loss_if_diverged``: the loss, such as infinity, of a failed point, whose run diverges or whose
+    parameter is out of range; by default NaN, with a `CortadoWarning`. A failed point's gradient is NaN, and its
+    `Estimate.diverged` is the error. ``on_result``: called with the number and the `Estimate` of each computed point,
+    in any order.
 
-    Any other error of a point is raised. If all points fail, the first one's error is raised, unless
+    Any other error of a point is raised. If all points fail, the error of the first point is raised, unless
     ``loss_if_diverged`` is given.
 
     Example::
@@ -229,7 +213,12 @@ def evaluate(
     chosen = checked_executor(InProcess() if executor is None else executor)
     estimator = None if gradient is None else checked_estimator(gradient)
     loss = np.nan if loss_if_diverged is None else loss_if_diverged
-    made = (Point(_by_name(values), estimator, loss, NO_RUN) for values in points)
+
+    def point(values: Values) -> Point:
+        require_table("a point", values, "{'gravity': value}")
+        return Point(values, estimator, loss, NO_RUN)
+
+    made = map(point, points)
     found = evaluated(problem, made, chosen, on_result=on_result)
     lost = {number: one.diverged for number, one in enumerate(found) if one.diverged is not None}
     if lost and loss_if_diverged is None:
@@ -237,14 +226,8 @@ def evaluate(
         if len(lost) == len(found):
             raise error
         said = without_runs([*lost.values()], counted(len(found), "point"))
-        sentence = f"{said}, and their losses are NaN. The first of them is point {first}: {error}"
-        warn(sentence)
+        warn(f"{said}, and their losses are NaN. The first of them is point {first}: {error}")
     return found
-
-
-def _by_name(point: Values) -> Values:
-    require_table("a point", point, "{'gravity': value}")
-    return point
 
 
 @public
@@ -260,27 +243,23 @@ def optimise(
     on_iteration: Callable[[Record], None] | None = None,
     **settings: Any,
 ) -> Result:
-    """Lower the loss of a problem, beginning at given parameters; `cortado.optimize` is the same function.
+    """Lower the loss of a problem from first parameters on; `cortado.optimize` is the same function.
 
-    Parameters:
-        problem: a `Problem`, or any object with `value_and_gradient`, or a function that takes the parameters by name
-            and returns the loss and its gradient, `{"gravity": array of the parameter's shape}`.
-        start: first parameters by name, numbers or arrays of any shape; they are optimised together, in float64.
-        optimiser: an object such as `cortado.optimisers.Adam(learning_rate=0.1)`, or "adam", "gradient_descent",
-        "lbfgs" or "line_search" with its settings as keywords: `optimise(problem, start, "adam", learning_rate=0.1,
-        iterations=50)`. iterations: greatest number of updates. Adam and gradient descent then evaluate the last
-        iterate too. bounds: by name, (lower, upper), each a number, an array of the parameter's shape, or None.
-        gradient: gradient estimator, passed on to the problem. checkpoint: folder for the replay log. Each evaluation
-        is written to disk before the next begins. resume: continue the run in `checkpoint`, bit for bit as if it had
-        not been interrupted; begin a new one if there is none. `iterations` may differ from the first call's.
-        on_iteration: called with the `Record` of every evaluation, including those read from the checkpoint. L-BFGS may
-        evaluate several times per iteration; all evaluations are recorded. The trial losses of `LineSearch` are in the
-        checkpoint alone.
+    ``problem``: a `Problem`, or any object with `value_and_gradient`, or a function that takes the parameters by name
+    and returns the loss and its gradient, ``{"gravity": array of the parameter's shape}``. ``start``: first parameters
+    by name, numbers or arrays of any shape, optimised together in float64. ``optimiser``: an object such as
+    `cortado.optimisers.Adam(learning_rate=0.1)`, or "adam", "gradient_descent", "lbfgs" or "line_search" with settings
+    as keywords. ``settings``: settings of such an optimiser, as in ``optimise(problem, start, "adam",
+    learning_rate=0.1, iterations=50)``. ``iterations``: greatest number of updates. ``bounds``: by name, (lower,
+    upper), each a number, an array of the parameter's shape, or None. ``gradient``: gradient estimator for the problem.
+    ``checkpoint``: folder for the replay log, to which every evaluation is written before the next evaluation begins.
+    ``resume``: continue the run in ``checkpoint`` with the same bits as without an interruption, or begin a new run in
+    an empty folder. A resumed run may have another number of ``iterations``. ``on_iteration``: called with the `Record`
+    of every evaluation, including those read from the checkpoint, but not of `LineSearch`'s trials.
 
-    If the run after a step diverges, or a parameter is out of its range, the step is refused. Adam and gradient descent
-    then try half of the step, a quarter and so on, and take shorter steps from then on. The line searches take shorter
-    trials. `Result.refused` counts refused steps, `Result.message` mentions them, and the checkpoint contains them.
-    `Result.left_out` counts runs that ensemble averages left out for the same reasons; only the first time warns.
+    A step is refused if the run after the step diverges, or a parameter is out of range. Adam and gradient descent then
+    halve the step until it succeeds, and all later steps too. The line searches take shorter trials. `Result.refused`
+    counts refused steps, `Result.message` mentions them, and the checkpoint contains them.
 
     Raises InputError for unsuitable ``start``, ``bounds`` or settings, and for a checkpoint of another run. Raises
     DivergedError if the run at the start diverges, or after a step halved ten times. Raises ComputationError if a
@@ -303,7 +282,9 @@ def optimise(
     lower, upper = checked_bounds({} if bounds is None else bounds, layout)
     require_within(vector, lower, upper, layout)
     algorithm.check(layout)
-    require_count(iterations)
+    if not is_whole(iterations) or not 1 <= iterations <= MOST_ITERATIONS:
+        wanted = f"an integer of at least 1 and at most {MOST_ITERATIONS:,}"
+        raise InputError(f"The number of iterations must be {wanted}, not {shown(iterations)}.")
     identity = {
         "optimiser": _description(algorithm),
         "gradient": _description(gradient),
@@ -352,12 +333,11 @@ optimize = optimise
 
 
 def _description(setting: object) -> str:
-    """Return the repr of a setting, without the memory address in the default repr of objects."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(setting))
 
 
 def _without_runs_in_words(refused: int, left_out: int) -> str:
-    """Return the sentence about refused steps and left-out runs at the end of a search's message."""
+    """Return the last sentence of a search's message, about refused steps and left-out runs."""
     why = ["refused " + counted(refused, "step")] * bool(refused)
     why += [f"left {counted(left_out, 'run')} out of its averages"] * bool(left_out)
     return f" It {' and '.join(why)}, as runs diverged or parameters were out of their range." if why else ""

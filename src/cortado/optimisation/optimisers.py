@@ -1,8 +1,7 @@
-"""The optimisers; each object contains the settings and the algorithm.
+"""The optimisers: objects with settings and an algorithm.
 
-An optimiser is deterministic: the points that it evaluates depend only on its settings and on earlier losses and
-gradients. Resuming (`cortado.optimisation.optimise`) relies on this. An optimiser with random numbers must draw them
-from its own seed.
+The points that an optimiser evaluates may depend only on its settings and on earlier losses and gradients, because
+resuming a search replays them. Random numbers must come from a seed among the settings.
 """
 
 from collections.abc import Mapping
@@ -28,45 +27,36 @@ from cortado.optimisation.search import (
     require_positive,
 )
 
-MOST_TRIALS = 1_000
-"""Greatest number of trials of an update; each trial is a run."""
 GROWTH = 3.0
-"""Longest trial of the next update, relative to the best length of this one."""
+"""Longest trial of the line search, relative to the best length of the previous update."""
 SMALL = 0.01
-"""If the last gradient exceeds this part of the first, L-BFGS has not ended at an optimum."""
-MOST_MEMORY = 1_000
-"""Greatest number of past updates that L-BFGS keeps; about ten suffice."""
+"""L-BFGS has not ended at an optimum if the last gradient exceeds this part of the first gradient."""
 
 __all__ = ["LBFGS", "Adam", "GradientDescent", "LineSearch", "Optimiser", "Outcome", "Search"]
 
 
 @dataclass(frozen=True)
 class Adam:
-    """Adam: steps along the mean of recent gradients, divided by the root of the mean of their squares.
+    """Adam: steps along the mean of recent gradients, divided by the root mean square of recent gradients.
 
-    A step changes a component by at most about its learning rate, whatever the size of the gradient. Each update ends
-    with a projection onto the bounds. If the run after a step diverges, the step is halved until a run does not
-    diverge, at most 10 times; the learning rate is halved with it, and the means restart from 0. There is no
-    convergence test: all iterations are made.
+    A step changes a component by at most about the learning rate, for gradients of any size. Every update ends with a
+    projection onto the bounds. If the run after a step diverges, Adam halves the step and the learning rate, at most 10
+    times, and restarts both means from 0. Adam has no convergence test: all iterations are made.
 
     Source: D. P. Kingma and J. Ba, "Adam: a method for stochastic optimization", ICLR 2015, Algorithm 1.
     Raises InputError for settings out of range.
 
-    ``learning_rate``: for all parameters or by name, in the parameters' units; ``beta1`` and ``beta2``: decay of the
-    two means; ``epsilon``: added to the root.
+    ``learning_rate``: a number, or a number per parameter by name [unit of the parameter]. ``beta1`` and ``beta2``:
+    decay of the mean gradient and of the mean squared gradient, in [0, 1) [-]. ``epsilon``: added to the root against
+    division by 0 [unit of the gradient].
 
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.Adam(0.1), iterations=50)``
     """
 
     learning_rate: PerParameter
-    """One number, or one per parameter by name [unit of the parameter]."""
     beta1: float = 0.9
-    """Decay of the mean gradient, in [0, 1) [-]."""
     beta2: float = 0.999
-    """Decay of the mean squared gradient, in [0, 1) [-]."""
     epsilon: float = 1e-8
-    """Added to the root against division by 0; with a gradient that has always been 0 the step is 0 [unit of the
-    gradient]."""
 
     def __post_init__(self) -> None:
         require_positive("learning_rate", self.learning_rate)
@@ -76,11 +66,11 @@ class Adam:
         require_positive("epsilon", self.epsilon)
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise `InputError` if the learning rates are not those of these parameters."""
+        """Raise `InputError` if the learning rates do not match the parameters."""
         require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
-        """Make `search.iterations` updates by Adam, with one gradient each, and evaluate the last iterate."""
+        """Make `search.iterations` updates with one gradient per update, and evaluate the last iterate."""
         learning_rate = search.layout.spread(self.learning_rate)
         theta = Iterate(search)
         m, v, t = np.zeros_like(theta.x), np.zeros_like(theta.x), 0
@@ -101,21 +91,21 @@ class Adam:
 class GradientDescent:
     """Gradient descent with a heavy ball: x_{k+1} = P(x_k - learning_rate g_k + momentum (x_k - x_{k-1})).
 
-    P projects onto the bounds. If the run after a step diverges, the step is halved until a run does not diverge, at
-    most 10 times. The learning rate is halved with it, and the momentum term restarts from 0. There is no convergence
-    test: all iterations are made.
+    P projects onto the bounds. If the run after a step diverges, the step and the learning rate are halved, at most 10
+    times, and the momentum term restarts from 0. The method has no convergence test: all iterations are made.
 
     Source: B. T. Polyak, "Some methods of speeding up the convergence of iteration methods", USSR
     Computational Mathematics and Mathematical Physics 4(5), 1964; plain gradient descent with momentum 0.
     Raises InputError for settings out of range.
 
+    ``learning_rate``: a number, or a number per parameter by name [unit of the parameter^2 / unit of the loss].
+    ``momentum``: factor of the previous step, in [0, 1) [-].
+
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.GradientDescent(0.01), iterations=50)``
     """
 
     learning_rate: PerParameter
-    """One number, or one per parameter by name [unit of the parameter^2 / unit of the loss]."""
     momentum: float = 0.0
-    """Factor of the previous step, in [0, 1) [-]."""
 
     def __post_init__(self) -> None:
         require_positive("learning_rate", self.learning_rate)
@@ -123,11 +113,11 @@ class GradientDescent:
         require_fraction("momentum", self.momentum)
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise `InputError` if the learning rates are not those of these parameters."""
+        """Raise `InputError` if the learning rates do not match the parameters."""
         require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
-        """Make `search.iterations` updates by gradient descent, with one gradient each; evaluate the last iterate."""
+        """Make `search.iterations` updates with one gradient per update, and evaluate the last iterate."""
         learning_rate = search.layout.spread(self.learning_rate)
         at, before = Iterate(search), search.start
         for _ in range(search.iterations):
@@ -139,53 +129,50 @@ class GradientDescent:
 
 @dataclass(frozen=True)
 class LBFGS:
-    """L-BFGS-B: a quasi-Newton method with bounds and a line search of one or more evaluations an iteration.
+    """L-BFGS-B: a quasi-Newton method with bounds and a line search of one or more evaluations per iteration.
 
-    Use it for smooth losses: it finds accurate optima in few evaluations, but stops early if the gradient is noisy. It
-    works on (x - start) / scale, and divides the loss by the greatest component of its first gradient in these
-    coordinates. So the first trial step is at most about `scale` long, whatever the unit of the loss.
+    L-BFGS finds accurate optima of smooth losses in few evaluations, but stops early if the gradient is noisy. The
+    coordinates are (x - start) / scale, and the loss is divided by the greatest component of the first gradient in
+    these coordinates. The first trial step is therefore at most about `scale` long, for any unit of the loss.
 
-    If the run of a trial diverges, the line search gets values of a parabola instead. This parabola has the loss and
-    slope of the last iterate, and its minimum at a quarter of the step. So the next trial is about a quarter as long.
-    The trial does not enter the approximate Hessian.
+    If the run of a trial diverges, the next trial is about a quarter as long, because the line search gets values of a
+    parabola. The parabola has the loss and slope of the last iterate, and its minimum at a quarter of the step. A
+    diverged trial does not enter the approximate Hessian.
 
-    Sums over components use BLAS. With more than about 10^4 components their last bits depend on the number of BLAS
-    threads, so resuming needs the same number of threads. Resuming a run with different bits raises an error.
+    With more than about 10^4 components the last bits of sums depend on the number of BLAS threads, so that resuming
+    needs the same number of threads. Resuming a run with different bits raises an error.
 
     Source: R. H. Byrd, P. Lu, J. Nocedal and C. Zhu, SIAM Journal on Scientific Computing 16(5), 1995, as in
     `scipy.optimize.minimize(method="L-BFGS-B")`.
     Raises InputError for settings out of range.
 
-    ``memory``: number of past updates used for the curvature; ``tolerance``: convergence threshold for the greatest
-    component of the gradient, relative to the first one.
+    ``memory``: number of past updates in the approximate Hessian, at most 1,000. ``tolerance``: convergence threshold
+    for the greatest component of the projected gradient, relative to the first gradient [-]. ``scale``: typical change
+    of a parameter, a number or a number per parameter by name [unit of the parameter].
 
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.LBFGS(scale=0.5), iterations=20)``
     """
 
     memory: int = 10
-    """Number of past updates in the approximate Hessian, at most 1,000."""
     tolerance: float = 0.0
-    """The search has converged when the greatest component of the projected gradient is this fraction of the first one
-    [-]."""
     scale: PerParameter = 1.0
-    """Typical change of a parameter: one number, or one per parameter by name [unit of the parameter]."""
 
     def __post_init__(self) -> None:
         if not is_whole(self.memory) or self.memory < 1:
             raise InputError(f"The memory of L-BFGS must be an integer of at least 1, not {shown(self.memory)}.")
-        require_at_most("The memory of L-BFGS", self.memory, MOST_MEMORY)
+        require_at_most("The memory of L-BFGS", self.memory, 1_000)
         require_fraction("The tolerance of L-BFGS", self.tolerance)
         require_positive("scale", self.scale)
         keep_own(self, "scale")
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise `InputError` if the scales are not those of these parameters, or there is no memory for the updates."""
+        """Raise `InputError` if the scales do not match the parameters, or if past updates need too much memory."""
         require_names("scale", self.scale, layout)
         numbers = 2.0 * self.memory * layout.size + 11.0 * self.memory**2
         require({f"{self.memory:,} past updates": 8.0 * numbers}, "take fewer of them, by memory")
 
     def minimise(self, search: Search) -> Outcome:
-        """Make at most `search.iterations` updates by L-BFGS, of one or more evaluations each."""
+        """Make at most `search.iterations` updates of one or more evaluations."""
         from scipy.optimize import minimize
 
         scale = search.layout.spread(self.scale)
@@ -244,14 +231,14 @@ class _Trial:
     gradient: Vector
 
     def rising(self, y: Vector) -> tuple[float, Vector]:
-        """Return a substitute loss and gradient at y, whose run diverged. From this point (t = 0) to y (t = 1) they
-        follow the parabola f + s t - 2 s t^2. This point's loss is f and its slope s < 0; the minimum is at t = 1 /
-        4."""
+        """Return a substitute loss and gradient at y, whose run diverged: values of the parabola f + s t - 2 s t^2 from
+        this point (t = 0, loss f, slope s < 0) to y (t = 1)."""
         return self.loss - float(self.gradient @ (y - self.y)), -3.0 * self.gradient
 
 
 def _lbfgs_in_words(status: int, iterations: int, left: float) -> str:
-    """Return a sentence on the end of L-BFGS, from scipy's status and the last gradient relative to the first."""
+    """Describe the end of L-BFGS, from scipy's ``status`` and the size ``left`` of the last gradient relative to the
+    first."""
     share = f"the gradient is {left:.2g} of the first one"
     if status == 1:
         return f"L-BFGS made all its {iterations} iterations without converging: {share}. More may lower the loss."
@@ -266,7 +253,7 @@ def _lbfgs_in_words(status: int, iterations: int, left: float) -> str:
 
 
 def _scaled_bounds(search: Search, scale: Vector) -> list[tuple[float, float]] | None:
-    """Return the bounds on (x - start) / scale in scipy's form; None if no component has a bound."""
+    """Return bounds on (x - start) / scale for scipy; None if no component has a bound."""
     if np.isinf(search.lower).all() and np.isinf(search.upper).all():
         return None
     lower, upper = (search.lower - search.start) / scale, (search.upper - search.start) / scale
@@ -274,43 +261,43 @@ def _scaled_bounds(search: Search, scale: Vector) -> list[tuple[float, float]] |
 
 
 def _greatest_projected(search: Search, x: Vector, gradient: Vector, scale: Vector) -> float:
-    """Return the greatest component, in units of `scale`, of the gradient within the bounds."""
+    """Return the greatest component of ``scale`` times the projected gradient."""
     outwards = ((x <= search.lower) & (gradient > 0.0)) | ((x >= search.upper) & (gradient < 0.0))
     return float(np.max(np.abs(np.where(outwards, 0.0, scale * gradient))))
 
 
 @dataclass(frozen=True)
 class LineSearch:
-    """Gradient descent whose step is the best of several lengths tried in one launch.
+    """Gradient descent whose step is the best of several trial lengths.
 
-    Use it for rough losses, and for gradients with the right direction but a wrong size, such as those of long runs.
-    The search steps over local minima narrower than its trials. It never steps to a point whose run diverges or whose
-    parameters are out of range. A trial is a run without a gradient; all trials of an update are one batch.
+    Use `LineSearch` for rough losses, and for gradients with the right direction but a wrong size, as in long runs. The
+    search steps over local minima narrower than its trials, and never to a point whose run diverges or whose parameters
+    are out of range. A trial is a run without a gradient; all trials of an update form one batch.
 
     Formula: with g the gradient times the scale, and unit(a) = a over its root mean square,
 
         d_k = unit(momentum d_{k-1} - unit(g_k)),   x_{k+1} = the best of P(x_k + r_k s scale d_k),
 
     over lengths s at even ratios from ``shortest`` to 1. P projects onto the bounds. The reach r is 1 at first, and
-    then `GROWTH` times the best length, at most 1. If no trial lowers the loss, the update still takes the best trial
-    and sets the reach to 1, so that the search leaves narrow local minima. So the last iterate need not be the best. If
-    every trial diverges, x stays, the momentum is set to 0, and the reach is multiplied by ``shortest``. If the
-    gradient at the best trial diverges, as an ensemble's may, x moves only a part of the way, and the reach is
-    shortened in proportion. There is no convergence test: all iterations are made.
+    later 3 times the best length, at most 1. If no trial lowers the loss, the update still takes the best trial and
+    sets the reach to 1, to leave narrow local minima. The last iterate need not be the best one. If every trial
+    diverges, x stays, the momentum is set to 0, and the reach is multiplied by ``shortest``. If the gradient at the
+    best trial diverges, the step and the reach are shortened. The method has no convergence test: all iterations are
+    made.
 
     Raises InputError for settings out of range.
+
+    ``scale``: longest change of a parameter in a trial, a number or a number per parameter by name [unit of the
+    parameter]. ``trials``: number of lengths per update, at most 1,000. ``shortest``: ratio of the shortest to the
+    longest length. ``momentum``: factor of the previous direction in the new direction, in [0, 1) [-].
 
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.LineSearch(scale=0.5), iterations=20)``
     """
 
     scale: PerParameter = 1.0
-    """Longest change of a parameter in a trial: one number, or one per parameter by name [unit of the parameter]."""
     trials: int = 5
-    """Number of lengths tried in one update, at most 1,000."""
     shortest: float = 1.0 / 64.0
-    """Ratio of the shortest to the longest of these lengths."""
     momentum: float = 0.5
-    """Factor of the previous direction in the new one, in [0, 1) [-]."""
 
     def __post_init__(self) -> None:
         require_positive("scale", self.scale)
@@ -322,15 +309,15 @@ class LineSearch:
                 f"trials is {shown(self.trials)} and shortest {shown(self.shortest)}, but must be at least 2 and "
                 "greater than 0."
             )
-        require_at_most("trials", self.trials, MOST_TRIALS)
+        require_at_most("trials", self.trials, 1_000)
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise `InputError` if the scales are not those of these parameters, or there is no memory for the trials."""
+        """Raise `InputError` if the scales do not match the parameters, or if the trials need too much memory."""
         require_names("scale", self.scale, layout)
         require({f"{self.trials:,} trials": 16.0 * self.trials * layout.size}, "take fewer trials")
 
     def minimise(self, search: Search) -> Outcome:
-        """Make at most `search.iterations` updates, of a gradient and some trials each; evaluate the last iterate."""
+        """Make `search.iterations` updates with one gradient per update, and evaluate the last iterate."""
         scale, at, reach = search.layout.spread(self.scale), Iterate(search), 1.0
         along = np.zeros_like(at.x)
         for _ in range(search.iterations):
@@ -349,7 +336,6 @@ class LineSearch:
 
 
 def unit(vector: Vector) -> Vector:
-    """Divide a vector (size,) by its root mean square; a vector of zeros stays."""
     greatest = np.abs(vector).max(initial=0.0)
     scaled = vector / greatest if greatest else vector
     size = np.sqrt(np.mean(scaled**2)) if greatest else 1.0
@@ -357,12 +343,10 @@ def unit(vector: Vector) -> Vector:
 
 
 BY_NAME: dict[str, Any] = {"adam": Adam, "gradient_descent": GradientDescent, "lbfgs": LBFGS, "line_search": LineSearch}
-"""Optimiser classes by the names that `cortado.optimise` accepts."""
 
 
 def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
-    """Return an optimiser from a name and settings, or a given optimiser unchanged; raise `InputError` for anything
-    else."""
+    """Return an optimiser from a name and settings, or the given optimiser; raise `InputError` for anything else."""
     if isinstance(optimiser, str):
         return _named(optimiser, settings)
     if isinstance(optimiser, type) or not isinstance(optimiser, Optimiser):
@@ -379,7 +363,6 @@ def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
 
 
 def _named(name: str, settings: Mapping[str, Any]) -> Optimiser:
-    """Make the optimiser with this name; raise `InputError` for missing or unknown settings."""
     if name not in BY_NAME:
         raise InputError(f"The optimiser is {shown(name)}, but must be one of {quoted(BY_NAME)}, or an object.")
     known = {field.name: field.default is MISSING for field in fields(BY_NAME[name])}

@@ -1,9 +1,8 @@
-"""The interface between optimisers and problems, in which all parameters are one vector, and the replay log of
-evaluations.
+"""The interface between optimisers and problems, with all parameters in one vector, and the replay log of evaluations.
 
-An optimiser is deterministic: with the losses and gradients of an earlier run it takes the same steps. So the replay
-log, which stores every evaluation, is a complete checkpoint of any optimiser: resuming replays the log. The log is an
-append-only file, because sqlite3 databases need locks, which file systems of clusters may lack.
+Optimisers are deterministic: with the losses and gradients of an earlier run they take the same steps. The replay log
+of all evaluations is therefore a checkpoint of any optimiser. The log is an append-only file, because sqlite3 databases
+need locks, which file systems of clusters may lack.
 """
 
 import json
@@ -26,8 +25,6 @@ from cortado.runs.run_folder import REPLAY_LOG
 
 Vector = npt.NDArray[np.float64]
 FORMAT = "cortado replay log 1"
-LONGEST_HEADER = 2**20
-"""Greatest length of the first line of a log [byte]."""
 PerParameter = float | Mapping[str, float]
 HALVINGS = 10
 """Greatest number of halvings of one step before the search ends."""
@@ -35,79 +32,55 @@ HALVINGS = 10
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """The order and shapes of named parameters within the optimiser's vector."""
+    """Order and shapes of named parameters in the optimiser's vector; the shape of a number is ()."""
 
     names: tuple[str, ...]
-    # in the order in which they follow each other in the vector
     shapes: tuple[tuple[int, ...], ...]
-    # one per name; () for a scalar
 
     @classmethod
     def of(cls, parameters: Mapping[str, Vector]) -> Self:
-        """Return the layout of these parameters, in their order."""
         return cls(tuple(parameters), tuple(np.shape(value) for value in parameters.values()))
 
     @property
     def sizes(self) -> list[int]:
-        """Return the number of components of each parameter."""
         return [int(np.prod(shape)) for shape in self.shapes]
 
     @property
     def size(self) -> int:
-        """Return the number of components of the vector."""
         return sum(self.sizes)
 
     def ravel(self, parameters: Mapping[str, Any]) -> Vector:
-        """Return the vector (size,) of parameters that have the names and shapes of this layout."""
+        """Return the vector (size,) of parameters by name."""
         parts = [np.asarray(parameters[name], dtype=np.float64).ravel() for name in self.names]
         return np.concatenate(parts)
 
     def unravel(self, vector: Vector) -> dict[str, Vector]:
-        """Return the parameters, by name, of a vector (size,), as copies; scalars are arrays of shape ()."""
+        """Return copies of the parameters in a vector (size,) by name; numbers become arrays of shape ()."""
         parts = np.split(vector, np.cumsum(self.sizes)[:-1])
         return {
             name: part.reshape(shape).copy() for name, shape, part in zip(self.names, self.shapes, parts, strict=True)
         }
 
     def spread(self, values: float | Mapping[str, float]) -> Vector:
-        """Expand one number, or one number per parameter, to a vector (size,) with a number for every component."""
+        """Expand a number, or a number per parameter, to a vector (size,)."""
         by_name = values if isinstance(values, Mapping) else dict.fromkeys(self.names, values)
         return np.repeat([float(by_name[name]) for name in self.names], self.sizes)
 
 
 @dataclass(frozen=True, eq=False)
 class LoggedEvaluation:
-    """One evaluation of the loss and its gradient in a replay log."""
+    """An evaluation of the loss and its gradient (size,) at parameters (size,) in a replay log."""
 
     parameters: Vector
-    # (size,), each component in its parameter's unit
     loss: float
     gradient: Vector
-
-
-class Log(Protocol):
-    """Protocol of a replay log of evaluations."""
-
-    @property
-    def fate(self) -> str:
-        """Return the rest of a sentence that begins "the evaluations ..." and says if they are kept."""
-
-    def __len__(self) -> int: ...
-
-    def read(self, index: int) -> LoggedEvaluation:
-        """Return the evaluation of an index, bit for bit as it was appended."""
-
-    def append(self, evaluation: LoggedEvaluation, /) -> None:
-        """Append one more evaluation."""
-
-    def close(self) -> None:
-        """Close the log's file, if there is one."""
 
 
 class MemoryLog(list[LoggedEvaluation]):
     """A replay log in memory, which is lost when the process ends."""
 
     fate = "were not kept, as there is no checkpoint"
+    """End of the sentence "The evaluations ..." in messages."""
 
     def read(self, index: int) -> LoggedEvaluation:
         return self[index]
@@ -117,26 +90,20 @@ class MemoryLog(list[LoggedEvaluation]):
 
 
 class ReplayLog:
-    """A replay log in one file of a folder; a kill at any moment costs at most the evaluation being written.
+    """A replay log in one file of a folder; a killed process loses at most the evaluation that it is writing.
 
-    The file is a line of JSON (format, names, shapes, settings) and then one record of fixed size per
-    evaluation: index (uint64), loss, parameters and gradient (float64), and the CRC-32 of all these (uint32),
-    little-endian. The first line appears with the file in one rename; every record is on the disk before
-    `append` returns. Only the last record can be torn; the next evaluation is written over it.
+    The file is a line of JSON (format, names, shapes, settings), and one record of fixed size per evaluation. A record
+    is little-endian: index (uint64), loss, parameters and gradient (float64), and the CRC-32 of all these (uint32).
+    Every record is on the disk before `append` returns. The next evaluation overwrites an incomplete last record.
     """
 
     def __init__(
         self, folder: str | os.PathLike[str], layout: ParameterLayout, settings: Mapping[str, str], resume: bool
     ) -> None:
-        """Open the log of `folder`, or begin one there.
+        """Open the log of ``folder`` to ``resume`` a search, or begin a new log.
 
-        Parameters:
-            folder: path of the folder, which is made if it does not exist. layout: names and shapes of the parameters.
-            settings: texts by name that must be equal when the run is resumed. resume: continue with the evaluations in
-            the folder, if there are any.
-
-        Raises InputError if the folder contains evaluations and `resume` is false, if they have other settings, or if
-        the file is damaged anywhere but at its end.
+        Raise `InputError` if the folder contains evaluations and ``resume`` is false, if ``settings`` differ, or if a
+        record before the last one is damaged.
         """
         self._layout = layout
         self._path = Path(folder) / REPLAY_LOG
@@ -147,7 +114,7 @@ class ReplayLog:
             raise InputError(f"'{self._path}' is no regular file; give another checkpoint folder.")
         if not resume:
             _require_unused(self._path)
-        if not resume or not self._path.exists():  # the file is there with the whole first line, or not at all
+        if not resume or not self._path.exists():
             with sentences(self._path.parent):
                 self._path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(self._path, json.dumps(header) + "\n")
@@ -155,28 +122,26 @@ class ReplayLog:
             self._file: BinaryIO = open(self._path, "r+b", buffering=0)  # noqa: SIM115 closed by close()
         try:
             self._first_record = _check_header(self._file, header, self._path)
-            self._count = self._count_whole()
+            self._count = self._count_complete()
         except BaseException:
             self._file.close()
             raise
 
     @property
     def fate(self) -> str:
-        """Return the rest of a sentence that begins "the evaluations ..." and says where they are stored."""
         return f"are in '{self._path}'"
 
     def __len__(self) -> int:
         return self._count
 
     def read(self, index: int) -> LoggedEvaluation:
-        """Return the evaluation of an index, 0 <= index < len(self), bit for bit as it was appended."""
         self._file.seek(self._first_record + index * self._record_size)
         values = np.frombuffer(self._file.read(self._record_size)[8:-4], dtype="<f8").astype(np.float64)
         size = self._layout.size
         return LoggedEvaluation(values[1 : 1 + size], float(values[0]), values[1 + size :])
 
     def append(self, evaluation: LoggedEvaluation) -> None:
-        """Write one more evaluation; it is on the disk on return. Raises `ComputationError` if writing fails."""
+        """Write an evaluation to the disk; raise `ComputationError` if writing fails."""
         values = np.concatenate([[evaluation.loss], evaluation.parameters, evaluation.gradient])
         content = struct.pack("<Q", self._count) + values.astype("<f8").tobytes()
         try:
@@ -191,27 +156,27 @@ class ReplayLog:
         self._count += 1
 
     def close(self) -> None:
-        """Close the file of the log."""
         self._file.close()
 
-    def _count_whole(self) -> int:
-        """Return the number of complete records, without an incomplete last one; raise `InputError` if any other record
-        is damaged."""
+    def _count_complete(self) -> int:
+        """Count the complete records; raise `InputError` if a record before the last one is damaged."""
         end = self._file.seek(0, os.SEEK_END)
-        complete, whole = (end - self._first_record) // self._record_size, 0
+        records, complete = (end - self._first_record) // self._record_size, 0
         self._file.seek(self._first_record)
-        while _is_whole(self._file.read(self._record_size), whole, self._record_size):
-            whole += 1
-        if whole < complete - 1:
+        while _is_complete(self._file.read(self._record_size), complete, self._record_size):
+            complete += 1
+        if complete < records - 1:
             raise InputError(
-                f"Evaluation {whole} of the {complete} in '{self._path}' is damaged; restore the file from a "
+                f"Evaluation {complete} of the {records} in '{self._path}' is damaged; restore the file from a "
                 "copy, or begin again in another checkpoint folder."
             )
-        return whole
+        return complete
+
+
+Log = MemoryLog | ReplayLog
 
 
 def _require_unused(path: Path) -> None:
-    """Raise `InputError` if there is a log with evaluations in it."""
     if not path.exists():
         return
     with open(path, "rb") as file:
@@ -225,9 +190,9 @@ def _require_unused(path: Path) -> None:
 
 
 def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
-    """Compare the first line of a log with the expected one; return the position of the first record [byte]."""
+    """Compare the first line of a log with ``header``; return the position of the first record [byte]."""
     try:
-        found = parsed_json(file.readline(LONGEST_HEADER))
+        found = parsed_json(file.readline(2**20))  # a damaged file may have no line end
     except ValueError:
         found = None
     if not isinstance(found, dict) or found.get("format") != FORMAT:
@@ -245,8 +210,7 @@ def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
 
 
 def _differing(former: str, given: str) -> tuple[str, str]:
-    """Return the parts, separated by semicolons, in which two texts differ; the whole texts if their numbers of parts
-    differ."""
+    """Return the semicolon-separated parts in which two texts differ; both texts if their numbers of parts differ."""
     formers, givens = former.split("; "), given.split("; ")
     if len(formers) != len(givens):
         return former, given
@@ -254,8 +218,7 @@ def _differing(former: str, given: str) -> tuple[str, str]:
     return "; ".join(one for one, _ in parts), "; ".join(other for _, other in parts)
 
 
-def _is_whole(record: bytes, index: int, size: int) -> bool:
-    """Test that these bytes are the whole record of an index."""
+def _is_complete(record: bytes, index: int, size: int) -> bool:
     if len(record) < size:
         return False
     content, (checksum,) = record[:-4], struct.unpack("<I", record[-4:])
@@ -267,14 +230,13 @@ class Search:
     """The problem for an optimiser, as a function of one vector."""
 
     evaluate: Callable[[Vector], tuple[float, Vector]]
-    """Function from a vector (size,) to the loss and the gradient (size,). If the run fails, its error ends the
-    search."""
+    """Function from a vector (size,) to the loss and the gradient (size,); an error of the run ends the search."""
     attempt: Callable[[Vector], tuple[float, Vector] | None]
     """Function from a vector (size,) to the loss and the gradient (size,), or to None if the run diverges or a
-    parameter is out of range. The search counts this and continues."""
+    parameter is out of range. The search counts and survives a None."""
     losses: Callable[[Sequence[Vector]], list[float]]
     """Function from several vectors (size,) to their losses, infinite if the run diverges or parameters are out of
-    range. It is cheaper than evaluations with gradients."""
+    range. Losses alone are cheaper than `evaluate`."""
     layout: ParameterLayout
     """Assignment of the vector's components to parameters."""
     start: Vector
@@ -286,7 +248,7 @@ class Search:
     iterations: int
     """Greatest number of updates."""
     updated: Callable[[], None] = lambda: None
-    """Called after each update, so that the search counts it."""
+    """Called after each update, to count updates."""
 
     def project(self, vector: Vector) -> Vector:
         """Return the nearest vector within the bounds."""
@@ -295,14 +257,14 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The result of an optimiser: its last iterate, and how the search ended."""
+    """The result of an optimiser: its last iterate, and the end of the search."""
 
     last: Vector
-    """The last iterate (size,), which has been evaluated."""
+    """Last iterate (size,), which has been evaluated."""
     converged: bool
     """True if the optimiser's convergence test was met."""
     message: str
-    """A sentence about the end of the search."""
+    """Sentence about the end of the search."""
 
 
 @runtime_checkable
@@ -341,15 +303,15 @@ def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> N
 
 
 class Iterate:
-    """The current iterate of an optimiser: an evaluated point that can move to the next one."""
+    """The current, evaluated point of an optimiser."""
 
     def __init__(self, search: Search):
         self._search, self.x = search, search.start
         self.loss, self.gradient = search.evaluate(search.start)
 
     def move(self, target: Vector) -> float:
-        """Move to a vector (size,), as one update. If the run there fails, try half of the way, a quarter and so on.
-        Returns the fraction of the way taken; if even the shortest try fails, raises its error."""
+        """Move to a vector (size,); while the run there fails, halve the step. Return the fraction of the step that was
+        taken, or raise the error of the shortest step."""
         self._search.updated()
         part, tried = 1.0, target
         found = self._search.attempt(tried)
@@ -361,5 +323,5 @@ class Iterate:
         return part
 
     def outcome(self, name: str) -> Outcome:
-        """Return the outcome of an optimiser without a test of convergence."""
+        """Return the outcome of an optimiser that has no convergence test."""
         return Outcome(self.x, False, f"{name} made all its {self._search.iterations} updates.")

@@ -1,5 +1,4 @@
-"""Results of a solved task (knots in time, plots, pictures, films), and the input of ``cortado fit``: a scene with the
-tables [problem] and [fit], and measured data."""
+"""Plots, pictures and films of a solved task, and the input of ``cortado fit``: scenes with measured data."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -35,7 +34,7 @@ from cortado.pictures.painter import colours_of, painter, side_by_side
 from cortado.pictures.plots import images, loss_curve, panels, particles
 from cortado.pictures.shown_solids import solid_outline
 from cortado.pictures.tracing.space import State
-from cortado.runs.frames import Pace, pace_of
+from cortado.runs.frames import pace_of
 from cortado.runs.probes import sensors_of
 from cortado.runs.sensor import measured_columns
 from cortado.scene.appearance import Picture
@@ -50,53 +49,45 @@ MOST_CURVES = 12
 """Greatest number of components for which a parameter gets its own picture."""
 TITLES = ("first guess", "found", "target")
 IMAGES = 6
-"""Number of images that show the course of the optimisation."""
 EVALUATIONS = (1, 5, 20, 100)
-"""Numbers of the evaluations whose runs are shown, if the search reached them; 0 is the start."""
+"""Numbers of the evaluations whose runs are shown; 0 is the start."""
 Run = Mapping[int, Snapshot]
-"""States by the number of steps before them."""
+"""States by step number."""
 
 
 @dataclass(frozen=True)
 class TaskFigures:
-    """Pictures and films of a solved task, with (caption, path) of each."""
-
     found: Figures = field(default_factory=list)
     """Films of the run with the found parameters."""
     compared: Figures = field(default_factory=list)
-    """Pictures that compare the start, the result and the target."""
     parameters: Figures = field(default_factory=list)
-    """Plots of the found and the true parameters."""
     search: Figures = field(default_factory=list)
-    """Plots and pictures of the course of the search."""
 
     def __add__(self, other: "TaskFigures") -> "TaskFigures":
-        """Return these figures followed by another task's."""
         return TaskFigures(**{name: figures + getattr(other, name) for name, figures in vars(self).items()})
 
 
 @dataclass(frozen=True)
 class KnotValues:
-    """The values of one parameter at knots in time, between which it changes along a straight line."""
+    """Values of a parameter at k knots in time, with linear interpolation between them."""
 
     times: np.ndarray
-    """(k,) [s] A step has the value at its middle, so the first knot is half a step after the start of the run. For
-    positions it is one step after the start."""
+    """(k,) [s] The first knot is half a step after the start of the run, because a step uses the value at its middle;
+    for positions one step."""
     start: np.ndarray
     """Values at the start of the search (k, d), or (k,) for numbers, in the unit of the parameter."""
     estimate: np.ndarray
     """Found values (k, d), in the unit of the parameter."""
     true: np.ndarray | None
-    """Values (k, d) at these knots nearest to the true course; None if the target is a picture."""
+    """Values (k, d) that approximate the true parameter over time best; None if the target is a picture."""
 
     def for_machines(self) -> dict[str, np.ndarray]:
-        """Return the arrays by name, without the true values if they are None."""
         known = {} if self.true is None else {"true": self.true}
         return {"times": self.times, "estimate": self.estimate, **known}
 
 
 def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndarray]) -> dict[str, KnotValues]:
-    """Return, by name, the searched parameters that ``coordinates`` interpolates between knots in time."""
+    """Return by name the searched parameters that are interpolated between knots."""
     step = float(estimate.get("time_step", made.task.scene.solver.time_step))
     found = {}
     for name, bijector in made.search.coordinates.items():
@@ -112,13 +103,12 @@ def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndar
 
 
 def _without_round_off(values: np.ndarray) -> np.ndarray:
-    """Round values to twelve digits of the largest, so that a user's numbers are printed as they were written."""
+    """Round values to twelve digits of the largest value."""
     largest = np.abs(values).max()
     return np.round(values, 11 - int(np.floor(np.log10(largest)))) + 0.0 if largest > 0.0 else values  # no -0
 
 
 def task_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
-    """Draw plots and pictures of a solved task into a folder."""
     losses = [record.loss for record in result.history]
     label = "loss [m²]" if made.renderer is None else "loss"
     figures = TaskFigures(search=[("The loss.", loss_curve(losses, folder / "loss.png", label=label))])
@@ -157,7 +147,7 @@ def _images(made: Setup, result: Result, folder: Path) -> TaskFigures:
 
 
 def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
-    """Plot the estimate of a parameter over the evaluations; for a parameter over time, plot the last estimate."""
+    """Plot a parameter's estimate over the evaluations; of a parameter over time, plot the last estimate."""
     estimate, true = made.search.parameters(result.parameters)[name], made.true_parameter(name)
     path, first = folder / f"{name}.png", np.asarray(made.search.parameters(made.start)[name])
     names = component_names(made.task, name, estimate)
@@ -179,7 +169,7 @@ def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
 
 
 def component_names(task: Task, name: str, value: np.ndarray) -> list[str]:
-    """Name the components of a parameter, or of a row of a parameter over time: axes, phases, or numbers."""
+    """Name the components of a parameter, or of a row of a parameter over time, by axes, phases, or numbers."""
     scene, parameter, last = task.scene, task.known[name], np.shape(value)[-1:]
     count = int(np.prod(np.shape(value))) if parameter.axis is not Axis.STEP else int(np.prod(last))
     label = name.replace("_", " ")
@@ -197,7 +187,6 @@ def component_names(task: Task, name: str, value: np.ndarray) -> list[str]:
 
 
 def begin_shaded(made: Setup) -> None:
-    """Compile the renderer of shaded pictures during the search, which leaves one core free."""
     simulation = made.problem.simulation
     artist = painter(made.task.scene, simulation.positions, simulation.device)
     compile_meanwhile(artist, simulation.device)
@@ -214,13 +203,11 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
     def found(u: dict[str, np.ndarray]) -> Run:
         return run(made.search.parameters(u))
 
-    before, after = found(made.start), found(result.parameters)
-    runs = {"first guess": before, "found": after}
-    if made.task.problem.picture is None:  # else there is a picture to aim at, and no run
+    runs = {"first guess": found(made.start), "found": found(result.parameters)}
+    if made.task.problem.picture is None:
         runs["target"] = run(made.task.true_parameters)
     still, moving = (partial(_page, made, one, device=device) for one in (picture, picture.for_films))
-    three = still(list(runs), list(runs.values()))
-    write_picture(folder / "found.png", three.image(steps[-1]))
+    write_picture(folder / "found.png", still(list(runs), list(runs.values())).image(steps[-1]))
     compared: Figures = [(f"The end of the run: {', '.join(runs)}.", folder / "found.png")]
     shown = [k for k in EVALUATIONS if k < len(result.history)] or [0]
     searched = [f"evaluation {k}" for k in shown], [found(result.history[k].parameters) for k in shown]
@@ -229,9 +216,8 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
     if picture.film_frames == 0 or len(steps) < 2:
         return TaskFigures(compared=compared, search=search)
     pair = {name: runs[name] for name in (("found", "target") if "target" in runs else ("first guess", "found"))}
-    two = moving(list(pair), list(pair.values()))
-    pace = step_pace(made.task.scene, steps)
-    motion = film(folder / "found.mp4", two, steps, pace)
+    pace = replace(pace_of(float(made.task.scene.solver.time_step) * np.asarray(steps), picture), of_search=True)
+    motion = film(folder / "found.mp4", moving(list(pair), list(pair.values())), steps, pace)
     announce(str(motion))
     sought = film(folder / "search.mp4", moving(*searched), steps, pace)
     search.insert(0, (f"The search in motion, {pace.in_words}.", sought.path))
@@ -239,22 +225,12 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
     return TaskFigures(found=found_figures, compared=compared, search=search)
 
 
-def step_pace(scene: Scene, steps: Sequence[int]) -> Pace:
-    """Return the pace of films with one frame for each of these numbers of steps."""
-    if scene.solver.chooses:
-        return Pace.unknown(len(steps))
-    pace = pace_of(float(scene.solver.time_step) * np.asarray(steps), scene.picture or Picture())
-    return replace(pace, of_search=True)
-
-
 def _page(made: Setup, picture: Picture, names: Sequence[str], runs: Sequence[Run], device: Any) -> Page:
-    """Lay out the pictures of runs after a number of steps, side by side, each with its name."""
     scene, across, half = made.task.scene, len(runs) if len(runs) < 4 else 2, len(runs) > 1
     size = {"width": picture.width // (1 + half), "height": picture.height // (1 + (len(runs) > across))}
     panel = picture.model_copy(update=size)
     places = [run[step].positions for run in runs for step in run]
     artist = painter(scene.model_copy(update={"picture": panel}), places, device)
-
     filmed = [FilmedRun(artist, partial(_state, made, run)) for run in runs]
     return Page(filmed, partial(side_by_side, across=across, names=names))
 
@@ -268,27 +244,18 @@ def _state(made: Setup, run: Run, step: int) -> State:
     return State(state.positions[out], colours[out], fractions=fractions)
 
 
-LIGHT = 0.5
-"""Brightness above which a pixel of a mask counts."""
-
-
 class ExperimentTables(Table):
-    """The table [problem] of a file with one more experiment."""
-
     problem: ProblemTable
 
 
 @dataclass(frozen=True)
 class MeasuredScene:
-    """A scene with the measurements of an experiment, as read from a file."""
-
     file: str
     scene: Scene
     problem: ProblemTable
 
     def experiment(self, device: str, precision: str) -> Experiment:
-        """Make the experiment on a device; raise `InputError` or `SceneError` for data that do not fit or cannot be
-        opened."""
+        """Make the experiment on a device; raise `InputError` or `SceneError` for unsuitable or unreadable data."""
         simulation, folder = Simulation(self.scene, device, precision), Path(self.file).parent
         last = self.problem.steps * float(self.scene.solver.time_step)
         found = {}
@@ -302,19 +269,18 @@ class MeasuredScene:
 
 @dataclass(frozen=True)
 class FitTask:
-    """A task of `cortado fit`: measured experiments, and the parameters to fit to them."""
+    """A task of `cortado fit`: measured experiments, and the parameters to fit."""
 
     experiments: tuple[MeasuredScene, ...]
     fit: FitTable
 
     @property
     def scene(self) -> Scene:
-        """Return the scene of the first experiment."""
         return self.experiments[0].scene
 
 
 def load_fit(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> FitTask:
-    """Read a task of `cortado fit` from a TOML file; raise `SceneError` in one sentence."""
+    """Read a task of `cortado fit` from a TOML file; raise `SceneError` if it is invalid."""
     file = os.fspath(path)
     data = read_toml(path, overrides, ("optimise", "dataset"))
     if "fit" not in data:
@@ -330,9 +296,8 @@ def _also(path: Path) -> MeasuredScene:
     """Read a further experiment from its file; a table [fit] in this file is ignored."""
     found, _ = _read(read_toml(path), os.fspath(path), ExperimentTables)
     if found.problem.also:
-        raise SceneError(
-            found.file, "problem.also", list(found.problem.also), "left out, as another file names this one"
-        )
+        also, wanted = list(found.problem.also), "left out, as another file names this one"
+        raise SceneError(found.file, "problem.also", also, wanted)
     return found
 
 
@@ -346,8 +311,8 @@ def _read(data: dict[str, Any], file: str, model: type[Table]) -> tuple[Measured
 
 @singledispatch
 def observation(table: MeasuredTable, simulation: Simulation, folder: Path, last: float) -> Observation:
-    """Make the observation that a table describes, up to the ``last`` time of the run [s]; its files are in a folder.
-    Raises `InputError`."""
+    """Make the observation of a table, up to the ``last`` time of the run [s], from files in ``folder``; raise
+    `InputError`."""
     raise NotImplementedError(type(table))
 
 
@@ -362,7 +327,7 @@ def _(table: VideoTable, simulation: Simulation, folder: Path, last: float) -> O
         picture = open_picture(folder / table.mask)
         cropped = picture if table.crop is None else picture.crop(table.crop)
         warn_of_cropping(f"The mask {folder / table.mask} has", cropped.size, (columns, rows))
-        mask = resized(cropped, (columns, rows)).mean(axis=2) > LIGHT
+        mask = resized(cropped, (columns, rows)).mean(axis=2) > 0.5  # brightness
     return Video(renderer, times[chosen], frames[chosen], mask, table.noise, table.calibrate, table.start)
 
 
@@ -413,15 +378,12 @@ def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> 
 
 
 def _instants(times: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
-    """Merge times that differ by at most ``apart``; return the remaining ones in order, and the index of each given
-    time among them."""
     each, which = np.unique(times, return_inverse=True)
     begins = np.diff(each, prepend=-np.inf) > apart
     return each[begins], np.cumsum(begins)[which] - 1
 
 
 def _within(times: np.ndarray, last: float) -> np.ndarray:
-    """Return a mask of the times that are within the run."""
     return (times >= -1e-12) & (times <= last * (1.0 + 1e-9))
 
 

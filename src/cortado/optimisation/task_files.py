@@ -1,5 +1,4 @@
-"""Read a task of ``cortado optimise`` (a scene with the tables [problem] and [optimise]), describe it in words, and set
-it up on a device."""
+"""Read, describe and set up a task of ``cortado optimise``: a scene with the tables [problem] and [optimise]."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -12,7 +11,7 @@ import numpy as np
 from cortado.calls import counted
 from cortado.errors import DivergedError, InputError, SceneError, Words
 from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
-from cortado.optimisation.task_tables import DISTANCES, RANDOM, OptimiseTable, ProblemTable, TaskTables
+from cortado.optimisation.task_tables import DISTANCES, OptimiseTable, ProblemTable, TaskTables
 from cortado.optimisation.transforms import Bijector, Logarithm, Softmax, TimeInterpolation, Transformed
 from cortado.pictures.image_files import heart, read_picture, rosetta
 from cortado.problem import Problem
@@ -39,7 +38,7 @@ GIVEN = Words("given")
 
 @dataclass(frozen=True)
 class Task:
-    """An inverse problem: a scene, a target, and a search. Parameters over time have a row for each step."""
+    """An inverse problem: a scene, a target, and a search. Parameters over time have one row per step."""
 
     scene: Scene
     problem: ProblemTable
@@ -47,15 +46,13 @@ class Task:
     true_parameters: Arrays
     """Parameters of the run that made the target; empty if the target is a picture."""
     start: dict[str, Any]
-    """First values of the search by parameter: arrays, or the word "random"."""
     known: Known
-    """The parameters of the scene."""
     folder: Path = Path()
     """The folder of the task's file; paths in the task are relative to it."""
 
 
 def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Task:
-    """Read a task from a TOML file; raises `SceneError` in one sentence."""
+    """Read a task from a TOML file; raise `SceneError` if it is invalid."""
     file = os.fspath(path)
     data = read_toml(path, overrides, ("fit", "dataset"))
     scene = scene_from_dict(data, file)
@@ -88,8 +85,7 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
 
 
 def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Table]) -> tuple[Known, Any]:
-    """Read the tables of a model, whose keys are names of a scene's parameters, and return the parameters and the
-    tables; raise `SceneError`."""
+    """Return the scene's parameters, and the tables of a ``model`` checked against them; raise `SceneError`."""
     try:
         known = known_in(scene)
         names = (*offered(scene), *(p.name for p in known.own if p.role is not Role.CLOCK))
@@ -103,7 +99,7 @@ def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Ta
 
 
 def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, known: Known) -> dict[str, Any]:
-    """Return values; those that change over time get a row for each step. Raise `SceneError` for a wrong shape."""
+    """Check values by parameter, and interpolate rows over time to one row per step; raise `SceneError`."""
     found = {}
     for name, array in values.items():
         field, parameter = f"{table}.{name}", known[name]
@@ -141,7 +137,7 @@ def _check_range(parameter: Parameter, field: str, array: np.ndarray) -> None:
 
 
 def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any], known: Known) -> None:
-    """Raise `SceneError` for an option that contradicts others, so that no option is silently ignored."""
+    """Raise `SceneError` for an option that contradicts others or has no effect."""
     over_time = [name for name in known.over_time if name in start and known.has_rows(name, start[name])]
     if optimise.knots is not None and not over_time:
         raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")
@@ -177,7 +173,7 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
 def _check_bounds(
     name: str, pair: np.ndarray, optimise: OptimiseTable, start: Mapping[str, Any], scene: Scene, known: Known
 ) -> None:
-    """Raise `SceneError` for bounds that do not fit the start."""
+    """Raise `SceneError` for bounds that are invalid, or exclude the start."""
     field = f"optimise.bounds.{name}"
     if name not in start:
         raise SceneError(None, field, GIVEN, "left out, as optimise.start lacks it")
@@ -207,8 +203,6 @@ def _check_bounds(
 
 
 def _shapes(parameter: Parameter, scene: Scene, steps: int) -> list[tuple[int, ...]]:
-    """Return the shapes that a parameter may have; () is a number. Only if the parameter has a value for each particle,
-    the scene is filled with particles, which may take a second."""
     particles = len(fluid_particles(scene).positions) if parameter.axis is Axis.PARTICLE else 0
     return parameter.shapes(steps, len(scene.phase), (particles, scene.dimension))
 
@@ -245,7 +239,6 @@ def _listed(names: object) -> str:
 
 
 def _asked(task: Task) -> str:
-    """Return the conditions of a task's check in words; empty if there are none."""
     check = task.optimise.check
     words = {
         "loss_reduction": f"a loss {check.loss_reduction:g} times smaller than at the start",
@@ -258,17 +251,14 @@ def _asked(task: Task) -> str:
 
 @dataclass(frozen=True)
 class Setup:
-    """A task on a device: the arguments for `cortado.optimise`, and the target that its result is compared with."""
+    """A task on a device: the arguments for `cortado.optimise`, and the target."""
 
     task: Task
     problem: Problem
     searches: tuple[Transformed, ...]
-    """One problem for each entry of the extinction schedule, in the same coordinates; the last has the scene's
-    extinction."""
+    """One search for each entry of the extinction schedule, in the same coordinates."""
     start: Arrays
-    """First coordinates of the search."""
     bounds: dict[str, tuple[Any, Any]]
-    """Lower and upper bounds of coordinates."""
     renderer: Renderer | None
     """Renderer of the compared pictures; None if positions are compared."""
     targets: dict[int, np.ndarray]
@@ -276,16 +266,14 @@ class Setup:
 
     @property
     def search(self) -> Transformed:
-        """Return the last of the searches, which is that of the task itself."""
+        """Return the last search, with the scene's extinction."""
         return self.searches[-1]
 
     def image(self, end: Snapshot) -> np.ndarray:
-        """Render the picture (rows, columns, 3) of a state."""
         assert self.renderer is not None
         return _image(self.renderer, end)
 
     def true_parameter(self, name: str) -> np.ndarray | None:
-        """Return a parameter's value in the run that made the target; None if the target is a picture."""
         return self.task.true_parameters.get(name)
 
 
@@ -293,25 +281,21 @@ def setup(task: Task, device: str, precision: str) -> Setup:
     """Set up a task on a device; raise `InputError` for a picture that cannot be read."""
     simulation = Simulation(task.scene, device, precision)
     start = {name: _start(name, value, simulation) for name, value in task.start.items()}
-    found = _coordinates(task, start)
-    searches = []
+    found, searches = _coordinates(task, start), []
     for factor in task.optimise.extinction_schedule:
         renderer = scene_renderer(simulation, factor) if task.problem.loss == "image" else None
         targets = _targets(task, simulation, renderer)
-        problem = Problem(simulation, task.problem.steps, _frames(task, targets, renderer))
+        losses: dict[int, Loss] = {
+            step: Image(renderer, target, DISTANCES[task.problem.distance]) if renderer else FinalPositions(target)
+            for step, target in targets.items()
+        }
+        problem = Problem(simulation, task.problem.steps, Frames(losses))
         searches.append(Transformed(problem, found))
     bounds = _bounds(task)
     coordinates = searches[-1].coordinate(start)
     for name, (lower, upper) in bounds.items():
         coordinates[name] = np.clip(coordinates[name], lower, upper)  # what is random, or a little outside by round-off
     return Setup(task, problem, tuple(searches), coordinates, bounds, renderer, targets)
-
-
-def _frames(task: Task, targets: dict[int, np.ndarray], renderer: Renderer | None) -> Frames:
-    def loss(target: np.ndarray) -> Loss:
-        return Image(renderer, target, DISTANCES[task.problem.distance]) if renderer else FinalPositions(target)
-
-    return Frames({step: loss(target) for step, target in targets.items()})
 
 
 def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> dict[int, np.ndarray]:
@@ -333,13 +317,11 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
 
 
 def _image(renderer: Renderer, end: Snapshot) -> np.ndarray:
-    """Render the picture (rows, columns, 3) of a state."""
     return renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
 
 
 def _picture(task: Task, renderer: Renderer) -> np.ndarray:
-    """Read the picture that a task names; "heart" and "rosetta" are drawn in the scene's colours, last phase on
-    first."""
+    """Read the picture of a task; draw "heart" and "rosetta" with the colour of the last phase on the first one."""
     name, scene = task.problem.picture, task.scene
     assert name is not None
     rows, columns, _ = renderer.shape
@@ -354,7 +336,7 @@ def _picture(task: Task, renderer: Renderer) -> np.ndarray:
 
 
 def _start(name: str, value: Any, simulation: Simulation) -> np.ndarray:
-    if not isinstance(value, str) or value != RANDOM:
+    if not isinstance(value, str):
         return np.asarray(value)
     random = np.random.default_rng(0)
     if name == "mass_fractions":
@@ -382,11 +364,7 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
 
 
 def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
-    """Return bounds of coordinates by name.
-
-    Bounds of a parameter over time apply to its knots, and so to the values interpolated between them. Bounds of a
-    logarithmic parameter are logarithms. A parameter that cannot be negative has the lower bound 0.
-    """
+    """Return bounds of coordinates by name, of knots or logarithms; not negative parameters have the lower bound 0."""
     with_zero = [name for name in task.start if task.known[name].range is Range.NOT_NEGATIVE]
     free = [name for name in with_zero if name not in task.optimise.logarithmic]
     found: dict[str, tuple[Any, Any]] = dict.fromkeys(free, (0.0, None))

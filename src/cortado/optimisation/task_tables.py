@@ -1,4 +1,4 @@
-"""The tables of a task, [problem] with what was measured, [optimise] and [fit], and the JSON schema of all files."""
+"""The tables [problem], [optimise] and [fit] of a task, and the JSON schema of scene, task and data set files."""
 
 import json
 from collections.abc import Collection, Mapping
@@ -22,13 +22,7 @@ from pydantic import (
 from cortado.arrays import as_number
 from cortado.errors import Words
 from cortado.executors import Executor, InProcess
-from cortado.gradients import (
-    AdjointEstimator,
-    AdjointViscosity,
-    EnsembleMean,
-    Exact,
-    GradientEstimator,
-)
+from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, GradientEstimator
 from cortado.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.datasets import DatasetTables
 from cortado.optimisation.optimise import MOST_ITERATIONS
@@ -43,17 +37,12 @@ Pixel = Annotated[int, count(0, 100_000)]
 Seconds = Annotated[float, quantity("s")]
 Clock = tuple[Literal["start"], ...]
 _NUMBERS: list[Any] = [{"type": "number"}, {"type": "array"}]
-WITH_A_SCALE = ("lbfgs", "line_search")
-"""Optimisers whose learning rate is the size of the first step, or the longest one."""
 DISTANCES: dict[str, ImageLoss] = {"squared_difference": SquaredDifference(), "pyramid": Pyramid()}
-ESTIMATORS: dict[str, AdjointEstimator] = {
-    "exact": Exact(),
-    "adjoint_viscosity": AdjointViscosity(),
-}
+ESTIMATORS: dict[str, AdjointEstimator] = {"exact": Exact(), "adjoint_viscosity": AdjointViscosity()}
 
 
 def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return values by name as arrays, or as one of the words where a parameter can be random; raise `field_error`."""
+    """Convert values to arrays by parameter name; parameters in `CAN_BE_RANDOM` may instead be one of ``words``."""
     if not isinstance(values, Mapping) or not values:
         raise field_error((), Words("empty") if values == {} else values, wanted(VALUES))
     found = {}
@@ -67,7 +56,7 @@ def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> d
 
 
 def _flat(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Return values by name, where ``drag.k = 2.0`` came as a table in a table."""
+    """Flatten nested tables of dotted parameter names: {"drag": {"k": 2.0}} becomes {"drag.k": 2.0}."""
     found = {}
     for name, value in values.items():
         deeper = isinstance(value, Mapping) and any(known.startswith(f"{name}.") for known in names)
@@ -76,17 +65,16 @@ def _flat(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
 
 
 def _names(info: ValidationInfo) -> Collection[str]:
-    """Return the names of all parameters, with those of parts of packages if the reader of the tables knows these."""
+    """Return all parameter names, including user-defined ones from the validation context."""
     return (*NAMES, *(info.context or {}).get("names", ()))
 
 
 def _offered(info: ValidationInfo) -> str:
-    """Name in words the right parameters: the scene's, if the reader of the tables knows these."""
     return f"one of {', '.join((info.context or {}).get('names', NAMES))}"
 
 
 def _known(name: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
-    """Check the name of a parameter; raise a `field_error` if the reader of the tables knows other names only."""
+    """Check a parameter's name against the names in the validation context, if there are any."""
     if info.context and name not in _names(info):
         raise field_error((), name, _offered(info))
     return name if info.context else check(name)
@@ -101,98 +89,94 @@ def _array(name: str, value: Any) -> Any:
 
 
 def _is_numeric(value: Any) -> bool:
-    """Test for a finite number, or a list, not empty, of nothing else."""
+    """Test for a finite number, or a non-empty (nested) list of finite numbers."""
     if isinstance(value, list):
         return bool(value) and all(map(_is_numeric, value))
     return as_number(value) is not None
 
 
 def _schema(words: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return the JSON schema of values by name; parameters that can be random may be one of the words too."""
     allowed = [{"enum": list(words)}] if words else []
     properties = {
         name: {"anyOf": [*_NUMBERS, *allowed] if name in CAN_BE_RANDOM else _NUMBERS, "unit": unit or "-"}
         for name, unit in UNITS.items()
     }
-    dotted = {r"\.": {"anyOf": _NUMBERS, "unit": "-"}}  # of parts of packages, also written as tables
+    dotted = {r"\.": {"anyOf": _NUMBERS, "unit": "-"}}  # user-defined parameters; tables are allowed too
     others = {"patternProperties": dotted, "additionalProperties": {"type": "object"}}
     return {"type": "object", "minProperties": 1, "properties": properties, **others}
 
 
 VALUES = _schema()
-"""The JSON schema of `Values`."""
 Values = Annotated[dict[str, Any], BeforeValidator(_arrays), WithJsonSchema(VALUES)]
 """Parameters by name, each a number, a list of numbers, or a list of lists of numbers."""
 Start = Annotated[
     dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_schema(words=(RANDOM,)))
 ]
-"""Values, of which some may be the word "random"."""
+"""`Values` in which first positions and mass fractions may be the word "random"."""
 ParameterName = Annotated[str, OneOf(NAMES), WrapValidator(_known)]
-"""Of a parameter of Cortado, or of a part of a package where whoever reads the tables knows it."""
 
 
 class MeasuredTable(Table):
-    """Something that was measured."""
+    """A measurement of an experiment."""
 
     name: Text
-    """Its name in results; its camera's parameters begin with it, as "camera.rotation"."""
+    """Name of the measurement in results, and prefix of its camera's parameters, as in "camera.rotation"."""
     file: Text
-    """File with the numbers, beside the task's own file."""
+    """File with the measured data, relative to the folder of the task's file."""
     start: Seconds = 0.0
-    """Time on the clock of the run where that of the file shows 0."""
+    """Time of the run at which the file's times are 0."""
 
 
 class VideoTable(MeasuredTable):
-    """Frames of a video, beside pictures of the simulation, whose camera [render] describes."""
+    """Frames of a video, compared with pictures of the simulation by the camera of the table [render]."""
 
     kind: Literal["video"]
     """Frames, compared with pictures."""
     frame_rate: Annotated[float, quantity("1/s", gt=0.0)] | None = None
-    """Frames in a second; needed for a folder of pictures, what the video itself says if left out."""
+    """Frames per second; by default the video's frame rate. Needed for a folder of pictures."""
     every: Annotated[int, count(1, 1_000_000)] = 1
-    """Take only every so many frames."""
+    """Use only every n-th frame."""
     crop: Annotated[tuple[Pixel, ...], components("left", "top", "right", "bottom")] | None = None
-    """The part of each frame that counts, in its pixels; all of it if left out."""
+    """Rectangle of each frame that is compared, in pixels of the frame; by default the full frame."""
     mask: Text | None = None
-    """A picture of the frames' size, beside the task's own file, black where pixels do not count."""
+    """Picture of the frames' size whose black pixels are ignored, relative to the folder of the task's file."""
     calibrate: tuple[Literal["start", "translation", "rotation", "field_of_view", "width", "extinction"], ...] = ()
-    """What of the camera, the fluid's extinction, and the clock is searched beside the parameters; "start" is the key
-    start."""
+    """Camera parameters, extinction of the fluid, or clock ("start", the key start) that are fitted too."""
     noise: Annotated[float, quantity(gt=0.0)] | None = None
-    """Standard deviation of the linear light of a pixel; the residuals tell if left out."""
+    """Standard deviation of the linear light of a pixel; by default estimated from the residuals."""
 
 
 class SensorSeriesTable(MeasuredTable):
-    """What a sensor measured: a CSV file with a column "time" [s], and columns by the names of the sensor's numbers.
-    They may be named as in `sensors.csv`, such as "gauge.height [m]"; columns of other sensors are left out."""
+    """Readings of a sensor: a CSV file with a column "time" [s], and columns named like the sensor's numbers. Columns
+    may be named as in `sensors.csv`, such as "gauge.height [m]"; columns of other sensors are ignored."""
 
     kind: Literal["sensor"]
-    """A series, compared with a [[sensor]] of the scene; heights of a surface are those of a "wave_gauge"."""
+    """A series, compared with a [[sensor]] of the scene; a "wave_gauge" predicts heights of a surface."""
     sensor: Text
-    """The name of the [[sensor]]."""
+    """Name of the [[sensor]]."""
     calibrate: Clock = ()
-    """["start"] to search the key start beside the parameters."""
+    """["start"] fits the key start too."""
     noise: Annotated[float, quantity(gt=0.0)] | None = None
-    """Standard deviation of a number, in its unit; the residuals tell if left out."""
+    """Standard deviation of a number, in its unit; by default estimated from the residuals."""
 
 
 class TracksTable(MeasuredTable):
-    """Paths of tracers: a CSV file with columns "time" [s], "tracer" (a number), "x", "y" and in 3-D "z" [m]. Each
+    """Paths of tracers: a CSV file with columns "time" [s], "tracer" (a number), "x", "y" and in 3-D "z" [m]. Every
     tracer needs a line for the start of the run."""
 
     kind: Literal["tracks"]
     """Tracers, which swim with the fluid around them."""
     calibrate: Clock = ()
-    """["start"] to search the key start beside the parameters."""
+    """["start"] fits the key start too."""
     noise: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Standard deviation of a coordinate [m]; the residuals tell if left out."""
+    """Standard deviation of a coordinate [m]; by default estimated from the residuals."""
 
 
 AnyMeasured = Annotated[VideoTable | SensorSeriesTable | TracksTable, Field(discriminator="kind")]
 
 
 def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ...]:
-    """Check that factors grow to 1, and return them; raise a `field_error` if not."""
+    """Return the factors of a continuation schedule; raise a `field_error` unless they increase to 1."""
     with suppress(ValidationError):
         factors = check(value)
         if factors[-1] == 1.0 and all(a < b for a, b in pairwise(factors)):
@@ -202,7 +186,6 @@ def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ..
 
 
 Schedule = Annotated[Several[Annotated[float, quantity(gt=0.0, le=1.0)]], WrapValidator(_growing)]
-"""A continuation schedule: factors that grow to 1."""
 
 
 class ProblemTable(Table):
@@ -211,27 +194,27 @@ class ProblemTable(Table):
     steps: Annotated[int, count(0, 10_000_000)]
     """Time steps; 0 for a loss of the first state."""
     loss: Literal["positions", "image"] = "positions"
-    """What is compared with the target: positions of particles, or images."""
+    """Compare positions of particles, or images, with the target."""
     distance: Annotated[str, OneOf(DISTANCES)] = "squared_difference"
-    """How images are compared: by their difference, or by a pyramid, for shapes that do not overlap yet."""
+    """Distance between images: their squared difference, or a pyramid, for shapes that do not overlap yet."""
     frames: Annotated[int, count(1, 10_000)] = 1
     """Number of states that are compared, evenly spaced up to the last one."""
     target: Values | None = None
-    """The true parameters by name: the target is what a run with them makes. Either this or a picture is needed."""
+    """True parameters by name: the target is the result of a run with them. Either target or picture is needed."""
     picture: Text | None = None
-    """"heart", "rosetta", or a file with a picture, beside the task's own."""
+    """"heart", "rosetta", or a picture file, relative to the folder of the task's file."""
     measured: tuple[AnyMeasured, ...] = ()
-    """What was measured of an experiment, in the place of a target or a picture; for `cortado fit`."""
+    """Measurements of an experiment, in place of a target or a picture; for `cortado fit`."""
     also: tuple[Text, ...] = ()
-    """Files of other experiments with the same fluid, beside the task's own: scenes with a table [problem] of measured
-    data; for `cortado fit`."""
+    """Files of other experiments with the same fluid, relative to the folder of the task's file, for `cortado fit`:
+    scenes with a table [problem] of measured data."""
 
     @model_validator(mode="after")
     def _check_measured(self) -> Self:
         if not self.measured:
             if self.also:
                 raise field_error(("also",), list(self.also), "left out, as nothing is measured")
-            return self
+            return self._check_target()
         others = {"loss", "distance", "frames", "target", "picture"} & self.model_fields_set
         for name in sorted(others):
             raise field_error((name,), Words("given"), "left out, as there is measured data")
@@ -241,10 +224,7 @@ class ProblemTable(Table):
                 raise field_error(("measured", k, "name"), name, "a name of its own, without a dot")
         return self
 
-    @model_validator(mode="after")
     def _check_target(self) -> Self:
-        if self.measured:
-            return self
         has_picture, most = self.picture is not None, max(self.steps, 1)
         if not has_picture and self.target is None:
             raise field_error(("target",), MISSING, f"{wanted(VALUES)}, as there is no picture")
@@ -262,19 +242,19 @@ class ProblemTable(Table):
 
     @property
     def compared(self) -> list[int]:
-        """Return the numbers of steps before the states that are compared."""
+        """Return the step numbers of the states that are compared."""
         return [round(self.steps * (k + 1) / self.frames) for k in range(self.frames)]
 
 
 class CheckTable(Table):
-    """[optimise.check]: what the estimate has to reach."""
+    """[optimise.check]: criteria that the estimate has to meet."""
 
     loss_reduction: Annotated[float, quantity(ge=1.0)] = 1.0
     """First loss / best loss."""
     parameter_error: Annotated[float, quantity(gt=0.0)] = 1e50
-    """Largest relative distance (L2) of an estimated parameter from its true value."""
+    """Greatest allowed relative distance (L2) of an estimated parameter from its true value."""
     psnr: Annotated[float, quantity("dB", ge=0.0)] = 0.0
-    """Peak signal-to-noise ratio of the image of the estimate to the target."""
+    """Least peak signal-to-noise ratio between the image of the estimate and the target image."""
 
 
 class GradientTable(Table):
@@ -283,12 +263,12 @@ class GradientTable(Table):
     name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
     """Name of the estimator; "adjoint_viscosity" is for long splashes."""
     coefficient: Annotated[float, quantity(ge=0.0)] | None = None
-    """C of `AdjointViscosity`, whose strength is C times what the fluid strains in a step; if left out, 2."""
+    """C of `AdjointViscosity`, whose strength is C times the strain of the fluid in a step; by default 2."""
     samples: Annotated[int, count(1, 10_000)] = 1
     """Runs of the ensemble over which the gradient is averaged: 1, or an even number of at least 4."""
     spread: Values | None = None
-    """By name, for every parameter that is searched, the width of the ensemble in its units (knots, logarithms); needed
-    with several samples. Samples may be outside of the bounds: make parameters that must stay positive logarithmic."""
+    """Width of the ensemble for every searched parameter by name, in the units of its knots or logarithms; needed with
+    several samples. Samples may be out of bounds: make parameters logarithmic that must stay positive."""
     position_noise: Annotated[float, quantity("spacings", ge=0.0)] = EnsembleMean.position_noise
     """Standard deviation of the perturbations of first positions in the ensemble."""
 
@@ -333,31 +313,30 @@ class OptimiseTable(Table):
     """[optimise]: the start of the search, its algorithm, and its length."""
 
     start: Start
-    """By name the parameters that are searched, as the search starts; first positions and mass fractions may be the
-    word "random"."""
+    """First values of the searched parameters by name; first positions and mass fractions may be the word "random"."""
     knots: Annotated[int, count(2, 10_000_000)] | None = None
-    """Number of free rows between which parameters over time are interpolated; if left out, one row for each step."""
+    """Number of knots in time between which parameters over time are interpolated; by default one row per step."""
     logarithmic: tuple[ParameterName, ...] = ()
     """Parameters that are searched by their logarithm."""
     bounds: Values | None = None
-    """By the name of a parameter the lower and the upper bound; viscosity, mobility and fractions never go below 0
-    anyway."""
+    """Lower and upper bound by parameter name; viscosity, mobility and fractions never become negative anyway."""
     extinction_schedule: Schedule = (1.0,)
-    """A continuation schedule: one search for each factor, which starts where the last one ended and sees the fluid
-    with the scene's extinction times that factor. A picture of thinner fluid shows what is behind its surface."""
+    """A continuation schedule of searches. Each search multiplies the scene's extinction by one factor, and starts at
+    the end of the previous search. Pictures of thinner fluid show what is behind its surface."""
     optimiser: Annotated[str, OneOf(BY_NAME)] = "adam"
     """Name of the algorithm; the line search of "lbfgs" needs exact gradients."""
     learning_rate: Annotated[float, quantity("units of the parameters", gt=0.0)]
-    """For Adam about the size of its steps, in units of the parameters; for L-BFGS the size of its first step, for the
-    line search its longest step. For gradient descent the factor of the gradient."""
+    """Approximate step size of Adam, first step size of L-BFGS, or greatest step size of the line search, in units of
+    the parameters. Gradient descent multiplies the gradient by it."""
     tolerance: Annotated[float, quantity(gt=0.0, le=0.5)] | None = None
-    """L-BFGS ends where the gradient is this part of the first one; if left out, where round-off stops it."""
+    """L-BFGS ends if the gradient is smaller than this part of the first gradient; by default, if round-off stops
+    it."""
     iterations: Annotated[int, count(1, MOST_ITERATIONS)]
-    """Updates at most, of each search."""
+    """Greatest number of updates of each search."""
     gradient: GradientTable = GradientTable()
-    """The gradient that the search follows."""
+    """Gradient that the search follows."""
     check: CheckTable = CheckTable()
-    """What the estimate has to reach."""
+    """Criteria that the estimate has to meet."""
 
     @model_validator(mode="after")
     def _check_tolerance(self) -> Self:
@@ -367,7 +346,7 @@ class OptimiseTable(Table):
 
     def algorithm(self) -> Optimiser:
         """Make the optimiser of the table."""
-        setting = "scale" if self.optimiser in WITH_A_SCALE else "learning_rate"
+        setting = "scale" if self.optimiser in ("lbfgs", "line_search") else "learning_rate"
         given = {setting: self.learning_rate, "tolerance": self.tolerance}
         made: Optimiser = BY_NAME[self.optimiser](**{key: one for key, one in given.items() if one is not None})
         return made
@@ -381,19 +360,19 @@ class TaskTables(Table):
 
 
 class FitTable(Table):
-    """[fit]: the parameters that are fitted to measured data, and how long."""
+    """[fit]: the parameters that are fitted to measured data, and the length of the fit."""
 
     start: Values
-    """By name the parameters that are fitted, as the fit starts; positive ones are searched by their logarithm."""
+    """First values of the fitted parameters by name; positive parameters are searched by their logarithm."""
     bounds: Values | None = None
-    """By the name of a parameter the lower and the upper bound; a number whose bounds are the same is not fitted."""
+    """Lower and upper bound by parameter name; a number with equal bounds is not fitted."""
     iterations: Annotated[int, count(1, 10_000)] = 50
-    """Trial points at most, of each of the two fits."""
+    """Greatest number of trial points of each of the two fits."""
     starts: Annotated[int, count(1, 100)] | None = None
-    """From how many starts the fit searches; if left out, from the one that is given, and from three others where that
-    ends in doubt. Others lie within the bounds, or within two decades of a positive number."""
+    """Number of starts of the fit; by default 1, and three more if the first fit ends in doubt. Further starts lie
+    within the bounds, or within two decades of a positive number."""
     profiles: Annotated[int, count(0, 100)] = 7
-    """Points of the profile of each number, each with a fit of all others; 0 for no profiles."""
+    """Number of points of each fitted number's profile, with a fit of all other numbers at each point; 0 for none."""
 
 
 class FitTables(Table):
@@ -404,23 +383,20 @@ class FitTables(Table):
 
 
 def file_schema() -> dict[str, Any]:
-    """Return the JSON schema of a scene or a task. It knows names, types, units and ranges; Cortado itself checks what
-    must fit together."""
-    models = (Scene, TaskTables, FitTables, DatasetTables)
-    scene, task, fit, data_set = (model.model_json_schema() for model in models)
-    tables = {**scene["$defs"], **task["$defs"], **fit["$defs"], **data_set["$defs"]}
+    """Return the JSON schema of scenes, tasks and data sets: names, types, units and ranges of all keys."""
+    schemas = [model.model_json_schema() for model in (Scene, TaskTables, FitTables, DatasetTables)]
+    tables = {name: table for schema in schemas for name, table in schema["$defs"].items()}
     for table in tables.values():
         if "shape" in table.get("properties", {}):  # it has a default in Python, but has to be named in a file
             table["required"] = list(dict.fromkeys(["shape", *table.get("required", [])]))
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **{key: value for key, value in scene.items() if key != "$defs"},
+        **{key: value for key, value in schemas[0].items() if key != "$defs"},
         "title": "A scene of Cortado, a task, or a data set",
-        "properties": {**scene["properties"], **task["properties"], **fit["properties"], **data_set["properties"]},
+        "properties": {key: value for schema in schemas for key, value in schema["properties"].items()},
         "$defs": tables,
     }
 
 
 def file_schema_text() -> str:
-    """Return the JSON schema as the text that is shipped."""
     return json.dumps(file_schema(), indent=1, ensure_ascii=False) + "\n"

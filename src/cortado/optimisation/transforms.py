@@ -1,8 +1,7 @@
-"""Transforms of parameters: coordinates u without constraints for a parameter p(u). Also problems with fixed
-parameters.
+"""Transforms of parameters, and problems with fixed parameters.
 
-For every u, p(u) is a valid parameter: fractions that sum to 1, a positive number, or a parameter over time that
-changes slowly.
+A transform p(u) maps unconstrained coordinates u to a valid parameter: fractions that sum to 1, a positive number, or
+values over time between knots.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +21,7 @@ from cortado.rollout.rollout import Observer
 from cortado.scene.parameter_values import Arrays, Values, check_known, require_points
 
 SMALLEST = 1e-4
-"""Smaller fractions are replaced by this one to compute coordinates, because the coordinate of 0 is minus infinity."""
+"""Least fraction for which `Softmax` computes a coordinate, because the coordinate of 0 is minus infinity."""
 
 
 class Bijector(Protocol):
@@ -32,15 +31,15 @@ class Bijector(Protocol):
         """Return the parameter p(u) at coordinates u."""
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        """Return the u for which p(u) is ``parameter``, or as near to it as possible."""
+        """Return the u for which p(u) is nearest to ``parameter``."""
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
-        """Return the derivative of a loss with respect to u from ``bar``, its derivative with respect to p(u)."""
+        """Return the derivative of a loss with respect to u from ``bar``, the derivative with respect to p(u)."""
 
 
 @dataclass(frozen=True)
 class Logarithm:
-    """The transform p = exp(u): a step in u multiplies the parameter, which stays positive."""
+    """The transform p = exp(u) for positive parameters: a step in u multiplies p."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):  # a problem refuses a parameter that is not finite
@@ -58,7 +57,7 @@ class Logarithm:
 
 @dataclass(frozen=True)
 class Softmax:
-    """The transform p_k = exp(u_k) / sum_l exp(u_l), row by row: fractions (n, phases) that add up to 1."""
+    """The transform p_k = exp(u_k) / sum_l exp(u_l) of each row to fractions (n, phases) that add up to 1."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         return softmax(_fractions("coordinates", u), axis=1)
@@ -74,7 +73,7 @@ class Softmax:
 
 @dataclass(frozen=True)
 class TimeInterpolation:
-    """A transform of p (steps, d), linear in time between knots u (k, d) at even times from first to last step."""
+    """Linear interpolation p (steps, d) between knots u (k, d) at even times from the first to the last step."""
 
     steps: int
     knots: int
@@ -85,12 +84,11 @@ class TimeInterpolation:
 
     @property
     def places(self) -> np.ndarray:
-        """Return the positions (k,) of the knots in steps, counted from 0; they may lie between steps."""
+        """Return the times (k,) of the knots in steps, counted from 0; knots may lie between steps."""
         return np.linspace(0.0, self.steps - 1.0, self.knots)
 
     @property
     def _weights(self) -> np.ndarray:
-        """Return the weights (steps, knots) with which knots enter the values of steps."""
         places = np.linspace(0.0, self.knots - 1.0, self.steps)
         return np.maximum(1.0 - np.abs(places[:, None] - np.arange(self.knots)), 0.0)
 
@@ -106,26 +104,24 @@ class TimeInterpolation:
 
 @fixed
 class Affine:
-    """The transform p = base + matrix u. Examples are accelerations of a tank with a fixed end position, and a nozzle
-    that follows commands with a lag."""
+    """The transform p = base + matrix u, for example for accelerations of a tank with a fixed end position."""
 
     def __init__(self, base: Any, matrix: Any):
-        """Store a ``base`` with the parameter's shape and unit, and a ``matrix`` whose shape is the parameter's
-        followed by that of u."""
+        """Store a ``base`` with the parameter's shape and unit, and a ``matrix`` of shape (*base.shape, *u.shape)."""
         self.base, self.matrix = read_only("base", base), read_only("matrix", matrix)
         if self.matrix.shape[: self.base.ndim] != self.base.shape or self.matrix.ndim == self.base.ndim:
             wanted = f"{self.base.shape}, the shape of base, followed by the shape of the coordinates"
             raise InputError(f"matrix has shape {self.matrix.shape}, but must have {wanted}.")
 
     def __repr__(self) -> str:
-        """Return a text with a checksum of the numbers; a resumed search compares it."""
+        """Return a text with a checksum of the numbers, which a resumed search compares."""
         return f"Affine({sha256(self.base.tobytes() + self.matrix.tobytes()).hexdigest()[:16]})"
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         return self.base + np.tensordot(self.matrix, _shaped("coordinates", u, self._shape), len(self._shape))
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        """Return the shortest vector u among those for which p(u) is nearest to ``parameter``."""
+        """Return the least-norm u for which p(u) is nearest to ``parameter``."""
         offset = _shaped("values", parameter, self.base.shape) - self.base
         matrix = self.matrix.reshape(self.base.size, -1)
         return np.linalg.lstsq(matrix, offset.ravel(), rcond=None)[0].reshape(self._shape)
@@ -135,12 +131,11 @@ class Affine:
 
     @property
     def _shape(self) -> tuple[int, ...]:
-        """Return the shape of u."""
         return self.matrix.shape[self.base.ndim :]
 
 
 class OtherParameters:
-    """A base class of problems as functions of other parameters than their own."""
+    """Base class of problems that are functions of other parameters than the original ``problem``."""
 
     problem: Problem
 
@@ -149,11 +144,10 @@ class OtherParameters:
         raise NotImplementedError
 
     def value(self, u: Values) -> Any:
-        """Return the loss at coordinates u by a forward run."""
         return self.problem.value(self.parameters(u))
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """Return how many points the problem can compute together, see `Batchable.room`."""
+        """Return the greatest number of points in a batch, see `Batchable.room`."""
         return self.problem.room(estimator)
 
     def together(
@@ -166,12 +160,11 @@ class OtherParameters:
 
 @fixed
 class Transformed(OtherParameters):
-    """A problem as a function of coordinates of some parameters, given by bijectors, and of all other parameters
-    unchanged."""
+    """A problem as a function of coordinates of some parameters, and of all other parameters unchanged."""
 
     def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
-        """Store a problem and bijectors by parameter name; raise `InputError` for a parameter that the scene does not
-        have."""
+        """Store a ``problem`` and bijectors ``coordinates`` by parameter name; raise `InputError` for a parameter that
+        the scene does not have."""
         require_methods("problem", problem, ("value", "forward_pass"), "a cortado.Problem")
         require_table("coordinates", coordinates, "{'viscosity': Logarithm()}")
         for name, bijector in coordinates.items():
@@ -209,11 +202,11 @@ class Transformed(OtherParameters):
     def estimate(
         self, u: Mapping[str, Any], gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """Estimate loss and gradient at coordinates u; an ensemble's spread is in units of the coordinates."""
+        """Estimate loss and gradient at coordinates u; an ensemble's spread has the units of the coordinates."""
         return estimate(self, u, gradient, observe)
 
     def forward_pass(self, u: Mapping[str, Any]) -> "TransformedPass":
-        """Run the problem forward at coordinates u, for backward passes by estimators."""
+        """Run the problem forward at coordinates u, before backward passes."""
         return TransformedPass(self.problem.forward_pass(self.parameters(u)), self.coordinates, u)
 
     def together(
@@ -228,14 +221,13 @@ class Transformed(OtherParameters):
 
 
 class TransformedPass:
-    """A forward run of a problem, whose backward pass returns derivatives with respect to coordinates."""
+    """A forward pass whose backward pass returns derivatives with respect to coordinates."""
 
     def __init__(self, forward_pass: ForwardPass, coordinates: Mapping[str, Bijector], u: Mapping[str, Any]):
         self._pass, self._coordinates, self._u = forward_pass, coordinates, u
         self.loss = forward_pass.loss
 
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """Make the backward pass and return the gradient with respect to the coordinates."""
         gradient = self._pass.back(estimator, observe)
         return gradient | by_coordinates(self._coordinates, self._u, gradient)
 
@@ -262,14 +254,12 @@ def _fractions(what: str, value: Any) -> np.ndarray:
 
 
 def by_coordinates(coordinates: Mapping[str, Bijector], u: Mapping[str, Any], gradient: Arrays) -> Arrays:
-    """Return the derivatives with respect to coordinates, given those with respect to the parameters."""
     names = coordinates.keys() & gradient.keys()
     return {name: coordinates[name].adjoint(np.asarray(u[name]), gradient[name]) for name in names}
 
 
 class FixedParameters(OtherParameters):
-    """A problem with some parameters fixed, including first positions, as a function of the other parameters. Ensembles
-    vary the first positions around the fixed ones."""
+    """A problem as a function of the parameters that are not fixed; ensembles perturb the fixed first positions."""
 
     def __init__(self, problem: Problem, fixed: Arrays):
         """Store a problem and ``fixed`` parameters by name, including ``initial_positions`` (n, d) [m]."""
@@ -277,25 +267,21 @@ class FixedParameters(OtherParameters):
         self.simulation = _Simulation(problem, fixed["initial_positions"])
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle and copy the problem by the arguments that it was made from."""
         return FixedParameters, (self.problem, self._fixed)
 
     @property
     def fingerprint(self) -> str:
-        """Return a text that identifies the problem; it does not depend on the fixed values."""
         return f"{self.problem.fingerprint}; fixed {', '.join(self._fixed)}"
 
     def parameters(self, u: Values) -> Values:
-        """Return the parameters of the problem: the fixed ones and those in ``u``."""
         return {**self._fixed, **u}
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
-        """Run the problem forward, for backward passes by estimators."""
         return self.problem.forward_pass(self.parameters(parameters))
 
 
 class _Simulation:
-    """The attributes of a simulation that ensembles use, with other first positions."""
+    """The attributes of a simulation that ensembles use, with fixed first positions."""
 
     batch = None
 

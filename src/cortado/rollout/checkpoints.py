@@ -1,9 +1,4 @@
-"""States that a forward run keeps for its backward pass, and the state at which a resumed run starts.
-
-If a run loses a particle, these states show where, for the error message.
-
-Protocols define what is computed from states on the device: with each step, and after each chunk.
-"""
+"""Checkpoints of a forward run, the state at which a resumed run starts, and the error for a lost particle."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,13 +15,12 @@ from cortado.solvers.containment import Lost, shut_in
 from cortado.solvers.solver import Solver
 
 MEMORY_BUDGET = 8 * 2**30
-"""Bytes of memory for checkpoints; a run that needs more keeps fewer states and recomputes the others."""
 
 
 def checkpoint_interval(steps: int, affordable: int) -> int:
-    """Return the fewest steps between checkpoints for which at most ``affordable`` states are in memory: the
-    checkpoints and the states recomputed between two of them. If no number is few enough, return about the square root
-    of the steps."""
+    """Return the least interval between checkpoints [steps] for which at most ``affordable`` states are in memory:
+    checkpoints, and states recomputed between two checkpoints. If no interval suffices, return about the square root of
+    the steps."""
     if steps <= affordable:
         return 1
     intervals = range(1, isqrt(steps) + 2)
@@ -34,22 +28,18 @@ def checkpoint_interval(steps: int, affordable: int) -> int:
 
 
 class Checkpoints:
-    """The states that one forward run of a rollout keeps, from which a backward pass recomputes the others."""
+    """States of a forward run at every ``interval``-th step, from which a backward pass recomputes the others."""
 
     def __init__(self, first: State, interval: int):
-        """Begin with the first state alone; a checkpoint is kept every ``interval`` steps."""
         self._first, self._interval = first, interval
         self._states: dict[int, Callable[[], State]] = {0: lambda: first}
-        """States by number, each as a function that returns it."""
         self._copies: list[StateSeries] = []
-        """Series with copies of whole chunks."""
 
     def __len__(self) -> int:
         return len(self._states)
 
     def keep(self, step: int, chunk: list[State], series: StateSeries, length: int, spare: list[StateSeries]) -> None:
-        """Keep every interval-th state of a chunk of steps; a chunk of full ``length`` is copied whole into one of the
-        ``spare`` series."""
+        """Store every interval-th state of a chunk; a chunk of full ``length`` is copied to a ``spare`` series."""
         numbers = [n for n in range(step + 1, step + len(chunk) + 1) if n % self._interval == 0]
         if len(numbers) == length:
             copy = spare.pop() if spare else series.like()
@@ -63,8 +53,7 @@ class Checkpoints:
             self._states[n] = partial(_itself, state)
 
     def state(self, n: int, next_state: Callable[[int, State], State]) -> State:
-        """Return state ``n``, recomputed from the last checkpoint with ``next_state(m, state m)`` if need be; called
-        from the last to the first."""
+        """Return state ``n``, if needed recomputed by ``next_state(m, state m)``; call with decreasing ``n``."""
         if n not in self._states:
             for m in range(n - n % self._interval, n):
                 self._states[m + 1] = partial(_itself, next_state(m, self._states[m]()))
@@ -73,7 +62,7 @@ class Checkpoints:
         return self._states[n]()
 
     def release(self) -> list[StateSeries]:
-        """Hand over the copies of whole chunks for reuse; no checkpoint may be read afterwards."""
+        """Return the copies of complete chunks for reuse, which invalidates all checkpoints."""
         copies, self._copies = self._copies, []
         return copies
 
@@ -84,19 +73,17 @@ def _itself(state: State) -> State:
 
 @dataclass(frozen=True)
 class Progress:
-    """The point at which an earlier process stopped a run with equal first state, parameters and steps; a run resumed
-    here has the bits of an unbroken one."""
+    """The point at which an earlier process stopped a run; the resumed run has the bits of an uninterrupted run."""
 
     step: int = 0
-    """Number of steps that the earlier process took."""
     state: State | None = None
     """State after the steps of the earlier process; None for the first state of the run."""
     diagnostics: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Diagnostics of the earlier steps: arrays (step,) by name."""
+    """Diagnostics (step,) of the earlier steps by name."""
 
     def begin(self, initial: State, sizes: StepSizes, keep: bool) -> tuple[State, int, bool]:
-        """Return the state to resume at, its step number, and True if the run ends there. Raises `InputError` where
-        ``keep`` asks for a backward pass, as earlier states are unknown."""
+        """Return the state to resume at, its step number, and True if the run ends there. Raise `InputError` if
+        ``keep`` requires a backward pass through unknown states."""
         if self.state is None:
             return initial, 0, False
         if keep:
@@ -104,7 +91,7 @@ class Progress:
         return self.state, self.step, sizes.go_on(self.step, self.state, self.diagnostics.get("time_steps"))
 
     def whole(self, found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the diagnostics of all steps: those of the earlier process, then those just ``found``."""
+        """Prepend the diagnostics of the earlier process to those ``found``."""
         if self.state is None:
             return dict(found)
         n = self.step
@@ -112,31 +99,26 @@ class Progress:
 
 
 class Beside(Protocol):
-    """Launches beside the steps of a chunk, which are captured with them."""
+    """Protocol of launches that are captured together with the steps of a chunk."""
 
     def launch(self, step: int, parameters: Parameters) -> None:
-        """Launch what reads the solver's arrays after a step of a chunk, counted from 0."""
+        """Launch kernels that read the solver's arrays after a step of a chunk, counted from 0."""
 
 
 class ChunkReader(Protocol):
-    """A reader of the states of a run on the device, chunk by chunk."""
+    """Protocol of readers of states on the device, chunk by chunk."""
 
     @property
     def beside(self) -> Beside | None:
-        """Return what is to be launched beside each step; None for nothing."""
+        """Return launches for each step, or None."""
 
     def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
-        """Read the states at which steps ``step`` to ``end`` began, the ``first`` and those ``later``; the next chunk
-        overwrites them."""
-
-
-AROUND = 6.0
-"""Distance, in spacings, around a lost particle's last position within which causes are sought."""
+        """Read the states before steps ``step`` to ``end``: ``first``, and those of ``later``, which the next chunk
+        overwrites."""
 
 
 def diverged(solver: Solver, member: int, lost: Lost, known: Sequence[State], advice: str) -> DivergedError:
-    """Return the error for a scene of a batch that lost a particle, given at least two states up to the failed step,
-    and advice."""
+    """Return the error for a lost particle of a ``member``, given at least two states up to the failed step."""
     containment, particles = solver.containment, solver.layout.particles
     spacing, d = containment.walled.spacing, containment.walled.dimension
     own = slice(member * particles, (member + 1) * particles)
@@ -145,8 +127,8 @@ def diverged(solver: Solver, member: int, lost: Lost, known: Sequence[State], ad
         where = "had been lost in steps before these"
         return DivergedError(lost.step + 1, lost.particle, "begin that scene anew", where, lost.others)
     position, places = after[lost.particle], np.concatenate([first, was])
-    if not lost.others:
-        places = places[np.linalg.norm(places - was[lost.particle], axis=1) < AROUND * spacing]
+    if not lost.others:  # the cause is near the particle
+        places = places[np.linalg.norm(places - was[lost.particle], axis=1) < 6.0 * spacing]
     if narrow := shut_in(containment, member, places):
         advice = f"{narrow}, or {advice}"
     return DivergedError(

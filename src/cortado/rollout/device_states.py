@@ -1,5 +1,4 @@
-"""States of steps, and derivatives with respect to them, as NumPy arrays or on the device. Other programs exchange
-device arrays by DLPack; parameters over time may stay on the device, too."""
+"""States of steps, derivatives with respect to states, and parameters over time, as NumPy arrays or on the device."""
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,13 +25,11 @@ from cortado.scene.parameters import Axis, Role
 from cortado.scene.restart import Clock, RestartState
 
 OfLost = Mapping[int, float]
-"""For each lost scene of a batch, by number, the value of its derivatives: 0 where the given derivatives are all zero,
-else NaN."""
+"""Value of the derivatives of lost scenes by number: 0 if all given derivatives are 0, else NaN."""
 
 
 def of_lost(rollout: Rollout, given: State, times: np.ndarray, parameters: Parameters | None = None) -> OfLost:
-    """Return, for each lost scene of a batch, 0 if all derivatives given of its state, time (batch,) and parameters are
-    0, else NaN."""
+    """Return 0 for each lost scene whose given derivatives of state, time (batch,) and parameters are 0, else NaN."""
     found = {}
     for b in rollout.lost:
         own = [array.numpy() for array in given.member(b).arrays()]
@@ -42,7 +39,6 @@ def of_lost(rollout: Rollout, given: State, times: np.ndarray, parameters: Param
 
 
 def without_lost(lost: OfLost, found: Arrays) -> Arrays:
-    """Overwrite the rows of lost scenes in the derivatives of a batch with NaN or 0, as ``lost`` says."""
     for b, number in lost.items():
         for array in found.values():
             array[b] = number
@@ -50,28 +46,26 @@ def without_lost(lost: OfLost, found: Arrays) -> Arrays:
 
 
 States = RestartState | tuple[RestartState, ...]
-"""One restart state, or a tuple with one for each scene of a batch."""
+"""A restart state, or a tuple of those of all scenes of a batch."""
 Given = RestartState | Sequence[RestartState] | None
-"""A restart state to go on from, or a sequence with one for each scene of a batch; None for the scene's first state."""
+"""A restart state, or a sequence of those of all scenes of a batch; None for the scene's first state."""
 
 
 class HostStates:
-    """The interface of steps to states on the host: it takes and gives a `RestartState` (one for each scene of a
-    batch), and derivatives as float64 NumPy arrays."""
+    """The interface of steps to states on the host: restart states, and derivatives as float64 NumPy arrays."""
 
     def __init__(self, simulation: Simulated):
         self._simulation = simulation
 
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
-        """Set the first state and the checked parameters of a rollout; raises `InputError` for a state of another
+        """Set the first state and checked parameters of a rollout; raise `InputError` for a state of another
         simulation."""
         states = one_for_each(state, self._simulation.batch)
         space.check_restarts(states, values)
         space.begin(rollout, values, varied, states)
 
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> Any:
-        """Return the state of a rollout after ``steps`` steps as read-only restart states; a lost scene of a batch has
-        NaN in all fields."""
+        """Return the state of a rollout after ``steps`` steps as read-only restart states, NaN for lost scenes."""
         scenes = zip(clocks_after(rollout, steps), rollout.origins, strict=True)
         found = self.states(state, [RestartState({}, clock, origin) for clock, origin in scenes], rollout.lost)
         self._simulation.judged_states.update(found)
@@ -80,7 +74,8 @@ class HostStates:
     def states(
         self, state: State, scenes: Sequence[RestartState], lost: Container[int] = ()
     ) -> tuple[RestartState, ...]:
-        """Copy a device state to read-only restart states with clocks and origins of ``scenes``; lost ones are NaN."""
+        """Copy a device state to read-only restart states with clocks and origins of ``scenes``, NaN for ``lost``
+        scenes."""
         fields, batch = state.numpy(self._simulation.dimension), self._simulation.batch
         found = []
         for b, scene in enumerate(scenes):
@@ -93,8 +88,8 @@ class HostStates:
         return tuple(found)
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
-        """Write derivatives by field name to a device state, 0 for fields left out, and return the derivative of the
-        time; raises `InputError`."""
+        """Write derivatives by field name to a device state, 0 for missing fields; return the derivative of the time.
+        Raise `InputError` for unsuitable arrays."""
         fields, shapes = require_fields(what, given, to), shapes_of_fields(self._simulation, to.batch)
         arrays = {name: as_numbers(f"{what} {name}", value) for name, value in fields.items()}
         for name, array in arrays.items():
@@ -108,20 +103,19 @@ class HostStates:
         return times
 
     def _require_finite(self, what: str, array: np.ndarray) -> None:
-        """Raise `InputError` for derivatives that are not finite, except scenes of a batch that are all NaN."""
         for scene in [array] if self._simulation.batch is None else array:
             lost = self._simulation.batch is not None and np.isnan(scene).all()
             if not lost and not np.isfinite(scene).all():
                 raise InputError(f"{what} has a value that is not finite, but must be numbers.")
 
     def read(self, state: State, lost: OfLost) -> dict[str, Any]:
-        """Return the derivatives of a state's fields by name, in float64. Rows of lost scenes are NaN or 0."""
+        """Return derivatives by field name in float64, with values of ``lost`` for lost scenes."""
         found = {name: array.astype(np.float64) for name, array in state.numpy(self._simulation.dimension).items()}
         return without_lost(lost, found)
 
 
 def require_fields(what: str, given: Values, state: State) -> Values:
-    """Return a table of derivatives by field name without its time. Raises `InputError` for other names and types."""
+    """Return a table of derivatives by field name without the time; raise `InputError` for other names and types."""
     if not isinstance(given, Mapping):
         raise InputError(f"{what} is {shown(given)}, but must be a table of arrays by name, {{'positions': ...}}.")
     known = (*state.names, STATE_TIME)
@@ -132,7 +126,7 @@ def require_fields(what: str, given: Values, state: State) -> Values:
 
 
 def time_of(what: str, given: Values, state: State) -> np.ndarray:
-    """Return the derivative with respect to a state's time, () or (batch,), from a table; 0 where left out."""
+    """Return the derivative with respect to a state's time, () or (batch,), from a table; by default 0."""
     members = () if state.batch is None else (state.batch,)
     found = as_numbers(f"{what} {STATE_TIME}", given.get(STATE_TIME, np.zeros(members)))
     if found.shape != members:
@@ -141,7 +135,7 @@ def time_of(what: str, given: Values, state: State) -> np.ndarray:
 
 
 def clocks_after(rollout: Rollout, steps: int) -> list[Clock]:
-    """Return each scene's clock after ``steps`` steps of a rollout. Scenes that share a clock share its successor."""
+    """Return each scene's clock after ``steps`` steps of a rollout; scenes with the same clock share the new clock."""
     made: dict[tuple[int, float], Clock] = {}
     for clock, size in zip(rollout.clocks, rollout.time_steps.tolist(), strict=True):
         if (id(clock), size) not in made:
@@ -152,11 +146,10 @@ def clocks_after(rollout: Rollout, steps: int) -> list[Clock]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DeviceState:
-    """A state, or those of all scenes of a batch, that stay on the device. `Simulation.on_device` returns one, and
-    steps from it return others, each with arrays of its own.
+    """A state, or the states of all scenes of a batch, in arrays on the device, from `Simulation.on_device` or steps.
 
-    ``state["positions"]`` is a Warp array whose memory ``torch.from_dlpack``, ``jax.dlpack.from_dlpack`` and their like
-    share; nobody may write to it. It has the precision of the simulation, and vectors have three components in 2-D too.
+    ``state["positions"]`` is a read-only Warp array whose memory ``torch.from_dlpack`` and ``jax.dlpack.from_dlpack``
+    share. Arrays have the precision of the simulation, and vectors have three components in 2-D too.
     """
 
     arrays: State
@@ -179,16 +172,15 @@ class DeviceState:
 
 
 class DeviceStates(HostStates):
-    """The interface of steps to states on the device: a `DeviceState`, and derivatives as arrays of DLPack."""
+    """The interface of steps to states on the device: a `DeviceState`, and derivatives as DLPack arrays."""
 
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
-        """Set the first state of a rollout from a `DeviceState`, and its parameters; see `HostStates.begin`."""
         self._require_taken(state)
         space.begin(rollout, values, varied, state.scenes, state.arrays)
         rollout.step_sizes.begin_at(rollout.initial)
 
     def follow(self, rollout: Rollout, state: DeviceState) -> None:
-        """Set the first state of a rollout from a `DeviceState`, and leave its parameters unchanged."""
+        """Set only the first state of a rollout, from a `DeviceState`."""
         self._require_taken(state)
         rollout.begin_evaluation()
         rollout.goes_on, rollout.clocks = True, [scene.clock for scene in state.scenes]
@@ -196,10 +188,9 @@ class DeviceStates(HostStates):
         rollout.step_sizes.begin_at(rollout.initial)
 
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> DeviceState:
-        """Return the state of a rollout after ``steps`` steps as a `DeviceState` with arrays of its own. It shares
-        arrays that no step changes with the `DeviceState` at which the rollout has ``begun``."""
-        made: dict[tuple[int, int], RestartState] = {}
-        """One restart state for all scenes with equal clock and origin: a batch has hundreds of scenes."""
+        """Copy the state of a rollout after ``steps`` steps to a `DeviceState`, which shares constant arrays with the
+        `DeviceState` at which the rollout has ``begun``."""
+        made: dict[tuple[int, int], RestartState] = {}  # one for all scenes with equal clock and origin
         keys = []
         for clock, origin in zip(clocks_after(rollout, steps), rollout.origins, strict=True):
             keys.append((id(clock), id(origin)))
@@ -211,19 +202,18 @@ class DeviceStates(HostStates):
         return DeviceState(own, tuple(made[key] for key in keys))
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
-        """Write derivatives given as arrays on the device, and return that of time; see `HostStates.write`."""
         fields = require_fields(what, given, to)
         to.clear()
         copy_to(to, what, fields)
         return time_of(what, given, to)
 
     def read(self, state: State, lost: OfLost) -> dict[str, Any]:
-        """Return copies of the derivatives of a state's fields by name, in the simulation's precision."""
+        """Return copies of derivatives by field name, in the simulation's precision."""
         own = _without_lost(lost, state.copy())
         return {name: own.numbers(name) for name in own.names}
 
     def replaced(self, space: ParameterSpace, state: DeviceState, fields: Values) -> DeviceState:
-        """Overwrite fields of a device state with given arrays, and check the result on the host."""
+        """Overwrite ``fields`` of a device state, and check the result on the host."""
         given = require_fields("state", fields, state.arrays)
         copy_to(state.arrays, "state", given)
         densities = np.array([scene.origin.rest_density for scene in state.scenes if scene.origin])
@@ -236,7 +226,7 @@ class DeviceStates(HostStates):
         return state
 
     def on_host(self, state: DeviceState) -> States:
-        """Return a device state as read-only NumPy arrays, in a restart state for each scene."""
+        """Copy a device state to read-only restart states."""
         self._require_own(state)
         found = self.states(state.arrays, state.scenes)
         judged = zip(found, state.scenes, strict=True)
@@ -244,7 +234,6 @@ class DeviceStates(HostStates):
         return found[0] if self._simulation.batch is None else found
 
     def _require_taken(self, state: DeviceState) -> None:
-        """Raise `InputError` for a state that this simulation has not made; its arrays are not read."""
         self._require_own(state)
         if not all(scene in self._simulation.judged_states for scene in set(state.scenes)):
             advice = "simulation.on_host(state) is taken by any of the same scene"
@@ -264,8 +253,7 @@ class DeviceStates(HostStates):
 
 
 def copy_to(state: State, what: str, given: Mapping[str, Any]) -> None:
-    """Copy arrays with the DLPack interface to fields of a state; raises `InputError` for arrays of another shape, type
-    or device."""
+    """Copy DLPack arrays to fields of a state; raise `InputError` for another shape, type or device."""
     for name, value in given.items():
         own, array = state.numbers(name), _taken(f"{what} {name}", value)
         if (array.device, array.dtype, array.shape) != (own.device, own.dtype, own.shape):
@@ -275,19 +263,18 @@ def copy_to(state: State, what: str, given: Mapping[str, Any]) -> None:
 
 
 def _taken(what: str, value: Any) -> wp.array:
-    """Return an array of another program as a Warp array that shares its memory; raises `InputError`."""
+    """Convert a DLPack array to a Warp array in the same memory; raise `InputError`."""
     if isinstance(value, wp.array):
         return value
     if not hasattr(value, "__dlpack__"):
         raise InputError(f"{what} is {shown(value)}, but must be an array that speaks DLPack, such as a torch.Tensor.")
-    try:  # NumPy gives nothing that is read-only by DLPack
+    try:  # NumPy refuses DLPack for read-only arrays
         return wp.array(value, device="cpu") if isinstance(value, np.ndarray) else wp.from_dlpack(value)
     except (BufferError, RuntimeError, TypeError, ValueError) as error:
         raise InputError(f"{what} cannot be taken: {error}") from error
 
 
 def _without_lost(lost: OfLost, state: State) -> State:
-    """Overwrite lost scenes in a state, or in derivatives with respect to one, with NaN or 0."""
     for b, number in lost.items():
         for array in state.member(b).arrays() if state.batch is not None else state.arrays():
             array.fill_(number)
@@ -295,15 +282,15 @@ def _without_lost(lost: OfLost, state: State) -> State:
 
 
 class DeviceRows:
-    """Parameters with a row for each step that stay on the device, as Warp arrays in the simulation's precision; a
-    number has shape (1,). Values are not checked: they may be infinite, and a solid may move too far in a step."""
+    """Parameters over time on the device, as Warp arrays in the simulation's precision, with numbers of shape (1,).
+    Values are not checked: they may be infinite, and a solid may move too far in a step."""
 
     def __init__(self, simulation: Simulated, space: ParameterSpace):
         self._simulation, self._space = simulation, space
         self._spread, self._fold = _kernels(simulation.precision)
 
     def split(self, given: Values | None, what: str = "parameter") -> tuple[Values, dict[str, wp.array]]:
-        """Split parameters by name into values for the host to check and Warp arrays that stay on the device; raises
+        """Split parameters by name into values for the host, and Warp arrays that stay on the device; raise
         `InputError` for an array of another shape, type or device."""
         if not isinstance(given, Mapping):
             return {} if given is None else given, {}
@@ -318,27 +305,22 @@ class DeviceRows:
         return {name: value for name, value in given.items() if name not in rows}, rows
 
     def takes(self, name: str) -> bool:
-        """Test if a parameter may stay on the device: one over time that steps use unchanged, and that does not choose
-        their length."""
+        """Test if a parameter may stay on the device: steps of fixed length use its rows unchanged."""
         parameter = None if self._simulation.scene.solver.chooses else self._simulation.known.get(name)
         return parameter is not None and parameter.axis is Axis.STEP and parameter.role is Role.RUN
 
     def stand_ins(self, rows: Mapping[str, wp.array]) -> Arrays:
-        """Return arrays of NaN by name for parameters on the device, until `write` overwrites them."""
         return {name: np.full(self._space.shapes(name)[0], np.nan) for name in rows}
 
     def write(self, rows: Mapping[str, wp.array], parameters: Parameters) -> None:
-        """Copy rows on the device, parameters or tangents, to those of a rollout for all scenes and steps."""
         for name, array in rows.items():
             own = wp.empty_like(parameters[name])
             numbers = _numbers(own)
-            arguments = {"given": self._in_three(name, array), "rows": numbers}
-            launch(self._spread, numbers.shape, numbers.device, **arguments)
+            launch(self._spread, numbers.shape, numbers.device, given=self._in_three(name, array), rows=numbers)
             parameters.set({name: own})
 
     def adjoints(self, rows: Mapping[str, wp.array], found: Parameters, lost: OfLost) -> dict[str, wp.array]:
-        """Sum the adjoints of a rollout's parameters to those of the given rows, in their shapes; NaN or 0 for ``lost``
-        scenes."""
+        """Sum the adjoints ``found`` of a rollout's parameters over scenes and steps that share a row."""
         adjoints = {}
         for name, array in rows.items():
             bars, shape = _numbers(found[name]), self._in_three(name, array).shape
@@ -349,27 +331,26 @@ class DeviceRows:
         return adjoints
 
     def _folded(self, bars: wp.array, shape: tuple[int, ...]) -> wp.array:
-        """Sum adjoints (members, steps, k) over axes that ``shape`` has as 1, as their entries share one row."""
         sums = wp.empty(shape, dtype=bars.dtype, device=bars.device)
         launch(self._fold, shape, bars.device, bars=bars, sums=sums)
         return sums
 
     def _in_three(self, name: str, array: wp.array) -> wp.array:
-        """Reshape rows to (scenes, steps, components), with 1 for an axis along which all share a row."""
+        """Reshape rows to (members, steps, k), with length 1 for an axis along which all share a row."""
         each = prod(self._space.shapes(name)[0])
-        of_each = array.ndim == self._simulation.known[name].rank + 2  # else all scenes of a batch share them
+        of_each = array.ndim == self._simulation.known[name].rank + 2  # otherwise all scenes share the rows
         members = len(array) if of_each else 1
         return array.contiguous().reshape((members, array.size // (members * each), each))
 
 
 def _numbers(array: wp.array) -> wp.array:
-    """View a parameter over time, (members, steps) of vectors or numbers, as numbers (members, steps, k)."""
+    """View vectors or numbers (members, steps) as numbers (members, steps, k)."""
     return components(array, (*array.shape, wp.types.type_size(array.dtype)))
 
 
 @cache
 def _kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return two kernels: one that spreads rows over all scenes and steps, and its transpose, which sums adjoints."""
+    """Return two kernels: ``spread`` copies rows to all scenes and steps, and its transpose ``fold`` sums adjoints."""
     real = precision.real
     module = kernel_module(f"device_rows_{precision.name}")
 

@@ -1,4 +1,4 @@
-"""Warnings about a run: that its pressure did not converge, that an emitter runs dry, or that a batch lost scenes."""
+"""Warnings about a run: unconverged pressure, divergence, a dry emitter, lost scenes."""
 
 from collections.abc import Iterator, Mapping
 
@@ -12,13 +12,7 @@ from cortado.scene.scene import Scene
 from cortado.sph.viscous_stress import Solve
 
 TORN = 0.015
-"""Divergence, times the step, above which a warning is given. Vortices, water at rest, and dams within the longest step
-of a coarse grid reach 0.014. Tanks that sink while pressure builds up reach 0.02, longer steps with a coarse grid 0.02
-to 0.06, and dams at their limit without a coarse grid 0.04."""
-RARE = 0.05
-"""Fraction of steps that may exceed `TORN` without a warning: the first has no earlier pressure, and splashes hit."""
-SAME = 1e-6
-"""Relative shortfall of an emitter's supply that still counts as enough."""
+"""Greatest divergence, times the step, without a warning; stable flows reach 0.014."""
 
 
 def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
@@ -46,7 +40,7 @@ def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
 
 
 def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
-    """Return a warning that says how many steps ended with pressure above the tolerance, and what to try."""
+    """Return a warning with the number of steps whose pressure did not converge, and advice."""
     advice = "try a smaller time step, more iterations or a larger tolerance."
     spacing = scene.discretisation.spacing
     for index, emitter in enumerate(scene.emitter):
@@ -59,12 +53,13 @@ def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
 
 
 def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> str | None:
-    """Return a warning on the step in which the projection left most divergence; None where few steps left much."""
+    """Return a warning on the step with the greatest divergence after the projection, or None if at most 5 % of the
+    steps exceed `TORN`."""
     found = diagnostics.get("divergence", np.zeros(0))
     if not (found > TORN).any():
         return None
-    torn = np.nan_to_num(found, nan=0.0, posinf=0.0)  # what is not finite is of a scene that is lost
-    if scene.solver.kind != "projection" or np.count_nonzero(torn > TORN) <= RARE * torn.size:
+    torn = np.nan_to_num(found, nan=0.0, posinf=0.0)  # lost scenes are not finite
+    if scene.solver.kind != "projection" or np.count_nonzero(torn > TORN) <= 0.05 * torn.size:
         return None
     step, *member = np.unravel_index(torn.argmax(), torn.shape)
     where = f"step {step + 1}" + "".join(f" of scene {b}" for b in member)
@@ -76,8 +71,7 @@ def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> 
 
 
 def dry_sentence(scene: Scene, rollout: Rollout) -> str | None:
-    """Return a warning on the first emitter that runs out of fluid before the run ends, else None. With chosen steps,
-    the end is known only after the run."""
+    """Return a warning on the first emitter that runs out of fluid before the end of the run, or None."""
     spacing, clock = scene.discretisation.spacing, rollout.clocks[0]
     taken = rollout.taken if scene.solver.chooses else rollout.steps
     times = clock.times(np.arange(taken + 1), float(rollout.time_steps.max()))
@@ -86,7 +80,7 @@ def dry_sentence(scene: Scene, rollout: Rollout) -> str | None:
         begun = float(np.max(rollout.initial[emitted_name(emitter.name)].numpy()))
         lengths = begun + np.cumsum(np.append(0.0, flow * np.diff(times))) / emitter.area(spacing)
         supply, end = emitter.supply(spacing) * spacing, times[-1]
-        if emitter.fed_by or lengths[-1] * (1.0 - SAME) <= supply:
+        if emitter.fed_by or lengths[-1] * (1.0 - 1e-6) <= supply:
             continue
         advice = f"scene.lasting({end:.4g}) has more in reserve, as has a scene with emitter[{index}].volume"
         if emitter.volume is not None or scene.lasting(end) is scene:

@@ -1,5 +1,4 @@
-"""Parameters by name: checks of what a user writes, and the conversion to the arrays of a rollout and back. Also the
-number of steps of a run with these parameters."""
+"""Parameters by name: checks, and the conversion to the arrays of a rollout and back; the number of steps of a run."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cached_property
@@ -38,14 +37,14 @@ SAME = 1e-9
 STATE_TIME = "time"
 """Name of the time of a state in tables of derivatives by field."""
 _VARIED = frozenset({"mobility", "viscosity"})
-"""Parameters for which it counts whether a derivative is wanted."""
+"""Parameters for which `ParameterSpace.begin` depends on ``varied``."""
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
-"""Names of parameters on which the number of explicit diffusion substeps depends."""
+"""Parameters that determine the number of explicit diffusion substeps."""
 
 
 class ParameterSpace:
-    """The map from parameters by name, checked, to the arrays of a rollout and back to gradients. In a batch, a value
-    holds for all scenes, or has a first axis for them."""
+    """The map from parameters by name to the arrays of a rollout, and back to gradients. In a batch, values are for all
+    scenes, or have a first axis for the scenes."""
 
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._batch, self._steps = simulation, simulation.batch, steps
@@ -54,18 +53,15 @@ class ParameterSpace:
         self._one = SceneParameters(simulation, steps)
         self._first_positions = FirstPositions(simulation)
         self._told: set[str] = set()
-        """Warnings already given: names of stability limits, and sentences."""
         self._begun: tuple[Rollout, int, Arrays, frozenset[str]] | None = None
-        """How a rollout last began: its evaluation, its values, and the names of varied parameters."""
+        """The last rollout that began, with evaluation, values, and names of varied parameters."""
         self._constants: dict[str, wp.array] = {}
-        """Arrays that no step changes, of the device state at which the rollout began."""
         self._judged: Arrays | None = None
-        """Values that passed the last check: successive steps often have the same values."""
         self._strongest: tuple[Arrays, float] | None = None
-        """Values last checked against stability limits, except gravity, and the strongest gravity [m/s2] so far."""
+        """Values of the last check of stability limits, except gravity, and the strongest gravity [m/s2] so far."""
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
-        """Return values as float64 arrays; raises `InputError`. If ``what`` is "direction", they may be negative."""
+        """Return values as float64 arrays; raise `InputError`. Values of a "direction" may be negative."""
         if not isinstance(values, Mapping):
             raise InputError(f"{what}s are {shown(values)}, but must be given by name, as {{'gravity': value}}.")
         for view, name in self._known.views.items():
@@ -86,7 +82,6 @@ class ParameterSpace:
         return found
 
     def checked_names(self, what: str, names: Iterable[str]) -> list[str]:
-        """Return names of parameters as a list; raises `InputError` for one that the scene does not have."""
         if isinstance(names, str) or not isinstance(names, Iterable):
             raise InputError(f"{what} is {shown(names)}, but must be a list of names, such as ['mobility'].")
         found = list(names)
@@ -95,30 +90,27 @@ class ParameterSpace:
         return found
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
-        """Return the shapes that a parameter may have; raises `InputError` for one unknown to the scene."""
+        """Return the shapes that a parameter may have; raise `InputError` for an unknown parameter."""
         check_known(name, self._simulation.scene, known=self._known)
         own = self._one.shapes(name)
         return [*own, *self._batched(own)]
 
     def members(self, values: Arrays) -> list[Arrays]:
-        """Return checked values as one table for each scene of a batch."""
         different = self._different(values)
         return different if len(different) > 1 else different * (self._batch or 1)
 
     def defaults(self) -> Arrays:
-        """Return the default of every parameter of the scene: a row for each step where its schedule or a force changes
-        it, else the value of `Simulation.parameters`."""
+        """Return the scene's values of all parameters, with a row for each step of scheduled parameters."""
         found = {**scene_values(self._simulation, self._known), **self._one.scheduled({})}
         return {name: value for name, value in found.items() if self._known[name].role is not Role.CLOCK}
 
     def depends_on_time(self, values: Arrays) -> bool:
-        """Test if the clock of a state changes any other parameters than these, or the lengths of its next steps."""
+        """Test if parameters outside ``values``, or lengths of steps, depend on a state's clock."""
         courses = self._one.courses(values).values()
         still = [isinstance(course, Steady) and course.greatest() == 0.0 for course in courses]
         return self._simulation.scene.solver.chooses or not all(still)
 
     def colours(self, values: Arrays) -> np.ndarray:
-        """Return the colours (phases, 3) of the phases in one scene, given or the scene's."""
         return values.get("colours", self._one.values["colours"])
 
     @WARP
@@ -130,12 +122,10 @@ class ParameterSpace:
         states: Sequence[RestartState] = (),
         arrays: State | None = None,
     ) -> None:
-        """Set the first state and the parameters of a rollout: ``values``, and the scene's own, as scheduled, for those
-        left out.
+        """Set the first state and the parameters of a rollout to ``values``, or by default to the scene's values.
 
-        ``varied`` are the parameters whose derivatives are wanted. If the mobility is one, there is a substep of
-        diffusion even if it is 0. ``states`` replace the scene's first state. Their fields come from them or from
-        ``arrays``; those that come from arrays are checked by `check_restarts`.
+        ``varied``: parameters whose derivatives are needed; with the mobility, a substep of diffusion is taken even if
+        the mobility is 0. ``states`` replace the scene's first state, with fields from ``arrays`` if given.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         if arrays is not None and self._goes_on(rollout, values, varied, states):
@@ -158,7 +148,7 @@ class ParameterSpace:
         if simulation.scene.solver.chooses:
             members = [{**own, "time_step": np.array(greatest_step(simulation.scene, own))} for own in members]
         if (simulation.scene.schedule.courses or self._known.courses) and len(members) < len(rollout.clocks):
-            members = members * len(rollout.clocks)  # each at its own time
+            members = members * len(rollout.clocks)
         clocks = rollout.clocks if len(members) > 1 else rollout.clocks[:1]
         chosen = [
             self._one.run({**self._one.scheduled(own, clock), **own})
@@ -168,7 +158,7 @@ class ParameterSpace:
         self._warn(path_sentence(simulation.scene, rollout.initial, members[0], chosen[0], courses))
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
         origins = [origin_of(simulation, one["rest_density"]) for one in chosen]
-        shared = {one: one for one in origins}  # one object where they are equal: a batch has hundreds
+        shared = {one: one for one in origins}  # equal origins are one object, because a batch has hundreds
         rollout.origins = [shared[one] for one in origins] * (len(rollout.clocks) // len(origins))
         rollout.parameters.set(stacked(chosen))
         if not simulation.scene.solver.chooses:
@@ -193,7 +183,6 @@ class ParameterSpace:
         members: list[Arrays],
         arrays: State | None,
     ) -> list[Arrays]:
-        """Record how a rollout has begun, and return the values of each scene."""
         each, scene = members * (len(rollout.clocks) // len(members)), self._simulation.scene
         rollout.advice = lambda member: divergence_advice(scene, each[member], float(rollout.time_steps[member]))
         own = {name: value.copy() for name, value in values.items()}
@@ -202,8 +191,7 @@ class ParameterSpace:
         return each
 
     def _goes_on(self, rollout: Rollout, values: Arrays, varied: Iterable[str], states: Sequence[RestartState]) -> bool:
-        """Test if only the state and gravity have changed since the rollout last began, as in most chains of steps.
-        Then nothing else has to be written and checked again."""
+        """Test if only the state and gravity have changed since the rollout last began."""
         if self._begun is None or self._begun[:2] != (rollout, rollout.evaluation) or not self._is_still:
             return False
         _, _, last, others = self._begun
@@ -217,7 +205,6 @@ class ParameterSpace:
         )
 
     def _go_on(self, rollout: Rollout, members: list[Arrays], states: Sequence[RestartState], arrays: State) -> None:
-        """Set only the state and gravity of a rollout; nothing else has changed."""
         rollout.begin_evaluation()
         rollout.clocks = [state.clock for state in states]
         for name in arrays.names:
@@ -229,19 +216,17 @@ class ParameterSpace:
 
     @cached_property
     def _is_still(self) -> bool:
-        """Return True if nothing in the scene depends on the clock, moves by itself or enters."""
+        """Return True if the scene has no scheduled parameters, emitters or moving solids."""
         scene = self._simulation.scene
         return not (self.depends_on_time({}) or scene.emitter or any(table.moves for table in scene.solid))
 
     def _warn(self, sentence: str | None) -> None:
-        """Give a warning sentence unless this space has given it before."""
         if sentence and sentence not in self._told:
             self._told.add(sentence)
             warn(sentence)
 
     def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
-        """Check that restart states, one for each scene, are of this simulation and fit ``values``; raises
-        `InputError`."""
+        """Raise `InputError` unless restart states of all scenes suit this simulation and ``values``."""
         for name in self._known.state if states else ():
             if name in values:
                 raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
@@ -252,8 +237,8 @@ class ParameterSpace:
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
-        """Return tangents of the first state (0 if it was given) and of the parameters for a direction by name, at
-        ``values``. The next call for this rollout overwrites the latter tangents, so captured graphs stay valid."""
+        """Return tangents of the first state and of the parameters for a direction ``along`` by name, at ``values``.
+        The next call for this rollout overwrites the tangents of the parameters, so that captured graphs stay valid."""
         if self._parameters_dot is None or self._parameters_dot[0] is not rollout:
             self._parameters_dot = rollout, rollout.solver.new_parameters(self._steps)
         dot, parameters = rollout.solver.new_state(), self._parameters_dot[1]
@@ -270,8 +255,8 @@ class ParameterSpace:
         parameters: Parameters,
         time_dots: np.ndarray | None = None,
     ) -> None:
-        """Write a direction by name to tangents of the first state, unless that was given, and of the parameters.
-        ``time_dots`` (members,) are tangents of the first states' times."""
+        """Write a direction ``along`` by name to the tangents ``dot`` of the first state, unless it was given, and
+        ``parameters``. ``time_dots``: tangents (members,) of the first states' times."""
         members, times = self.members(values), np.zeros(len(rollout.clocks)) if time_dots is None else time_dots
         each = zip(members, self.members(along), rollout.clocks, times, strict=True)
         directions = [self._one.direction(*own) for own in each]
@@ -286,8 +271,8 @@ class ParameterSpace:
         return np.array([self._one.time_adjoint(own, entry(run, b), clock) for b, (own, clock) in members])
 
     def state_adjoint(self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters) -> Arrays:
-        """Return the adjoint of the first state as float64 arrays by field name, with its ``time``; in a batch each has
-        a first axis for the scenes."""
+        """Return the adjoint of the first state as float64 arrays by field name, with ``time``; in a batch with a first
+        axis for the scenes."""
         found = {name: bar.astype(np.float64) for name, bar in state.numpy(self._simulation.dimension).items()}
         times = self.time_adjoints(rollout, values, parameters)
         return {**found, STATE_TIME: times[0] if self._batch is None else times}
@@ -300,8 +285,8 @@ class ParameterSpace:
         parameters: Parameters,
         elsewhere: Collection[str] = (),
     ) -> Arrays:
-        """Return the gradient for the names and in the shapes of ``values``, given adjoints of the first state and of
-        the parameters. In a batch each array has a first axis for the scenes; names ``elsewhere`` are left out."""
+        """Return the gradient with respect to ``values``, given adjoints of the first ``state`` and the parameters. In
+        a batch, arrays have a first axis for the scenes. Names in ``elsewhere`` are left out."""
         dimension = self._simulation.dimension
         read = {self._known.views.get(name, name) for name in values}
         read |= set(self._known.over_time) if "time_step" in values else set()
@@ -316,7 +301,6 @@ class ParameterSpace:
         return {name: bar.reshape(self._batch, *self._row(name, values[name])) for name, bar in found.items()}
 
     def _read(self, parameters: Parameters, names: Collection[str]) -> Arrays:
-        """Copy adjoints of some parameters to float64 arrays by name, with a first axis for the scenes."""
         found = {name: parameters[name].numpy().astype(np.float64) for name in self._known.run if name in names}
         vectors = {name: found[name] for name in self._known.vectors if name in found}
         return found | {name: array[..., : self._simulation.dimension] for name, array in vectors.items()}
@@ -334,8 +318,8 @@ class ParameterSpace:
         return array
 
     def _batched(self, own: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
-        """Return the shapes in a batch of a parameter that has shapes ``own`` in one scene. A parameter over time then
-        always has an axis of steps."""
+        """Return the shapes in a batch of a parameter with shapes ``own`` in a scene; parameters over time always have
+        an axis of steps."""
         if self._batch is None:
             return []
         if len(own) == 1:
@@ -343,11 +327,10 @@ class ParameterSpace:
         return [(self._batch, 1, *own[0]), (self._batch, *own[1]), (1, *own[1])]
 
     def _row(self, name: str, value: np.ndarray) -> tuple[int, ...]:
-        """Return the shape of one scene's part of a checked value."""
         return value.shape if value.shape in self._one.shapes(name) else value.shape[1:]
 
     def _different(self, values: Arrays) -> list[Arrays]:
-        """Return one table of values for each scene of a batch, or a single one where all scenes share every value."""
+        """Return a table of values for each scene of a batch, or a single table if the scenes share all values."""
         shared, each = {}, {}
         for name, value in values.items():
             own = self._one.shapes(name)
@@ -361,8 +344,8 @@ class ParameterSpace:
         return [shared | {name: value[b] for name, value in each.items()} for b in members]
 
     def _check(self, values: Arrays, number: int) -> None:
-        """Check the values of one scene; raises `InputError`. It warns, once each, of a time step beyond a limit of
-        stability, and of crowded first positions."""
+        """Check the values of a scene; raise `InputError`. Warn of time steps beyond limits of stability, and of
+        crowded first positions."""
         simulation = self._simulation
         if self._steps == 0:
             return
@@ -381,8 +364,8 @@ class ParameterSpace:
             warn(sentence)
 
     def _is_stronger(self, values: Arrays) -> bool:
-        """Test if values may exceed stability limits that the last checked values met. A change of gravity alone, as
-        policies make in every step, counts only if it is stronger than before."""
+        """Test if values may exceed stability limits that the last values met; False if only gravity changed and is
+        not stronger."""
         others = {name: np.zeros(0) if name == "gravity" else value.copy() for name, value in values.items()}
         strength = float(np.linalg.norm(np.atleast_2d(values["gravity"]), axis=1).max()) if "gravity" in values else 0.0
         last, self._strongest = self._strongest, (others, strength)
@@ -394,13 +377,12 @@ class ParameterSpace:
         return strength > last[1]
 
     def _together(self, fields: list[Arrays]) -> Arrays:
-        """Stack the fields of the states of all scenes along a first axis, from one table or one for each scene."""
         return fields[0] if self._batch is None else stacked(fields * (self._batch // len(fields)))
 
 
 def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, values: Mapping[str, Any]) -> int:
-    """Return the number of steps of a run, given directly or by a time [s] to reach. With adaptive steps it is the
-    number for which there is room. Raises `InputError`."""
+    """Return the number of steps of a run, given directly or by a time [s]; with adaptive steps an upper bound. Raise
+    `InputError` unless exactly one of both is given and valid."""
     if steps is None and time is None:
         raise InputError("steps is left out, but must be given where no time says how long the run is.")
     if steps is not None and time is not None:
@@ -420,12 +402,12 @@ def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, v
             "time is given, but must be left out of a batch that chooses its time steps, whose scenes do not reach it "
             "together: give steps."
         )
-    # a row for each step has no meaning: nobody knows how many there are
+    # with 0 steps, because rows for steps have no meaning with an unknown number of steps
     own = SceneParameters(simulation, 0).upright(ParameterSpace(simulation, 0).checked(values))
     return ROOM * expected_steps(simulation, time, own)
 
 
 def end_after(rollout: Rollout, time: float | None) -> None:
-    """Make a rollout that chooses its steps end with the first state at least ``time`` [s] after its first."""
+    """End a rollout with adaptive steps with the first state at least ``time`` [s] after its start."""
     if time is not None and isinstance(rollout.step_sizes, ChosenSteps):
         rollout.step_sizes.end_after(time * (1.0 - SAME))

@@ -1,8 +1,8 @@
-"""The only time loop: forward runs, checkpoints and backward passes.
+"""The time loop: forward runs, checkpoints and backward passes.
 
-Steps are launched in chunks without a host read in between. At the end of a chunk the host checks whether a particle
-was lost, and whether the neighbour lists were long enough; if not, they grow and the chunk is repeated. A chunk of
-steps, or a step of reverse or forward mode, is a captured graph on a GPU, and on a CPU if launches use one thread.
+Steps are launched in chunks without host reads. After a chunk, the host checks for lost particles, and repeats the
+chunk if neighbour lists were too short. A chunk of steps, or a step of reverse or forward mode, is a captured graph on
+a GPU, and on a CPU if launches use one thread.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,37 +35,36 @@ from cortado.scene.restart import Clock, Origin
 from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepLog, StepTangent
 
 Observer = Callable[[int, State], None]
-"""A function that a run calls with the number of a state and the state, which later steps overwrite."""
+"""Function of a state's number and the state, which later steps overwrite."""
 OBSERVED = "a number of steps", "a state"
 """Descriptions of an observer's two arguments, for error messages."""
 CHUNK = {"cpu": 8, "cuda": 64}
-"""Greatest number of steps between two reads by the host: on a CPU a capture costs four launches, a read little."""
+"""Greatest number of steps between two reads by the host."""
 FILLED = {"cpu": 32_000, "cuda": 16_000_000}
-"""Particles times steps of a chunk, by kind of device, above which a read by the host costs almost nothing."""
+"""Particles times steps of a chunk above which a read by the host costs almost nothing."""
 
 
 class BackwardStep(Protocol):
-    """Protocol of the backward pass through one step, made by an `AdjointEstimator` for one rollout."""
+    """Protocol of the backward pass through a step, made by an `AdjointEstimator` for a rollout."""
 
     capturable: bool
     """True if a backward step may be captured as a CUDA graph."""
     rollout: "Rollout"
-    """Rollout whose steps are differentiated."""
     solver: Solver
-    """Solver whose fields hold the replayed step after `step`."""
+    """Solver whose fields contain the replayed step after `step`."""
 
     def begin(self) -> None:
         """Set the adjoints of the parameters to 0, before a new backward pass."""
 
     def step(self, state: State, counts: Counts, bar: State) -> None:
-        """Replace ``bar``, the adjoint of a step's result, by the adjoint of the state before it."""
+        """Replace ``bar``, the adjoint of a step's result, by the adjoint of the ``state`` before the step."""
 
     def parameters(self) -> Parameters:
         """Return the adjoints of the parameters, summed over all steps since `begin`."""
 
 
 class AdjointStep:
-    """The exact `BackwardStep`: it repeats a step, then propagates the adjoint through it in reverse."""
+    """The exact `BackwardStep`, which repeats a step and propagates the adjoint through the step in reverse."""
 
     capturable = True
 
@@ -86,8 +85,8 @@ class AdjointStep:
 
 
 class Rollout(Staying):
-    """A number of steps of a solver from a first state, which can be repeated and differentiated. Between evaluations
-    ``steps`` may be set to any number up to the one given at construction, its ``room``."""
+    """Steps of a solver from a first state, which can be repeated and differentiated. Between evaluations ``steps`` may
+    be set to any number up to ``room``, the number at construction."""
 
     instead = "but the simulation that it is of can"
 
@@ -101,57 +100,46 @@ class Rollout(Staying):
         self.substeps = 0
         """Explicit steps of diffusion within each step."""
         self.time_steps = np.zeros(solver.layout.members)
-        """(members,) [s], as given; the device rounds them to its precision."""
+        """Time steps (members,) [s] before rounding to the device's precision."""
         self.advice: Callable[[int], str] = lambda member: "try a smaller time step, or more pressure iterations"
-        """Function that returns advice, in words, for a member that diverged."""
         self.clocks = [Clock()] * solver.layout.members
-        """Clocks of the first states, one for each scene of a batch."""
         self.origins: list[Origin] = []
-        """Origins of the particles, one for each scene of a batch."""
         self.lost: dict[int, DivergedError] = {}
-        """Scenes of a batch that lost a particle in the last forward run, by number; later states mean nothing."""
+        """Errors of scenes of a batch that lost a particle in the last forward run; their later states are invalid."""
         self.log = solver.new_log(steps)
-        """What the solver recorded of the steps of the last forward run."""
         self.step_sizes = StepSizes()
         """Lengths of the steps; for adaptive steps a `ParameterSpace` replaces this object."""
         self.progress = Progress()
-        """Where forward runs of the present evaluation start; by default at its first state."""
+        """Start of forward runs of the present evaluation."""
         self.taken = 0
-        """Number of steps of the last forward run: all of them, unless it ended earlier."""
         state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
         self._checkpoints = Checkpoints(self.initial, self._interval)
         self._spare: list[StateSeries] = []
-        """Series of earlier runs that are no longer needed, for the next run that keeps states."""
+        """Unused series of earlier runs, for the next run with checkpoints."""
         self._buffer, self._bar = self.initial.following(), self.initial.like()
         self._input = self._buffer
-        """State at which a chunk begins: the first state, if all steps are in one chunk."""
+        """State before a chunk: the first state, if all steps are in one chunk."""
         kind = "cpu" if self._device.is_cpu else "cuda"
         length = max(min(CHUNK[kind], FILLED[kind] // max(solver.layout.all_particles, 1), steps), 1)
         self._series = StateSeries(self.initial, length)
         self._chunk = [self._series.state(k) for k in range(length)]
-        """States of the last chunk."""
         self._tangent: tuple[Parameters, StepTangent, State] | None = None
-        """The last tangent step, the parameters' tangents for which it was built, and the present state's tangent."""
+        """Tangents of the parameters, the tangent step made for them, and the tangent of the present state."""
         self._generation = -1
         self._forget_stale_graphs()
         self.copies: list[State] = []
-        """Host memory for states that observers have yet to read, kept from run to run."""
         self.beside: dict[tuple[str, ...], Beside] = {}
-        """Launches added to steps, by the names of what they compute, kept from run to run."""
         self.longest_chunk = length
-        """Greatest number of steps in a chunk."""
         self.goes_on = False
-        """Whether the whole first state was given, so that it depends on no parameter."""
+        """True if the first state depends on no parameter."""
         self.evaluation = 0
-        """Number of the present evaluation (first state and parameters); a backward pass belongs to one evaluation."""
+        """Number of the present evaluation (first state and parameters)."""
         self._evaluations = count(1)
         self.pending: WeakSet[Residual] = WeakSet()
-        """Residuals that may return to the present evaluation."""
         self.aside: list[tuple[State, StepLog]] = []
-        """First states and logs that residuals saved and no longer need, reused for the next ones."""
         self._kept = self._run = -1
-        """The evaluations for which states were kept, and to which the last run belonged."""
+        """Evaluations of the present checkpoints, and of the last run."""
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
@@ -160,18 +148,16 @@ class Rollout(Staying):
         return self.progress.whole({**found, **self.step_sizes.diagnostics(len(found["converged"]))})
 
     def is_last(self, step: int) -> bool:
-        """Test if the run ends with the state after ``step`` steps, which was observed."""
         return step == self.steps or self.step_sizes.is_end(step)
 
     @property
     def turn(self) -> Turn:
-        """The lock that a thread holds while it uses the solver."""
         return self.solver.turn
 
     def begin_evaluation(self) -> None:
-        """Prepare for a new first state and parameters: residuals that return to the present ones save copies."""
+        """Prepare for a new first state and parameters; pending residuals save copies of the present ones."""
         if len(self.pending) > 1:
-            self._checkpoints.release()  # of several owners: not to be used again
+            self._checkpoints.release()  # several residuals share them, so they must not be reused
         for pending in list(self.pending):
             pending.put_aside()
         if self.pending:
@@ -187,10 +173,11 @@ class Rollout(Staying):
         meanwhile: Callable[[], None] | None = None,
         reader: ChunkReader | None = None,
     ) -> State:
-        """Run all steps, or those up to the end of its time, and return the last state, which the next run overwrites.
-        ``observe`` is given every state; ``keep`` checkpoints for a way back; ``meanwhile`` is called while a GPU takes
-        the next steps; a ``reader`` reads states on the device. Raises `DivergedError` after the good
-        states were observed; a batch goes on without the scenes that have ``lost`` a particle."""
+        """Run to the last step or the end time; return the last state, which the next run overwrites.
+
+        ``observe``: called with every state; ``keep``: store checkpoints for a backward pass; ``meanwhile``: called
+        while a GPU computes; ``reader``: reads states on the device. Raise `DivergedError` after the valid states were
+        observed; a batch continues without scenes that have ``lost`` a particle."""
         self._kept = self._run = -1
         self._spare += self._checkpoints.release()
         self._checkpoints = Checkpoints(self.initial, self._interval)
@@ -208,7 +195,7 @@ class Rollout(Staying):
                     self.initial if self.room <= self.longest_chunk and state is self.initial else self._buffer
                 )
                 if self._input is self._buffer:
-                    self._buffer.assign(state)  # which may be one of the states that steps overwrite
+                    self._buffer.assign(state)  # steps may overwrite this state
                 chunk = self._advance(step, last, reader)
                 if meanwhile is not None:
                     meanwhile()
@@ -243,8 +230,8 @@ class Rollout(Staying):
         return state
 
     def _advance(self, first: int, last: int, reader: ChunkReader | None) -> list[State]:
-        """Take steps ``first`` to ``last`` from the input state, and return the states after them, which the next
-        chunk overwrites."""
+        """Take steps ``first`` to ``last`` from the input state; return their states, which the next chunk
+        overwrites."""
         length, beside = last - first, None if reader is None else reader.beside
         if self._device.is_cuda and beside not in self._warm:
             self._warm_up(first, beside)
@@ -262,13 +249,13 @@ class Rollout(Staying):
         return self._chunk[:length]
 
     def _length(self, left: int) -> int:
-        """Return the number of steps of the next chunk, of those ``left``. A rollout that has room for more steps cuts
-        its end into powers of two, which runs of other lengths can use again."""
+        """Return the number of steps of the next chunk, at most ``left``. The last chunks of a rollout shorter than
+        its room are powers of two, so that runs of other lengths reuse graphs."""
         length = min(len(self._chunk), self.step_sizes.longest_chunk, left)
         return length if self.steps == self.room or length < left else 1 << (length.bit_length() - 1)
 
     def _warm_up(self, first: int, beside: Beside | None) -> None:
-        """Take one step by launches, as a capture must not load modules or allocate, and take it back."""
+        """Take a step and undo it, because captures must not load modules or allocate memory."""
         self._begin_at(first)
         self._take(1, beside)
         is_short = self.solver.make_room()
@@ -279,7 +266,6 @@ class Rollout(Staying):
         self._warm.add(beside)
 
     def _take(self, length: int, beside: Beside | None) -> None:
-        """Launch ``length`` steps from the input state, and what is launched beside each."""
         state = self._input
         for number, new_state in enumerate(self._chunk[:length]):
             self.solver.step(state, new_state, self.parameters, self.log)
@@ -289,23 +275,21 @@ class Rollout(Staying):
             state = new_state
 
     def _forget_stale_graphs(self) -> None:
-        """Drop captured graphs where this rollout or another has replaced arrays of the solver."""
         if self._generation == self.solver.generation:
             return
         self._generation, self._warm = self.solver.generation, set[Beside | None]()
         self._chunks: dict[tuple[int, Beside | None, bool], CapturedGraph] = {}
-        """Graphs by their number of steps, what is launched beside them, and whether they begin with the buffer."""
+        """Graphs by number of steps, launches beside them, and True if they begin with the buffer."""
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
         self._steps_along: dict[Counts, CapturedGraph] = {}
 
     @in_turn
     def backward(self, derivative: BackwardStep, bars: Mapping[int, State], observe: Observer | None = None) -> State:
-        """Return the adjoint of the first state for ``bars``, adjoints of states by number; the next backward pass
-        overwrites it.
+        """Return the adjoint of the first state, given adjoints ``bars`` of states by number. The next backward pass
+        overwrites the result.
 
-        ``observe`` is given the adjoint of every state, from the last to the first; the next step overwrites it. Raises
-        `InputError` unless `forward` has run to its end since the first state or the parameters were replaced, and has
-        kept states. The next way back overwrites what is returned.
+        ``observe``: called with the adjoint of every state, from the last to the first. Raise `InputError` unless
+        `forward` has run to the end with this first state and these parameters, and with ``keep``.
         """
         if derivative.rollout is not self:
             raise InputError("The derivative was made for another rollout, but must be one of this rollout's own.")
@@ -344,8 +328,8 @@ class Rollout(Staying):
 
     @in_turn
     def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
-        """Propagate ``dot``, the tangent of the first state, to that of the last, giving each state's to ``observe``;
-        `forward` has run with these parameters."""
+        """Replace ``dot``, the tangent of the first state, by the tangent of the last state; ``observe``: called with
+        the tangent of every state. Raise `InputError` unless `forward` has run with these parameters."""
         self._require("along a tangent", self._run)
         self.solver.set_substeps(self.substeps)
         self._forget_stale_graphs()
@@ -370,20 +354,18 @@ class Rollout(Staying):
         self.solver.write_state(counts, self.parameters, self._buffer)
 
     def _require(self, what: str, evaluation: int) -> None:
-        """Raise `InputError` unless a forward run was of the present evaluation."""
         if evaluation != self.evaluation:
             lacking = "as it has not gone forward with these parameters, or has kept no states"
             raise InputError(f"The rollout cannot go {what}, {lacking}: run forward first, with keep=True.")
 
     def _replayed(self, n: int, state: State) -> State:
-        """Return the state after state ``n``, computed again."""
         counts, new_state = self._seek(n), self.initial.following()
         self.solver.replay(state, self.parameters, counts)
         self.solver.write_state(counts, self.parameters, new_state)
         return new_state
 
     def _seek(self, step: int) -> Counts:
-        """Prepare the solver to take a step, counted from 0, again, and return its recorded counts."""
+        """Prepare the solver to repeat a step, counted from 0; return the recorded counts."""
         self._begin_at(step)
         return self.log.seek(step)
 
@@ -392,32 +374,27 @@ class Rollout(Staying):
         self.step_sizes.seek(step)
 
 
-_OF_RUNS = "lost", "_checkpoints", "_kept", "_run"
-OF_AN_EVALUATION = *_OF_RUNS, "clocks", "origins", "substeps", "advice", "goes_on", "evaluation"
-"""Attributes of a rollout that each evaluation replaces by new objects, rather than overwrites."""
+OF_RUNS = "lost", "_checkpoints", "_kept", "_run"
+REPLACED = *OF_RUNS, "clocks", "origins", "substeps", "advice", "goes_on", "evaluation"
 
 
 class Residual:
-    """A handle on one evaluation of a rollout (first state, parameters, checkpoints), which allows a backward pass also
-    after later evaluations.
+    """A handle on an evaluation of a rollout, which allows a backward pass after later evaluations.
 
-    Nothing is copied until another evaluation begins. Then the residual saves the first state and, for as long as it
-    exists, the checkpoints.
+    The residual copies the first state, parameters and log when the next evaluation begins.
     """
 
     def __init__(self, rollout: Rollout):
         self.rollout = rollout
         self._write_back: Callable[[], None] | None = None
-        """Function that writes the saved data back to the rollout."""
         rollout.pending.add(self)
 
     @property
     def turn(self) -> Turn:
-        """The lock that a thread holds while it uses the rollout."""
         return self.rollout.turn
 
     def put_aside(self) -> None:
-        """Copy the first state, parameters and log that another evaluation is about to overwrite."""
+        """Copy the first state, parameters and log before another evaluation overwrites them."""
         rollout = self.rollout
         made = rollout.aside.pop() if rollout.aside else (rollout.initial.like(), rollout.solver.new_log(rollout.room))
         first, log = made
@@ -426,7 +403,7 @@ class Residual:
         time_steps, sizes = rollout.time_steps.copy(), rollout.step_sizes.recorded()
         written = rollout.parameters.written.items()
         rows = {name: wp.clone(row) if isinstance(row, wp.array) else row.copy() for name, row in written}
-        replaced = {name: getattr(rollout, name) for name in OF_AN_EVALUATION}
+        replaced = {name: getattr(rollout, name) for name in REPLACED}
 
         def write_back() -> None:
             rollout.initial.assign(first)
@@ -442,7 +419,6 @@ class Residual:
 
     @in_turn
     def bring_back(self) -> None:
-        """Make this the rollout's present evaluation again."""
         if self._write_back is not None:
             write_back, self._write_back = self._write_back, None
             self.rollout.begin_evaluation()

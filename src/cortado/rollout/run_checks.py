@@ -1,5 +1,4 @@
-"""Checks that the input of a run suits its scene: parameters, first positions, paths of solids, and states at which a
-run resumes."""
+"""Checks of a run's input: parameters, first positions, paths of solids, and restart states."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import chain
@@ -26,9 +25,6 @@ from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.scene import Scene
 from cortado.scene.stability import broken_limits
 
-CROWDED = 0.5
-"""Fraction of the fluid's volume at rest: particles with less room than this in total cannot be pushed apart."""
-
 
 def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
     """Raise `OutOfRangeError` for numbers too large for the precision, or too small where they must be positive."""
@@ -43,8 +39,7 @@ def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
 
 
 def check_places(values: Arrays, scene: Scene, free: int) -> None:
-    """Raise `InputError` if fluid, or an emitter's opening, starts outside the container. Only the first ``free``
-    particles are checked; the others wait in emitters."""
+    """Raise `InputError` if one of the first ``free`` particles, or an emitter's opening, is outside the container."""
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
@@ -54,7 +49,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
                 f"parameter initial_positions has particle {particle} at {place}, outside the container or in a solid."
             )
         room = np.prod(np.ptp(positions[:free], axis=0) + spacing) if free else np.inf
-        if room < CROWDED * (needed := free * spacing**scene.dimension):
+        if room < 0.5 * (needed := free * spacing**scene.dimension):
             unit = "m2" if scene.dimension == 2 else "m3"
             raise InputError(
                 f"parameter initial_positions has all particles within {room:.3g} {unit}, but must leave them about "
@@ -78,8 +73,8 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
 
 
 def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
-    """Return a warning about the tightest stability limit that the time step exceeds, among those not yet in ``told``;
-    None if there is none. All exceeded limits are added to ``told``."""
+    """Return a warning about the tightest exceeded stability limit that is not in ``told``, or None; add all exceeded
+    limits to ``told``."""
     if scene.solver.time_step == "auto":
         return None
     time_step = float(values.get("time_step", scene.solver.time_step))
@@ -93,7 +88,7 @@ def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | Non
 
 
 def outside(room: Room, points: Any, spacing: float) -> np.ndarray:
-    """Return the indices of the points (n, d) [m] outside a room; along a periodic axis no point is outside."""
+    """Return the indices of points (n, d) [m] outside a room."""
     return np.flatnonzero(~room.contains(points, TOLERANCE * spacing))
 
 
@@ -101,27 +96,19 @@ def place_in_words(point: np.ndarray) -> str:
     return f"({', '.join(f'{x:g}' for x in point)}) m"
 
 
-MOVED = 0.05
-"""Distance in spacings: positions that all moved less than this along every axis since their last check are not checked
-again. Searches, ensembles and difference checks move particles so little between runs that they skip the cost."""
-
-
 class FirstPositions:
-    """A checker of the first positions of a batch's scenes, which skips positions that hardly moved since."""
-
     def __init__(self, simulation: Simulated):
         self._simulation, self._warned = simulation, False
         self._judged: dict[int, NDArray] = {}
-        """(n, d) [m], each scene's last checked positions; at first those of the scene itself."""
 
     def check(self, values: Arrays, member: int) -> str | None:
-        """Return a warning where a scene's first positions are crowded, else None. Raises `InputError` where two
-        particles coincide, or would burst apart."""
+        """Return a warning if first positions are crowded, or None; raise `InputError` if two particles coincide, or
+        would burst apart."""
         simulation = self._simulation
         positions = values.get("initial_positions", simulation.positions)
         spacing = simulation.scene.discretisation.spacing
         former = self._judged.get(member, simulation.positions)
-        if np.abs(positions - former).max(initial=0.0) < MOVED * spacing:
+        if np.abs(positions - former).max(initial=0.0) < 0.05 * spacing:
             return None
         lattice, period = simulation.lattice, simulation.scene.container.periods(simulation.dimension)
         check_apart("parameter initial_positions", positions, spacing, period)
@@ -141,16 +128,15 @@ class FirstPositions:
 
 
 FURTHEST = 1.0
-"""Greatest distance, in spacings, that a solid may move in one step: a faster one passes over fluid."""
+"""Greatest distance [spacings] that a solid may move in a step without passing over fluid."""
 SCALES = (0.6, 1.5)
-"""Least and greatest scale of a solid whose wall particles hold fluid: twice as large, a disc leaks 0.8 spacings."""
+"""Least and greatest scale of a solid whose wall particles hold fluid."""
 
 
 def path_sentence(
     scene: Scene, first: State, values: Arrays, run: Arrays, courses: Mapping[str, Changing]
 ) -> str | None:
-    """Return an error sentence on the first faulty path or scale of a solid or nozzle, else None, given the values, the
-    run's arrays and the courses."""
+    """Return a sentence on the first faulty path or scale of a solid or nozzle, or None; ``run``: arrays for steps."""
     leaps = _leaps(scene, values, courses) if scene.solver.chooses else ()
     return next(chain(_stretches(scene, values), leaps, _jumps(scene, first, run, courses)), None)
 
@@ -170,8 +156,8 @@ def _leaps(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> Ite
 
 
 def _jumps(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changing]) -> Iterator[str]:
-    """Yield sentences on solids that move more than a spacing in one step, from the first state on (of a batch, in its
-    first scene). With chosen steps, only solids moved by arrays, without a course, are checked."""
+    """Yield sentences on solids that move more than a spacing in a step, in the first scene of a batch. With adaptive
+    steps, solids with a course are not checked."""
     spacing = scene.discretisation.spacing
     for table in told(scene.solid):
         if scene.solver.chooses and displacement_name(table.name) in courses:
@@ -189,8 +175,7 @@ def _jumps(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changi
 
 
 def _stretches(scene: Scene, values: Arrays) -> Iterator[str]:
-    """Yield sentences on solids whose scale is too far from 1 for their walls, lets them overlap fluid beside them, or
-    leaves a gap in a period."""
+    """Yield sentences on solids whose scale is too far from 1, overlaps fluid, or leaves a gap in a period."""
     spacing, periods = scene.discretisation.spacing, scene.periods[1]
     for table in told(scene.solid):
         scale = float(values.get(scale_name(table.name), 1.0))
@@ -210,18 +195,13 @@ def _stretches(scene: Scene, values: Arrays) -> Iterator[str]:
 
 
 SAME = 1e-6
-"""Relative difference below which two numbers count as equal, as one may have been rounded to float32."""
+"""Relative difference between equal numbers of which one may have been rounded to float32."""
 MIXED = 0.02
 """Relative tolerance of the volume of particles whose phases have diffused, and of the sum of their fractions."""
-BEYOND = 0.5
-"""Amount by which fractions may be below 0 or above 1, as diffusion may leave them."""
-CLOSE, FAR, PART = 0.7, 1.4, 0.1
-"""Bounds in spacings on the distance to a particle's nearest neighbour, above ``CLOSE`` for half of all, and below
-``FAR`` for the part ``PART`` of them."""
 
 
 def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
-    """Return the origin (spacing, kernel, densities, ...) of particles with rest densities (phases,) [kg/m3]."""
+    """Return the origin of particles with rest densities (phases,) [kg/m3]."""
     scene, cut = simulation.scene, simulation.scene.discretisation
     return Origin(
         spacing=cut.spacing,
@@ -235,8 +215,7 @@ def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
 
 
 def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int | None) -> list[RestartState]:
-    """Return restart states as a list, one for each scene; empty for None. Raises `InputError` for another number or
-    type."""
+    """Return a list of restart states for all scenes, empty for None; raise `InputError` for another number or type."""
     if state is None:
         return []
     states = list(state) if isinstance(state, Sequence) and not isinstance(state, str) else [state]
@@ -249,22 +228,21 @@ def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int
 
 
 def check_directions(along: Mapping[str, NDArray], of_state: Collection[str]) -> None:
-    """Raise `InputError` where a direction names parameters of the first state, as its fields replace them."""
     if given := [name for name in of_state if name in along]:
         wanted = "but must be left out: give it among those of the state's fields"
         raise InputError(f"direction {given[0]} is given, {wanted}.")
 
 
 def shapes_of_fields(simulation: Simulated, batch: int | None = None) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of a state's fields by name; with ``batch``, each has a first axis for the scenes."""
+    """Return the shapes of a state's fields by name, with a first axis of length ``batch`` unless None."""
     sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
     members = () if batch is None else (batch,)
     return {field.name: (*members, *field.shape(*sizes)) for field in simulation.initial.fields}
 
 
 def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> None:
-    """Raise `InputError` unless a restart state fits the simulation and the origin of its particles. A state judged
-    before is compared by rest density alone; lost scenes of a batch are not checked."""
+    """Raise `InputError` unless a restart state suits the simulation and the ``origin`` of its particles. Only the
+    origin is compared for states in `Simulated.judged_states`; lost scenes of a batch are not checked."""
     if state.origin is not None and state in simulation.judged_states:
         _check_origin(state.origin, origin)
         return
@@ -289,8 +267,8 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
         _check_spacing(positions[: simulation.free_particles], simulation)
     else:
         _check_origin(state.origin, origin)
-    fractions = fields["mass_fractions"]  # of each particle shares of one whole
-    beyond = np.abs(fractions - 0.5).max(axis=1) > 0.5 + BEYOND
+    fractions = fields["mass_fractions"]
+    beyond = np.abs(fractions - 0.5).max(axis=1) > 1.0  # diffusion may leave fractions from -0.5 to 1.5
     bad = np.flatnonzero(beyond | (np.abs(fractions.sum(axis=1) - 1.0) > MIXED))
     if bad.size:
         wrong = f"state mass_fractions of particle {bad[0]} are {_listed(tuple(fractions[bad[0]].tolist()))}"
@@ -300,7 +278,7 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
     drained, spacing = fields.get("drained", np.zeros(len(positions))), scene.discretisation.spacing
     in_fluid = (drained == 0.0) & ~waits(scene, fields, len(positions))
     free = np.flatnonzero(in_fluid[: simulation.free_particles])
-    for index in outside(scene.resting_room, positions[free], spacing)[:1] if held else ():  # moving ones are elsewhere
+    for index in outside(scene.resting_room, positions[free], spacing)[:1] if held else ():
         particle = free[index]
         place = place_in_words(positions[particle])
         raise InputError(
@@ -311,7 +289,6 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
 
 
 def check_clock(clock: Clock) -> None:
-    """Raise `InputError` unless ``clock`` is a valid `Clock`: whole steps, finite time and step of at least 0."""
     if not isinstance(clock, Clock):
         raise InputError(f"state clock is {shown(clock)}, but must be a Clock, such as that of trajectory.last_state.")
     if not is_whole(clock.steps) or clock.steps < 0:
@@ -323,7 +300,6 @@ def check_clock(clock: Clock) -> None:
 
 
 def _check_origin(found: Origin, wanted: Origin) -> None:
-    """Raise `InputError` where a state's particles have another origin than the simulation's."""
     for name, words in WORDS.items() if found != wanted else ():
         one, other = getattr(found, name), getattr(wanted, name)
         if one is None:
@@ -348,7 +324,6 @@ WORDS = {
     "rest_density": "a rest density of {} kg/m3",
     "solver": "what {} carries from step to step",
 }
-"""Words for each field of an `Origin`, for error messages."""
 ADVICE = {"rest_density": "; a rest density that a run was given is to be given again where it goes on"}
 
 
@@ -359,8 +334,8 @@ def _listed(value: object) -> str:
 
 
 def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) -> None:
-    """Raise `InputError` unless the masses (n,) over volumes at rest match the rest densities. One phase is checked
-    particle by particle, phases that diffuse by their total volume."""
+    """Raise `InputError` unless reference densities (n,) match the rest densities, for a single phase particle by
+    particle, for several phases by total volume."""
     if (found <= 0.0).any():
         raise InputError("state reference_density must be greater than 0.")
     volumes = found * (fractions / rest_density).sum(axis=1)
@@ -377,14 +352,14 @@ def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) 
 
 
 def _check_spacing(positions: NDArray, simulation: Simulated) -> None:
-    """Raise `InputError` unless particles (n, d) of a state without origin are about as far apart as the scene's: most
-    no nearer, and a part of them no further."""
+    """Raise `InputError` unless half of the particles (n, d) of a state are at least 0.7 spacings from the nearest
+    neighbour, and a tenth at most 1.4 spacings."""
     if len(positions) < 2 or not simulation.scene.forces.pressure:
         return
     spacing = simulation.scene.discretisation.spacing
     found, first = (nearest(x) / spacing for x in (positions, simulation.positions[: len(positions)]))
-    usual, least = float(np.median(found)), float(np.quantile(found, PART))
-    if usual < CLOSE or least > FAR * max(float(np.quantile(first, PART)), 1.0):
+    usual, least = float(np.median(found)), float(np.quantile(found, 0.1))
+    if usual < 0.7 or least > 1.4 * max(float(np.quantile(first, 0.1)), 1.0):
         raise InputError(
             f"state positions are usually {usual:.2g} spacings of {spacing:g} m from the nearest other particle, but "
             "must be about one: the state is of a run with another spacing."

@@ -1,7 +1,4 @@
-"""The conversion from the named parameters of one scene to the NumPy arrays on which a run depends, and back.
-
-n counts fluid particles in the order in which the scene lists them, d is the scene's dimension.
-"""
+"""The conversion from the named parameters of a scene to the NumPy arrays of a run, and back."""
 
 from typing import Protocol
 from weakref import WeakSet
@@ -34,30 +31,25 @@ COMPOSITION = ("mass_fractions", "rest_density")
 
 
 class Simulated(Source, Protocol):
-    """Protocol of a simulation as its parameters need it."""
+    """Protocol of simulations for `SceneParameters` and `cortado.rollout.parameter_space`."""
 
     initial: State
     """First state, on the device."""
     known: Known
-    """Parameters of the scene."""
     forces: tuple[ForceMaker, ...]
-    """Makers of the user's own forces."""
     judged_states: WeakSet[RestartState]
-    """Restart states that were checked before; they are immutable, so no second check is needed."""
+    """Restart states that need no further check."""
     batch: int | None
-    """Number of scenes computed together; None for a single one."""
+    """Number of scenes in a batch; None for a single scene."""
 
     @property
-    def dimension(self) -> int:
-        """Number of space dimensions, 2 or 3."""
+    def dimension(self) -> int: ...
 
     @property
-    def precision(self) -> Precision:
-        """The precision of the device's arrays."""
+    def precision(self) -> Precision: ...
 
     @property
-    def smoothing(self) -> SmoothingKernel:
-        """The smoothing kernel W."""
+    def smoothing(self) -> SmoothingKernel: ...
 
     @property
     def lattice(self) -> Lattice:
@@ -65,60 +57,54 @@ class Simulated(Source, Protocol):
 
     @property
     def free_particles(self) -> int:
-        """Number of particles, the first ones, that do not wait in an emitter."""
+        """Number of particles that do not wait in an emitter, the first ones."""
 
     @property
     def carried_by(self) -> str | None:
-        """Name of the solver in sentences, if it adds fields of its own to states; else None."""
+        """Name of the solver in sentences, if it adds fields to states; else None."""
 
     def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
-        """Return the number of explicit diffusion substeps per time step that is stable with these parameters."""
+        """Return the stable number of explicit diffusion substeps per time step."""
 
 
 class SceneParameters:
-    """The map between one scene's parameters by name and the arrays of a run; with tangents and adjoints."""
+    """The map from a scene's parameters by name to the arrays of a run, with tangents and adjoints."""
 
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._steps, self._known = simulation, steps, simulation.known
         self._scheduled = simulation.scene.schedule.courses
         absent = {name: np.zeros(self.shapes(name)[0]) for name in self._known.run}
         self.values: Arrays = absent | scene_values(simulation, self._known)
-        """Values of the parameters in the scene."""
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
-        """Return the shapes that a parameter may have; () is a number."""
         simulation = self._simulation
         return self._known[name].shapes(self._steps, len(simulation.scene.phase), simulation.positions.shape)
 
     def upright(self, values: Arrays) -> Arrays:
-        """Return the values with a tilt replaced by the gravity that it gives."""
         return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
 
     def courses(self, values: Arrays) -> dict[str, Changing]:
-        """Return the courses, by parameter, that apply; a given gravity or tilt replaces scheduled gravity and tilt."""
+        """Return the courses of parameters that are not among ``values``; gravity or tilt replaces both courses."""
         replaced = {"gravity", "tilt"} if not values.keys().isdisjoint(("gravity", "tilt")) else set()
         courses = {**self._scheduled, **self._known.courses}
         found = {name: course for name, course in courses.items() if name not in values and name not in replaced}
         return found | {name: Steady(values[rate]) for rate, name in self._rates(values).items()}
 
     def _rates(self, values: Arrays) -> dict[str, str]:
-        """Return the names of the parameters whose growth rates are among the values."""
         known = self._known
         return {name: known.views[name] for name in values if name in known.views and known[known.views[name]].grows}
 
     def _times(self, name: str, values: Arrays, clock: Clock | None = None) -> NDArray:
-        """Return the times (steps,) [s] at which a scheduled parameter is evaluated; with chosen steps, those that the
-        clock has recorded."""
+        """Return the times (steps,) [s] at which a scheduled parameter is evaluated."""
         time_step = float(values.get("time_step", self.values["time_step"]))
         return (clock or Clock()).times(self._moments(name), time_step)
 
     def _moments(self, name: str) -> NDArray:
-        """Return the moments (steps,), in steps, at which a scheduled parameter is evaluated."""
+        """Return the times (steps,), in steps, at which a scheduled parameter is evaluated."""
         return np.arange(max(self._steps, 1)) + self._known[name].moment
 
     def _scheduled_rates(self, values: Arrays, clock: Clock | None, of_clock: bool = False) -> Arrays:
-        """Return the derivatives of `scheduled` with respect to the time step, or to the clock's time, with a row for
-        each step."""
+        """Return the derivatives (steps, ...) of `scheduled` with respect to the time step, or to the clock's time."""
         found = {}
         for name, course in self.courses(values).items():
             times, moments = self._times(name, values, clock), self._moments(name)
@@ -131,20 +117,20 @@ class SceneParameters:
         return found
 
     def scheduled(self, values: Arrays, clock: Clock | None = None) -> Arrays:
-        """Return the scheduled parameters that are not among ``values``, with a row for each step after a clock:
-        gravity, also from a scheduled tilt, and paths."""
+        """Return the scheduled parameters (steps, ...) that are not among ``values``, with gravity for a scheduled
+        tilt."""
         rows = {name: course.at(self._times(name, values, clock)) for name, course in self.courses(values).items()}
         return {name: value for name, value in self.upright(rows).items() if name in self._known.run}
 
     def scheduled_at(self, values: Arrays, time: float, size: float) -> Arrays:
-        """Return the scheduled parameters for a single step that begins at ``time`` and lasts ``size`` [s]."""
+        """Return the scheduled parameters of a step at ``time`` [s] with length ``size`` [s]."""
         courses = self.courses(values)
         rows = {name: course.at(np.array([time + self._known[name].moment * size])) for name, course in courses.items()}
         return {name: value[0] for name, value in self.upright(rows).items() if name in self._known.run}
 
     def run(self, values: Arrays) -> Arrays:
-        """Return the arrays that steps use, from upright ``values`` or the scene's own: parameters over time with a row
-        for each step, those of phases as (phases,), others as they are."""
+        """Return the arrays for steps, from upright ``values`` or the scene's: parameters over time (steps, ...),
+        parameters of phases (phases,), others unchanged."""
         known = self._known
         found = {name: values.get(name, self.values[name]) for name in known.run}
         for name, value in found.items():
@@ -156,8 +142,8 @@ class SceneParameters:
         return found
 
     def first(self, values: Arrays) -> Arrays:
-        """Return the fields of the first state that these values change. Raises `InputError` for mass fractions without
-        a volume, or more than a little below 0."""
+        """Return the fields of the first state that depend on ``values``; raise `InputError` for mass fractions without
+        volume."""
         fields = first_values(self._simulation.initial.fields, values)
         if values.keys().isdisjoint(COMPOSITION):
             return fields
@@ -175,8 +161,8 @@ class SceneParameters:
     def direction(
         self, values: Arrays, along: Arrays, clock: Clock | None = None, time_dot: float = 0.0
     ) -> tuple[Arrays, Arrays]:
-        """Return a direction by name as tangents of the first state's fields and of the arrays that steps use;
-        ``time_dot`` is the tangent of the clock's time."""
+        """Convert a direction ``along`` by name to tangents of the first state's fields, and of the arrays for steps;
+        ``time_dot``: tangent of the clock's time."""
         for view, replaced in self._known.views.items():
             for name, other in ((view, replaced), (replaced, view)):
                 if name in along and other in values:
@@ -206,22 +192,20 @@ class SceneParameters:
         return first, self.run({**along, **moved})
 
     def changing(self, values: Arrays) -> set[str]:
-        """Return the names of step arrays that the schedule or a force changes over time."""
         return {"gravity" if name == "tilt" else name for name in self.courses(values)}
 
     def time_adjoint(self, values: Arrays, run: Arrays, clock: Clock) -> float:
-        """Return the adjoint of the time at which the steps begin, given those of the step arrays that are
-        `changing`."""
+        """Return the adjoint of the clock's time, given adjoints ``run`` of the arrays for steps."""
         rates = self._scheduled_rates(values, clock, of_clock=True)
         return sum((float((run[name] * rate).sum()) for name, rate in rates.items()), 0.0)
 
     def gradient(self, values: Arrays, first: Arrays, run: Arrays, clock: Clock | None = None) -> Arrays:
-        """Return the gradient for ``values``, in their shapes, from the adjoints of the step arrays ``run`` and of the
-        ``first`` state's fields, at a clock. Names missing in ``run`` are left out."""
+        """Return the gradient with respect to ``values``, given adjoints ``run`` of the arrays for steps, and ``first``
+        of the first state's fields. Names missing in ``run`` are left out."""
         found = {name: run[name].copy() for name in self._known.run if name in values and name in run}
         for field in self._simulation.initial.fields:
             if field.first in values and field.name in first:
-                if self._known[field.first].axis is Axis.STEP:  # the field begins as its first row
+                if self._known[field.first].axis is Axis.STEP:  # the first row is the first value of the field
                     found[field.first][0] += first[field.name][0]
                 else:
                     own = values[field.first].shape

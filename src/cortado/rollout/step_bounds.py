@@ -1,5 +1,5 @@
-"""Bounds on the time steps of a run that hold at any speed of the fluid: limits of the scene, scheduled gravity, and
-motion along paths. Also the number of steps of a run."""
+"""Bounds on the time steps of a run at any speed of the fluid (limits of the scene, scheduled gravity, motion along
+paths), and the number of steps of a run."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,20 +24,17 @@ from cortado.scene.solvers import COURANT
 from cortado.scene.stability import SOLID_STEP, chosen_limits, gravity_limits, stability_limits
 
 ROOM = 4
-"""Safety factor on the number of steps for fluid that falls through the whole container all the time."""
+"""Safety factor on the expected number of steps."""
 MOST = 1e17
 """Greatest number of steps of a run given by its time."""
 LEAST = 1e-4
-"""Shortest step that a path may cause, as a part of the greatest step; a faster path counts as a jump."""
-PARTS = 8
-"""Number of parts of a step at whose ends a changing gravity is evaluated."""
+"""Shortest step that a path may cause, relative to the greatest step; a faster path counts as a jump."""
 Moved = Sequence[tuple[float, Changing | None]]
-"""Courses that move one object, each with the factor from its rate to a speed: 1, or an arm [m] for a turn."""
+"""Courses of an object, with factors from the course's rate to a speed: 1, or an arm [m] for a turn."""
 
 
 def greatest_step(scene: SceneTables, values: Arrays) -> float:
-    """Return the longest step [s] of a run with these parameters at any gravity; raises `InputError` where nothing
-    bounds it."""
+    """Return the longest step [s] of a run at any gravity; raise `InputError` without any bound."""
     found = min(chosen_limits(scene, values).values())
     if not np.isfinite(found):
         raise InputError(
@@ -48,13 +45,13 @@ def greatest_step(scene: SceneTables, values: Arrays) -> float:
 
 
 def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0.0) -> NDArray:
-    """Return the upper bounds (steps,) [s] of each step; a given gravity bounds each by its own row. Raises
-    `InputError` for a bound below the ``least`` [s] of the precision."""
+    """Return upper bounds (steps,) [s] of the steps, also by rows of gravity in ``values``. Raise `InputError` for a
+    bound below the ``least`` [s] of the precision."""
     bounds = np.full(max(steps, 1), greatest_step(scene, values))
     if "gravity" in values:
         limits = gravity_limits(scene, np.atleast_2d(values["gravity"])).values()
         bounds = np.minimum(bounds, np.minimum.reduce(list(limits)))
-    strongest = stability_limits(scene, values)  # which a schedule has at some time
+    strongest = stability_limits(scene, values)  # at the strongest scheduled gravity
     if (shortest := min(float(bounds.min()), strongest["gravity"], strongest["depth"])) < least:
         raise InputError(
             f"The time step is chosen as {shortest:.3g} s at most, but must be at least {least:g} s in this precision: "
@@ -64,7 +61,7 @@ def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0
 
 
 def moved_by(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> dict[str, Moved]:
-    """Return the courses that move each emitter and solid, by a phrase for each, under these values."""
+    """Return the courses of each emitter and solid, by a phrase such as "the emitter 'tap'"."""
     names = [emitter.name for emitter in scene.emitter]
     found: dict[str, Moved] = {f"the emitter {name!r}": [(1.0, courses.get(path_name(name)))] for name in names}
     for solid in told(scene.solid):
@@ -75,22 +72,21 @@ def moved_by(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> d
 
 @dataclass(frozen=True, eq=False)
 class Travel:
-    """The distance covered by the fastest point on some paths, as a piecewise linear function of time."""
+    """The distance that the fastest point on several paths covers, a piecewise linear function of time."""
 
     times: NDArray[np.float64]
-    """Times (k,) from 0 on [s] at which the speed changes."""
+    """Times (k,) [s] of changes of speed, from 0 on."""
     speeds: NDArray[np.float64]
-    """Speeds (k,) after each of the times [m/s]; 0 after the last."""
+    """Speeds (k,) [m/s] after each of the times; 0 after the last."""
     lengths: NDArray[np.float64]
-    """Distances covered (k,) at each of the times [m]."""
+    """Distances (k,) [m] covered at each of the times."""
     furthest: float
-    """Greatest distance in one step [m]."""
+    """Greatest distance in a step [m]."""
     least: float
-    """Length below which paths shorten no step [s]."""
+    """Least length [s] to which paths shorten steps."""
 
     @classmethod
     def of(cls, scene: Scene, values: Arrays, moved: Iterable[Moved]) -> "Travel":
-        """Make the travel of what moves in a scene, given parameter values."""
         known = [[(arm, c) for arm, c in one if isinstance(c, Knots)] for one in moved]
         times = np.unique(np.concatenate([[0.0], *(c.breaks for one in known for _, c in one)]))
         speeds = np.maximum.reduce([np.zeros(len(times)), *(fastest(one, times) for one in known)])
@@ -99,7 +95,7 @@ class Travel:
         return cls(times, speeds, lengths, furthest, LEAST * greatest_step(scene, values))
 
     def longest(self, time: float) -> float:
-        """Return the longest step [s] that may begin at a time [s]; infinite where the paths end before."""
+        """Return the longest step [s] that may begin at a time [s]; infinite after the end of the paths."""
         reached = float(self.at(time)) + self.furthest
         k = int(np.searchsorted(self.lengths, reached, side="right")) - 1
         if self.speeds[k] == 0.0:
@@ -108,12 +104,12 @@ class Travel:
         return max(float(end - time), self.least)
 
     def at(self, times: ArrayLike) -> NDArray[np.float64]:
-        """Return the distance covered [m] at times [s], in their shape."""
+        """Return the distances [m] covered at times [s]."""
         return np.asarray(np.interp(np.asarray(times), self.times, self.lengths))
 
     def steps(self, duration: float, longest: float) -> float:
-        """Return an upper bound on extra steps in ``duration`` [s], beside steps of length ``longest`` [s]: for the
-        distance, and for growing back wherever paths slow down."""
+        """Return an upper bound on further steps in ``duration`` [s], beside steps of length ``longest`` [s], for the
+        distance, and for steps that grow back after paths slow down."""
         begins = np.concatenate([self.times, self.times - duration])
         way = float((self.at(begins + duration) - self.at(begins)).max())
         with np.errstate(divide="ignore"):
@@ -124,18 +120,18 @@ class Travel:
 
 @dataclass(frozen=True, eq=False)
 class Pull:
-    """The bound on steps from gravity that changes over time, either directly or by a tilt."""
+    """The bound on steps by gravity or a tilt that changes over time."""
 
     scene: Scene
     course: Knots
     upright: Callable[[NDArray], NDArray]
     """Function from values of the course to gravity (k, d) [m/s2]."""
     greatest: float
-    """Length that no step exceeds [s]."""
+    """Greatest length of a step [s]."""
 
     @classmethod
     def of(cls, scene: Scene, courses: Mapping[str, Changing], greatest: float) -> "dict[str, Pull]":
-        """Return a `Pull` for each gravity or tilt among the courses of a scene, by a phrase for it."""
+        """Return a `Pull` for the courses of gravity and tilt, by a phrase such as "the scheduled gravity"."""
         upright: dict[str, Callable[[NDArray], NDArray]] = {
             "gravity": np.asarray,
             "tilt": Tilt(scene.forces.gravity).gravity,
@@ -147,8 +143,8 @@ class Pull:
         }
 
     def longest(self, time: float) -> float:
-        """Return the longest step [s] that may begin at a time [s], before gravity becomes too strong for it."""
-        ways = np.linspace(0.0, self.greatest, PARTS + 1)
+        """Return the longest step [s] that may begin at a time [s], before gravity becomes too strong."""
+        ways = np.linspace(0.0, self.greatest, 9)
         known = self.course.breaks - time
         ways = np.concatenate([ways, known[(known > 0.0) & (known < self.greatest)]])
         limits = np.minimum.reduce([*gravity_limits(self.scene, self.upright(self.course.at(time + ways))).values()])
@@ -156,15 +152,15 @@ class Pull:
 
 
 def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) -> dict[str, Travel | Pull]:
-    """Return, by a phrase, the bounds on steps that vary in time: speed along paths, and scheduled gravity."""
+    """Return the bounds on steps by speed along paths and by scheduled gravity, with a phrase as name."""
     courses = parameters.courses(values)
     travel = Travel.of(scene, values, moved_by(scene, values, courses).values())
     return {"the speed along paths": travel, **Pull.of(scene, courses, greatest_step(scene, values))}
 
 
 def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]) -> None:
-    """Make a rollout choose its steps: ``members`` are the upright values of the scenes of a batch; clocks and first
-    states are set."""
+    """Make a rollout choose its steps, after clocks and first states were set; ``members``: upright values of all
+    scenes."""
     if not isinstance(rollout.step_sizes, ChosenSteps):
         courant = COURANT if scene.solver.courant is None else scene.solver.courant
         length = courant * 0.5 * scene.discretisation.support_radius
@@ -177,31 +173,29 @@ def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, 
 
 
 class Courses:
-    """The `Scheduled` of a batch of scenes, each at its own time: bounds on steps, and rows of scheduled parameters."""
+    """The `Scheduled` of a batch: bounds on steps, and rows of scheduled parameters, at the time of each scene."""
 
     def __init__(self, rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]):
         self._rollout, self._parameters, self._members = rollout, parameters, members
         self._bounds = [scheduled_bounds(scene, own, parameters) for own in members]
 
     def longest(self, times: NDArray) -> NDArray:
-        """Return the longest steps (members,) [s] that scheduled changes allow at times (members,) [s]."""
         each = zip(self._bounds, times.tolist(), strict=True)
         return np.array([min(bound.longest(time) for bound in bounds.values()) for bounds, time in each])
 
     def fill(self, step: int, times: NDArray, sizes: NDArray) -> None:
-        """Write the scheduled parameters of a step that begins at ``times`` and lasts ``sizes`` (members,) [s]."""
         each = zip(self._members, times.tolist(), sizes.tolist(), strict=True)
         rows = [self._parameters.scheduled_at(*one) for one in each]
         self._rollout.parameters.set_row(step, stacked(rows))
 
 
 def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
-    """Return an estimate of the number of steps of a run over a time [s]. It assumes that fluid falls through the whole
-    container all the time, and adds steps for paths. Raises `InputError` above `MOST` steps."""
+    """Estimate the number of steps of a run over a time [s] in which fluid always falls through the container, plus
+    steps for paths. Raise `InputError` above `MOST` steps."""
     scene = simulation.scene
     courant = COURANT if scene.solver.courant is None else scene.solver.courant
     limits = stability_limits(scene, values)
-    limit = limits["speed"] * courant * 0.5 / 0.4  # which is of 0.4 support radii
+    limit = limits["speed"] * courant * 0.5 / 0.4  # the limit is for 0.4 support radii
     longest = min(float(step_bounds(scene, values, 1)[0]), limit, limits["gravity"], limits["depth"])
     courses = SceneParameters(simulation, 0).courses(values)
     travel = Travel.of(scene, values, moved_by(scene, values, courses).values())
@@ -209,24 +203,24 @@ def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
 
 
 def counted_steps(time: float, steps: float) -> int:
-    """Return a number of steps rounded up, at least 1; raises `InputError` above `MOST`."""
+    """Return a number of steps rounded up, at least 1; raise `InputError` above `MOST`."""
     if steps > MOST:
         raise InputError(f"time is {time:g} s, but must be less, as that takes about {steps:.2g} steps.")
     return max(ceil(steps), 1)
 
 
 def expected_frames(rollout: Rollout, record_every: int) -> int:
-    """Return the greatest expected number of frames of a run with one every ``record_every`` steps."""
+    """Return the greatest expected number of frames of a run with a frame every ``record_every`` steps."""
     return 2 + rollout.steps // (ROOM if ends_at_a_time(rollout) else 1) // record_every
 
 
 def ends_at_a_time(rollout: Rollout) -> bool:
-    """Test if a rollout ends at a time rather than after a known number of steps."""
+    """Test if a rollout ends at a time, not after a known number of steps."""
     return bool(np.isfinite(rollout.step_sizes.end))
 
 
 def done_of(rollout: Rollout, step: int, time: float) -> int:
-    """Return a rollout's progress after a step, at a time [s]: the step, or percents of a given end time."""
+    """Return a rollout's progress after a step, at a time [s]: the step, or the percentage of a given end time."""
     if not ends_at_a_time(rollout):
         return step
     begun, end = rollout.clocks[0].time, rollout.step_sizes.end

@@ -1,11 +1,8 @@
-"""Lengths of a rollout's steps: fixed, or chosen on the device before each step, recorded, and reused when the step is
-repeated. Some adaptive steps of the projection are taken again with a shorter length.
+"""Lengths of a rollout's steps: fixed, or chosen on the device before each step, recorded, and reused for repeats.
 
-A step is taken again if it compresses fluid or loses a particle. Between facing walls, closer than a spacing, a
-pressure that is right on one side of the middle is wrong on the other. If a step moves a particle too far there, it
-oscillates, and then passes through a wall. A step keeps its length if a shorter one does not help, because fluid was
-compressed before, or because repairs compress it. Only the state before a step decides, so that a resumed run has the
-steps of an uninterrupted one.
+An adaptive step of the projection is retaken with a shorter length if it compresses fluid or loses a particle, as
+between facing walls that are closer than a spacing. The step keeps its length if a shorter step does not help. Only the
+state before a step decides, so that a resumed run has the steps of an uninterrupted run.
 """
 
 from collections.abc import Sequence
@@ -27,22 +24,13 @@ from cortado.solvers.projection.steps import ProjectionSteps
 from cortado.solvers.solver import Solver
 
 PRESSED = 0.2
-"""Fraction of the density: a step that adds more compression than this to a particle is taken again. In dam breaks,
-with ink and with a jug that pours, repairs added at most 0.15."""
+"""Greatest compression, as a fraction of the density, that a step may add to a particle without being retaken."""
 SHORTER = 0.25
 """Factor by which a retaken step is shortened."""
-TIMES = 2
-"""Greatest number of times that a step is shortened."""
-LEAST_SHARE = 0.01
-"""Least length of a shortened step, as a part of the length that its state alone allows."""
-HELPED = 0.5
-"""A shortened step counts as a help if it adds at most this part of the compression of the longer one."""
 
 
 @dataclass(frozen=True)
 class Try:
-    """The length and outcome of one attempt at a step."""
-
     size: float
     """Length of the step [s]."""
     added: float
@@ -50,7 +38,7 @@ class Try:
 
 
 class Retaken:
-    """The record of steps of one run that were taken again with a shorter length."""
+    """The steps of a run that were retaken with a shorter length."""
 
     def __init__(self) -> None:
         self._tries: dict[tuple[int, int], tuple[float, list[Try]]] = {}
@@ -59,9 +47,9 @@ class Retaken:
     def found(
         self, first: int, added: NDArray, sizes: NDArray, longest: NDArray, lost: dict[int, int]
     ) -> dict[tuple[int, int], float]:
-        """Return new lengths [s] by (step, scene) for steps to retake, the first of each scene. Arrays are (steps,
-        members): compression ``added``, ``sizes`` and ``longest`` that states allow [s]; ``lost`` has the step in which
-        a scene lost a particle."""
+        """Return new lengths [s] by (step, scene) for the first step of each scene to retake. Arrays (steps, members):
+        ``added`` compression, ``sizes`` [s], and ``longest`` lengths [s] that states allow. ``lost``: number of the
+        step in which a scene lost a particle."""
         again = {}
         for member in range(added.shape[1]):
             end = lost.get(member, first + len(added))
@@ -69,17 +57,17 @@ class Retaken:
             for step in (*pressing, end) if first <= end < first + len(added) else pressing:
                 n, key = step - first, (step, member)
                 now = Try(float(sizes[n, member]), np.inf if step == end else float(added[n, member]))
-                if key not in self._settled and (size := self._next(key, now, LEAST_SHARE * float(longest[n, member]))):
+                if key not in self._settled and (size := self._next(key, now, 0.01 * float(longest[n, member]))):
                     again[key] = size
                     break
         return again
 
     def _next(self, key: tuple[int, int], now: Try, least: float) -> float | None:
-        """Return the next length [s] to try for a step that failed; None if it keeps its length."""
+        """Return the next length [s], at least ``least``, of a failed step; None if the step keeps its length."""
         least, tries = self._tries.setdefault(key, (least, []))
         tries.append(now)
-        helped = len(tries) == 1 or not np.isfinite(tries[-2].added) or now.added <= HELPED * tries[-2].added
-        if helped and len(tries) <= TIMES and SHORTER * now.size >= least:
+        helped = len(tries) == 1 or not np.isfinite(tries[-2].added) or now.added <= 0.5 * tries[-2].added
+        if helped and len(tries) <= 2 and SHORTER * now.size >= least:
             return SHORTER * now.size
         self._settled.add(key)
         whole = [one for one in tries if np.isfinite(one.added)]
@@ -88,7 +76,7 @@ class Retaken:
 
 
 class Compressions:
-    """The greatest compression that each step of a run adds to any particle, recorded on the device."""
+    """The greatest compression that each step of a run adds to a particle, recorded on the device."""
 
     def __init__(self, solver: ProjectionSteps, steps: int):
         layout, device = solver.layout, solver.device
@@ -98,7 +86,7 @@ class Compressions:
         self._added = wp.zeros((steps, layout.members), dtype=layout.precision.real, device=device)
 
     def measure(self, state: State) -> None:
-        """Record the compression added by the step that led to ``state``; kernel launches only."""
+        """Record the compression added by the step before ``state``; kernel launches only."""
         solver = self._solver
         repaired = solver.repaired[0]
         solver.launch(
@@ -121,14 +109,13 @@ class Compressions:
         )
 
     def read(self, first: int, last: int) -> NDArray[np.float64]:
-        """Return the added compressions (last - first, members) [-] of the steps between two numbers."""
+        """Return the added compressions (last - first, members) [-] of steps ``first`` to ``last``."""
         return np.asarray(self._added[first:last].numpy(), dtype=np.float64)
 
 
 @cache
 def compression_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return two kernels: the compression that a step adds to each particle, and its maximum in each scene. They have
-    no derivatives: a chosen step is held constant."""
+    """Return two kernels without derivatives: added compression of each particle, and its maximum in each scene."""
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"compressions_{precision.name}")
     typed = TypesByName(real, {pair: "added greatest", vector: "x", wp.int32: "order step"})
@@ -136,8 +123,8 @@ def compression_kernels(precision: Precision) -> tuple[Any, Any]:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def compare(particles: int, first_waiting: int, order, n, excess, x_free, x, added):
-        """Write to ``added`` a pair (0, growth of compression) per sorted particle: (n - 1)+ as the last repair finds
-        it less its value before the step. Particles moved by a nozzle, perhaps inside walls, add nothing."""
+        """Write to ``added`` a pair (0, growth of compression) per sorted particle. Compression is (n - 1)+, at the
+        last repair and before the step. Particles in a nozzle, perhaps inside walls, add 0."""
         i = wp.tid()
         more = wp.max(excess[i], real(0.0)) - wp.max(n[i] - real(1.0), real(0.0))
         p = order[i]
@@ -160,67 +147,64 @@ def compression_kernels(precision: Precision) -> tuple[Any, Any]:
 GROWTH = 1.1
 """Greatest ratio of the lengths of two successive steps."""
 LEAST = 1e-6
-"""Least fraction of its other bounds to which the fluid's speed shortens a step. Faster fluid was thrown about, ever
-faster from step to step, by walls that leave it no room."""
+"""Least length to which the fluid's speed shortens a step, as a fraction of the other bounds."""
 
 
 class Scheduled(Protocol):
-    """Protocol of scheduled parameters in the scenes of a batch, as functions of time."""
+    """Protocol of scheduled parameters of all scenes of a batch, as functions of time."""
 
     def longest(self, times: NDArray) -> NDArray:
         """Return the longest steps (members,) [s] that may begin at times (members,) [s]."""
 
     def fill(self, step: int, times: NDArray, sizes: NDArray) -> None:
-        """Write the scheduled parameters for a step, given its number, and its times and lengths (members,) [s]."""
+        """Write the scheduled parameters of a step with times and lengths (members,) [s]."""
 
 
 @dataclass(frozen=True)
 class RecordedSizes:
-    """The step lengths and times of one evaluation, read from the device."""
-
     sizes: NDArray
-    """Lengths (steps + 1, members) [s] of each step, and of the one that would follow."""
+    """Lengths (steps + 1, members) [s] of all steps and the next."""
     times: NDArray
-    """Times (steps + 1, members) [s] of each state."""
+    """Times (steps + 1, members) [s] of all states."""
 
 
 class StepSizes:
-    """The lengths of the steps of a rollout; in this base class a parameter of the scene, equal for all."""
+    """The lengths of the steps of a rollout, in this base class fixed by the parameter ``time_step``."""
 
     longest_chunk = 2**31
-    """Greatest number of steps before the host must read."""
+    """Greatest number of steps between two reads by the host."""
     end = inf
-    """Time [s] at which the run ends at the latest; infinite where it takes all of its steps."""
+    """Latest time [s] of the end of the run; infinite if the number of steps determines the end."""
 
     def begin_at(self, state: State) -> None:
-        """Choose the length of the first step, from the first state."""
+        """Choose the length of the first step."""
 
     def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
-        """Resume after ``step`` steps of lengths ``sizes`` (step,) [s] that an earlier process took, and choose the
-        next. Returns True if the run ends with the state."""
+        """Choose the length of the step after ``step`` steps of lengths ``sizes`` (step,) [s] by an earlier process.
+        Return True if the run ends with the state."""
         return False
 
     def choose(self, state: State) -> None:
-        """Choose the length of the step after ``state``, which the solver has counted; kernel launches only."""
+        """Choose the length of the step after ``state``; kernel launches only."""
 
     def seek(self, step: int) -> None:
         """Set the solver to the recorded length of a step, counted from 0."""
 
     def read(self, first: int, last: int) -> tuple[int, bool]:
-        """Read the lengths of the steps after states ``first`` to ``last``. Returns the last state that belongs to the
-        run, and True if the run ends with it."""
+        """Read the lengths of the steps after states ``first`` to ``last``. Return the number of the run's last state
+        among them, and True if the run ends there."""
         return last, False
 
     def again(self, first: int, last: int) -> bool:
-        """Test if steps between these states, already taken, must be retaken with a shorter length."""
+        """Test if steps between states ``first`` and ``last`` must be retaken with a shorter length."""
         return False
 
     def is_end(self, step: int) -> bool:
-        """Test if the run ends with the state after ``step`` steps, whose length was read."""
+        """Test if the run ends with the state after ``step`` steps."""
         return False
 
     def of_step(self, step: int) -> NDArray | None:
-        """Return the lengths (members,) [s] of a step that the host has read; None where a parameter has it."""
+        """Return the lengths (members,) [s] of a step; None for fixed steps."""
         return None
 
     def diagnostics(self, steps: int) -> dict[str, NDArray]:
@@ -228,20 +212,18 @@ class StepSizes:
         return {}
 
     def recorded(self) -> RecordedSizes | None:
-        """Return the recorded lengths and times that the next evaluation overwrites; None for fixed steps."""
+        """Return the recorded lengths and times; None for fixed steps."""
         return None
 
     def assign(self, recorded: RecordedSizes | None) -> None:
-        """Restore the lengths and times that another evaluation recorded."""
+        """Restore recorded lengths and times."""
 
 
 class ChosenSteps(StepSizes):
-    """Step lengths that each scene's state chooses on the device: see `choose` of `step_size_kernels`. They depend on
-    the greatest speed, a maximum with bits independent of order, and on the clock's last step, so a resumed run has the
-    steps of an unbroken one."""
+    """Step lengths chosen on the device from each scene's state, see `choose` of `step_size_kernels`."""
 
     def __init__(self, solver: Solver, parameters: Parameters, steps: int, length: float):
-        """Prepare the arrays for at most ``steps`` steps; ``length`` is how far a particle may move in one [m]."""
+        """Prepare the arrays for ``steps`` steps, in each of which a particle may move by ``length`` [m]."""
         layout, device, real = solver.layout, solver.device, solver.layout.precision.real
         shape = (steps + 1, layout.members)
         self._solver, self._parameters, self._length = solver, parameters, length
@@ -260,8 +242,8 @@ class ChosenSteps(StepSizes):
         self.longest_chunk = StepSizes.longest_chunk
 
     def begin(self, clocks: Sequence[Clock], bounds: NDArray, scheduled: Scheduled | None) -> list[Clock]:
-        """Prepare a run with upper bounds (steps, members) [s]; with ``scheduled`` parameters the host reads each step.
-        Returns clocks of the first states, which learn the times of later ones."""
+        """Prepare a run with upper bounds (steps, members) [s], and return clocks that record times. With
+        ``scheduled`` parameters the host reads every step."""
         self._steps, room = len(bounds), len(self._bounds)
         self._bounds.assign(np.pad(bounds, ((0, room - len(bounds)), (0, 0)), mode="edge"))
         self._first.assign([clock.time_step for clock in clocks])
@@ -278,9 +260,8 @@ class ChosenSteps(StepSizes):
         self._look(0, 0)
 
     def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
-        """Resume after steps of known lengths; times are summed as on the device, one by one in float64."""
         assert sizes is not None
-        times = np.cumsum([self._read.times[0, 0], *sizes[: step - 1].astype(np.float64)])
+        times = np.cumsum([self._read.times[0, 0], *sizes[: step - 1].astype(np.float64)])  # in the device's order
         self._sizes[:step].assign(sizes[:step, None])
         self._times[:step].assign(times[:, None])
         self._solver.step_number.fill_(step)
@@ -290,7 +271,7 @@ class ChosenSteps(StepSizes):
         return self.is_end(step)
 
     def end_after(self, duration: float) -> None:
-        """Make the run of a single scene end with the first state at least ``duration`` [s] after its first."""
+        """End the run of a single scene with the first state at least ``duration`` [s] after its start."""
         self.end = float(self._read.times[0, 0]) + duration
 
     def choose(self, state: State) -> None:
@@ -345,7 +326,7 @@ class ChosenSteps(StepSizes):
         return bool(self._read.times[step, 0] >= self.end)
 
     def _look(self, first: int, last: int) -> None:
-        """Read the lengths and times of these steps; with scheduled parameters, shorten the last one to their bound and
+        """Read the lengths and times of steps; with scheduled parameters, shorten the last step to their bound and
         write their rows."""
         for found, array in ((self._read.sizes, self._sizes), (self._read.times, self._times)):
             found[first : last + 1] = array[first : last + 1].numpy()
@@ -380,17 +361,14 @@ class ChosenSteps(StepSizes):
 
 @cache
 def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return the two kernels that choose a time step, ``speeds`` and ``choose``. They have no derivatives: a chosen
-    step is held constant."""
+    """Return two kernels without derivatives that choose a time step, ``speeds`` and ``choose``."""
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"step_sizes_{precision.name}")
-
     typed = TypesByName(real, {pair: "greatest squares", vector: "v", wp.int32: "step"})
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def speeds(v, squares):
-        """Write for each particle a pair (0, squared speed), from which a reduction takes the maximum."""
         i = wp.tid()
         squares[i] = pair(real(0.0), wp.length_sq(v[i]))
 
@@ -409,12 +387,11 @@ def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
         longest: wp.array2d(dtype=real),
         time_step,
     ):
-        """Write dt = min(bound, max(length / max |v|, least bound), growth dt of the step before), and the time at
-        which it begins.
+        """Write dt = min(bound, max(length / max |v|, least bound), growth dt of the step before), and the time before
+        the step.
 
-        ``length``: how far a particle may move in a step; ``first``: dt of the step before the first, 0 where there was
-        none; ``longest`` is dt without it. Where no particle moves, nothing is divided by its speed. A speed that is
-        not finite bounds nothing: its particle is lost, and the bound stands until the host has seen it.
+        ``length``: greatest move of a particle in a step; ``first``: dt of the step before the first step, or 0;
+        ``longest``: dt without the last term. Speeds of 0, and infinite speeds of lost particles, do not bound dt.
         """
         b = wp.tid()
         n = step[b]

@@ -1,5 +1,5 @@
-"""Steps of a simulation as a function of a state and of parameters, with derivatives. `Stepping` adds these functions
-to simulations."""
+"""Steps of a simulation as a function of a state and of parameters, with derivatives; `Stepping` adds the functions to
+simulations."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -35,32 +35,27 @@ from cortado.scene.parameter_values import Arrays, Values
 from cortado.solvers.solver import Solver
 
 KEPT = 4
-"""Number of different step counts for which a simulation keeps arrays and graphs."""
-
-
 MOST_GROWTH = 10.0
-"""Growth above which a warning is given [e-folds]: the start of the chain is then 1/22,000 of the adjoint."""
+"""Greatest growth of an adjoint without a warning [e-folds]."""
 
 
 class Steppable(Simulated, Protocol):
-    """Protocol of a simulation as its steps need it."""
-
     solver: Solver
 
 
 class ReverseEstimator(Protocol):
-    """Protocol of an estimator that goes back through a run step by step: a `cortado.gradients.AdjointEstimator`."""
+    """Protocol of `cortado.gradients.AdjointEstimator`, an estimator with a backward pass step by step."""
 
     @property
     def batches(self) -> bool:
-        """True if it treats each scene of a batch by itself."""
+        """True if the estimator treats the scenes of a batch separately."""
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
-        """Return the backward step for one rollout."""
+        """Return the backward step for a rollout."""
 
 
 def require_hash(estimator: Any) -> Any:
-    """Return an estimator by which something is kept; raise `InputError` for one whose settings may change."""
+    """Return an estimator that is a key of a cache; raise `InputError` if its settings may change."""
     try:
         hash(estimator)
     except TypeError as error:
@@ -69,15 +64,14 @@ def require_hash(estimator: Any) -> Any:
 
 
 class BackwardSteps:
-    """The backward steps of estimators for one rollout, each made once."""
+    """A cache of the backward steps of estimators for a rollout."""
 
     def __init__(self, rollout: Rollout):
         self._rollout, self._made = rollout, dict[ReverseEstimator | None, BackwardStep]()
 
     def of(self, estimator: ReverseEstimator | None) -> BackwardStep:
-        """Return an estimator's backward step, the exact one without an estimator. Raises `InputError` for an estimator
-        whose settings may change, as its backward step would keep the first ones, and for one that may mix up the
-        scenes of a batch."""
+        """Return the backward step of an estimator, by default of the exact one. Raise `InputError` for an estimator
+        with variable settings, or, in a batch, for one that may mix up scenes."""
         solver = self._rollout.solver
         if estimator is not None:
             wanted = "an AdjointEstimator such as cortado.gradients.AdjointViscosity()"
@@ -100,15 +94,12 @@ class BackwardSteps:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StepResidual(Staying):
-    """The result of `Stepper.step` that `Stepper.vjp` and `Stepper.jvp` need, valid whatever steps follow."""
+    """The data of `Stepper.step` for `Stepper.vjp` and `Stepper.jvp`, valid after further steps."""
 
     evaluation: Residual
     values: Arrays
-    """Parameters that were given, with stand-ins for rows on the device."""
     rows: Mapping[str, wp.array]
-    """Parameters over time that are on the device."""
     place: HostStates
-    """Interface to the states and to derivatives with respect to them, on the host or on the device."""
     instead = "but the state before its steps and the parameters can, from which they are taken again"
 
     def __repr__(self) -> str:
@@ -118,12 +109,11 @@ class StepResidual(Staying):
 
 
 class AdjointGrowth:
-    """The growth of the adjoint of a simulation's states from call to call of a way back.
+    """The growth of the adjoint of a simulation's states over successive calls of `Stepper.vjp`.
 
-    A call continues the previous call's chain if it ends at the time at which the previous call began. The growth in
-    e-folds is the smaller of two numbers: the norm's growth since the chain began, and the sum of the growths within
-    calls. So neither the losses of segments, nor growth that a policy removes again, count. The norm is that of
-    `cortado.certificate`, sqrt(|x^|^2 + |v^|^2 / T^2) with the time T of the chain.
+    A call continues a chain if its steps end at the time at which the previous call's steps began. The growth in
+    e-folds is the smaller of the norm's growth since the chain began, and the sum of the growths within calls, to
+    exclude losses and policies between calls. The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the time T of the chain.
     """
 
     def __init__(self) -> None:
@@ -132,10 +122,10 @@ class AdjointGrowth:
         self._warned = False
 
     def follow(self, rollout: Rollout, last: State, first: State) -> None:
-        """Record a call that computed the adjoint of the ``first`` state from that of the ``last``. Warn once, in the
-        call in which the growth exceeds `MOST_GROWTH`."""
+        """Add a call with adjoints of the ``last`` and the ``first`` state; warn once if the growth exceeds
+        `MOST_GROWTH`."""
         start, end = (clocks_after(rollout, steps)[0].time for steps in (0, rollout.steps))
-        into, out = _norms(last), _norms(first)
+        into, out = ((_norm(bar.positions), _norm(bar.velocities)) for bar in (last, first))
         if not (abs(end - self._reached) < 0.5 * (end - start) / rollout.steps and any(self._begun)):
             self._begun, self._ended, self._within, self._steps = into, end, 0.0, 0
         self._reached, self._steps = start, self._steps + rollout.steps
@@ -153,33 +143,24 @@ class AdjointGrowth:
             )
 
 
-def _norms(bar: State) -> tuple[float, float]:
-    """Return the norms of the adjoints of positions and velocities over all particles; infinite where squares
-    overflow."""
-    return _norm(bar.positions), _norm(bar.velocities)
-
-
 def _norm(bar: wp.array) -> float:
+    """Return the Euclidean norm of an array, infinite if squares overflow."""
     numbers = bar.numpy().reshape(-1) if bar.device.is_cpu else None
     return math.sqrt(wp.utils.array_inner(bar, bar) if numbers is None else numbers @ numbers)
 
 
 class Stepper:
-    """A fixed number of steps of a simulation, as a function of the state before them and of parameters.
-
-    Its arrays, graphs and kernels are made once and serve every call.
-    """
+    """A fixed number of steps of a simulation, as a function of the first state and of parameters. All calls share
+    arrays, graphs and kernels."""
 
     def __init__(self, simulation: Steppable, steps: int):
         """Prepare a rollout of ``steps`` steps, which may be 0."""
         self._simulation, self._space = simulation, ParameterSpace(simulation, steps)
         self._rows = DeviceRows(simulation, self._space)
         self.rollout = Rollout(simulation.solver, steps)
-        """The rollout that takes the steps, with the parameters of the last ones."""
         self._derivatives = BackwardSteps(self.rollout)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle or copy the stepper as its simulation and number of steps."""
         return type(self), (self._simulation, self.rollout.steps)
 
     @property
@@ -195,7 +176,7 @@ class Stepper:
 
     @in_turn
     def on_device(self, state: Given | DeviceState, fields: Values, parameters: Values | None = None) -> DeviceState:
-        """Return a state of a run with these parameters, in device arrays of its own, with other ``fields``."""
+        """Return a copy of a state on the device, with replaced ``fields``."""
         values, place = self._checked(parameters), DeviceStates(self._simulation)
         self._begin(state, values, {})
         found = place.state(self.rollout, self.rollout.initial, 0)
@@ -210,20 +191,17 @@ class Stepper:
 
     @in_turn
     def advance(self, state: Given | DeviceState, parameters: Values | None = None) -> States | DeviceState:
-        """Return the state after the steps, on the device if the given one is.
-
-        A parameter over time may be a Warp array on the device, in the simulation's precision. It stays there and is
-        not checked.
-        """
+        """Return the state after the steps, on the device if ``state`` is. Parameters over time may be Warp arrays on
+        the device in the simulation's precision, which are not checked."""
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows)
         return place.state(self.rollout, self._forward(keep=False), self.rollout.steps, state)
 
     @in_turn
     def follow(self, state: DeviceState, rows: Arrays) -> DeviceState:
-        """Return the state after the steps with the parameters of the last `advance`, except ``rows`` over time (batch,
-        steps, ...), which are not checked: for controllers of many scenes. ``rows`` must include all parameters over
-        time that `advance` was given."""
+        """Return the state after the steps, with the parameters of the last `advance` except ``rows`` (batch, steps,
+        ...), for controllers of many scenes. ``rows`` must include all parameters over time of the last `advance`, and
+        are not checked."""
         place = DeviceStates(self._simulation)
         if self._space.depends_on_time(rows):
             place.begin(self._space, self.rollout, state, dict(rows), set())
@@ -236,11 +214,10 @@ class Stepper:
     def step(
         self, state: Given | DeviceState, parameters: Values | None = None, along: Iterable[str] = ()
     ) -> tuple[States | DeviceState, StepResidual]:
-        """Return the state after the steps, and a residual for `vjp` and `jvp`; several may be held at once.
+        """Return the state after the steps, and a residual for `vjp` and `jvp`. Any number of residuals may exist.
 
-        Any number of residuals may exist at a time, each with states of its own. ``along`` names further parameters of
-        later `jvp` directions. Only the mobility must be named, because fluid with mobility 0 is computed without
-        diffusion. Parameters may be on the device, as for `advance`.
+        ``along``: further parameters in directions of `jvp`. Only the mobility must be named, because fluid with
+        mobility 0 is computed without diffusion. Parameters may be on the device, as for `advance`.
         """
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows, {*values, *self._space.checked_names("along", along)})
@@ -251,14 +228,14 @@ class Stepper:
     def vjp(
         self, residual: StepResidual, state_bar: Values, gradient: ReverseEstimator | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the adjoints of the state before the steps and of the given parameters, given the adjoint of the state
-        after the steps (reverse mode). ``gradient`` is the estimator, exact if left out: see `docs/gradients.md`.
+        """Return the adjoints of the first state and of the given parameters, given the adjoint ``state_bar`` of the
+        last state (reverse mode). ``gradient``: the estimator, by default the exact one, see `docs/gradients.md`.
 
-        The adjoint of a state is a table of arrays by field name, in the fields' shapes, and of its ``time``, a number;
-        missing entries are 0. For a `DeviceState` its arrays are on the device; all other results are in float64. In a
-        batch arrays have a first axis for the scenes. Results for a lost scene are NaN, or 0 if its given adjoint is 0
-        throughout. The adjoint of a parameter on the device is on the device, in the parameter's shape. Raises
-        `InputError` for fields that the state does not have, or that have other shapes.
+        The adjoint of a state is a table of arrays by field name, in the fields' shapes, and a number ``time``; missing
+        entries are 0. Arrays of a `DeviceState` are on the device; all other results are in float64. In a batch, arrays
+        have a first axis for the scenes. Results for a lost scene are NaN, or 0 if its adjoint in ``state_bar`` is 0.
+        The adjoint of a parameter on the device is on the device, in the parameter's shape. Raise `InputError` for
+        unknown fields, or fields of other shapes.
         """
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
         adjoint = self._derivatives.of(gradient)
@@ -281,8 +258,8 @@ class Stepper:
 
     @in_turn
     def jvp(self, residual: StepResidual, state_dot: Values, parameter_dots: Values | None = None) -> dict[str, Any]:
-        """Return the tangent of the state after the steps, given the tangents of the state before and of parameters
-        (forward mode). The forms are those of `vjp`."""
+        """Return the tangent of the last state, given the tangents of the first state and of parameters (forward mode),
+        in the same form as adjoints in `vjp`."""
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
         looked_at, rows = self._rows.split(parameter_dots, "direction")
         along = space.checked(looked_at, "direction")
@@ -324,7 +301,7 @@ class Stepper:
         rows: Mapping[str, wp.array],
         varied: Iterable[str] = (),
     ) -> HostStates:
-        """Set the first state and parameters of the rollout; return the host's or the device's interface to states."""
+        """Set the first state and parameters of the rollout; return the interface to states on the host or device."""
         place = (DeviceStates if isinstance(state, DeviceState) else HostStates)(self._simulation)
         place.begin(self._space, self.rollout, state, values, set(varied))
         self._rows.write(rows, self.rollout.parameters)
@@ -334,12 +311,10 @@ class Stepper:
         return self._space.checked({} if parameters is None else parameters)
 
     def _given(self, parameters: Values | None) -> tuple[Arrays, dict[str, wp.array]]:
-        """Return two tables: the checked parameters, with NaN where one is on the device, and those on the device."""
         looked_at, rows = self._rows.split(parameters)
         return self._space.checked(looked_at) | self._rows.stand_ins(rows), rows
 
     def _forward(self, keep: bool) -> State:
-        """Take the steps; ``keep`` stores checkpoints for a backward pass. Warns and raises as `Simulation.run`."""
         last = self.rollout.forward(keep=keep)
         for sentence in trouble(self.rollout, self._simulation.scene):
             warn(sentence)
@@ -355,29 +330,29 @@ class Stepping:
         raise NotImplementedError
 
     def state(self, parameters: Values | None = None) -> States:
-        """Return the state before the first step, from which `step` and ``Simulation.run(state=...)`` can start; for a
-        batch a tuple with one state for each scene.
+        """Return the state before the first step, for `step` and ``Simulation.run(state=...)``; in a batch a tuple of
+        the states of all scenes.
 
-        ``parameters`` may be any parameters of `Problem` on which the first state depends, such as
-        ``initial_velocities``. Raises `InputError` for parameters that do not fit.
+        ``parameters``: parameters of `Problem` on which the first state depends, such as ``initial_velocities``. Raise
+        `InputError` for unsuitable parameters.
         """
         return self.stepper(0).first(parameters)
 
     def on_device(
         self, state: Given | DeviceState = None, fields: Values | None = None, parameters: Values | None = None
     ) -> DeviceState:
-        """Return a state, by default the first one, in arrays on the device, which other programs read by DLPack. Steps
-        from this state stay on the device.
+        """Return a state, by default the first state, in arrays on the device, which other programs read by DLPack.
+        Steps from this state stay on the device.
 
-        ``fields`` are arrays with the DLPack interface that replace fields of the state, in the precision of the
-        simulation and on its device: vectors (n, 3), fractions (n, phases), numbers (n,), in a batch (batch, n, ...).
-        Such a state is checked like one from a file, by one read on the host. ``parameters`` are those of the run to
-        which the state belongs. Raises `InputError` for input that does not fit.
+        ``fields``: arrays with the DLPack interface that replace fields of the state, in the precision and on the
+        device of the simulation: vectors (n, 3), fractions (n, phases), numbers (n,), in a batch (batch, n, ...). The
+        new state is checked on the host. ``parameters``: those of the run to which the state belongs. Raise
+        `InputError` for unsuitable input.
         """
         return self.stepper(0).on_device(state, fields or {}, parameters)
 
     def on_host(self, state: DeviceState) -> States:
-        """Return a state on the device as NumPy arrays, for files, other processes and ``Simulation.run``. Raises
+        """Copy a ``state`` on the device to NumPy arrays, for files, other processes and ``Simulation.run``. Raise
         `InputError` for a state of another simulation."""
         return self.stepper(0).on_host(state)
 
@@ -389,12 +364,12 @@ class Stepping:
 
     def step(self, state: Any, parameters: Values | None = None, steps: int = 1) -> Any:
         """Return the state after ``steps`` steps from ``state``, with the bits of ``run(steps, parameters,
-        state=state)``; for a batch a tuple with one state for each scene, NaN for a lost scene.
+        state=state)``; in a batch a tuple of the states of all scenes, NaN for a lost scene. From a `DeviceState`
+        return another `DeviceState`.
 
-        ``parameters`` may be any of `Problem` except first values, which ``state`` contains; a parameter over time has
-        a row for each of these steps. Nothing is recorded between. For a `DeviceState` the result is another one. From
-        the second call with the same number of steps on (third on a CPU), no graph is captured, and only the arrays of
-        a `DeviceState` are allocated. Warns and raises as `Simulation.run` does.
+        ``parameters``: any parameters of `Problem` except first values, which ``state`` contains; a parameter over time
+        has a row for each of the ``steps``. Further calls with the same number of steps are faster. Warnings and errors
+        are those of `Simulation.run`.
         """
         return self.stepper(check_steps(steps)).advance(state, parameters)
 
@@ -407,8 +382,7 @@ class Stepping:
         gradient: ReverseEstimator | None = None,
     ) -> tuple[dict[str, Any], Arrays]:
         """Return the adjoints of ``state`` and of ``parameters``, given the adjoint ``state_bar`` of the state after
-        ``steps`` steps, by the estimator ``gradient`` (reverse mode). `Stepper.vjp` takes the steps once for several
-        adjoints."""
+        ``steps`` steps, by the estimator ``gradient`` (reverse mode); see `Stepper.vjp`, also for several adjoints."""
         stepper = self.stepper(check_steps(steps))
         return stepper.vjp(stepper.step(state, parameters)[1], state_bar, gradient)
 

@@ -1,43 +1,37 @@
 """Standard errors of a least-squares estimate with residuals correlated within a frame and from frame to frame.
 
 Near the estimate the residuals are r = e - J t, with the noise e (frames, m), the Jacobian J (frames, m, parameters)
-and the error t of the estimate. Counting pixels treats the m numbers of a frame as independent. Neighbouring pixels,
-and the light of a whole frame, vary together, so such error bars are several times too small. Here instead
+and the error t of the estimate. The m numbers of a frame are not independent, because neighbouring pixels, and all
+light of a frame, vary together.
 
-1. noise fades from frame to frame by exp(-dt / T), with the correlation time T. It is chosen so that the residuals left
-   by the fit would have the correlation between neighbouring frames that they have (`correlation_time`). The frames are
-   then `whitened` in time and fitted once more;
-2. within a frame the noise may have any covariance C, the same for every frame. The whitened residuals of all frames
-   are samples of it, so that the covariance of the score is the pooled sum
+1. The correlation of noise at two times is exp(-dt / T). The correlation time T reproduces the correlation of the fit's
+   residuals between neighbouring frames (`correlation_time`). A second fit uses frames that are `whitened` in time.
+2. Within a frame the noise has any covariance C, the same for every frame. The covariance of the score is the sum
 
-       B = sum_f J_f^T C J_f  with  C = 1 / F sum_h r_h r_h^T.
+       B = sum_f J_f^T C J_f  with  C = 1 / F sum_h r_h r_h^T
 
-   It has F times the samples of the cluster-robust sum of (J_f^T r_f)(J_f^T r_f)^T (Liang and Zeger 1986). The
-   covariance of the estimate is N^-1 B N^-1 with N = sum_f J_f^T J_f;
-3. the residuals lack what the fit took: B is made larger by what it lacks on average, and the degrees of freedom of
-   Student's distribution are those of Satterthwaite (1946);
-4. T is estimated itself. With the correlation c from frame to frame the variance of an estimate goes like
-   (1 + c) / (1 - c), and the variance of c is (1 - c^2) / n for n independent numbers. So to second order B is larger
-   by the factor 1 + 2 / (n (1 - c)) on average.
+   over the whitened residuals of F frames. B has F times the samples of the cluster-robust sum of (J_f^T r_f)(J_f^T
+   r_f)^T (Liang and Zeger 1986). The covariance of the estimate is N^-1 B N^-1 with N = sum_f J_f^T J_f.
+3. B is increased by the mean part that the fit absorbed, and the degrees of freedom of Student's distribution follow
+   Satterthwaite (1946).
+4. T is an estimate too. With the correlation c from frame to frame, the variance of an estimate is proportional to
+   (1 + c) / (1 - c), and the variance of c is (1 - c^2) / n for n independent numbers. To second order, B is therefore
+   larger by the factor 1 + 2 / (n (1 - c)) on average.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from cortado.errors import ComputationError
-from cortado.optimisation.fitting.least_squares import Linearised, Part, Weighting, weighted
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting, weighted
 
-MOST_TAKEN = 0.9
-"""Greatest part of the score's covariance that the fit may have absorbed; more means that there are too few frames."""
 LONGEST = 3.0
 """Greatest correlation time, relative to the length of the record."""
 SHORTEST = 0.05
-"""Correlation times below this, relative to the time between two frames, count as none."""
-SINGULAR = 1e-10
-"""Relative eigenvalue of the Hessian below which a combination of parameters is undetermined."""
+"""Shorter correlation times, relative to the time between two frames, count as 0."""
 
 
 @dataclass(frozen=True)
@@ -63,30 +57,28 @@ class Products:
 
 @dataclass(frozen=True)
 class ScoreCovariance:
-    """The covariance of the score J^T e of one observation, with the numbers of independent samples behind it."""
+    """The covariance of the score J^T e of an observation."""
 
     B: np.ndarray
     """Covariance (p, p) of the score."""
     products: Products
     lost: float
-    """Part of B that the fit absorbed on average."""
+    """Mean part of B that the fit absorbed."""
     samples: float
     """Number of independent numbers in a frame."""
     frames: float
-    """Number of independent frames, before they are whitened."""
+    """Number of independent frames, before frames are whitened."""
 
     def degrees_of_freedom(self, inverse: np.ndarray, direction: np.ndarray) -> float:
-        """Return the degrees of freedom of Student's distribution for the error of a combination of parameters
-        (Satterthwaite 1946), with coefficients ``direction`` (p,), given N^-1. They are at most the number of
-        independent numbers from which the correlation time was estimated."""
+        """Return Satterthwaite's degrees of freedom (1946) for the parameter combination ``direction`` (p,), given
+        N^-1; at most the number of independent numbers."""
         F, a = len(self.products.gram), inverse @ direction
         total, spread = _moments(np.einsum("p,fgpq,q->fg", a, self.products.S, a, optimize=True), F)
         return max(min(F * total / spread * (1.0 - self.lost), self.frames * self.samples), 1.0)
 
 
 def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: np.ndarray) -> float:
-    """Estimate the correlation time T [s] of the noise, 0 if neighbouring frames are not correlated. ``inverse``: N^-1
-    of the fit with these residuals."""
+    """Estimate the correlation time T [s] of the noise, 0 without correlation; ``inverse``: N^-1 of the fit."""
     from scipy.optimize import brentq
 
     products, gap = Products.of(J, r), float(np.median(np.diff(times)))
@@ -97,7 +89,7 @@ def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: n
     found = float(np.diag(gram, 1).sum()) / total
 
     def excess(logarithm: float) -> float:
-        """Return how much a T, given by its logarithm, exceeds the found correlation of neighbouring frames."""
+        """Return the difference between expected and found correlation of neighbouring frames, for log T."""
         R = np.exp(-np.abs(times[:, None] - times) / np.exp(logarithm))
         V = inverse @ np.einsum("kl,klpq->pq", R, products.S, optimize=True) @ inverse
         expected = R * total / len(r) - taken @ R - (taken @ R).T + np.einsum("pq,ghqp->hg", V, products.K)
@@ -112,17 +104,14 @@ def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: n
 
 
 def independent_frames(times: np.ndarray, correlation_time: float) -> float:
-    """Return the number of uncorrelated frames that give a mean with equal accuracy: F (1 - c) / (1 + c), with
-    correlation c from frame to frame."""
-    kept = np.exp(-np.median(np.diff(times)) / correlation_time) if correlation_time else 0.0
-    return float(len(times) * (1.0 - kept) / (1.0 + kept))
+    """Return the number F (1 - c) / (1 + c) of independent frames, with correlation c from frame to frame."""
+    c = np.exp(-np.median(np.diff(times)) / correlation_time) if correlation_time else 0.0
+    return float(len(times) * (1.0 - c) / (1.0 + c))
 
 
 def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: float) -> ScoreCovariance:
-    """Estimate the covariance of a fit's score J^T r, from whitened residuals r (F, m) and Jacobians J (F, m, p) of F
-    frames.
-
-    They are weighted as in the normal matrix, whose ``inverse`` is given; ``frames``: see `independent_frames`."""
+    """Estimate the covariance of the score J^T r from weighted, whitened residuals r (F, m) and Jacobians J (F, m, p).
+    ``inverse``: N^-1; ``frames``: see `independent_frames`."""
     F, products = len(r), Products.of(J, r)
     B = np.einsum("ffpq->pq", products.S)
     once = np.einsum("fhpq,qr,hfrs->ps", products.K, inverse, products.S, optimize=True) / F
@@ -134,16 +123,16 @@ def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: 
     root = axes[:, kept] * np.sqrt(size[kept])
     relative = np.linalg.pinv(root) @ taken @ np.linalg.pinv(root).T
     share, along = np.linalg.eigh(0.5 * (relative + relative.T))
-    share = np.clip(share, 0.0, MOST_TAKEN)
+    share = np.clip(share, 0.0, 0.9)  # with too few frames the fit absorbs nearly everything
     grown = root @ (along / (1.0 - share)) @ along.T @ root.T
     lost, samples = float(share.mean()) if len(share) else 0.0, max(total / spread, 1.0)
-    kept = (F - frames) / (F + frames)
-    return ScoreCovariance(grown * (1.0 + 2.0 / (F * samples * (1.0 - kept))), products, lost, samples, frames)
+    c = (F - frames) / (F + frames)
+    return ScoreCovariance(grown * (1.0 + 2.0 / (F * samples * (1.0 - c))), products, lost, samples, frames)
 
 
 def _moments(gram: np.ndarray, F: int) -> tuple[float, float]:
-    """Return estimates of (tr C)^2 and tr C^2 without bias, from a matrix whose trace estimates tr C and whose squared
-    norm tr C^2 of F samples. Of one number per frame, and of none that varies, both are equal."""
+    """Return unbiased estimates of (tr C)^2 and tr C^2, from a matrix of F samples whose trace estimates tr C, and
+    whose squared norm estimates tr C^2."""
     trace, square = float(np.trace(gram)), float((gram**2).sum())
     if not trace > 0.0:
         return 1.0, 1.0
@@ -154,16 +143,11 @@ def _moments(gram: np.ndarray, F: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class FittedPart:
-    """The fit to one observation: its residuals and their scatter."""
-
     part: Part
     weighting: Weighting
     residuals: np.ndarray
     """Predicted minus measured numbers (frames, m), in the unit of the observation; 0 for ignored numbers."""
     spread: float
-    """Root mean square of the residuals."""
-    inflation: float
-    """Factor by which correlation within frames makes variances larger than a count of numbers gives."""
     samples: float
     """Number of independent numbers in a frame."""
     frames: float
@@ -171,26 +155,22 @@ class FittedPart:
 
     @property
     def label(self) -> str:
-        """Return the observation's name, with the experiment's number if there are several experiments."""
         return self.part.label
 
     @property
     def correlation_time(self) -> float:
-        """Return the time [s] over which residuals are correlated."""
         return self.weighting.correlation_time
 
 
-class Fitted(Protocol):
-    """Protocol of least-squares problems for `certainty`: a `LeastSquares`, or an object with the same parts and
-    labels."""
+@dataclass(frozen=True)
+class Widened:
+    """A least-squares problem whose unknowns include the sizes of causes of residuals."""
 
-    @property
-    def parts(self) -> list[Part]:
-        """Return the part of the fit that belongs to each observation."""
+    parts: list[Part]
+    labels: list[str]
 
-    @property
-    def labels(self) -> list[str]:
-        """Return the labels (free,) of the fitted numbers."""
+
+Fitted = LeastSquares | Widened
 
 
 @dataclass(frozen=True)
@@ -198,13 +178,12 @@ class Certainty:
     """Hessian, covariance and degrees of freedom of an estimate, from the scatter of its residuals."""
 
     hessian: np.ndarray
-    """(free, free) N = J^T J of weighted Jacobians."""
+    """N = J^T J (free, free) of weighted Jacobians."""
     covariance: np.ndarray
     """Covariance (free, free) of the coordinates."""
     degrees_of_freedom: np.ndarray
     """Degrees of freedom (free,) of Student's t-distribution."""
     scores: tuple[ScoreCovariance, ...]
-    """Score covariance of each part."""
     parts: tuple[FittedPart, ...]
 
     @classmethod
@@ -218,15 +197,14 @@ class Certainty:
             frames = independent_frames(part.observation.times, weight.correlation_time)
             score = score_covariance(J, own, N_inverse, frames)
             scores.append(score)
-            parts.append(FittedPart(part, weight, r, spread(r), _inflation(J, own), score.samples, frames))
+            parts.append(FittedPart(part, weight, r, spread(r), score.samples, frames))
         covariance: Any = N_inverse @ sum(score.B for score in scores) @ N_inverse
         freedom = np.array([_freedom(scores, N_inverse, unit) for unit in np.eye(len(at.u))])
         return cls(N, covariance, freedom, tuple(scores), tuple(parts))
 
 
 def noise_of(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> list[Weighting]:
-    """Return weights from the residuals of a first fit: correlated numbers have less weight, because they contain less
-    information."""
+    """Return weights from the residuals of a first fit, smaller for correlated numbers."""
     N_inverse = inverse(problem, hessian(problem, at, weights))
     found = []
     for part, r, J, weight in zip(problem.parts, at.residuals, at.jacobians, weights, strict=True):
@@ -238,19 +216,19 @@ def noise_of(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> l
 
 
 def counted_covariance(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
-    """Return the covariance of the estimate if every number were independent of all others."""
+    """Return the covariance (free, free) of the estimate if all measured numbers were independent."""
     alone = [Weighting(spread(r) or weight.scale) for r, weight in zip(at.residuals, weights, strict=True)]
     return inverse(problem, hessian(problem, at, alone))
 
 
 def hessian(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
-    """Return N = J^T J of the weighted Jacobians of a least-squares problem."""
+    """Return N = J^T J (free, free) of the weighted Jacobians."""
     flat = (J.reshape(-1, len(at.u)) for J in weighted(problem.parts, weights, at.jacobians))
     return np.asarray(sum(J.T @ J for J in flat))
 
 
 def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
-    """Return N^-1 of a problem's Hessian; raise `ComputationError` if a combination of parameters is undetermined."""
+    """Return N^-1 (free, free); raise `ComputationError` if a combination of parameters is undetermined."""
     labels, size = problem.labels, np.sqrt(np.diag(N))
     if not np.isfinite(N).all():
         raise ComputationError("The derivatives are not finite: try fewer steps, or float64.")
@@ -258,7 +236,7 @@ def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
         lost = [label for label, s in zip(labels, size, strict=True) if not s]
         raise ComputationError(f"What was measured does not depend on {', '.join(lost)}: leave it out of the fit.")
     eigenvalues, axes = np.linalg.eigh(N / np.outer(size, size))
-    if eigenvalues[0] < SINGULAR:
+    if eigenvalues[0] < 1e-10:
         mixed = [label for label, a in zip(labels, axes[:, 0], strict=True) if abs(a) > 0.1]
         raise ComputationError(
             f"What was measured does not tell {' and '.join(mixed)} apart at all: leave one of them out of the fit, or "
@@ -268,13 +246,13 @@ def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
 
 
 def spread(r: np.ndarray) -> float:
-    """Return the root mean square of the residuals that are not 0; ignored numbers have residual 0."""
+    """Return the root mean square of the residuals, without the residuals 0 of ignored numbers."""
     count = np.count_nonzero(r)
     return float(np.sqrt((r**2).sum() / max(count, 1)))
 
 
 def _inflation(J: np.ndarray, r: np.ndarray) -> float:
-    """Return the ratio of the score's variance to its variance if the residuals of a frame were independent."""
+    """Return the ratio of the score's variance to the variance for independent residuals in a frame."""
     counted = np.einsum("fmp,fmp->p", J, J) * np.mean(r**2)
     pooled = np.einsum("fmp,hm->fhp", J, r, optimize=True)
     has = counted > 0.0
@@ -282,7 +260,7 @@ def _inflation(J: np.ndarray, r: np.ndarray) -> float:
 
 
 def _freedom(scores: Sequence[ScoreCovariance], N_inverse: np.ndarray, direction: np.ndarray) -> float:
-    """Return the degrees of freedom of a number's variance, which is a sum over parts (Welch 1947)."""
+    """Return the degrees of freedom of a variance that is a sum over parts (Welch 1947)."""
     a = N_inverse @ direction
     variances = np.array([a @ score.B @ a for score in scores])
     each = np.array([score.degrees_of_freedom(N_inverse, direction) for score in scores])

@@ -1,7 +1,7 @@
 """Sentences of doubt about a fitted model: residuals larger than the noise, and their possible causes.
 
-A cause is a trend, a late clock, another density, or slipping walls. Each is a direction in which predictions would
-change. It is fitted together with the parameters, and gets an error bar in the same way.
+Causes are a trend, a late clock, another density, or slipping walls. The size of a cause, a direction in which
+predictions change, is fitted together with the parameters, with an error bar.
 """
 
 import warnings
@@ -11,60 +11,37 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError
-from cortado.optimisation.fitting.certainty import Certainty, ScoreCovariance, hessian, inverse, noise_of, spread
+from cortado.optimisation.fitting.certainty import (
+    Certainty,
+    ScoreCovariance,
+    Widened,
+    hessian,
+    inverse,
+    noise_of,
+    spread,
+)
 from cortado.optimisation.fitting.experiment import Experiment
-from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting, weighted
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting, weighted
 from cortado.optimisation.fitting.observations import CLOCK
 from cortado.scene.parameter_values import Arrays
 
-TOO_LARGE = 1.3
-"""Ratio of residuals to the given noise above which a sentence warns of them."""
-STILL = 0.01
-"""Numbers count as still if their predicted change over the frames is less than this part of the greatest one."""
-FEW_STILL = 20
-"""Least number of still numbers for a sentence about them."""
 TOO_LARGE_IN_MOTION = 2.0
-"""Ratio of the residuals of moving numbers to those of still numbers above which a sentence warns of them."""
+"""Greatest ratio of the residuals of moving numbers to those of still numbers without a warning."""
 EXACT = 1e-4
-"""Residuals smaller than this part of the largest measured number come from simulated measurements, and never cause
-doubt."""
-ROUNDING = 0.002
-"""Residuals below this part of the largest measured number, half a step of 8 bits, are rounding."""
-TOO_SLOW = 0.35
-"""Ratio of the residuals' correlation time to the record's length above which a sentence warns."""
-VAGUE = 1.0
-"""Standard error of a logarithm above which a number is hardly determined."""
-GREATEST = 20.0
-"""Greatest standard error of a logarithm that a sentence prints."""
-AT_BOUND = 1e-6
-"""Distance from a bound up to which an estimate counts as at the bound, relative to the coordinate or to 1, whichever
-is larger."""
-TOO_FAR = 3.0
-"""Difference between the estimates from two halves of a record, in standard errors, above which a sentence warns."""
-SERIES = 4
-"""Greatest number of numbers in a frame for which trends are tested one by one."""
-SPARE = 3
-"""A cause is tested only if frames exceed the number of fitted numbers by at least this."""
-MOST_KEPT = 0.6
-"""Correlation of noise from frame to frame above which noise cannot be told from a trend."""
-BY_CHANCE = 1e-3
-"""An effect is reported if its probability by noise alone is below this."""
-LITTLE, MUCH = 0.05, 0.5
-"""A cause is reported only if it explains at least the first part of the sum of squares; a density or a slip, for
-residuals already in doubt, at least the second part."""
+"""Residuals below this part of the largest measured number come from simulated measurements, and cause no doubt."""
 
 
 def doubts_of(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], certainty: Certainty
 ) -> tuple[str, ...]:
-    """Return sentences of doubt about a fit; empty if the residuals look like noise and determine the parameters."""
+    """Return sentences of doubt about a fit; empty if residuals look like noise and determine the parameters."""
     found, is_exact = list[str](), True
     for part, r, weight in zip(problem.parts, at.residuals, weights, strict=True):
         times, noise, size = part.observation.times, part.observation.noise, spread(r)
         if size <= EXACT * np.nanmax(np.abs(part.observation.measured)):
             continue
         is_exact = False
-        if noise is not None and size > TOO_LARGE * noise:
+        if noise is not None and size > 1.3 * noise:
             found.append(
                 f"The residuals of {part.label} are {size / noise:.2g} times the noise that was given "
                 f"({size:.2g} against {noise:.2g} {part.observation.unit}): the model is wrong by that much."
@@ -77,7 +54,7 @@ def doubts_of(
                 "wrong by that much, and the error bars are too small."
             )
         length = times[-1] - times[0]
-        if weight.correlation_time > TOO_SLOW * length:
+        if weight.correlation_time > 0.35 * length:
             found.append(
                 f"The residuals of {part.label} hardly change from frame to frame: they are correlated over "
                 f"{weight.correlation_time:.2g} s of a record of {length:.2g} s, which noise seldom is. The model is "
@@ -90,24 +67,22 @@ def doubts_of(
 
 
 def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]:
-    """Return root mean squares of the residuals (frames, m) of two kinds of numbers. The first kind is predicted to be
-    still, such as a video's background, and shows the noise alone; the second kind is the rest. With few still numbers
-    the result is infinite and 0."""
+    """Return the root mean square residual of numbers with constant predictions, such as a video's background, and of
+    all other numbers. With fewer than 20 constant predictions return infinity and 0."""
     change = np.ptp(measured + r, axis=0)
     counted = ~np.isnan(change)
-    still = counted & (change <= STILL * np.max(change[counted], initial=0.0))
-    if still.sum() < FEW_STILL or not (counted & ~still).any():
+    still = counted & (change <= 0.01 * np.max(change[counted], initial=0.0))
+    if still.sum() < 20 or not (counted & ~still).any():
         return np.inf, 0.0
     quiet, moving = (float(np.sqrt(np.mean(r[:, chosen] ** 2))) for chosen in (still, counted & ~still))
-    return max(quiet, ROUNDING * float(np.nanmax(np.abs(measured)))), moving
+    return max(quiet, 0.002 * float(np.nanmax(np.abs(measured)))), moving  # half a step of 8 bits
 
 
 def _at_bounds(problem: LeastSquares, at: Linearised) -> list[str]:
-    """Return sentences about numbers whose estimates are at a bound."""
     found = []
     for which, ends in zip(("lower", "upper"), problem.coordinates.bounds, strict=True):
         for label, u, end, value in zip(problem.labels, at.u, ends, problem.coordinates.numbers(at.u), strict=True):
-            if np.isfinite(end) and abs(u - end) <= AT_BOUND * max(abs(end), 1.0):
+            if np.isfinite(end) and abs(u - end) <= 1e-6 * max(abs(end), 1.0):
                 found.append(
                     f"{label} is {value:.4g}, its {which} bound: what was measured asks for a value beyond it, and its "
                     "error bar tells nothing."
@@ -116,21 +91,21 @@ def _at_bounds(problem: LeastSquares, at: Linearised) -> list[str]:
 
 
 def _vague(problem: LeastSquares, at: Linearised, certainty: Certainty) -> list[str]:
-    """Return sentences about positive numbers that the residuals determine only to within a large factor."""
+    """Return sentences about positive numbers that are determined only to within a large factor."""
     coordinates = problem.coordinates
     bars = np.where(coordinates.by_logarithm, np.sqrt(np.diag(certainty.covariance)), 0.0)
     return [
-        f"What was measured hardly tells {label}: one standard error is a factor of {np.exp(min(bar, GREATEST)):.2g}."
+        f"What was measured hardly tells {label}: one standard error is a factor of {np.exp(min(bar, 20.0)):.2g}."
         for label, bar in zip(coordinates.labels, bars, strict=True)
-        if bar > VAGUE
+        if bar > 1.0
     ]
 
 
 def _halves(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], scores: Sequence[ScoreCovariance]
 ) -> list[str]:
-    """Return sentences about parameters for which the two halves of the frames disagree, by one Gauss-Newton step for
-    each half."""
+    """Return sentences about parameters for which a Gauss-Newton step by half of the frames differs from the other
+    half's."""
     size, steps, variances = len(at.u), [], []
     white, slopes = (weighted(problem.parts, weights, own) for own in (at.residuals, at.jacobians))
     for half in (0, 1):
@@ -150,26 +125,16 @@ def _halves(
         f"The first half of the frames and the second one say different things of {label}: by {off:.2g} times the "
         "error of the difference. The model is wrong, in a way that changes over time."
         for label, off in zip(problem.coordinates.labels, away, strict=True)
-        if off > TOO_FAR
+        if off > 3.0
     ]
 
 
 @dataclass(frozen=True)
-class Widened:
-    """A least-squares problem for `certainty` whose unknowns include the sizes of causes."""
-
-    parts: list[Part]
-    labels: list[str]
-
-
-@dataclass(frozen=True)
 class Explained:
-    """The size of a cause that explains residuals by more than noise does, and how much it explains."""
+    """The sizes (causes,) of causes of residuals, and the ``share`` of the sum of squares that the causes explain."""
 
     sizes: np.ndarray
-    """Sizes (causes,)."""
     share: float
-    """Part of the sum of squares that it explains."""
 
 
 def explained(
@@ -179,16 +144,16 @@ def explained(
     columns: Sequence[np.ndarray],
     is_doubted: bool = False,
 ) -> Explained | None:
-    """Estimate the size of a possible cause of residuals by one Gauss-Newton step; ``columns`` (frames, m, causes): the
-    derivatives of each part's predictions. Return None if the size is within the noise, or cannot be told apart from
-    the parameters. With ``is_doubted`` the residuals are no noise, and the part that a cause explains decides
-    instead."""
+    """Estimate the sizes of possible causes of residuals by a Gauss-Newton step. ``columns``: derivatives (frames, m,
+    causes) of each part's predictions. Return None if the sizes are within the noise, or undetermined.
+
+    ``is_doubted``: the residuals are no noise, so that causes must explain half of the sum of squares instead."""
     from scipy.stats import f as fisher
 
     count = columns[0].shape[-1]
     wide = Widened(problem.parts, [*problem.labels, *(f"cause {k}" for k in range(count))])
     free = len(wide.labels)
-    if sum(len(part.observation.times) for part in problem.parts) < free + SPARE:
+    if sum(len(part.observation.times) for part in problem.parts) < free + 3:
         return None
     jacobians = [np.concatenate([J, c], axis=-1) for J, c in zip(at.jacobians, columns, strict=True)]
     before = Linearised(np.zeros(free), at.residuals, jacobians)
@@ -201,15 +166,15 @@ def explained(
         return None
     sizes, V = left.u[-count:], found.covariance[-count:, -count:]
     statistic = float(sizes @ np.linalg.pinv(V) @ sizes) / count
-    least = fisher.isf(BY_CHANCE, count, found.degrees_of_freedom[-count:].min())
+    least = fisher.isf(1e-3, count, found.degrees_of_freedom[-count:].min())
     if not is_doubted and (statistic <= least or _fades_slowly(wide, weights)):
         return None
     share = 1.0 - problem.sum_of_squares(left.residuals, weights) / problem.sum_of_squares(before.residuals, weights)
-    return None if share < (MUCH if is_doubted else LITTLE) else Explained(sizes, share)
+    return None if share < (0.5 if is_doubted else 0.05) else Explained(sizes, share)
 
 
 def dear_causes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
-    """Return sentences about the fluid's density and the container's slip, from one or two runs of each experiment."""
+    """Return sentences about the fluid's density and the container's slip, from further runs."""
     values, found = problem.coordinates.values(at.u), list[str]()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
@@ -231,7 +196,6 @@ def dear_causes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighti
 
 
 def _step(wide: Widened, before: Linearised, weights: Sequence[Weighting]) -> Linearised:
-    """Return the point at which the sum of squares of the linear model is least."""
     N_inverse = inverse(wide, hessian(wide, before, weights))
     white, slopes = (weighted(wide.parts, weights, own) for own in (before.residuals, before.jacobians))
     score: np.ndarray = sum(np.einsum("fmp,fm->p", J, r) for J, r in zip(slopes, white, strict=True))
@@ -240,10 +204,10 @@ def _step(wide: Widened, before: Linearised, weights: Sequence[Weighting]) -> Li
 
 
 def _fades_slowly(wide: Widened, weights: Sequence[Weighting]) -> bool:
-    """Return True if noise of some part is so correlated from frame to frame that it cannot be told from a trend."""
+    """Return True if some noise is so correlated from frame to frame that it looks like a trend."""
     gaps = [float(np.median(np.diff(part.observation.times))) for part in wide.parts]
     each = zip(weights, gaps, strict=True)
-    return any(one.correlation_time and np.exp(-gap / one.correlation_time) > MOST_KEPT for one, gap in each)
+    return any(one.correlation_time and np.exp(-gap / one.correlation_time) > 0.6 for one, gap in each)
 
 
 def _nothing(problem: LeastSquares, count: int) -> list[np.ndarray]:
@@ -251,13 +215,13 @@ def _nothing(problem: LeastSquares, count: int) -> list[np.ndarray]:
 
 
 def _trends(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
-    """Return sentences about trends in single series: a line and a parabola in time."""
+    """Return sentences about linear and quadratic trends in parts of at most four numbers per frame."""
     found = []
     for k, part in enumerate(problem.parts):
         times, measured = part.observation.times, part.observation.measured
         x = 2.0 * (times - times[0]) / (times[-1] - times[0]) - 1.0
         shapes = np.stack([x, 1.5 * x**2 - 0.5], axis=-1)
-        for number in range(measured.shape[1]) if measured.shape[1] <= SERIES else ():
+        for number in range(measured.shape[1]) if measured.shape[1] <= 4 else ():
             columns, there = _nothing(problem, 2), ~np.isnan(measured[:, number])
             columns[k][there, number] = shapes[there]
             if said := explained(problem, at, weights, columns):
@@ -272,7 +236,6 @@ def _trends(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting])
 
 
 def _clocks(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
-    """Return sentences about parts whose uncalibrated clock seems late, from the predictions' rates of change."""
     found = []
     for k, part in enumerate(problem.parts):
         if CLOCK in part.observation.start:
@@ -292,8 +255,7 @@ def _clocks(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting])
 def _by_change(
     problem: LeastSquares, values: Arrays, change: Callable[[Experiment, Arrays], tuple[int, int, Arrays]]
 ) -> list[np.ndarray]:
-    """Return the change of predictions, part by part, from a function that computes it for one experiment and counts
-    its runs. It is 0 where it cannot be computed."""
+    """Return the change of each part's predictions by a function of an experiment, 0 where its run fails."""
     columns = _nothing(problem, 1)
     for k, experiment in enumerate(problem.experiments):
         try:
@@ -308,13 +270,13 @@ def _by_change(
 
 
 def _by_density(experiment: Experiment, values: Arrays) -> tuple[int, int, Arrays]:
-    """Return derivatives of predictions by the logarithm of all densities, and the runs that they took."""
+    """Return the numbers of runs and tangents, and the derivatives of predictions by the logarithm of all densities."""
     _, slopes = experiment.linearised(values, [{"rest_density": experiment.simulation.parameters()["rest_density"]}])
     return 1, 1, {name: slope[..., 0] for name, slope in slopes.items()}
 
 
 def _by_slip(experiment: Experiment, values: Arrays) -> tuple[int, int, Arrays]:
-    """Return the change of predictions with the container's other slip, if it has one, and the runs that it took."""
+    """Return the numbers of runs and tangents, and the change of predictions with the container's other slip."""
     slip = getattr(experiment.simulation.scene.container, "slip", None)
     if slip is None:
         return 0, 0, {}

@@ -20,10 +20,8 @@ from cortado.scene.restart import RestartState
 from cortado.scene.stability import is_implicit
 from cortado.simulation import Simulation
 
-OF_THE_SCHEME = ("viscosity", "rest_density", "time_step")
-"""Parameters that decide whether viscosity acts on the velocities at the start of a step or at its end."""
 ROOM = 16
-"""Number of steps added to a run at a time when a calibrated clock is late."""
+"""Number of steps by which a run is extended when a calibrated clock is late."""
 
 
 @fixed
@@ -75,13 +73,12 @@ class Experiment:
 
     @property
     def start(self) -> dict[str, np.ndarray]:
-        """Return first values of the observations' own parameters, such as "camera.rotation"."""
+        """Return first values of the observations' parameters, such as "camera.rotation"."""
         return {f"{name}.{key}": v for name, one in self.observations.items() for key, v in one.start.items()}
 
     @property
     def unseen(self) -> dict[str, np.ndarray]:
-        """Return masks by the names of `start`, true for numbers on which no measurement depends. Observations may have
-        no such masks."""
+        """Return masks by the names of `start`, true for numbers on which no measurement depends."""
         each = self.observations.items()
         return {f"{name}.{key}": mask for name, one in each for key, mask in getattr(one, "unseen", {}).items()}
 
@@ -121,7 +118,7 @@ class Experiment:
         wanted = self._wanted(frames)
         problem = self._problem(values, wanted)
         ends, dots = self._along(problem, wanted, values, [moved for moved in moves if moved])
-        # where only an observation's own parameters change, such as those of a camera, states stay
+        # states do not change if only an observation's parameters change, such as a camera's
         still = {step: end.state.like().numpy(self.simulation.dimension) for step, end in ends.items()}
         found = dict[str, np.ndarray]()
         along = [(one, moved, next(dots) if moved else still) for one, moved in zip(directions, moves, strict=True)]
@@ -148,7 +145,7 @@ class Experiment:
         return self._read(ends, frames, parameters), found
 
     def _frames(self, parameters: Values) -> dict[str, Frames]:
-        """Return the frames of each observation according to its clock; frames before the run show the first state."""
+        """Return the frames of each observation by its clock; frames before the run show the first state."""
         found = {}
         for name, one in self.observations.items():
             begun = one.start.get(CLOCK, 0.0)
@@ -158,23 +155,22 @@ class Experiment:
         return found
 
     def _wanted(self, frames: Mapping[str, Frames]) -> list[int]:
-        """Return the step numbers of the states that observations read."""
         clocks = (own.around for name, own in frames.items() if CLOCK in self.observations[name].start)
         return sorted(set().union(*(own.needed for own in frames.values()), *clocks))
 
     def _problem(self, values: Values, wanted: Sequence[int]) -> Problem:
-        """Return a problem of at least these steps, with the viscosity scheme that a scene with these values would
-        use."""
+        """Return a problem of at least the ``wanted`` steps, with the viscosity scheme for these values."""
         scene, steps = self.simulation.scene, self.problem.steps
         if wanted[-1] > steps:
             steps += -(-(wanted[-1] - steps) // ROOM) * ROOM
-        given = {name: as_numbers(name, values[name]) for name in OF_THE_SCHEME if name in values}
+        of_scheme = ("viscosity", "rest_density", "time_step")
+        given = {name: as_numbers(name, values[name]) for name in of_scheme if name in values}
         fits = all(array.size in (1, len(scene.phase)) for array in given.values())
         key = is_implicit(scene, given if fits else {}), steps
         if key not in self._problems:
             own, simulation = self.problem, self.simulation
             if key[0] != is_implicit(scene):
-                with warnings.catch_warnings():  # of the scene's own viscosity, with which nothing is run
+                with warnings.catch_warnings():  # about the scene's viscosity, which no run uses
                     warnings.simplefilter("ignore", CortadoWarning)
                     simulation = simulation.replaced(f"forces.viscous_solve={'implicit' if key[0] else 'explicit'}")
             self._problems[key] = Problem(simulation, steps, own.loss, state=own.state)
@@ -183,7 +179,6 @@ class Experiment:
     def _along(
         self, problem: Problem, steps: Sequence[int], values: Values, moves: Sequence[Values]
     ) -> tuple[dict[int, Any], Iterator[dict[int, Arrays]]]:
-        """Run a problem; return states by step number, and their tangents for each direction."""
         wanted, dimension, dots = set(steps), self.simulation.dimension, [dict[int, Arrays]() for _ in moves]
 
         def observe(kept: dict[int, Arrays], step: int, dot: State) -> None:
@@ -208,12 +203,11 @@ class Experiment:
         return found
 
     def _shared(self, values: Values) -> dict[str, Any]:
-        """Return the values of the simulation's parameters, without those of observations."""
         own = self.start
         return {name: value for name, value in values.items() if name not in own}
 
     def _own(self, observation: str, values: Values) -> dict[str, np.ndarray]:
-        """Return the values of one observation's own parameters, by the observation's names for them."""
+        """Return the values of an observation's parameters by name, without the prefix."""
         return {
             key: np.asarray(values[f"{observation}.{key}"], dtype=np.float64)
             for key in self.observations[observation].start

@@ -1,5 +1,4 @@
-"""Pictures of a fit, and its HTML page for notebooks: numbers, residuals, profiles, and videos compared with the
-simulation."""
+"""Pictures and HTML page of a fit: numbers, residuals, profiles, and videos compared with the simulation."""
 
 from collections.abc import Sequence
 from html import escape
@@ -13,15 +12,11 @@ from cortado.optimisation.fitting.observations import Video
 from cortado.pictures.pages import Figures, picture, table
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, images
 
-GREATEST_SERIES = 4
-"""Greatest number of series drawn one by one; for more, their root mean square and mean are drawn."""
 AGREE = 0.2
-"""Brightness of pixels at which two pictures agree: a middle grey."""
-HEAD = ("parameter", "unit", "start", "found", "95 %, from", "to")
+"""Brightness of pixels at which two pictures agree."""
 
 
 def residual_figure(fitted: Fit, path: Path) -> Figures:
-    """Draw the residuals of a fit over time, one panel for each observation."""
     with drawing(path, height=1.4 + 2.3 * len(fitted.parts)) as figure:
         rows = figure.subplots(len(fitted.parts), 1, squeeze=False)[:, 0]
         for axes, part in zip(rows, fitted.parts, strict=True):
@@ -34,7 +29,7 @@ def residual_figure(fitted: Fit, path: Path) -> Figures:
 def _residuals(axes: object, part: FittedPart) -> None:
     times, r = part.part.observation.times, part.residuals
     plot = axes.plot  # type: ignore[attr-defined]
-    if r.shape[1] <= GREATEST_SERIES:
+    if r.shape[1] <= 4:
         for k, series in enumerate(r.T):
             plot(times, series, marker="o", markersize=3, color=PALETTE[k % len(PALETTE)])
     else:
@@ -46,7 +41,6 @@ def _residuals(axes: object, part: FittedPart) -> None:
 
 
 def profile_figure(profiles: Sequence[Profile], path: Path) -> Figures:
-    """Draw the profile of each number, together with the parabola from which its interval is computed."""
     if not profiles:
         return []
     columns = min(len(profiles), 3)
@@ -68,7 +62,6 @@ def profile_figure(profiles: Sequence[Profile], path: Path) -> Figures:
 
 
 def video_figures(fitted: Fit, folder: Path) -> Figures:
-    """Draw the first, the middle and the last frame of each video: measured, fitted, and their difference."""
     found: Figures = []
     for number, part in enumerate(fitted.parts):
         video = part.part.observation
@@ -91,7 +84,6 @@ def video_figures(fitted: Fit, folder: Path) -> Figures:
 
 
 def fit_page(fitted: Fit) -> str:
-    """Return the HTML that a notebook shows of a fit."""
     rows = [
         (
             one.label.replace("_", " "),
@@ -104,4 +96,5 @@ def fit_page(fitted: Fit) -> str:
         for one in fitted.numbers()
     ]
     words = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*fitted.cautions, NOISE_ALONE))
-    return table(HEAD, rows) + words + picture(fitted, lambda path: residual_figure(fitted, path))
+    head = ("parameter", "unit", "start", "found", "95 %, from", "to")
+    return table(head, rows) + words + picture(fitted, lambda path: residual_figure(fitted, path))

@@ -1,4 +1,4 @@
-"""`cortado.fit`: the parameters of measured experiments, with error bars, and what the residuals say."""
+"""`cortado.fit`: fit parameters to measured experiments, with error bars and doubts about the model."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,14 +20,10 @@ from cortado.optimisation.fitting.least_squares import Coordinates, LeastSquares
 from cortado.scene.parameter_values import UNITS
 from cortado.scene.parameters import Range
 
-ALIKE = 0.9
-"""Two numbers whose estimates have a greater correlation cannot be distinguished."""
 NOISE_ALONE = (
     "The bars are of noise alone and leave out what the spacing and the time step have wrong: a fit with another "
     "discretisation.spacing shows how much that is."
 )
-NEARLY = 0.01
-"""Least decrease of the sum of squares per step [squared standard errors] while a point of a profile is searched."""
 OF_VIEWS = {
     "translation": "m",
     "rotation": "rad",
@@ -36,22 +32,14 @@ OF_VIEWS = {
     "extinction": "1/m",
     "start": "s",
 }
-POSITIVE = (Range.POSITIVE, Range.NOT_NEGATIVE)
-OTHERS = 3
-"""Number of additional starts for a fit that ends in doubt."""
-ROUGHLY = 1e-3
-"""The search for weights ends when a step lowers the sum of squares by a smaller relative amount."""
-FAR = 3.0
-"""Searches whose ends are further apart than this many standard errors ended in different local minima."""
-SAME = 1e-3
-"""Ends with a smaller relative difference than this count as equal, however small the error bars are."""
-NO_LESS_LIKELY = 9.0
-"""Threshold for twice the logarithm of the likelihood ratio of two local minima: three standard errors."""
+FAR, SAME = 3.0, 1e-3
+"""Two searches ended in different local minima if their ends are further apart than both thresholds: `FAR` standard
+errors, and the relative difference `SAME`."""
 
 
 @dataclass(frozen=True)
 class Profile:
-    """The least sum of squares as a function of one number, with all other numbers fitted."""
+    """The least sum of squares as a function of a number, with all other numbers fitted."""
 
     label: str
     values: np.ndarray
@@ -59,18 +47,17 @@ class Profile:
     deviance: np.ndarray
     """Sum of squares (points,) minus the least one, in squared standard errors."""
     expected: np.ndarray
-    """The same (points,) for the linear model from which the intervals are computed."""
+    """The deviance (points,) of the linear model from which the intervals are computed."""
 
 
 @dataclass(frozen=True)
 class FittedNumber:
-    """One number of a fit, with its standard error and its interval."""
+    """A fitted number with standard ``error`` and interval from ``lower`` to ``upper``."""
 
     label: str
     start: float
     value: float
     error: float
-    """Standard error."""
     lower: float
     upper: float
 
@@ -82,14 +69,12 @@ class FittedNumber:
 
 @dataclass(frozen=True)
 class Tried:
-    """A start of a fit, and the end of the search from this start."""
+    """A start of a fit, and the end of the search from this start, as coordinates (free,)."""
 
     start: np.ndarray
-    """(free,) coordinates."""
     end: np.ndarray
-    """(free,) coordinates."""
     misfit: float
-    """Logarithm of the size of the residuals at the end, averaged over all measured numbers."""
+    """Mean logarithm of the size of the residuals at the end."""
 
 
 @public
@@ -109,29 +94,28 @@ class Fit:
     coordinate_covariance: np.ndarray = field(repr=False)
     """Covariance (free, free) of the coordinates."""
     naive_covariance: np.ndarray = field(repr=False)
-    """Covariance (free, free) if all measured numbers were independent. It is far too small, and given for
-    comparison."""
+    """Covariance (free, free) if all measured numbers were independent, for comparison; far too small."""
     degrees_of_freedom: np.ndarray = field(repr=False)
     """Degrees of freedom (free,) of Student's t-distribution."""
     parts: tuple[FittedPart, ...] = field(repr=False)
     """Residuals and their scatter, for each observation."""
     doubts: tuple[str, ...] = field(repr=False)
-    """Sentences about residuals that do not look like noise, so that the model's error exceeds the error bars."""
+    """Sentences about residuals that do not look like noise; the model's error then exceeds the error bars."""
     converged: bool = True
-    """True if the search ended at a minimum of the sum of squares; False if it used up its iterations."""
+    """True if the search ended at a minimum of the sum of squares; False if the search used all iterations."""
     tried: tuple[Tried, ...] = field(default=(), repr=False)
     """All starts with the ends of their searches, including this fit's."""
     runs: int = 0
-    """Number of forward runs, each of one experiment."""
+    """Number of forward runs of single experiments."""
     tangents: int = 0
-    """Number of forward-mode runs, each of one experiment along one tangent."""
+    """Number of forward-mode runs of single experiments along single tangents."""
     refused: int = 0
-    """Number of trial points whose runs diverged, so that the fit did not use them."""
+    """Number of trial points that the fit did not use, because their runs diverged."""
     sum_of_squares: float = field(default=0.0, repr=False)
     hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     problem: LeastSquares | None = field(default=None, repr=False)
     at: Linearised | None = field(default=None, repr=False)
-    """The end of the search with the Jacobian from which the error bars are computed; it is not pickled."""
+    """The end of the search with the Jacobian of the error bars; None in pickled fits."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "problem": None, "at": None}
@@ -148,7 +132,7 @@ class Fit:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Return the covariance (free, free) of the numbers in the parameters' units, which holds for small errors."""
+        """Return the covariance (free, free) of the numbers in the parameters' units, valid for small errors."""
         slopes = self.coordinates.slopes(self.u)
         return self.coordinate_covariance * np.outer(slopes, slopes)
 
@@ -165,15 +149,15 @@ class Fit:
 
     @property
     def not_told_apart(self) -> tuple[tuple[str, str, float], ...]:
-        """Return pairs of numbers whose estimates are correlated by more than 0.9, and their correlation."""
+        """Return pairs of labels whose estimates have a correlation of more than 0.9, with the correlation."""
         found, labels = self.correlation, self.labels
         pairs = combinations(range(len(labels)), 2)
-        return tuple((labels[i], labels[j], float(found[i, j])) for i, j in pairs if abs(found[i, j]) > ALIKE)
+        return tuple((labels[i], labels[j], float(found[i, j])) for i, j in pairs if abs(found[i, j]) > 0.9)
 
     def intervals(self, confidence: float = 0.95) -> dict[str, tuple[Any, Any]]:
-        """Return by name the lower and the upper end of an interval that contains the true value with the probability
-        ``confidence``, if the model is right; positive numbers have an interval of their logarithm. Raises
-        `InputError`."""
+        """Return, by name, lower and upper ends of intervals that contain the true value with the probability
+        ``confidence``, if the model is right. Intervals of positive numbers are those of their logarithms. Raise
+        `InputError` for an unsuitable confidence."""
         if not 0.0 < as_one_number("confidence", confidence) < 1.0:
             raise InputError(f"confidence is {shown(confidence)}, but must be between 0 and 1.")
         from scipy.stats import t as student
@@ -184,9 +168,9 @@ class Fit:
         return {name: (lower[name], upper[name]) for name in lower}
 
     def profile(self, label: str, points: int = 7, reach: float = 2.5) -> Profile:
-        """Compute the least sum of squares at ``points`` values of the number ``label``, fitting all others at each
-        value. If it is no parabola, the intervals are rough. The values reach ``reach`` standard errors to both sides.
-        Raises `InputError`."""
+        """Compute the least sum of squares at ``points`` values of the number ``label``, with all other numbers fitted.
+        The values extend by ``reach`` standard errors to both sides. Intervals are rough unless the profile is a
+        parabola. Raise `InputError` for an unknown label, or if the fit was pickled."""
         if label not in self.labels or self.problem is None or self.at is None:
             raise InputError(f"label is {shown(label)}, but must be one of {', '.join(self.labels)}.")
         k, weights = self.labels.index(label), [part.weighting for part in self.parts]
@@ -198,24 +182,24 @@ class Fit:
             begun = np.clip(self.u + V[:, k] / V[k, k] * shift, lower, upper)
             begun[k] = self.u[k] + shift
             at = Linearised(begun, self.problem.residuals(begun), self.at.jacobians)
-            ended = search(self.problem, at, weights, 2, NEARLY / max(self.sum_of_squares, TINY), fixed=[k])
+            ended = search(self.problem, at, weights, 2, 0.01 / max(self.sum_of_squares, TINY), fixed=[k])
             squares = self.problem.sum_of_squares(ended.at.residuals, weights) - ended.gain
             deviance.append((squares - self.sum_of_squares) * counted / V[k, k])
         values = np.array([self.coordinates.numbers(self.u + shift * np.eye(len(self.u))[k])[k] for shift in shifts])
         return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])
 
     def log_posterior(self, u: Any) -> float:
-        """Return the logarithm of the posterior density, up to a constant, at coordinates (free,), for samplers. Each
-        call takes a forward run.
+        """Return the logarithm of the posterior density, up to a constant, at coordinates ``u`` (free,), for samplers.
+        A call takes a forward run.
 
-        The prior is flat in the coordinates (logarithms of positive numbers) within the bounds. Outside, and if the run
-        diverges, the result is -inf. Near the estimate ``u`` it is the normal distribution of the error bars.
-        `Fit.coordinates.values` converts coordinates to parameters. Raises `InputError`.
+        The prior is flat in the coordinates (logarithms of positive numbers) within the bounds. The result is -inf
+        out of bounds, and if the run diverges. `Fit.coordinates.values` converts coordinates to parameters. Raise
+        `InputError` for a wrong shape, or if the fit was pickled.
 
-        The result is minus half of the weighted sum of squares, relative to its minimum. With correlated noise the
-        error bars are longer than the curvature N of the sum of squares gives. Distances from the estimate are
-        therefore shortened by the matrix W with W^T N W = V^-1, the inverse of the covariance of the bars: the
-        curvature adjustment of Ribatet, Cooley and Davison (2012).
+        The result is minus half of the weighted sum of squares, relative to the minimum. With correlated noise the
+        error bars, of covariance V, are longer than the curvature N of the sum of squares gives. Distances from the
+        estimate are therefore multiplied by the matrix W with W^T N W = V^-1, the curvature adjustment of Ribatet,
+        Cooley and Davison (2012).
         """
         point = as_numbers("u", u)
         if point.shape != self.u.shape:
@@ -238,7 +222,7 @@ class Fit:
         return -0.5 * (squares - self.sum_of_squares)
 
     def numbers(self, confidence: float = 0.95) -> list["FittedNumber"]:
-        """Return the fitted numbers, with the `intervals` of a ``confidence``."""
+        """Return the fitted numbers with their `intervals` for a ``confidence``."""
         ends = self.intervals(confidence)
         free = self.coordinates.free
         lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
@@ -247,7 +231,7 @@ class Fit:
         return [FittedNumber(label, *map(float, rest)) for label, *rest in each]
 
     def lines(self, confidence: float = 0.95) -> list[str]:
-        """Return a line for each number: its value, its standard error, and its interval of a ``confidence``."""
+        """Return a line for each number, with value, standard error, and interval for a ``confidence``."""
         return [
             f"{one.words} ({100 * confidence:g} % between {one.lower:.4g} and {one.upper:.4g})"
             for one in self.numbers(confidence)
@@ -263,7 +247,6 @@ class Fit:
         return f"Fit({', '.join(one.words for one in self.numbers())}{ended})"
 
     def _repr_html_(self) -> str:
-        """Show a table of the numbers, the doubts, and residuals over time in a notebook."""
         page: str = on_top("fit_page")(self)
         return page
 
@@ -272,7 +255,7 @@ class Fit:
 
     @property
     def cautions(self) -> list[str]:
-        """Return sentences about numbers that cannot be distinguished, an early end, refused points, and doubts."""
+        """Return sentences about correlated numbers, an early end, refused points, and doubts."""
         apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})." for a, b, c in self.not_told_apart]
         ended = [] if self.converged else ["The fit has not converged: give it more iterations."]
         lost = f"The runs at {counted(self.refused, 'point')} that the fit tried diverged, and it knows nothing of them"
@@ -281,12 +264,11 @@ class Fit:
 
 
 def _plain(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return arrays by name; arrays of shape () become numbers."""
     return {name: array if array.shape else float(array) for name, array in arrays.items()}
 
 
 def with_error(value: float, error: float) -> str:
-    """Format a value and its standard error, with two digits of the error if its first digit is 1 to 3, else one."""
+    """Format a value and its standard error, with two digits of an error that begins with 1 to 3, or one digit."""
     if not np.isfinite(error) or error <= 0.0:
         return f"{value:.6g} ± {error:.2g}"
     power = int(np.floor(np.log10(error)))
@@ -297,7 +279,7 @@ def with_error(value: float, error: float) -> str:
 
 
 def unit_of(label: str) -> str:
-    """Return the unit of a fitted number, by its label; empty where it has none."""
+    """Return the unit of a fitted number by its label; empty without a unit."""
     name = label.partition("[")[0]
     return UNITS.get(name) or OF_VIEWS.get(name.rpartition(".")[2], "")
 
@@ -311,26 +293,24 @@ def fit(
     on_trial: Callable[[], None] | None = None,
     starts: int | None = None,
 ) -> Fit:
-    """Fit parameters to measured experiments by least squares, and say how certain they are.
+    """Fit parameters to measured experiments by least squares, with error bars.
 
     A residual is a simulation's prediction minus the measured number. The search estimates the Jacobian by a forward
-    run for each fitted number; at its end the Jacobian is computed by forward mode. The first fit weights all residuals
-    equally. Their scatter and correlation give the weights of a second fit, whose residuals give the error bars (see
-    `cortado.optimisation.fitting.certainty`).
+    run for each fitted number, and at its end computes the Jacobian by forward mode. The first fit weights all
+    residuals equally. The scatter and correlation of the residuals give the weights of a second fit, whose residuals
+    give the error bars (see `cortado.optimisation.fitting.certainty`).
 
-    Args:
-        experiments: one `measured.Experiment`, or several with the same parameters. start: first values of the fitted
-        parameters, by name. Positive ones, such as a viscosity, are searched by their logarithm. Parameters that videos
-        calibrate are added automatically, with the cameras' given aim. bounds: by name, (lower, upper), each a number,
-        an array of the parameter's shape, or None. A number with two equal bounds is not searched. iterations: greatest
-        number of trial points of each of the two fits. on_trial: called after each trial point. starts: number of
-        starts. All but the first are chosen by forward runs within the bounds, or within two decades to both sides of a
-        positive number. By default the fit begins at `start` alone, and at three others if that fit ends in doubt. The
-        fit with the least residuals is returned; its ``tried`` lists the ends of all searches.
+    ``experiments``: a `measured.Experiment`, or several with the same parameters. ``start``: first values of the fitted
+    parameters, by name. Positive parameters, such as a viscosity, are searched by their logarithm. Parameters that
+    videos calibrate are added automatically, with the values of the cameras. ``bounds``: by name, (lower, upper), each
+    a number, an array of the parameter's shape, or None. A number with two equal bounds is not searched.
+    ``iterations``: greatest number of trial points of each of the two fits. ``on_trial``: called after each trial
+    point. ``starts``: number of starts, by default one, and three more if the first fit ends in doubt. Forward runs
+    choose further starts within the bounds, or within two decades to both sides of a positive number. The fit with the
+    least residuals is returned, and the fit's ``tried`` lists the ends of all searches.
 
-    Raises:
-        InputError: the start, bounds or experiments are unsuitable. DivergedError: the run at the start diverges.
-        ComputationError: the measurements do not determine all parameters.
+    Raises InputError for unsuitable start, bounds or experiments, DivergedError if the run at the start diverges, and
+    ComputationError if the measurements do not determine all parameters.
 
     Example::
 
@@ -351,7 +331,8 @@ def fit(
     given = {**start, **{name: value for name, value in own.items() if name not in start}}
     if not given:
         raise InputError("start is empty, but must have a parameter to fit.")
-    positive = [n for n in given if (n in known and known[n].range in POSITIVE) or n.endswith(".extinction")]
+    above_zero = (Range.POSITIVE, Range.NOT_NEGATIVE)
+    positive = [n for n in given if (n in known and known[n].range in above_zero) or n.endswith(".extinction")]
     unseen = {name: mask for one in each for name, mask in one.unseen.items()}
     clocks = {name: ends for one in each for name, ends in one.clocks.items()}
     coordinates = Coordinates.of(given, positive, {**clocks, **({} if bounds is None else bounds)}, unseen)
@@ -367,12 +348,11 @@ def fit(
 
 
 def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
-    """Fit from one start: a first search with equal weights, and a second one with weights from its residuals. The
-    result has its covariance and its doubts about noise and model."""
+    """Fit from a start, first with equal weights, and again with weights from the residuals."""
     at = problem.estimated(start)
     sizes = [part.observation.noise or spread(r) or 1.0 for part, r in zip(problem.parts, at.residuals, strict=True)]
     weights = [Weighting(size) for size in sizes]
-    at = search(problem, at, weights, iterations, ROUGHLY).at
+    at = search(problem, at, weights, iterations, 1e-3).at
     weights = noise_of(problem, at, weights)
     at, converged = least(problem, at, weights, iterations)
     at, settled = over_the_bars(problem, at, weights)
@@ -398,13 +378,13 @@ def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
 
 
 def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None) -> Fit:
-    """Return the fit with the least residuals among this one and fits from other starts. If ``starts`` is None, no
-    further start is tried after a fit without doubts, or one with the same end as all others."""
+    """Return the fit with the least residuals among ``found`` and fits from other starts. With ``starts`` None, stop
+    after a fit without doubts, or if all fits have the same end."""
     tried = list(found.tried)
-    for start in other_starts(problem, OTHERS if starts is None else starts - 1):
+    for start in other_starts(problem, 3 if starts is None else starts - 1):
         try:
             other = _from(problem, start, iterations)
-        except (ComputationError, DivergedError):  # there, nothing is told
+        except (ComputationError, DivergedError):
             continue
         tried += other.tried
         if other.tried[0].misfit < min(one.misfit for one in found.tried):
@@ -425,13 +405,13 @@ def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
 
 
 def other_valleys(found: Fit, tried: Sequence[Tried]) -> list[str]:
-    """Return a sentence about the lowest other local minimum, if its residuals are hardly larger."""
+    """Return a sentence about the lowest other local minimum, if it is nearly as likely."""
     others, bars = elsewhere(found, tried), np.sqrt(np.diag(found.coordinate_covariance))
     if not others:
         return []
     other, least = others[0], min(one.misfit for one in tried)
     independent = sum(part.frames * part.samples for part in found.parts)
-    if 2.0 * independent * (other.misfit - least) > NO_LESS_LIKELY:
+    if 2.0 * independent * (other.misfit - least) > 9.0:  # log of the likelihood ratio: three standard errors
         return []
     k = int(np.argmax(np.abs(other.end - found.u) / np.maximum(bars, TINY)))
     label, value = found.labels[k], found.coordinates.numbers(other.end)[k]

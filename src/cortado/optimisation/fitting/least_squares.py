@@ -1,9 +1,9 @@
 """The least-squares problem of several experiments, as a function of one vector, and its Jacobians.
 
-The vector has the fitted numbers, positive ones as logarithms. The Jacobian is computed at the first point only; trial
-points run forward and give residuals. Kriging interpolates the residuals (Sacks, Welch, Mitchell and Wynn 1989): a
-linear function plus a random function with Matérn covariance of index 7/2. Slopes of the interpolant estimate the
-Jacobian. Near points determine slopes, far points curvature; the likelihood chooses how smooth the residuals are.
+The vector has the fitted numbers, or logarithms of positive numbers. The Jacobian is computed at the first point only;
+at trial points, slopes of an interpolation of the residuals by Kriging estimate the Jacobian (Sacks, Welch, Mitchell
+and Wynn 1989). The interpolation is a linear function plus a random function with Matérn covariance of index 7/2, whose
+width has the greatest likelihood.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,24 +18,16 @@ from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.observations import Observation
 
 MOST_NUMBERS = 100
-"""Greatest number of fitted numbers; each costs a forward-mode run."""
 DIFFERENCE = 0.02
-"""Step of a number's logarithm for estimating a derivative by a difference."""
-HARD_BY = 1e-3
-"""Of the size of the residuals: by so much they change up to the points that stand for the first Jacobian."""
-MOST = 5
-"""Points for each coefficient of a linear function, at which they become too many."""
+"""Step of a number's logarithm in a finite difference."""
 WIDTHS = (0.1, 1.0, 3.0)
-"""Widths of the covariance, for rough to smooth residuals, relative to the greatest distance between two points."""
-ROUND_OFF = 1e-12
-"""Round-off relative to a variance."""
+"""Widths of the covariance, relative to the greatest distance between two points."""
 TINY = 1e-300
-"""Smallest denominator of a fraction, against division by 0."""
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """All numbers of the parameters, in order, with marks for those that are fitted."""
+    """All numbers (all,) of the parameters, of which those with different bounds are fitted (free,)."""
 
     names: tuple[str, ...]
     shapes: tuple[tuple[int, ...], ...]
@@ -44,9 +36,7 @@ class Coordinates:
     logarithmic: np.ndarray
     """Mask (all,) of numbers that are fitted by their logarithm."""
     lower: np.ndarray
-    """(all,)"""
     upper: np.ndarray
-    """(all,)"""
 
     @classmethod
     def of(
@@ -56,8 +46,8 @@ class Coordinates:
         bounds: Mapping[str, tuple[Any, Any]] | None,
         unseen: Mapping[str, np.ndarray] | None = None,
     ) -> "Coordinates":
-        """Make coordinates for a start. ``positive`` parameters use their logarithm if all of their numbers are above
-        0; ``unseen`` numbers are not fitted. Raises `InputError` for unsuitable arguments."""
+        """Make coordinates for a start, with logarithms of ``positive`` parameters whose numbers are all above 0.
+        ``unseen`` numbers are not fitted. Raise `InputError` for unsuitable arguments."""
         require_table("start", start, "{'viscosity': 0.5}")
         values = {name: as_numbers(f"start of {name}", value) for name, value in start.items()}
         given = {} if bounds is None else bounds
@@ -86,17 +76,17 @@ class Coordinates:
 
     @property
     def free(self) -> np.ndarray:
-        """Return (all,) true for numbers that are searched: their bounds differ."""
+        """Return a mask (all,) of fitted numbers."""
         return self.lower < self.upper
 
     @property
     def by_logarithm(self) -> np.ndarray:
-        """Return (free,) true for searched numbers that are searched by their logarithm."""
+        """Return a mask (free,) of numbers that are fitted by their logarithm."""
         return self.logarithmic[self.free]
 
     @property
     def labels(self) -> list[str]:
-        """Return the free numbers' labels: the parameter's name, with an index where it has several numbers."""
+        """Return the names of parameters, with an index for parameters of several numbers, such as "gravity[1]"."""
         every = [
             name if not shape else f"{name}[{', '.join(map(str, index))}]"
             for name, shape in zip(self.names, self.shapes, strict=True)
@@ -106,43 +96,40 @@ class Coordinates:
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower and upper bounds (free,) of the vector that is searched."""
+        """Return lower and upper bounds (free,) of the coordinates."""
         with np.errstate(divide="ignore"):
             logs = [np.where(self.logarithmic, np.log(np.maximum(e, 0.0)), e) for e in (self.lower, self.upper)]
         return logs[0][self.free], logs[1][self.free]
 
     @property
     def start(self) -> np.ndarray:
-        """Return the vector (free,) that is searched, at the start."""
         return self.vector(self.at_start)
 
     def vector(self, numbers: np.ndarray) -> np.ndarray:
-        """Return the coordinates (free,) of all numbers (all,)."""
         chosen, is_log = numbers[self.free], self.by_logarithm
         return np.where(is_log, np.log(np.where(is_log, chosen, 1.0)), chosen)
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """Return the searched numbers (free,) at coordinates u (free,), in the units of the parameters."""
+        """Return the fitted numbers (free,) at coordinates u (free,), in the units of the parameters."""
         with np.errstate(over="ignore"):  # an interval may have no upper end
             return np.where(self.by_logarithm, np.exp(np.where(self.by_logarithm, u, 0.0)), u)
 
     def slopes(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivative (free,) of each searched number with respect to its coordinate."""
+        """Return the derivatives (free,) of numbers with respect to their coordinates."""
         return np.where(self.by_logarithm, self.numbers(u), 1.0)
 
     def values(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """Return parameters by name at coordinates u (free,)."""
         whole = self.at_start.copy()
         whole[self.free] = self.numbers(u)
         return self.named(whole)
 
     def named(self, whole: np.ndarray) -> dict[str, np.ndarray]:
-        """Return all numbers (all,) as arrays by name."""
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)])
         return {n: whole[ends[k] : ends[k + 1]].reshape(self.shapes[k]) for k, n in enumerate(self.names)}
 
     def directions(self, u: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Return the direction of the parameters along each coordinate, only with the parameter that it moves."""
+        """Return the derivative of the parameters with respect to each coordinate, without parameters of derivative
+        0."""
         found, slopes = [], self.slopes(u)
         for k, place in enumerate(np.flatnonzero(self.free)):
             whole = np.zeros(len(self.at_start))
@@ -151,14 +138,13 @@ class Coordinates:
         return found
 
     def spread(self, free: np.ndarray, otherwise: float) -> dict[str, np.ndarray]:
-        """Return searched numbers (free,) as arrays by name, in which fixed numbers are ``otherwise``."""
+        """Return fitted numbers (free,) as arrays by name, filled with ``otherwise`` for other numbers."""
         whole = np.full(len(self.at_start), otherwise)
         whole[self.free] = free
         return self.named(whole)
 
 
 def _ends(name: str, value: np.ndarray, pair: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper bound of a parameter, each of its shape."""
     if len(pair) != 2:
         raise InputError(f"bounds of {name} must be a pair, the lower and the upper one.")
     try:
@@ -174,8 +160,7 @@ def _ends(name: str, value: np.ndarray, pair: Any) -> tuple[np.ndarray, np.ndarr
 
 
 def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> np.ndarray:
-    """Return values (frames, ...) minus their prediction from the previous frame, scaled to unchanged standard
-    deviation."""
+    """Return values (frames, ...) minus their prediction from the previous frame, with unchanged standard deviation."""
     if not correlation_time:
         return values
     kept = np.exp(-np.diff(times) / correlation_time).reshape(-1, *[1] * (values.ndim - 1))
@@ -184,49 +169,43 @@ def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> 
 
 @dataclass(frozen=True)
 class Part:
-    """An observation of one of the experiments of a fit."""
+    """An observation of an experiment of a fit; ``label``: name, and number of the experiment among several."""
 
     experiment: int
     name: str
     label: str
-    """Label that tells it from the parts of other experiments."""
     observation: Observation
 
 
 @dataclass(frozen=True)
 class Weighting:
-    """The scale by which the residuals of a part are divided, and the correlation time by which they are whitened."""
+    """A scale [unit of the observation] that divides residuals, and a correlation time [s] that whitens them."""
 
     scale: float
-    """[unit of the observation]"""
     correlation_time: float = 0.0
-    """[s]"""
 
     def of(self, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Return values (frames, ...) whitened in time and divided by the scale."""
+        """Whiten values (frames, ...) in time, and divide them by the scale."""
         return whitened(values, times, self.correlation_time) / self.scale
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals and Jacobians of all parts at a point, in the units of the measurements."""
+    """Residuals and Jacobians of all parts at coordinates u (free,), in the units of the measurements."""
 
     u: np.ndarray
     residuals: list[np.ndarray]
-    """Residuals of each part (frames, m), predicted minus measured; 0 for ignored numbers."""
+    """Predicted minus measured numbers (frames, m) of each part; 0 for ignored numbers."""
     jacobians: list[np.ndarray]
-    """Jacobians of each part, (frames, m, free)."""
+    """Jacobian (frames, m, free) of each part."""
 
 
 def weighted(parts: Sequence[Part], weights: Sequence[Weighting], values: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return values (frames, ...) of each part, whitened and divided by its weighting."""
     each = zip(parts, weights, values, strict=True)
     return [weight.of(own, part.observation.times) for part, weight, own in each]
 
 
 class LeastSquares:
-    """The least-squares problem of several experiments that a search solves; it counts its runs."""
-
     def __init__(
         self,
         experiments: Sequence[Experiment],
@@ -242,16 +221,14 @@ class LeastSquares:
             for name, one in experiment.observations.items()
         ]
         self.runs = self.tangents = self.refused = 0
-        """Numbers of forward runs and of forward-mode runs, each of one experiment, and of points whose runs
-        diverged."""
+        """Numbers of forward runs, of forward-mode runs, and of diverged runs of single experiments."""
 
     @property
     def labels(self) -> list[str]:
-        """Return the labels (free,) of the numbers that are searched."""
         return self.coordinates.labels
 
     def residuals(self, u: np.ndarray) -> list[np.ndarray]:
-        """Return the residuals of each part at u; raise `DivergedError` where the run diverges."""
+        """Return the residuals of each part at u; raise `DivergedError` if a run diverges."""
         found = [self._run(k, self.coordinates.values(u), ())[0] for k in range(len(self.experiments))]
         if self._on_trial is not None:
             self._on_trial()
@@ -262,8 +239,8 @@ class LeastSquares:
         return self._along(u, range(len(u)))
 
     def estimated(self, u: np.ndarray) -> Linearised:
-        """Return residuals and estimated Jacobians at a point. Derivatives of positive numbers are differences, because
-        a forward run costs less than a forward-mode run. Raises `DivergedError`."""
+        """Return residuals and estimated Jacobians at a point; raise `DivergedError`. Derivatives with respect to
+        positive numbers are differences, because a forward run costs less than a forward-mode run."""
         positive = self.coordinates.by_logarithm
         at = self._along(u, np.flatnonzero(~positive))
         _, upper = self.coordinates.bounds
@@ -271,14 +248,14 @@ class LeastSquares:
             change = DIFFERENCE if u[k] + DIFFERENCE <= upper[k] else -DIFFERENCE
             try:
                 moved = self.residuals(u + change * np.eye(len(u))[k])
-            except DivergedError:  # hard by a point that does not
+            except DivergedError:
                 return self.linearised(u)
             for J, before, after in zip(at.jacobians, at.residuals, moved, strict=True):
                 J[..., k] = (after - before) / change
         return at
 
     def _along(self, u: np.ndarray, columns: Iterable[int]) -> Linearised:
-        """Return residuals, and derivatives along some of the coordinates."""
+        """Return residuals, and derivatives with respect to some of the coordinates."""
         every, values = self.coordinates.directions(u), self.coordinates.values(u)
         directions = {number: every[number] for number in columns}
         residuals, jacobians = list[np.ndarray](), list[np.ndarray]()
@@ -301,13 +278,12 @@ class LeastSquares:
         return np.concatenate(J), np.concatenate([r.ravel() for r in weighted(self.parts, weights, at.residuals)])
 
     def sum_of_squares(self, residuals: Sequence[np.ndarray], weights: Sequence[Weighting]) -> float:
-        """Return the sum of squares of weighted residuals."""
         return float(sum((r**2).sum() for r in weighted(self.parts, weights, residuals)))
 
     def _run(
         self, number: int, values: dict[str, np.ndarray], along: Sequence[dict[str, np.ndarray]]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Run an experiment; return its predictions, and their derivatives along directions, if there are any."""
+        """Run an experiment; return predictions, and their derivatives along directions."""
         experiment, at = self.experiments[number], self.values_of(number, values)
         self.runs, self.tangents = self.runs + 1, self.tangents + len(along)
         try:
@@ -317,7 +293,7 @@ class LeastSquares:
             raise
 
     def values_of(self, experiment: int, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the values that an experiment has: all but those of other experiments' observations."""
+        """Return the values of an experiment's parameters, without those of other experiments' observations."""
         others = {name for one in self.experiments for name in one.start} - set(self.experiments[experiment].start)
         return {name: value for name, value in values.items() if name not in others}
 
@@ -326,32 +302,29 @@ class LeastSquares:
 
 
 class TrialPoints:
-    """Points of a search with their residuals, in coordinates in which the first Jacobian is orthonormal."""
-
     def __init__(self, problem: LeastSquares, weights: Sequence[Weighting], at: Linearised):
         J, r = problem.stacked(at, weights)
         self._metric = np.asarray(np.linalg.qr(J, mode="r"))
         self._scales = [weight.scale for weight in weights]
         self._points, self._residuals = [at.u], [at.residuals]
-        changes = HARD_BY * np.linalg.norm(r) / np.maximum(np.linalg.norm(J, axis=0), TINY)
-        for k, change in enumerate(changes):
+        changes = 1e-3 * np.linalg.norm(r) / np.maximum(np.linalg.norm(J, axis=0), TINY)
+        for k, change in enumerate(changes):  # points close to the first one represent its Jacobian
             moved = [r + change * J[..., k] for r, J in zip(at.residuals, at.jacobians, strict=True)]
             self.add(at.u + change * np.eye(len(at.u))[k], moved)
 
     def add(self, u: np.ndarray, residuals: list[np.ndarray]) -> int:
-        """Add a point that was run, and return its number."""
         self._points.append(u)
         self._residuals.append(residuals)
         return len(self._points) - 1
 
     @property
     def are_many(self) -> bool:
-        """Return True if the search should restart from the lowest point, before the points need too much memory."""
-        return len(self._points) >= MOST * (len(self._points[0]) + 1)
+        """Return True if the points need too much memory, so that the search should restart from the lowest point."""
+        return len(self._points) >= 5 * (len(self._points[0]) + 1)
 
     def linearised(self, number: int) -> Linearised:
-        """Return residuals and estimated Jacobians at one of the points, by its number."""
-        x = np.array(self._points) @ self._metric.T
+        """Return residuals and estimated Jacobians at the point of a ``number``."""
+        x = np.array(self._points) @ self._metric.T  # the first Jacobian is orthonormal in these coordinates
         parts = [np.array(part) for part in zip(*self._residuals, strict=True)]
         flat = [part.reshape(len(x), -1) / scale for part, scale in zip(parts, self._scales, strict=True)]
         products = np.sum([part @ part.T for part in flat], axis=0)
@@ -361,9 +334,8 @@ class TrialPoints:
 
 
 def slope_weights(x: np.ndarray, products: np.ndarray, number: int) -> np.ndarray:
-    """Return weights (d, points) of the values at points ``x`` (points, d), whose sums are the slopes of an
-    interpolation at one of them. ``products`` (points, points) of the values at two points, summed over all
-    residuals."""
+    """Return weights (d, points) of the values at points ``x`` (points, d) for the slopes of the interpolation at point
+    ``number``. ``products``: products (points, points) of values at two points, summed over all residuals."""
     from scipy.spatial.distance import cdist
 
     points, d = x.shape
@@ -379,13 +351,13 @@ def slope_weights(x: np.ndarray, products: np.ndarray, number: int) -> np.ndarra
 
 
 def _covariance(apart: np.ndarray) -> np.ndarray:
-    """Return the covariance of a smooth random function between points ``apart``, in units of its width."""
+    """Return the Matérn covariance (points, points) for distances ``apart``, in units of the width."""
     smooth = (1.0 + apart + 0.4 * apart**2 + apart**3 / 15.0) * np.exp(-apart)
-    return smooth + ROUND_OFF * np.eye(len(apart))
+    return smooth + 1e-12 * np.eye(len(apart))
 
 
 def _most_likely_width(apart: np.ndarray, linear: np.ndarray, products: np.ndarray) -> float:
-    """Return the width of greatest likelihood for the contrasts that no linear function changes; one tells none."""
+    """Return the width of greatest likelihood, from contrasts of values that linear functions do not change."""
     from scipy.linalg import null_space
 
     contrasts = null_space(linear.T)

@@ -24,50 +24,48 @@ from cortado.simulation import Simulation
 CLOCK = "start"
 """Name of an observation's clock parameter, which shifts the times of its frames."""
 LEAST_FRAMES = 4
-"""Least number of frames of an observation, because error bars are computed from the scatter between frames."""
 
 
 @dataclass(frozen=True)
 class Direction:
-    """The direction of a directional derivative at one state, for an observation."""
+    """The direction of a directional derivative of an observation's prediction at a state."""
 
     fields: Arrays
-    """The tangent of the state, by fields: vectors (n, d), fractions (n, phases)."""
+    """Tangents of the state's fields by name, such as positions (n, d) and mass fractions (n, phases)."""
     parameters: Mapping[str, np.ndarray]
-    """The direction of the parameters of the simulation, by name."""
+    """Direction of the simulation's parameters by name."""
     own: Mapping[str, np.ndarray]
-    """The direction of the observation's own parameters, by name."""
+    """Direction of the observation's parameters by name."""
     quantities: Callable[[Iterable[str]], Arrays]
-    """The tangents of quantities of the particles, by name."""
+    """Function from names of quantities of particles to their tangents."""
 
 
 class Observation(Protocol):
-    """Protocol of an observation: numbers measured at several times, called frames, and their prediction from a
-    state."""
+    """Protocol of an observation: numbers measured at several times (frames), and their prediction from a state."""
 
     times: np.ndarray
     """Increasing times (frames,) [s] after the start of the run."""
     measured: np.ndarray
     """Measured numbers (frames, m); NaN for numbers to ignore."""
     noise: float | None
-    """Standard deviation of a number, if known; None estimates it from the residuals."""
+    """Standard deviation of a number; None to estimate it from the residuals."""
     unit: str
     """Unit of the numbers."""
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """Return first values of the observation's own parameters, such as those of a camera. A parameter called
-        "start" is a clock [s]: `Experiment` shifts the frames to later times as it grows."""
+        """Return first values of the observation's parameters, such as a camera's. A parameter called "start" is a
+        clock [s] that is added to the times of the frames."""
 
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the numbers (m,) that a state predicts, given values of the observation's own parameters."""
+        """Return the predicted numbers (m,) at a state, for values ``own`` of the observation's parameters."""
 
     def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
         """Return the derivatives (m, directions) of `value` along directions."""
 
 
 class Again:
-    """An observation with other numbers in place of its measured ones."""
+    """An observation with other measured numbers."""
 
     def __init__(self, observation: Observation, measured: np.ndarray):
         _, values, _ = checked(observation.times, measured, observation.noise)
@@ -83,17 +81,16 @@ class Again:
 
 @dataclass(frozen=True)
 class Frames:
-    """The positions of an observation's frames between the steps of a run; predictions are interpolated linearly
-    between two states."""
+    """Times of an observation's frames, for linear interpolation between the states of a run."""
 
     steps: np.ndarray
-    """(frames,) number of steps before each frame."""
+    """Number of steps (frames,) before each frame."""
     shares: np.ndarray
-    """(frames,) share of the state after the next step, from 0 to 1."""
+    """Interpolation weight (frames,) of the state after the next step, from 0 to 1."""
 
     @classmethod
     def of(cls, times: np.ndarray, time_step: float, steps: int) -> "Frames":
-        """Find frames at times [s] among the steps of a run; raise `InputError` for times beyond the run."""
+        """Make frames for times [s]; raise `InputError` for times beyond the run."""
         places = times / time_step
         if places[-1] > steps + 1e-6:
             raise InputError(
@@ -105,20 +102,18 @@ class Frames:
 
     @property
     def needed(self) -> set[int]:
-        """Return the step numbers of the states that frames read."""
         return {int(k) for k in self.steps} | {int(k) + 1 for k in self.steps[self.shares > 0.0]}
 
     @property
     def around(self) -> set[int]:
-        """Return the step numbers of the states that `rates` needs: each frame's state and the next."""
         return {int(k) + more for k in self.steps for more in (0, 1)}
 
     def rates(self, read: Mapping[int, np.ndarray], time_step: float) -> np.ndarray:
-        """Return the rates of change (frames, ...) per second of readings of states, by the number of steps."""
+        """Return rates of change (frames, ...) [1/s] of readings by step number."""
         return np.array([(read[int(k) + 1] - read[int(k)]) / time_step for k in self.steps])
 
     def between(self, read: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Interpolate readings of states to the frames, (frames, ...)."""
+        """Interpolate readings by step number to the frames (frames, ...)."""
         last = max(read)
         after = [read[min(int(k) + int(share > 0.0), last)] for k, share in zip(self.steps, self.shares, strict=True)]
         before = np.array([read[int(k)] for k in self.steps])
@@ -127,7 +122,6 @@ class Frames:
 
 
 def clock_of(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray]:
-    """Return the parameter of a calibrated clock, whose time 0 is the time ``start`` [s] of the run."""
     return {CLOCK: np.array(as_one_number("clock", start))} if CLOCK in calibrate else {}
 
 
@@ -140,8 +134,8 @@ def only_a_clock(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray
 
 
 def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Return the times, the numbers and the noise of an observation; raise `InputError` for arrays that cannot be
-    fitted. ``clock`` [s] is added to the times."""
+    """Return times plus ``clock`` [s], numbers and noise of an observation; raise `InputError` for unsuitable
+    arrays."""
     moments = read_only("times", as_numbers("times", times) + as_one_number("clock", clock))
     values = read_only("measured", measured)
     if moments.ndim != 1 or len(moments) < LEAST_FRAMES:
@@ -183,8 +177,8 @@ class Video:
         calibrate: tuple[str, ...] | list[str] = (),
         clock: float = 0.0,
     ):
-        """Store a ``renderer`` from `Simulation.renderer` with the camera's measured place. ``times`` (frames,) [s]
-        count from the start of the run. ``frames`` (frames, rows, columns, 3): linear light from 0 to 1, see
+        """Store a ``renderer`` from `Simulation.renderer` with the camera's measured position. ``times`` (frames,) [s]
+        begin at the start of the run. ``frames`` (frames, rows, columns, 3): linear light from 0 to 1, see
         `cortado.pictures.read_picture`. ``mask`` (rows, columns): true for pixels to use. ``noise``: standard deviation
         of a number, if known. ``calibrate``: view parameters to fit too: "translation", "rotation", "field_of_view" or
         "width", "extinction", and "start", the ``clock`` [s] added to the times."""
@@ -205,16 +199,16 @@ class Video:
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """Return first values of the calibrated parameters: of the given camera and of its clock."""
+        """Return first values of the calibrated parameters of camera and clock."""
         return {**self.calibration.start, **self._clock}
 
     @property
     def unseen(self) -> Mapping[str, np.ndarray]:
-        """Return masks by name, true for numbers of the camera that do not affect the picture."""
+        """Return masks by name, true for camera parameters that do not affect the picture."""
         return self.calibration.unseen
 
     def picture(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the picture (rows, columns, 3) of a state, with values of calibrated parameters."""
+        """Return the picture (rows, columns, 3) of a state, for values ``own`` of calibrated parameters."""
         return self._renderer(own).render(at.state.positions, at.state.mass_fractions, at.colours)
 
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -230,7 +224,7 @@ class Video:
         return np.stack(found, axis=1)
 
     def _renderer(self, own: Mapping[str, np.ndarray]) -> Renderer:
-        """Return the renderer of the view with these values; the last one is kept."""
+        """Return the renderer for values of calibrated parameters, with a cache of one renderer."""
         if not self.calibration.names:
             return self.renderer
         key = b"".join(np.asarray(own[name]).tobytes() for name in self.calibration.names)
@@ -283,8 +277,7 @@ class SensorSeries:
         return value_of(self.sensor, at)[self._picked]
 
     def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
-        """Return the derivatives along directions. They are computed from adjoints of the numbers, because sensors have
-        no forward mode."""
+        """Return the derivatives along directions by adjoints of the numbers, because sensors have no forward mode."""
         rows = [self.sensor.adjoint(at, np.eye(self._width)[k]) for k in self._picked]
         others = [name for name in rows[0] if along and name not in along[0].fields]
         found = np.zeros((len(rows), len(along)))
@@ -296,14 +289,13 @@ class SensorSeries:
 
 @fixed
 class Tracks:
-    """An observation of a fit: tracers' positions over time. A tracer moves with the particles around its first
+    """An observation of a fit: positions of tracers over time. A tracer moves with the particles around its first
     position:
 
     X(t) = X(0) + sum_i w_i (x_i(t) - x_i(0)),
 
-    with Wendland's weights (1995) at the start, normalised to sum 1 within the support radius. Along periodic axes,
-    images of particles count at the start, and paths are not wrapped: a tracer that went around once is one period
-    further.
+    with Wendland's weights (1995) at the start, normalised to sum 1 within the support radius. Weights include periodic
+    images of particles. Paths are not wrapped: a tracer that crossed a periodic box is one period further.
 
     Example: ``tracks = cortado.measured.Tracks(simulation, first, times, positions, noise=0.001)``
     """
@@ -320,10 +312,10 @@ class Tracks:
         calibrate: Sequence[str] = (),
         clock: float = 0.0,
     ):
-        """Set the tracers' ``first`` positions (tracers, d) [m], and ``positions`` (frames, tracers, d) [m] at
-        ``times`` (frames,) [s] after the start of the run, with NaN for unseen tracers. ``noise``: standard deviation
-        of a coordinate [m], if known. ``clock`` [s] is added to the times; ``calibrate=["start"]`` fits it. Raises
-        `InputError` for a tracer without fluid around it."""
+        """Store the tracers' ``first`` positions (tracers, d) [m], and ``positions`` (frames, tracers, d) [m] at
+        ``times`` (frames,) [s] after the start of the run, NaN for unseen tracers. ``noise``: standard deviation of a
+        coordinate [m], if known. ``clock`` [s] is added to the times; ``calibrate=["start"]`` fits it. Raise
+        `InputError` if a tracer has no fluid around it."""
         self.start = only_a_clock(calibrate, clock)
         begun, places = as_numbers("first", first), as_numbers("positions", positions)
         tracers, d = begun.shape if begun.ndim == 2 else (0, 0)

@@ -43,18 +43,15 @@ from cortado.scene.parameters import QUANTITIES, check_quantity
 from cortado.simulation import Simulation
 
 LOSS, READING, PICTURE = "loss", "reading", "picture"
-"""Names of the result in layers that return one array."""
 
 
 class OfSimulation(Layer):
-    """A base class of layers whose arrays are a state of a simulation, and parameters over a number of steps."""
+    """Base class of layers whose arrays are a state of a simulation, and parameters over a number of steps."""
 
     def __init__(self, simulation: Simulation, steps: int, each: bool = False):
-        """Prepare a layer over ``steps`` steps; ``each`` is explained in `LayerParameters`."""
         super().__init__()
         self._simulation, self._each = simulation, each
         self.states = named_states(simulation)
-        """The converter between states and named arrays."""
         self._parameters = LayerParameters(simulation, steps, each)
         self.real, self.device = simulation.precision.numpy, simulation.device
         self.on_device = frozenset(STATE + name for name in self.states.fields)
@@ -63,7 +60,6 @@ class OfSimulation(Layer):
 
     @property
     def turn(self) -> Turn:
-        """Return the lock that a thread holds while it uses the simulation."""
         return self._simulation.turn
 
     def check(self, given: Shapes) -> None:
@@ -71,17 +67,14 @@ class OfSimulation(Layer):
         self._parameters.check(given, with_state=True)
 
     def _last_step(self) -> dict[str, Array]:
-        """Return a zero adjoint for the last step's length if the state has this array, which has no derivative."""
+        """Return a zero adjoint of the last step's length, which has no derivative, if states have this array."""
         return {LAST_STEP: np.zeros(self.states.shapes[LAST_STEP])} if LAST_STEP in self.states.shapes else {}
 
 
 class Steps(OfSimulation):
-    """A layer that takes a number of steps of a simulation, from a state to a later one."""
-
     def __init__(
         self, simulation: Simulation, steps: int, gradient: AdjointEstimator | None = None, each: bool = False
     ):
-        """Prepare the layer; reverse mode uses the estimator ``gradient``, by default the exact adjoint."""
         self._steps, self._gradient = check_steps(steps), gradient
         super().__init__(simulation, steps, each)
         self.kept_bytes = min(steps * self._state_size, MEMORY_BUDGET)
@@ -120,7 +113,6 @@ class Steps(OfSimulation):
         return Steps(self._simulation.batch_of(size), self._steps, self._gradient, each=True)
 
     def _derivatives(self, given: Named) -> dict[str, Any]:
-        """Return derivatives with respect to a state in the form that a stepper takes."""
         own = part(given, STATE)
         fields = self.states.written({name: array for name, array in own.items() if name in self.states.fields})
         found = {name: fields.numbers(name) for name in own if name in self.states.fields}
@@ -128,13 +120,12 @@ class Steps(OfSimulation):
         return found | {name: np.reshape(on_host(own[name]), members) for name in (STATE_TIME,) if name in own}
 
     def _named(self, found: dict[str, Any]) -> dict[str, Array]:
-        """Return derivatives of a stepper with respect to a state as named arrays of the layer."""
         fields = {**self.states.narrowed(found), STATE_TIME: np.asarray(found[STATE_TIME])}
         return named(STATE, {**fields, **self._last_step()})
 
 
 class Evaluation:
-    """A forward run of a problem; its derivatives are computed when they are first needed."""
+    """A forward run of a problem, with derivatives on demand."""
 
     def __init__(self, problem: Problem, values: Arrays, estimator: GradientEstimator, with_state: bool):
         self._problem, self.values, self._estimator, self._with_state = problem, values, estimator, with_state
@@ -147,8 +138,7 @@ class Evaluation:
 
     @property
     def gradient(self) -> Arrays:
-        """Return the loss's derivatives by names of arrays, in float64; for a batch with a first axis for the
-        scenes."""
+        """Return the loss's derivatives by names of arrays, in float64; in a batch with a first axis for the scenes."""
         if self._found is None:
             assert self._run is not None and isinstance(self._estimator, AdjointEstimator)
             if self._with_state:
@@ -157,7 +147,7 @@ class Evaluation:
                 self._found = {**named(PARAMETER, found), **named(STATE, state | last)}
             else:
                 self._found = named(PARAMETER, self._estimator.back(self._run))
-            self._run = None  # and the states that it keeps
+            self._run = None  # frees its states
         return self._found
 
     def along(self, dots: Named) -> Any:
@@ -169,11 +159,9 @@ class Evaluation:
 
 
 class Value(OfSimulation):
-    """A layer whose result is a problem's loss. Its arrays are parameters, and the fields of a state at which the
-    problem begins, if one is given."""
+    """A layer of parameters, and optionally of a problem's first state, whose result is the problem's loss."""
 
     def __init__(self, problem: Problem, gradient: GradientEstimator | None = None, each: bool = False):
-        """Prepare the layer; reverse mode uses the estimator ``gradient``, by default `gradients.Exact`."""
         if not isinstance(problem, Problem):
             raise InputError(f"problem is {shown(problem)}, but must be a cortado.Problem.")
         super().__init__(problem.simulation, problem.steps, each)
@@ -223,8 +211,7 @@ class Value(OfSimulation):
         return {LOSS: np.where(self._moved(dots), found, 0.0)}
 
     def _moved(self, dots: Named) -> Any:
-        """Return for each scene, (batch,) or (), whether a tangent is not 0; tangents shared by a batch count for
-        each."""
+        """Return True, (batch,) or (), for scenes with a tangent other than 0, also a shared one."""
         found = np.zeros(self.outputs()[LOSS], dtype=bool)
         for name, dot in dots.items():
             array = on_host(dot)
@@ -240,24 +227,21 @@ class Value(OfSimulation):
 
 
 def _times(found: np.ndarray, bar: Any) -> np.ndarray:
-    """Return ``found`` times ``bar``, a loss's derivative for each scene of a batch; 0 where ``bar`` is 0, even if
-    NaN."""
+    """Return ``found`` times ``bar`` of each scene, and 0 where ``bar`` is 0 and ``found`` NaN."""
     factor = np.reshape(bar, (*np.shape(bar), *(1,) * (found.ndim - np.ndim(bar))))
     return np.where(factor == 0.0, 0.0, found) * factor
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A state that was read, with everything that derivatives of the reading need."""
-
     snapshot: Snapshot
     step: Residual
     values: Arrays
 
 
 class Measure(OfSimulation):
-    """A layer that reads a sensor, or a quantity of the particles by name. Its arrays are the fields of a state and the
-    parameters of the step that follows."""
+    """A layer that reads a sensor, or a quantity of the particles by name, from a state and parameters of the next
+    step."""
 
     def __init__(self, simulation: Simulation, what: Sensor | str):
         if simulation.batch is not None:
@@ -308,7 +292,6 @@ class Measure(OfSimulation):
         return {READING: moment.tangents([name], fields.numpy(self._simulation.dimension), row)[name]}
 
     def _back(self, look: Look, bar: np.ndarray) -> dict[str, Any]:
-        """Convert the adjoint of the reading to adjoints of all arrays, in float64."""
         snapshot, rollout = look.snapshot, self._rollout
         found = {str(self._name): bar} if self._sensor is None else self._sensor.adjoint(snapshot, bar)
         whole = bar_on_device(found, snapshot).through_quantities(snapshot)
@@ -326,8 +309,8 @@ class Measure(OfSimulation):
 
 
 class Picture(Layer):
-    """A layer that renders pictures. Its arrays are positions (n, d) [m] and, optionally, mass fractions (n, phases)
-    and colours (phases, 3). They pass through the host."""
+    """A layer that renders pictures of positions (n, d) [m], and optionally mass fractions (n, phases) and colours
+    (phases, 3), on the host."""
 
     def __init__(self, renderer: Renderer):
         super().__init__()
@@ -355,7 +338,7 @@ class Picture(Layer):
 
     @WARP
     def pull(self, residual: dict[str, np.ndarray], bars: Named) -> Named:
-        self._renderer.render(**residual)  # whose last picture may be another one
+        self._renderer.render(**residual)  # because the renderer's last picture may be another one
         found = self._renderer.adjoint(on_host(bars[PICTURE]).astype(np.float64))
         positions = found.positions.numpy()[:, : residual["positions"].shape[1]]
         all_found = {"positions": positions, "fractions": found.fractions.numpy(), "colours": found.colours}

@@ -1,7 +1,6 @@
 """Base classes of layers, which are differentiable functions of named arrays, and converters of states and parameters.
 
-Other programs get complete states, and a state is checked when it comes back. Parameters are equal for all evaluations
-of a layer, or have an entry for each.
+Parameters are equal for all evaluations of a layer, or have an entry for each evaluation.
 """
 
 import warnings
@@ -27,18 +26,14 @@ from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.simulation import Simulation
 
 STATE, PARAMETER = "state ", "parameter "
-"""Prefixes of a layer's array names for fields of a state and for parameters, which keep them apart and begin error
-messages."""
+"""Prefixes of array names for fields of a state and for parameters, also in error messages."""
 POSITIONS = (STATE + "positions", "positions")
 """Names of the positions in layers whose arrays include particles."""
 LAST_STEP = "time_step"
 """Name of the length [s] of the step before a state, in a scene with adaptive time steps."""
 KEPT = 2
-"""Greatest number of batch sizes for which a layer is kept for the next call."""
-MOST_KNOWN = 256
-"""Greatest number of stored checksums of states."""
 Array = Any
-"""A Warp or NumPy array of numbers. An array of shape () may also have shape (1,)."""
+"""A Warp or NumPy array of numbers; an array of shape () may also have shape (1,)."""
 Named = Mapping[str, Array]
 Shapes = Mapping[str, tuple[int, ...]]
 K = TypeVar("K")
@@ -46,79 +41,70 @@ V = TypeVar("V")
 
 
 class Layer(ABC):
-    """A function of named arrays of one precision, with its derivatives.
-
-    Arrays are read where they are, on the host or on the layer's device. Given arrays are never written.
-    """
+    """A function of named arrays of one precision, with derivatives. Given arrays are not modified."""
 
     real: type
-    """The NumPy type of the numbers of all arrays."""
     device: Any
-    """Device of the arrays; parameters and other small arrays may be anywhere and are read on the host."""
+    """Device of the arrays in `on_device`; other arrays are read on the host."""
     on_device: frozenset[str] = frozenset()
-    """Names of the arrays that must be on the device."""
     kept_bytes: int = 0
-    """Approximate size of a residual [byte]."""
     unmapped: str = ""
-    """A name of the layer for messages, if it has no `many`; else empty."""
+    """Name of the layer in messages if `many` is unavailable; else empty."""
 
     def __init__(self) -> None:
         self._batched: dict[int, Layer] = {}
 
     @abstractmethod
     def check(self, given: Shapes) -> None:
-        """Raise `InputError`, in a sentence, for arrays with wrong names or shapes."""
+        """Raise `InputError` for arrays with wrong names or shapes."""
 
     @abstractmethod
     def outputs(self) -> dict[str, tuple[int, ...]]:
-        """Return the names and the shapes of the layer's results."""
+        """Return the shapes of the layer's results by name."""
 
     @abstractmethod
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        """Return the layer's results and, if ``keep``, a residual for `pull` and `push`, else None."""
+        """Return the layer's results, and a residual for `pull` and `push` if ``keep`` is true."""
 
     @abstractmethod
     def pull(self, residual: Any, bars: Named) -> Named:
-        """Reverse mode: return adjoints of all given arrays from adjoints of the results; those left out are 0."""
+        """Return adjoints of all given arrays for adjoints of the results, 0 for missing names (reverse mode)."""
 
     @abstractmethod
     def push(self, residual: Any, dots: Named) -> Named:
-        """Forward mode: return tangents of the results from tangents of given arrays; those left out are 0."""
+        """Return tangents of the results for tangents of given arrays, 0 for missing names (forward mode)."""
 
     def check_mapped(self) -> None:
-        """Raise `InputError`, in a sentence, if the layer has no `many`."""
+        """Raise `InputError` if `many` is unavailable."""
         if self.unmapped:
             raise InputError(
                 f"{self.unmapped} cannot be mapped over a further axis: map over one axis, of what has none."
             )
 
     def many(self, size: int) -> "Layer":
-        """Return a layer that evaluates ``size`` arrays of each kind at once, stacked along a first axis."""
+        """Return a layer of ``size`` evaluations, with arrays stacked along a first axis."""
         return OneByOne(self, size)
 
     def batched(self, size: int) -> "Layer":
-        """Return the layer of `many`; those of the last few sizes are kept."""
+        """Return the layer of `many`, from a cache."""
         self.check_mapped()
         return kept_or_made(self._batched, size, self.many, KEPT)
 
 
 @dataclass(frozen=True)
 class Lost:
-    """The residual of one of several evaluations of a layer whose run diverged, so that it has no result."""
+    """The residual of a diverged evaluation among several, with shapes of the ``given`` arrays, and the reason."""
 
     given: Shapes
-    """Shapes of its arguments."""
     why: str
 
     def along(self, of: Named, shapes: Shapes) -> Named:
-        """Return derivatives in these shapes: 0 if all given arrays are 0, else NaN."""
+        """Return derivatives of given ``shapes``: 0 if all arrays ``of`` are 0, else NaN."""
         number = np.nan if any(on_host(array).any() for array in of.values()) else 0.0
         return {name: np.full(shape, number) for name, shape in shapes.items()}
 
 
 class OneByOne(Layer):
-    """A layer of several evaluations that takes them one after the other."""
-
     def __init__(self, layer: Layer, size: int):
         super().__init__()
         self._layer, self._size = layer, size
@@ -141,7 +127,7 @@ class OneByOne(Layer):
         return stacked([one for one, _ in found]), [residual for _, residual in found] if keep else None
 
     def _evaluated(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        """Evaluate one entry; results are NaN if its particles are NaN or one of them is lost."""
+        """Evaluate an entry; results are NaN if positions are NaN or a particle is lost."""
         shapes = {name: np.shape(array) for name, array in given.items()}
         positions = next((array for name, array in given.items() if name in POSITIONS), np.zeros(1))
         lost = Lost(shapes, "its particles had been lost in steps before it.")
@@ -168,36 +154,32 @@ class OneByOne(Layer):
 
 
 def kept_or_made(kept: dict[K, V], key: K, make: Callable[[K], V], most: int) -> V:
-    """Return the value stored under a key, or make it; only the ``most`` last used values are kept."""
+    """Return the value of a key, or make it; keep the ``most`` last used values."""
     found = kept.pop(key, None) or make(key)
-    kept[key] = found  # the last one
+    kept[key] = found  # as the last used value
     while len(kept) > most:
         kept.pop(next(iter(kept)))
     return found
 
 
 def on_host(array: Array) -> np.ndarray:
-    """Return the numbers of an array, on the host or on a device, as a NumPy array."""
     return array.numpy() if isinstance(array, wp.array) else np.asarray(array)
 
 
 def part(given: Mapping[str, Any], kind: str) -> dict[str, Any]:
-    """Return the arrays whose names begin with a kind, with the kind removed from their names."""
     return {name.removeprefix(kind): array for name, array in given.items() if name.startswith(kind)}
 
 
 def named(kind: str, found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return arrays with a kind added in front of their names."""
     return {kind + name: array for name, array in found.items()}
 
 
 def rows(given: Named, chosen: int | np.ndarray) -> dict[str, Array]:
-    """Return one entry of the first axis of each array, or several in another order."""
     return {name: _rows(array, chosen) for name, array in given.items()}
 
 
 def stacked(found: Iterable[Named]) -> dict[str, Array]:
-    """Stack arrays of equal names along a first axis for the tables, on the device of the first table's."""
+    """Stack the arrays of several tables by name along a first axis, on the device of the first table."""
     tables = list(found)
     return {name: _stack([table[name] for table in tables]) for name in tables[0]}
 
@@ -222,24 +204,23 @@ def _stack(arrays: list[Array]) -> Array:
 
 
 class NamedStates:
-    """A converter of one simulation's states from named arrays, and to named arrays.
+    """A converter between a simulation's states and named arrays in the simulation's precision.
 
-    The arrays have the names and shapes of the fields of a `RestartState`, and a ``time`` [s]; for a batch they have a
-    first axis for the scenes. All are of the simulation's precision.
+    The arrays have the names and shapes of the fields of a `RestartState`, and a ``time`` [s]; in a batch they have a
+    first axis for the scenes.
     """
 
     def __init__(self, simulation: Simulation):
         self._simulation, self._place = simulation, DeviceStates(simulation)
         self._space = ParameterSpace(simulation, 0)
         self._known: OrderedDict[bytes, tuple[Origin, ...]] = OrderedDict()
-        """Origins of the particles of states that were checked or computed by steps, by the state's checksum."""
+        """Origins of particles of valid states, by checksum."""
         constant = (field.name for field in simulation.initial.fields if field.is_constant)
         self._constants: dict[str, tuple[np.ndarray, wp.array] | None] = dict.fromkeys(constant)
-        """Fields that no step changes, with the last given numbers."""
+        """Last given numbers of fields that no step changes, and their arrays."""
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of all arrays of a state, by name."""
         simulation = self._simulation
         members = () if simulation.batch is None else (simulation.batch,)
         last = {LAST_STEP: members} if simulation.scene.solver.chooses else {}
@@ -251,11 +232,8 @@ class NamedStates:
         return self._simulation.initial.names
 
     def state(self, given: Named, parameters: Arrays) -> DeviceState:
-        """Return a new state of the simulation. ``parameters`` are those of the steps that follow.
-
-        Raises `InputError` for a state that is impossible in this scene. On a GPU states and derivatives are not
-        checked, because that would copy them to the host.
-        """
+        """Convert arrays to a state before steps with ``parameters``; raise `InputError` for a state that is impossible
+        in this scene. On a GPU, states and derivatives are not checked, to avoid copies to the host."""
         arrays = self.written({name: given[name] for name in self.fields})
         times, sizes = (self._numbers(given, name) for name in (STATE_TIME, LAST_STEP))
         solver = self._simulation.scene.solver
@@ -270,7 +248,7 @@ class NamedStates:
         return DeviceState(arrays, scenes)
 
     def arrays(self, state: DeviceState) -> dict[str, Array]:
-        """Return the named arrays of a state computed by steps; `state` accepts them again."""
+        """Convert a state to named arrays, the inverse of `state`."""
         members = self.shapes[STATE_TIME]
         clocks = [scene.clock for scene in state.scenes]
         found: dict[str, Array] = self.read(state.arrays)
@@ -282,7 +260,7 @@ class NamedStates:
         return found
 
     def written(self, given: Named) -> State:
-        """Copy fields, or derivatives with respect to fields, to a `State`; fields left out are 0."""
+        """Copy fields, or derivatives with respect to fields, to a `State`, with 0 for missing fields."""
         if self._simulation.device.is_cpu:
             like = self._simulation.initial
             own = {name: self._on_host(name, like[name], given.get(name)) for name in like.names}
@@ -297,8 +275,8 @@ class NamedStates:
         return state
 
     def _on_host(self, name: str, like: wp.array, given: Array | None) -> wp.array:
-        """Return a field like another one, with given numbers or 0, in NumPy's memory. A field that no step changes
-        keeps its array as long as the numbers are equal."""
+        """Return an array like ``like`` with given numbers or 0, in NumPy's memory, for constant fields with unchanged
+        numbers the same array."""
         last = self._constants.get(name) if given is not None else None
         if last is not None and np.array_equal(on_host(given), last[0]):
             return last[1]
@@ -312,11 +290,11 @@ class NamedStates:
         return found
 
     def read(self, state: State) -> dict[str, Array]:
-        """Return the fields of a `State` as named arrays; on a CPU they may share its memory."""
+        """Return the fields of a `State` as named arrays, on a CPU possibly in the state's memory."""
         return self.narrowed({name: state.numbers(name) for name in self.fields})
 
     def narrowed(self, found: Named) -> dict[str, Array]:
-        """Return fields whose three-component vectors are cut to the scene's components."""
+        """Return fields with vectors cut to the scene's components."""
         is_cpu = self._simulation.device.is_cpu
         read = {n: on_host(found[n]) if is_cpu or e is Entry.DOUBLE else found[n] for n, e in self._entries.items()}
         narrow = {name: self._narrow(name, array) for name, array in read.items()}
@@ -324,23 +302,22 @@ class NamedStates:
 
     @cached_property
     def _entries(self) -> dict[str, Entry]:
-        """Return what the entries of each field are."""
         return {field.name: field.entry for field in self._simulation.initial.fields}
 
     def _narrow(self, name: str, whole: Array) -> Array:
-        """Return a view of a field's numbers; vectors have the scene's number of components."""
+        """Return a view of a field's numbers with vectors cut to the scene's components."""
         if self._entries[name] is not Entry.VECTOR or self._simulation.dimension == 3:
             return whole
         return whole[:, :, :2] if whole.ndim == 3 else whole[:, :2]
 
     def _numbers(self, given: Named, name: str) -> np.ndarray:
-        """Return a named array as numbers (members,) in float64; 0 if it is left out."""
+        """Return a named array as numbers (members,) in float64, by default 0."""
         members = self._simulation.batch or 1
         return on_host(given[name]).astype(np.float64).reshape(members) if name in given else np.zeros(members)
 
     def _clock(self, time: float, step: float, last: float) -> Clock:
-        """Return the clock of a state at a time that may have been rounded. If the time is a whole number of steps, the
-        clock counts steps, so that later times have the same bits as in one run."""
+        """Return the clock of a state at a possibly rounded time [s]. If the time is a multiple of the ``step``, the
+        clock counts steps, so that later times have the bits of a single run."""
         if self._simulation.scene.solver.chooses:
             return Clock(0, time, last)
         steps = round(time / step) if np.isfinite(time) and time >= 0.0 else 0
@@ -348,7 +325,6 @@ class NamedStates:
         return Clock(steps, steps * step) if abs(time - steps * step) <= room * time else Clock(0, time)
 
     def _judged(self, arrays: State, clocks: list[Clock], parameters: Arrays) -> tuple[Origin, ...]:
-        """Check a state's scenes, and return the origins of their particles."""
         known = self._known.get(self._checksum(arrays)) if self._simulation.device.is_cpu else None
         if known is not None:
             return known
@@ -366,12 +342,11 @@ class NamedStates:
     def _remember(self, arrays: State, origins: tuple[Origin, ...]) -> None:
         if self._simulation.device.is_cpu:
             self._known[self._checksum(arrays)] = origins
-            while len(self._known) > MOST_KNOWN:
+            while len(self._known) > 256:
                 self._known.popitem(last=False)
 
     def _checksum(self, arrays: State) -> bytes:
-        """Return the checksum of a state's numbers in other programs. In 2-D it excludes third components, because
-        their 0 may have a sign."""
+        """Return a checksum of a state's numbers, in 2-D without third components, whose 0 may have a sign."""
         found = blake2b(digest_size=16)
         for name in arrays.names:
             found.update(np.ascontiguousarray(self._narrow(name, arrays.numbers(name).numpy())).data)
@@ -379,7 +354,6 @@ class NamedStates:
 
 
 def check_state(given: Shapes, wanted: Shapes) -> None:
-    """Raise `InputError` for arrays of other names or shapes than those of a state."""
     if not given:
         raise InputError(f"state is left out, but must have {', '.join(wanted)} in this scene.")
     if given.keys() != wanted.keys():
@@ -390,17 +364,16 @@ def check_state(given: Shapes, wanted: Shapes) -> None:
 
 
 def named_states(simulation: Simulation) -> NamedStates:
-    """Return the state converter of a simulation, which all of its layers share."""
     found: NamedStates = simulation.__dict__.get("_named_states") or NamedStates(simulation)
     simulation.__dict__["_named_states"] = found
     return found
 
 
 class LayerParameters:
-    """The parameters of a layer over a number of steps, converted between the layer's arrays and the forms of problems.
+    """A converter of a layer's parameters over a number of steps to the forms of problems and steppers.
 
-    ``each``: True if the simulation is a batch of evaluations of a layer, and all arrays have an entry for each. A
-    batch made by a user has parameters in all shapes of `docs/batches.md`.
+    ``each``: True if the simulation is a batch of evaluations of a layer, and all arrays have an entry for each
+    evaluation. Other batches have parameters in all shapes of `docs/batches.md`.
     """
 
     def __init__(self, simulation: Simulation, steps: int, each: bool):
@@ -409,7 +382,6 @@ class LayerParameters:
         self._rows = DeviceRows(simulation, self._space)
 
     def check(self, given: Shapes, with_state: bool) -> None:
-        """Raise `InputError` for arrays of other names or shapes than the parameters'."""
         for name, shape in part(given, PARAMETER).items():
             shapes = self._space.shapes(name)
             if with_state and name in self._simulation.known.state:
@@ -418,19 +390,18 @@ class LayerParameters:
                 raise InputError(f"parameter {name} has shape {shape}, but must be {' or '.join(map(str, shapes))}.")
 
     def values(self, given: Named) -> Arrays:
-        """Return parameters in the form of problems, in float64."""
         own = part(given, PARAMETER)
         return {name: self._shaped(name, on_host(array).astype(np.float64)) for name, array in own.items()}
 
     def on_device(self, given: Named) -> dict[str, Array]:
-        """Return parameters in the form of steppers; parameters over time that are on the device stay there."""
+        """Return parameters in the form of steppers, with parameters over time possibly on the device."""
         own = part(given, PARAMETER)
         stay = {name: array for name, array in own.items() if isinstance(array, wp.array) and self._rows.takes(name)}
         others = {PARAMETER + name: array for name, array in own.items() if name not in stay}
         return {**self.values(others), **{name: self._shaped(name, array) for name, array in stay.items()}}
 
     def _shaped(self, name: str, array: Array) -> Array:
-        """Return a parameter's array, with an axis for steps added if each evaluation of a batch has one value for all
+        """Return a parameter's array, with an axis for steps added if an evaluation's value is the same in all
         steps."""
         shapes = self._space.shapes(name)
         if self._each and name in self._simulation.known.over_time and array.ndim == len(shapes[0]) + 1:
@@ -439,12 +410,11 @@ class LayerParameters:
         return array.reshape(()) if is_number else array
 
     def adjoints(self, found: Mapping[str, Array], values: Arrays) -> Named:
-        """Return derivatives in the shapes of the values; for a batch the given ones have a first axis for the scenes.
-        Derivatives on the device have these shapes already."""
+        """Return derivatives in the shapes of ``values``, summed over scenes that share a value."""
         shared = {}
         for name, bar in found.items():
             if isinstance(bar, np.ndarray):
                 shape = values[name].shape
-                is_shared = bar.size != int(np.prod(shape))  # by all scenes, over which it is added up
+                is_shared = bar.size != int(np.prod(shape))
                 shared[name] = (bar.sum(axis=0) if is_shared else bar).reshape(shape)
         return named(PARAMETER, {**found, **shared})

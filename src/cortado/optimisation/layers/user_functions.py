@@ -1,8 +1,5 @@
-"""The functions of a layer, such as `cortado.jax` and `cortado.torch`: states, steps, rollouts and losses of arrays.
-
-`smoothed` treats a closed loop, such as a policy's, as a problem of `cortado.gradients` and smooths its loss and
-gradient.
-"""
+"""The functions of `cortado.jax` and `cortado.torch`: states, steps, rollouts and losses of arrays, and smoothed losses
+of closed loops."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -27,50 +24,49 @@ from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
 
 Table = Mapping[str, Any]
-"""Arrays by name."""
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 KEPT = 4
-"""Greatest number of layers kept per simulation, by number of steps, and of compiled losses kept, by estimator."""
 
 
 class Bridge(ABC):
-    """Base class of the functions of JAX or PyTorch that layers call."""
+    """Base class of the functions of JAX or PyTorch for layers."""
 
     stack: Callable[[list[Any]], Any]
-    """Stacks arrays of the other program along a first axis."""
+    """Function that stacks arrays along a first axis."""
 
     @abstractmethod
     def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
-        """Apply a layer to arrays by name, differentiably, and return its results by name."""
+        """Return the results of a layer by name, as a differentiable function of arrays by name."""
 
     @abstractmethod
     def array(self, what: str, value: Any, layer: Layer) -> Any:
-        """Return an array of the layer's precision unchanged, or convert plain numbers to one; raise `InputError` for
+        """Return an array of the layer's precision unchanged, or convert numbers to an array; raise `InputError` for
         anything else."""
 
     @abstractmethod
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
-        """Copy arrays of a layer to arrays of the other program."""
+        """Copy arrays of a layer to arrays of JAX or PyTorch."""
 
     @abstractmethod
     def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
-        """Return a function of many weights and first positions, along a first axis, whose results are the losses (k,)
-        and, with ``slope``, their gradients by name, else an empty table."""
+        """Return a function of k weights and k first positions, along a first axis, whose results are the losses (k,)
+        and, with ``slope``, their gradients by name."""
 
     @abstractmethod
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return the value of a function of numbers as the other program's value, with its gradient in reverse mode."""
+        """Return the value of a function at ``weights`` as an array of JAX or PyTorch, with its gradient in reverse
+        mode."""
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
-        """Copy an array to the host, in float64; raise `InputError` for anything else."""
+        """Copy an array to the host in float64; raise `InputError` for anything else."""
         return as_precise_numbers(what, value)
 
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
     ) -> dict[str, Any]:
-        """Apply a step repeatedly, with the next row of each array, and return all states, including the first, along a
-        first axis."""
+        """Apply a step repeatedly, with the next row of each array in ``rows``; return all states along a first
+        axis."""
         states = [state]
         for k in range(count):
             states.append(step(states[-1], {name: row[k] for name, row in rows.items()}))
@@ -80,7 +76,7 @@ class Bridge(ABC):
 def bound(
     function: Callable[Concatenate[Bridge, Arguments], Result], bridge: Bridge, module: str
 ) -> Callable[Arguments, Result]:
-    """Return a function of this module, with its ``bridge`` filled in, as a public function of another ``module``."""
+    """Return a function of this module with a given ``bridge``, as a public function of another ``module``."""
 
     def call(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
         return function(bridge, *arguments, **named)
@@ -95,7 +91,6 @@ def bound(
 
 
 def steps_layer(simulation: Simulation, steps: int, gradient: AdjointEstimator | None = None) -> Steps:
-    """Return the layer of ``steps`` steps of a simulation; the last few layers are kept."""
     if not isinstance(simulation, Simulation):
         raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
     steps = whole_number("steps", steps, 1)
@@ -108,14 +103,13 @@ def steps_layer(simulation: Simulation, steps: int, gradient: AdjointEstimator |
 def state(
     bridge: Bridge, simulation: Simulation, given: Given | DeviceState = None, parameters: Values | None = None
 ) -> dict[str, Any]:
-    """Return a state as arrays: the scene's first state, or a ``given`` one, such as ``trajectory.last_state``.
+    """Return a state of a ``simulation`` as arrays: the first state, or a ``given`` one, such as
+    ``trajectory.last_state``.
 
-    ``parameters`` are numbers on which the first state depends, such as ``initial_velocities``, or those of the given
-    state's run. Returns positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases), reference_density
-    (n,), time () [s], and further fields of the solver; for a batch with a first axis for the scenes. Raises
-    `InputError` for unsuitable arguments.
-
-    ``simulation`` is the simulation to which the state belongs.
+    ``parameters``: numbers on which the first state depends, such as ``initial_velocities``, or those of the given
+    state's run. Return positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases), reference_density (n,),
+    time () [s], and further fields of the solver; in a batch with a first axis for the scenes. Raise `InputError` for
+    unsuitable arguments.
 
     Example: ``first = state(simulation)  # first["positions"]: (n, d)``
     """
@@ -130,7 +124,7 @@ def restart_state(
 ) -> RestartState | tuple[RestartState, ...]:
     """Convert a state of arrays to restart states for `Simulation.run`, files and other processes.
 
-    ``given`` is a state of ``simulation``; ``parameters`` are those of the run so far if the state depends on them.
+    ``given``: a state of ``simulation``; ``parameters``: those of the run so far, if the state depends on them.
 
     Example: ``run = simulation.run(100, state=restart_state(simulation, end))``
     """
@@ -154,14 +148,12 @@ def step(
 ) -> dict[str, Any]:
     """Return the state after ``steps`` steps from ``given``: `Simulation.step` as a function of arrays.
 
-    ``parameters`` are numbers or arrays for any parameters of `Problem` except initial values; parameters over time
-    have a row for each of these steps. Reverse mode uses the estimator ``gradient``, such as
-    `gradients.AdjointViscosity`, by default the exact adjoint; forward mode is exact. Exact derivatives of chained
+    ``simulation``: takes the steps. ``parameters``: numbers or arrays for any parameters of `Problem` except initial
+    values; parameters over time have a row for each of these steps. Reverse mode uses the estimator ``gradient``, such
+    as `gradients.AdjointViscosity`, by default the exact adjoint; forward mode is exact. Exact derivatives of chained
     steps are useful up to the horizon that `cortado gradients check` finds, some hundred steps. A chain warns if
-    adjoints grow by more than ten e-folds. A call adds 1.4 ms to its steps on a CPU, 3.4 ms with its backward pass: see
-    `docs/layers.md`. Raises `InputError` for unsuitable arguments, and `DivergedError` when a particle is lost.
-
-    ``simulation`` is the simulation that takes the steps.
+    adjoints grow by more than ten e-folds. Raise `InputError` for unsuitable arguments, and `DivergedError` if a
+    particle is lost.
 
     Example: ``end = step(simulation, state(simulation), {"viscosity": 0.1}, steps=5)``
     """
@@ -209,10 +201,10 @@ def rollout(
 
 
 def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., Any]:
-    """Return the loss of a problem as a function ``loss(parameters, state=None)`` of arrays by name. Its result is an
-    array (), or (batch,) for a batch.
+    """Return the loss of a ``problem`` as a function ``loss(parameters, state=None)`` of arrays by name, with results
+    (), or (batch,) for a batch.
 
-    With a state, the problem begins there. Reverse mode returns the gradient by the estimator ``gradient``, by default
+    The problem begins at ``state``, if given. Reverse mode uses the estimator ``gradient``, by default
     `gradients.Exact`, with the same bits as `Problem.value_and_gradient`.
 
     Example::
@@ -223,20 +215,19 @@ def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None =
     layer = Value(problem, gradient)
 
     def loss(parameters: Table, given: Table | None = None) -> Any:
-        """Return the loss for these parameters; if a state is given, the problem begins there."""
+        """Return the loss for parameters, and optionally for a first state."""
         return _applied(bridge, layer, given, parameters)[LOSS]
 
     return loss
 
 
 def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Callable[..., Any]:
-    """Return a function ``reading(state, parameters=None)`` of arrays that reads a sensor, such as one of
+    """Return a function ``reading(state, parameters=None)`` of arrays that reads ``what``: a sensor, such as one of
     `cortado.sensors`, or a quantity of the particles, such as "pressure".
 
-    It returns (k,), a number for each column of the sensor, or the quantity (n,) or (n, d). ``parameters`` are those of
-    the step that begins at the state, in which the pressure is computed. Raises `InputError` for a batch.
-
-    ``what`` is the sensor, or the name of the quantity.
+    A reading is an array (k,) with a number for each column of the sensor, or the quantity (n,) or (n, d).
+    ``parameters``: those of the step after the state, in which the pressure is computed. Raise `InputError` for a
+    ``simulation`` that is a batch.
 
     Example::
 
@@ -248,7 +239,7 @@ def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Calla
     layer = Measure(simulation, what)
 
     def reading(given: Table, parameters: Table | None = None) -> Any:
-        """Return the reading of a state; the pressure is computed in the step that begins there."""
+        """Return the reading of a state, with parameters of the next step."""
         return _applied(bridge, layer, given, parameters)[READING]
 
     return reading
@@ -257,9 +248,9 @@ def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Calla
 def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> Any:
     """Return a picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of arrays.
 
-    ``positions`` (n, d) [m]; ``fractions`` (n, phases), optional with one phase; ``colours`` (phases, 3), by default
-    the renderer's. Arrays pass through the host, and derivatives exist in reverse mode only. Raises `InputError` for
-    unsuitable arguments.
+    ``renderer``: from `Simulation.renderer`; ``positions`` (n, d) [m]; ``fractions`` (n, phases), optional with one
+    phase; ``colours`` (phases, 3), by default the renderer's. Arrays pass through the host, and derivatives exist in
+    reverse mode only. Raise `InputError` for unsuitable arguments.
 
     Example: ``image = picture(simulation.renderer(resolution=(64, 48)), end["positions"])  # (48, 64, 3)``
     """
@@ -280,7 +271,7 @@ def _applied(bridge: Bridge, layer: Layer, given: Table | None, parameters: Tabl
 
 
 def table_of(what: str, given: Table | None) -> Table:
-    """Return a given table, or an empty one for None; raise `InputError` for anything but a table by names."""
+    """Return a table, or an empty table for None; raise `InputError` for anything else."""
     found = {} if given is None else given
     likely = {"parameters": "{'gravity': array}", "weights": "{'bias': array}"}.get(what, "{'positions': array, ...}")
     require_table(what, found, likely)
@@ -291,15 +282,9 @@ def table_of(what: str, given: Table | None) -> Table:
 
 
 DISPLACED = "initial_positions"
-"""Name of the first positions among the weights of a sample; ensembles perturb them."""
-CHECKPOINTS = 2**30
-"""Greatest number of bytes of states stored for the backward passes of a batch of loops."""
 
 
 class Loop:
-    """A user's loss of weights and a first state as a problem for estimators; many loops are computed by one mapped
-    call."""
-
     def __init__(
         self, bridge: Bridge, simulation: Simulation, loss: Callable[..., Any], begin: Mapping[str, Any] | None
     ):
@@ -314,19 +299,18 @@ class Loop:
         self._mapped: dict[Any, Callable[..., tuple[Any, Any]]] = {}
 
     def value(self, parameters: Values) -> float:
-        """Return the loss of these weights."""
         return float(self.at([parameters])[0][0])
 
     def forward_pass(self, parameters: Values) -> "OneLoop":
-        """Return the forward pass of one loop, for a backward pass by any estimator."""
         return OneLoop(self, [parameters])
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """Return the number of loops that one launch should compute."""
-        return self.simulation.room(1, CHECKPOINTS if estimator else 0.0)
+        """Return the greatest number of loops in a mapped call, with 1 GiB for the states of backward passes."""
+        return self.simulation.room(1, 2**30 if estimator else 0.0)
 
     def together(self, points: Sequence[Values], estimator: AdjointEstimator | None = None) -> list[Estimate]:
-        """Return estimates of several loops from one launch; an estimate whose loss is not finite contains an error."""
+        """Estimate losses and gradients of several loops in a mapped call; an estimate with an infinite loss contains
+        an error."""
         loops, gradient = LoopPass(self, points), dict[str, Any]()
         if estimator is not None:
             gradient = estimator.back(loops)
@@ -340,7 +324,7 @@ class Loop:
     def at(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None, slope: bool = False
     ) -> tuple[np.ndarray, Arrays]:
-        """Return the losses (k,) of several loops, and, with ``slope``, their gradients by name (k, ...), float64."""
+        """Return the losses (k,) of k loops and, with ``slope``, gradients (k, ...) by name, in float64."""
 
         def loss(weights: Any, positions: Any) -> Any:
             return self._loss(weights, {**self._state, "positions": positions}, estimator)
@@ -359,7 +343,7 @@ class Loop:
 
 
 class LoopPass:
-    """A forward run of several loops, like `ForwardPass` for a problem."""
+    """The `ForwardPass` of several loops."""
 
     def __init__(self, loop: Loop, points: Sequence[Values]):
         self._loop, self._points = loop, points
@@ -367,13 +351,12 @@ class LoopPass:
 
     @property
     def loss(self) -> Any:
-        """Losses (k,), taken from the backward pass if there was one."""
         if self._losses is None:
             self._losses, _ = self._loop.at(self._points)
         return self._losses
 
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """Return the gradients (k, ...) by name, by an estimator; the loops run again for this."""
+        """Run the loops again, and return the gradients (k, ...) by name."""
         self._losses, gradient = self._loop.at(self._points, estimator, slope=True)
         return gradient
 
@@ -383,22 +366,20 @@ class OneLoop(LoopPass):
 
     @property
     def loss(self) -> float:
-        """Loss of the loop."""
         return float(super().loss[0])
 
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """Return the gradient by name, by an estimator."""
         return {name: array[0] for name, array in super().back(estimator).items()}
 
 
 class Smoothed:
-    """A loss of a closed loop smoothed by an estimator over an ensemble: see `smoothed`."""
+    """A loss of a closed loop, smoothed by an estimator over an ensemble: see `smoothed`."""
 
     def __init__(self, bridge: Bridge, estimator: GradientEstimator, loop: Loop):
         self._bridge, self._estimator, self._loop = bridge, estimator, loop
 
     def __call__(self, weights: Mapping[str, Any]) -> Any:
-        """Return the mean of the loss over the ensemble; its derivative in reverse mode is that of `estimate`."""
+        """Return the mean of the loss over the ensemble, whose reverse mode returns the gradient of `estimate`."""
 
         def found(given: Mapping[str, Any]) -> tuple[float, Arrays]:
             own = self.estimate(given)
@@ -407,10 +388,9 @@ class Smoothed:
         return self._bridge.with_gradient(found, table_of("weights", weights))
 
     def estimate(self, weights: Mapping[str, Any]) -> Estimate:
-        """Return the loss at the weights and the smoothed gradient with its standard error, in NumPy arrays by name.
+        """Return the loss at the weights, and the smoothed gradient with its standard error, as NumPy arrays by name.
 
-        Raises `InputError` for weights that are no numbers, and for a weight with the reserved name
-        "initial_positions".
+        Raise `InputError` for weights that are no numbers, and for a weight with the reserved name "initial_positions".
         """
         given = table_of("weights", weights)
         own = {name: self._bridge.numbers(f"weight {name}", array) for name, array in given.items()}
@@ -426,17 +406,15 @@ def smoothed(
     estimator: GradientEstimator,
     state: Mapping[str, Any] | None = None,
 ) -> Smoothed:
-    """Return the loss of a closed loop smoothed over an ensemble, as a function of ``weights``, arrays by name.
+    """Return the ``loss`` of a closed loop, smoothed over an ensemble, as a function of ``weights``, arrays by name.
 
-    The function's value is the mean of the loss over the ensemble, its gradient the smoothed gradient. Its method
-    ``estimate(weights)`` returns an `Estimate` of both, with the standard error. You write ``loss(weights, state,
-    gradient)``; it returns a number and passes ``gradient`` on to `step` or `rollout`. The ``estimator`` sets the
-    spread of the weights, in their units, and the scatter of first positions: `gradients.EnsembleMean` averages
-    gradients, and `gradients.Guided` corrects their size by differences of the loss. Loops run in batches by
-    `jax.vmap`, compiled, or by `torch.vmap`. They begin at ``state``, by default the scene's first state. Raises
-    `InputError` for unsuitable arguments, and if called inside a compiled program.
-
-    ``simulation`` is the simulation that the loop controls.
+    The function's value is the mean of the loss over the ensemble; the derivative is the smoothed gradient. The
+    function's method ``estimate(weights)`` returns an `Estimate` of both, with the standard error. A user writes
+    ``loss(weights, state, gradient)``, which returns a number, and passes ``gradient`` on to `step` or `rollout` of the
+    ``simulation``. The ``estimator`` sets the spread of the weights, in their units, and of first positions:
+    `gradients.EnsembleMean` averages gradients, and `gradients.Guided` corrects their size by differences of the loss.
+    Loops run in batches by `jax.vmap`, compiled, or by `torch.vmap`, from ``state`` on, by default the scene's first
+    state. Raise `InputError` for unsuitable arguments, and in a compiled program.
 
     Example::
 

@@ -1,11 +1,11 @@
 """Layers as functions of JAX arrays: primitives with rules for both modes, for `jax.vmap` and for compiled programs.
 
-A layer is one primitive. Its forward-mode rule calls the layer, which then also returns its residual's number, and a
-second primitive, the tangent, which is linear in tangents. The tangent's transpose is a third primitive, the adjoint.
-So `jax.jvp` and `jax.grad` use the same rules, and JAX can transpose both again.
+A layer is a primitive. The primitive's forward-mode rule evaluates the layer, and calls a second primitive, the
+tangent, which is linear in tangents. The tangent's transpose is a third primitive, the adjoint. `jax.jvp` and
+`jax.grad` therefore use the same rules.
 
-JAX programs contain arrays only, so the residual is stored in `RESIDUALS` and found by a ticket, which is an array.
-Compiled programs call Python by Warp's foreign functions, which use the program's memory and, on a GPU, its stream.
+JAX programs contain only arrays: residuals are stored in `RESIDUALS`, and an array, the ticket, contains a residual's
+number. Compiled programs call Python by Warp's foreign functions.
 """
 
 import inspect
@@ -41,24 +41,19 @@ except ModuleNotFoundError as error:
 
 SECOND = "A second derivative is asked for, but there are first ones only: differentiate once."
 MOST_KEPT = 2**30
-"""Greatest number of bytes of stored residuals; older residuals are computed again when they are needed."""
 TICKET = 2
 """Number of integers in a ticket: the residual's number, and the entry's number if the layer is mapped."""
-LONGER = 64
-"""Greatest number of foreign functions kept after their programs have ended."""
 Kept = tuple[Layer, int | None, Any]
-"""A layer, its number of mapped entries (None if it is not mapped), and its residual."""
+"""A layer, the number of mapped entries (None if not mapped), and a residual."""
 Names = tuple[str, ...]
 Sizes = tuple[int, ...]
-"""Numbers of entries over which a layer is mapped, axis by axis."""
+"""Lengths of the axes over which a layer is mapped."""
 Arrays = Sequence[Any]
 Way = Literal["push", "pull"]
-"""Names of the methods of a layer for its derivatives, in forward and in reverse mode."""
+"""Methods of a layer for derivatives in forward and in reverse mode."""
 
 
 class Residuals:
-    """A store of residuals that wait for a derivative, by their numbers."""
-
     def __init__(self) -> None:
         self._kept: OrderedDict[int, Kept] = OrderedDict()
         self._numbers, self._lock = count(1), Lock()
@@ -67,7 +62,6 @@ class Residuals:
         return len(self._kept)
 
     def put(self, kept: Kept) -> int:
-        """Store a residual and return its number."""
         with self._lock:
             number = next(self._numbers) % 2**31
             self._kept[number] = kept
@@ -76,7 +70,6 @@ class Residuals:
             return number
 
     def get(self, number: int, last: bool) -> Kept | None:
-        """Return a residual by its number, or None if it was discarded; remove it if this is the ``last`` call."""
         with self._lock:
             return self._kept.pop(number, None) if last else self._kept.get(number)
 
@@ -85,8 +78,8 @@ RESIDUALS = Residuals()
 
 
 def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tuple[Named, NDArray[np.int32]]:
-    """Return a layer's results, mapped over ``entries`` entries along a first axis; and the tickets (entries, 2) or
-    (2,) of its residual if that is to be kept (``keep``), else 0."""
+    """Return a layer's results, mapped over ``entries`` along a first axis, and tickets (entries, 2) or (2,) of the
+    residual, which is stored if ``keep`` is true."""
     own = layer if entries is None else layer.batched(entries)
     found, residual = own.evaluate(given, keep)
     number = RESIDUALS.put((own, entries, residual)) if keep else 0
@@ -97,11 +90,11 @@ def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tup
 def derivative(
     way: Way, layer: Layer, entries: int | None, tickets: NDArray[np.int32], given: Named, others: Named
 ) -> Named:
-    """Compute a layer's derivative: push tangents ``others`` of the arrays ``given`` forward, or pull adjoints of its
+    """Push tangents ``others`` of the arrays ``given`` forward through a layer, or pull adjoints ``others`` of the
     results back. The tickets name the residual.
 
-    JAX may have mapped the derivative over ``entries`` entries. If it mapped the layer over fewer entries, or not at
-    all, several derivatives belong to each call of the layer, such as several directions."""
+    If JAX mapped the derivative over more ``entries`` than the layer, several derivatives, such as directions, belong
+    to an entry of the layer."""
     numbers, places = tickets.reshape(-1, TICKET).T
     last = way == "pull"
     kept = RESIDUALS.get(int(numbers[0]), last) if (numbers == numbers[0]).all() else None
@@ -137,19 +130,17 @@ def _derived(way: Way, arrays: Arrays, *, layer: Layer, names: Names, along: Nam
 
 
 def _results(*avals: Any, layer: Layer, sizes: Sizes, keep: bool = False, **others: Any) -> list[Any]:
-    """Return the abstract shapes and types of a layer's results."""
     found = [jax.core.ShapedArray((*sizes, *shape), layer.real) for shape in layer.outputs().values()]
     return [*found, jax.core.ShapedArray((*sizes, TICKET), np.int32)] if keep else found
 
 
 def _of_given(number: Any, *avals: Any, names: Names, along: Names, **others: Any) -> list[Any]:
-    """Return the traced shapes and types of the given arrays that ``along`` names."""
     each = dict(zip(names, avals, strict=False))
     return [jax.core.ShapedArray(each[name].shape, each[name].dtype) for name in along]
 
 
 def _primitive(name: str, run: Callable[..., list[Array]], results: Callable[..., list[Any]]) -> Any:
-    """Make a JAX primitive that runs a function of arrays; all mapped arrays have one mapped axis."""
+    """Make a JAX primitive from a function of arrays, whose mapped axes are merged into one."""
     made = Primitive(f"cortado_{name}")
     made.multiple_results = True
     made.def_abstract_eval(results)
@@ -195,7 +186,6 @@ pull_p = _primitive("pull", partial(_derived, "pull"), _of_given)
 
 
 def _evaluate_forward(arrays: Arrays, dots: Arrays, *, keep: bool, **options: Any) -> tuple[Any, Any]:
-    """Apply JAX's rule of forward mode for a layer: results, and their tangents by the residual's number."""
     *found, number = evaluate_p.bind(*arrays, keep=True, **options)
     there = [(name, dot) for name, dot in zip(options["names"], dots, strict=True) if type(dot) is not ad.Zero]
     along, own = tuple(name for name, _ in there), [dot for _, dot in there]
@@ -208,14 +198,12 @@ def _evaluate_forward(arrays: Arrays, dots: Arrays, *, keep: bool, **options: An
 def _transposed(
     transpose: Any, bars: Arrays, number: Any, *given: Any, names: Names, along: Names, **options: Any
 ) -> list[Any]:
-    """Apply the reverse-mode rule, the transpose, of a linear primitive whose first arrays have no derivative."""
     own = [ad.instantiate_zeros(bar) for bar in bars]
     found = transpose.bind(number, *given[: len(names)], *own, names=names, along=along, **options)
     return [None] * (1 + len(names)) + list(found)
 
 
 def _linear_forward(primitive: Any, given: Arrays, dots: Arrays, *, names: Names, **options: Any) -> tuple[Any, Any]:
-    """Apply the forward-mode rule of a linear primitive whose first arrays have no derivative."""
     fixed = 1 + len(names)
     if any(type(dot) is not ad.Zero for dot in dots[1:fixed]):
         raise InputError(SECOND)
@@ -233,8 +221,6 @@ for _one, _other in ((push_p, pull_p), (pull_p, push_p)):
 
 
 class JaxBridge(Bridge):
-    """The functions of JAX that layers call."""
-
     stack = staticmethod(jnp.stack)
 
     def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
@@ -263,7 +249,7 @@ class JaxBridge(Bridge):
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
     ) -> dict[str, Any]:
-        """Take one step after the other; in a compiled program as a loop."""
+        """Apply a step repeatedly, in a compiled program as a loop."""
         if not any(isinstance(array, jax.core.Tracer) for array in jax.tree.leaves((state, rows))):
             return super().repeated(step, state, rows, count)
 
@@ -275,11 +261,10 @@ class JaxBridge(Bridge):
         return {name: jnp.concatenate([state[name][None], own]) for name, own in found.items()}
 
     def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
-        """Map the loss, or the loss and its gradient, by `jax.vmap` in a compiled program."""
         return jax.jit(jax.vmap(jax.value_and_grad(loss) if slope else lambda *given: (loss(*given), {})))
 
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return the value with a given gradient, by a custom JAX rule; only outside compiled programs."""
+        """Return a value with a given gradient by a custom JAX rule, outside compiled programs."""
 
         def forward(given: Any) -> tuple[Any, Any]:
             if any(isinstance(array, jax.core.Tracer) for array in given.values()):
@@ -293,14 +278,13 @@ class JaxBridge(Bridge):
 
 
 def _array(array: Any) -> Array:
-    """Return a JAX array as a NumPy or Warp array that shares its memory."""
+    """Return a JAX array as a NumPy or Warp array in the same memory."""
     if not isinstance(array, jax.Array) or next(iter(array.devices())).platform == "cpu":
         return np.asarray(array)
     return wp.from_dlpack(array.reshape(array.shape or (1,)))
 
 
 def _jax_array(found: Array, wanted: Any) -> Any:
-    """Return the result of a layer as a JAX array of the wanted shape and type."""
     if isinstance(found, wp.array) and not found.device.is_cpu:
         return jnp.from_dlpack(found).astype(wanted.dtype).reshape(wanted.shape)
     own = found.numpy() if isinstance(found, wp.array) else np.asarray(found)
@@ -308,8 +292,8 @@ def _jax_array(found: Array, wanted: Any) -> Any:
 
 
 class ForeignFunction:
-    """A Python function of arrays that a compiled program calls. It is kept for some time after the program, because
-    JAX may release a program that is still running."""
+    """A Python function of arrays for compiled programs, which outlives the program because JAX may release a running
+    program."""
 
     def __init__(self, function: Callable[[list[Array]], Sequence[Array]]):
         self._number = next(_NUMBERS)
@@ -318,8 +302,8 @@ class ForeignFunction:
 
     @WARP
     def __call__(self, *arrays: Any, shapes: Sequence[Sizes], results: Sequence[Any]) -> list[Any]:
-        """Call the function within a function that JAX traces. ``shapes`` are its results' shapes; ``results`` are the
-        shapes and types that JAX receives."""
+        """Call the function in a traced function. ``shapes``: shapes of its results; ``results``: shapes and types for
+        JAX."""
         given = [array.reshape(array.shape or (1,)) for array in arrays]
         dims = {f"out_{k}": shape or (1,) for k, shape in enumerate(shapes)}
         kinds = tuple((array.ndim, str(array.dtype)) for array in given)
@@ -335,13 +319,13 @@ _GONE: deque[int] = deque()
 
 def _let_go(number: int) -> None:
     _GONE.append(number)
-    while len(_GONE) > LONGER:
+    while len(_GONE) > 64:
         _FUNCTIONS.pop(_GONE.popleft(), None)
 
 
 @cache
 def _callable(given: tuple[tuple[int, str], ...], made: tuple[tuple[int, str], ...]) -> Any:
-    """Make the JAX function that calls a function by its number, with arrays of these numbers of axes and types."""
+    """Make the JAX function that calls a function by number, with arrays of given numbers of axes and types."""
 
     def call(*arguments: Any) -> None:
         arrays, number, results = arguments[: len(given)], arguments[len(given)], arguments[len(given) + 1 :]
@@ -364,21 +348,21 @@ def _callable(given: tuple[tuple[int, str], ...], made: tuple[tuple[int, str], .
         [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in types]
     )
     call.__annotations__ = types
-    call.__qualname__ = f"call_{uuid4().hex}"  # a program that was kept on disk does not find it in another process
+    call.__qualname__ = f"call_{uuid4().hex}"  # for programs that JAX caches on disk, of other processes
     found = wp.jax_callable(call, len(made), wp.JaxCallableGraphMode.NONE, vmap_method=None)
     vars(sys.modules[type(found).__module__])["print"] = _print
     return found
 
 
 def _print(*words: Any, **options: Any) -> None:
-    """Replace Warp's printing of tracebacks in foreign functions: Cortado's errors are not printed, because JAX raises
-    them with their sentence. Warp has no setting for this."""
+    """Replace Warp's printing of tracebacks in foreign functions, which has no setting: do not print Cortado's errors,
+    because JAX raises them."""
     if not isinstance(sys.exc_info()[1], CortadoError):
         print(*words, **options)
 
 
 def _in_order(device: Any) -> AbstractContextManager[Any]:
-    """Return a context that runs in our own GPU stream, after earlier and before later work of the program's stream."""
+    """Return a context with a separate GPU stream, after earlier and before later work of the program's stream."""
     return nullcontext() if device.is_cpu else wp.ScopedStream(_stream(device.alias), sync_enter=True, sync_exit=True)
 
 

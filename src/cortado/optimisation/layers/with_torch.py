@@ -28,52 +28,44 @@ Tensors = tuple[Any, ...]
 
 @dataclass(eq=False)
 class Call:
-    """One application of a layer to tensors, with all that its derivatives need."""
+    """An application of a layer to tensors with ``names``, and the residual for derivatives."""
 
     layer: Layer
     names: tuple[str, ...]
-    """Names of the layer's tensors, in order."""
     keep: bool
-    """True if derivatives are likely to be needed."""
     residual: Any = None
     many: "Call | None" = field(default=None, repr=False)
-    """The application to several tensors of each name, made by `torch.vmap`."""
+    """The application to a batch of tensors by `torch.vmap`."""
 
     def evaluate(self, tensors: Tensors, keep: bool) -> Tensors:
-        """Evaluate the layer, and return its results as tensors."""
         with _in_order(_device(self.layer)):
             found, self.residual = self.layer.evaluate(_arrays(self.names, tensors), keep)
             return _tensors(self.layer, found, self.layer.outputs())
 
     def kept(self, tensors: Tensors) -> Any:
-        """Return the residual for derivatives; it is computed on the first call."""
         if self.residual is None:
             self.evaluate(tensors, keep=True)
         return self.residual
 
     def pull(self, tensors: Tensors, bars: Tensors) -> Tensors:
-        """Return the adjoints of all tensors, each on its device, by reverse mode of the layer."""
+        """Return the adjoints of all tensors, on the tensors' devices (reverse mode)."""
         with _in_order(_device(self.layer)):
             found = self.layer.pull(self.kept(tensors), _arrays(self.layer.outputs(), bars))
             each = zip(self.names, tensors, strict=True)
             return tuple(_tensor(found[name], tensor.shape, tensor.dtype, tensor.device) for name, tensor in each)
 
     def push(self, tensors: Tensors, dots: Tensors) -> Tensors:
-        """Return the tangents of the layer's results."""
         with _in_order(_device(self.layer)):
             found = self.layer.push(self.kept(tensors), _arrays(self.names, dots))
             return _tensors(self.layer, found, self.layer.outputs())
 
     def batched(self, size: int) -> "Call":
-        """Return the application to ``size`` of each tensor."""
         if self.many is None or self.many.layer is not self.layer.batched(size):
             self.many = Call(self.layer.batched(size), self.names, self.keep)
         return self.many
 
 
 class Evaluate(torch.autograd.Function):
-    """The application of a layer as a function of PyTorch's automatic differentiation."""
-
     @staticmethod
     def forward(call: Call, *tensors: Any) -> Tensors:
         return call.evaluate(tensors, call.keep)
@@ -103,12 +95,8 @@ class Evaluate(torch.autograd.Function):
 
 
 class _Linear(torch.autograd.Function):
-    """A derivative of a layer as a PyTorch function without second derivatives. Its inputs are the layer's tensors,
-    followed by adjoints or tangents."""
-
-    @staticmethod
-    def of(call: Call, tensors: Tensors, given: Tensors) -> Tensors:
-        raise NotImplementedError
+    """A derivative of a layer as a PyTorch function of the layer's tensors, followed by adjoints or tangents, without
+    second derivatives."""
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Tensors, output: Tensors) -> None:
@@ -124,8 +112,8 @@ class _Linear(torch.autograd.Function):
 
 
 def _mapped(function: Any) -> Callable[..., tuple[Tensors, Any]]:
-    """Make the `vmap` rule of a layer's derivative: one derivative of the layer mapped over the batch if its inputs are
-    mapped, else one derivative of the same layer for each entry."""
+    """Make the `vmap` rule of a layer's derivative: a derivative of the mapped layer if the layer's inputs are mapped,
+    else a derivative of the layer for each entry."""
 
     def vmap(info: Any, in_dims: Sequence[int | None], call: Call, *tensors: Any) -> tuple[Tensors, Any]:
         size, count = info.batch_size, len(call.names)
@@ -142,16 +130,12 @@ def _mapped(function: Any) -> Callable[..., tuple[Tensors, Any]]:
 
 
 class Pull(_Linear):
-    """The derivative of a layer in reverse mode, as a function of PyTorch."""
-
     @staticmethod
     def forward(call: Call, *tensors: Any) -> Tensors:
         return call.pull(tensors[: len(call.names)], tensors[len(call.names) :])
 
 
 class Push(_Linear):
-    """The derivative of a layer in forward mode, as a function of PyTorch."""
-
     @staticmethod
     def forward(call: Call, *tensors: Any) -> Tensors:
         return call.push(tensors[: len(call.names)], tensors[len(call.names) :])
@@ -162,8 +146,6 @@ for _one in (Pull, Push):
 
 
 class TorchBridge(Bridge):
-    """The functions of PyTorch that layers call."""
-
     stack = staticmethod(torch.stack)
 
     @torch.compiler.disable
@@ -193,14 +175,13 @@ class TorchBridge(Bridge):
         return {name: own.clone() for name, own in zip(shapes, _tensors(layer, found, shapes), strict=True)}
 
     def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
-        """Map the loss, or the loss and its gradient, by `torch.vmap`."""
         if not slope:
             return torch.vmap(lambda *given: (loss(*given), {}))
         mapped = torch.vmap(torch.func.grad_and_value(loss))
         return lambda *given: mapped(*given)[::-1]
 
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return the value with a given gradient, by adding terms that are 0 and have this gradient."""
+        """Return a value with a given gradient: add terms that are 0 and have this gradient."""
         value, gradient = found(weights)
         own = {name: array for name, array in weights.items() if isinstance(array, torch.Tensor)}
         moved = (((array - array.detach()) * array.new_tensor(gradient[name])).sum() for name, array in own.items())
@@ -222,7 +203,7 @@ def _device(layer: Layer) -> Any:
 
 @contextmanager
 def _in_order(device: Any) -> Iterator[None]:
-    """Run launches on a GPU after PyTorch's work in its stream, and before its next work there."""
+    """Run launches on a GPU after PyTorch's earlier work, and before PyTorch's later work."""
     if device.type != "cuda":
         yield
         return
@@ -233,7 +214,6 @@ def _in_order(device: Any) -> Iterator[None]:
 
 
 def _arrays(names: Any, tensors: Tensors) -> dict[str, Array]:
-    """Return tensors by name as arrays that share their memory, without the tensors left out."""
     each = zip(names, tensors, strict=True)
     return {name: _array(tensor) for name, tensor in each if tensor is not None}
 
@@ -244,21 +224,20 @@ def _array(tensor: Any) -> Array:
 
 
 def _tensors(layer: Layer, found: Named, shapes: dict[str, tuple[int, ...]]) -> Tensors:
-    """Return a layer's results as tensors; arrays that need not be on its device are copied to the host."""
+    """Return a layer's results as tensors, on the host unless `Layer.on_device` has their name."""
     real, device = _dtype(layer), _device(layer)
     each = ((found[name], shape, device if name in layer.on_device else "cpu") for name, shape in shapes.items())
     return tuple(_tensor(array, shape, real, place) for array, shape, place in each)
 
 
 def _tensor(array: Array, shape: Sequence[int], dtype: Any, device: Any) -> Any:
-    """Return an array as a tensor in its memory, or as a copy where the type or the device differs."""
+    """Return an array as a tensor in the same memory, or as a copy if type or device differ."""
     own = wp.to_torch(array) if isinstance(array, wp.array) else torch.from_numpy(np.array(array))
     assert own.numel() == prod(shape)
     return own.to(dtype=dtype, device=device).reshape(tuple(shape))
 
 
 def _in_front(tensors: Tensors, dims: Sequence[int | None], size: int) -> Tensors:
-    """Return tensors with the mapped axis moved to the front."""
     each = zip(tensors, dims, strict=True)
     return tuple(
         None if tensor is None else tensor.movedim(dim, 0) if dim is not None else tensor.expand(size, *tensor.shape)
