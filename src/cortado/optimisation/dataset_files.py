@@ -147,7 +147,6 @@ class DatasetFolder:
             ) from problem
 
     def write_metadata(self, content: Mapping[str, Any]) -> None:
-        """Write the metadata, which mark a data set as complete, and remove the files of single runs."""
         write_atomically(self.out / METADATA, json.dumps(content, indent=2) + "\n")
         shutil.rmtree(self.parts, ignore_errors=True)
 

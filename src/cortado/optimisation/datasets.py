@@ -134,7 +134,6 @@ class Sample:
 
     @property
     def overrides(self) -> list[str]:
-        """Return the random values as overrides "key=value" of a scene."""
         return [f"{key}={json.dumps(value)}" for key, value in self.values.items()]
 
     def start(self, positions: np.ndarray, velocities: np.ndarray, spacing: float) -> dict[str, np.ndarray]:

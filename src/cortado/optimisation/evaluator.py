@@ -27,8 +27,7 @@ GREATEST_GRADIENT = 1e150
 REFUSED = (DivergedError, InputError)
 """Errors after which a trial has an infinite loss."""
 WRONG = 10.0
-"""Greatest factor between a change of the loss and its predictions by gradients that does not count as a
-contradiction."""
+"""A step contradicts its gradients if the change of the loss differs from the predictions by more than this factor."""
 FELT = 0.01
 """Greatest change of the loss, relative to the range of all losses, that counts as none."""
 ROUND_OFF = 1e-5
@@ -178,7 +177,6 @@ class Doubt:
     """The verdict on a search; ``words``: sentences of doubt with advice, empty without doubts."""
 
     misled: bool
-    """True if the gradient disagreed with the steps, and the search used more than the gradient's direction."""
     stays: bool
     words: str
 

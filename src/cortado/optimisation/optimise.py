@@ -112,7 +112,6 @@ class Result:
         return f"Result({sized(self.parameters)}: {found}; {end})"
 
     def _repr_html_(self) -> str:
-        """Show the last states of the first and the best run, the target, the parameters and the losses."""
         losses, start = [record.loss for record in self.history], self.history[0].parameters
         page: str = on_top("result_page")(self, self.message, self.problem, start, self.parameters, losses)
         return page

@@ -52,13 +52,11 @@ IMAGES = 6
 EVALUATIONS = (1, 5, 20, 100)
 """Numbers of the evaluations whose runs are shown; 0 is the start."""
 Run = Mapping[int, Snapshot]
-"""States by step number."""
 
 
 @dataclass(frozen=True)
 class TaskFigures:
     found: Figures = field(default_factory=list)
-    """Films of the run with the found parameters."""
     compared: Figures = field(default_factory=list)
     parameters: Figures = field(default_factory=list)
     search: Figures = field(default_factory=list)
@@ -103,7 +101,6 @@ def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndar
 
 
 def _without_round_off(values: np.ndarray) -> np.ndarray:
-    """Round values to twelve digits of the largest value."""
     largest = np.abs(values).max()
     return np.round(values, 11 - int(np.floor(np.log10(largest)))) + 0.0 if largest > 0.0 else values  # no -0
 
@@ -147,7 +144,6 @@ def _images(made: Setup, result: Result, folder: Path) -> TaskFigures:
 
 
 def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
-    """Plot a parameter's estimate over the evaluations; of a parameter over time, plot the last estimate."""
     estimate, true = made.search.parameters(result.parameters)[name], made.true_parameter(name)
     path, first = folder / f"{name}.png", np.asarray(made.search.parameters(made.start)[name])
     names = component_names(made.task, name, estimate)
@@ -193,7 +189,6 @@ def begin_shaded(made: Setup) -> None:
 
 
 def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
-    """Draw shaded pictures and films of a solved task into a folder."""
     picture, device = made.task.scene.picture or Picture(), made.problem.simulation.device
     steps = np.unique(np.linspace(0, made.problem.steps, max(picture.searched_frames, 2)).astype(int)).tolist()
 
@@ -269,8 +264,6 @@ class MeasuredScene:
 
 @dataclass(frozen=True)
 class FitTask:
-    """A task of `cortado fit`: measured experiments, and the parameters to fit."""
-
     experiments: tuple[MeasuredScene, ...]
     fit: FitTable
 

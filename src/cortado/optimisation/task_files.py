@@ -266,7 +266,6 @@ class Setup:
 
     @property
     def search(self) -> Transformed:
-        """Return the last search, with the scene's extinction."""
         return self.searches[-1]
 
     def image(self, end: Snapshot) -> np.ndarray:

@@ -65,7 +65,6 @@ def _flat(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
 
 
 def _names(info: ValidationInfo) -> Collection[str]:
-    """Return all parameter names, including user-defined ones from the validation context."""
     return (*NAMES, *(info.context or {}).get("names", ()))
 
 

@@ -65,9 +65,7 @@ class ScoreCovariance:
     lost: float
     """Mean part of B that the fit absorbed."""
     samples: float
-    """Number of independent numbers in a frame."""
     frames: float
-    """Number of independent frames, before frames are whitened."""
 
     def degrees_of_freedom(self, inverse: np.ndarray, direction: np.ndarray) -> float:
         """Return Satterthwaite's degrees of freedom (1946) for the parameter combination ``direction`` (p,), given
@@ -149,9 +147,7 @@ class FittedPart:
     """Predicted minus measured numbers (frames, m), in the unit of the observation; 0 for ignored numbers."""
     spread: float
     samples: float
-    """Number of independent numbers in a frame."""
     frames: float
-    """Number of independent frames."""
 
     @property
     def label(self) -> str:
@@ -164,8 +160,6 @@ class FittedPart:
 
 @dataclass(frozen=True)
 class Widened:
-    """A least-squares problem whose unknowns include the sizes of causes of residuals."""
-
     parts: list[Part]
     labels: list[str]
 

@@ -91,7 +91,6 @@ def _at_bounds(problem: LeastSquares, at: Linearised) -> list[str]:
 
 
 def _vague(problem: LeastSquares, at: Linearised, certainty: Certainty) -> list[str]:
-    """Return sentences about positive numbers that are determined only to within a large factor."""
     coordinates = problem.coordinates
     bars = np.where(coordinates.by_logarithm, np.sqrt(np.diag(certainty.covariance)), 0.0)
     return [
@@ -204,7 +203,6 @@ def _step(wide: Widened, before: Linearised, weights: Sequence[Weighting]) -> Li
 
 
 def _fades_slowly(wide: Widened, weights: Sequence[Weighting]) -> bool:
-    """Return True if some noise is so correlated from frame to frame that it looks like a trend."""
     gaps = [float(np.median(np.diff(part.observation.times))) for part in wide.parts]
     each = zip(weights, gaps, strict=True)
     return any(one.correlation_time and np.exp(-gap / one.correlation_time) > 0.6 for one, gap in each)

@@ -145,7 +145,6 @@ class Experiment:
         return self._read(ends, frames, parameters), found
 
     def _frames(self, parameters: Values) -> dict[str, Frames]:
-        """Return the frames of each observation by its clock; frames before the run show the first state."""
         found = {}
         for name, one in self.observations.items():
             begun = one.start.get(CLOCK, 0.0)
@@ -207,7 +206,6 @@ class Experiment:
         return {name: value for name, value in values.items() if name not in own}
 
     def _own(self, observation: str, values: Values) -> dict[str, np.ndarray]:
-        """Return the values of an observation's parameters by name, without the prefix."""
         return {
             key: np.asarray(values[f"{observation}.{key}"], dtype=np.float64)
             for key in self.observations[observation].start

@@ -32,7 +32,6 @@ class Searched:
     next: np.ndarray
     """End (free,) of the next step, which was not run."""
     gain: float
-    """Predicted decrease of the sum of squares by the next step."""
     converged: bool
 
 

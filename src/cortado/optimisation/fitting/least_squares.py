@@ -235,7 +235,6 @@ class LeastSquares:
         return [self._residual(part, found[part.experiment][part.name]) for part in self.parts]
 
     def linearised(self, u: np.ndarray) -> Linearised:
-        """Return residuals and Jacobians at a point, by tangents."""
         return self._along(u, range(len(u)))
 
     def estimated(self, u: np.ndarray) -> Linearised:
@@ -255,7 +254,6 @@ class LeastSquares:
         return at
 
     def _along(self, u: np.ndarray, columns: Iterable[int]) -> Linearised:
-        """Return residuals, and derivatives with respect to some of the coordinates."""
         every, values = self.coordinates.directions(u), self.coordinates.values(u)
         directions = {number: every[number] for number in columns}
         residuals, jacobians = list[np.ndarray](), list[np.ndarray]()
@@ -283,7 +281,6 @@ class LeastSquares:
     def _run(
         self, number: int, values: dict[str, np.ndarray], along: Sequence[dict[str, np.ndarray]]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Run an experiment; return predictions, and their derivatives along directions."""
         experiment, at = self.experiments[number], self.values_of(number, values)
         self.runs, self.tangents = self.runs + 1, self.tangents + len(along)
         try:
@@ -323,7 +320,6 @@ class TrialPoints:
         return len(self._points) >= 5 * (len(self._points[0]) + 1)
 
     def linearised(self, number: int) -> Linearised:
-        """Return residuals and estimated Jacobians at the point of a ``number``."""
         x = np.array(self._points) @ self._metric.T  # the first Jacobian is orthonormal in these coordinates
         parts = [np.array(part) for part in zip(*self._residuals, strict=True)]
         flat = [part.reshape(len(x), -1) / scale for part, scale in zip(parts, self._scales, strict=True)]

@@ -65,8 +65,6 @@ class Observation(Protocol):
 
 
 class Again:
-    """An observation with other measured numbers."""
-
     def __init__(self, observation: Observation, measured: np.ndarray):
         _, values, _ = checked(observation.times, measured, observation.noise)
         if values.shape != observation.measured.shape:
@@ -224,7 +222,6 @@ class Video:
         return np.stack(found, axis=1)
 
     def _renderer(self, own: Mapping[str, np.ndarray]) -> Renderer:
-        """Return the renderer for values of calibrated parameters, with a cache of one renderer."""
         if not self.calibration.names:
             return self.renderer
         key = b"".join(np.asarray(own[name]).tobytes() for name in self.calibration.names)

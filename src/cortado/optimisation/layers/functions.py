@@ -125,8 +125,6 @@ class Steps(OfSimulation):
 
 
 class Evaluation:
-    """A forward run of a problem, with derivatives on demand."""
-
     def __init__(self, problem: Problem, values: Arrays, estimator: GradientEstimator, with_state: bool):
         self._problem, self.values, self._estimator, self._with_state = problem, values, estimator, with_state
         self._run = problem.forward_pass(values) if isinstance(estimator, AdjointEstimator) else None

@@ -294,7 +294,6 @@ class NamedStates:
         return self.narrowed({name: state.numbers(name) for name in self.fields})
 
     def narrowed(self, found: Named) -> dict[str, Array]:
-        """Return fields with vectors cut to the scene's components."""
         is_cpu = self._simulation.device.is_cpu
         read = {n: on_host(found[n]) if is_cpu or e is Entry.DOUBLE else found[n] for n, e in self._entries.items()}
         narrow = {name: self._narrow(name, array) for name, array in read.items()}
@@ -394,7 +393,6 @@ class LayerParameters:
         return {name: self._shaped(name, on_host(array).astype(np.float64)) for name, array in own.items()}
 
     def on_device(self, given: Named) -> dict[str, Array]:
-        """Return parameters in the form of steppers, with parameters over time possibly on the device."""
         own = part(given, PARAMETER)
         stay = {name: array for name, array in own.items() if isinstance(array, wp.array) and self._rows.takes(name)}
         others = {PARAMETER + name: array for name, array in own.items() if name not in stay}

@@ -305,7 +305,6 @@ class Loop:
         return OneLoop(self, [parameters])
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """Return the greatest number of loops in a mapped call, with 1 GiB for the states of backward passes."""
         return self.simulation.room(1, 2**30 if estimator else 0.0)
 
     def together(self, points: Sequence[Values], estimator: AdjointEstimator | None = None) -> list[Estimate]:
@@ -343,8 +342,6 @@ class Loop:
 
 
 class LoopPass:
-    """The `ForwardPass` of several loops."""
-
     def __init__(self, loop: Loop, points: Sequence[Values]):
         self._loop, self._points = loop, points
         self._losses: np.ndarray | None = None
@@ -362,8 +359,6 @@ class LoopPass:
 
 
 class OneLoop(LoopPass):
-    """The `ForwardPass` of a single loop."""
-
     @property
     def loss(self) -> float:
         return float(super().loss[0])

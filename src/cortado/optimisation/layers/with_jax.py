@@ -50,7 +50,6 @@ Sizes = tuple[int, ...]
 """Lengths of the axes over which a layer is mapped."""
 Arrays = Sequence[Any]
 Way = Literal["push", "pull"]
-"""Methods of a layer for derivatives in forward and in reverse mode."""
 
 
 class Residuals:

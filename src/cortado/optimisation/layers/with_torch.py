@@ -188,7 +188,6 @@ class TorchBridge(Bridge):
         return sum(moved, torch.tensor(value))
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
-        """Copy a tensor, or other numbers, to the host in float64."""
         whole = isinstance(value, torch.Tensor) and value.dtype not in (torch.float16, torch.bfloat16)
         return as_precise_numbers(what, value.detach().cpu().numpy() if whole else value)
 
