@@ -21,7 +21,6 @@ FURTHEST = 2.0**24
 
 @cache
 def cell_grid_type(precision: Precision) -> Any:
-    """Return the Warp struct of a grid and of the first particle in each cell."""
     vector = precision.vector
 
     class CellGrid:
@@ -103,8 +102,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def place(arrivals, starts, counts, placed, before):
-        """Write the particle at each place, and to ``before`` the number of earlier arrivals in its cell; reset
-        ``counts``."""
+        """Write each place's particle, and to ``before`` its number of earlier arrivals; reset ``counts``."""
         i = wp.tid()
         arrival = arrivals[i]
         p = starts[arrival[0]] + arrival[1]
@@ -115,7 +113,6 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def rank(placed, before, order):
-        """Sort the particles of each cell by index; ``before`` is -1 after the last cell."""
         p = wp.tid()
         i = placed[p]
         first = p - before[p]

@@ -18,7 +18,6 @@ from cortado.device.threads import MOST_CORES, WARP, in_parallel, usable_cores
 
 MOST_BUNDLES = 4_096
 _FIELDS: dict[Any, tuple[str, ...]] = {}
-"""Names of the arrays of each bundle type."""
 
 
 @cache
@@ -101,24 +100,19 @@ def _signature(kernel: wp.Kernel) -> tuple[dict[str, None], list[tuple[str, Any,
 
 
 MOST_PARTS = 32
-"""Greatest number of ranges of particles in a launch on a CPU."""
 LEAST_PART = 2000
-"""Least number of particles in a range."""
 PARTS_A_CORE = 4
 """Greatest number of ranges per core, so that an idle core can take over the ranges of a busy core."""
 LEAST_SHARED_PART = 10_000
-"""Least number of particles in a range if each core has several ranges."""
 
 Watcher = Callable[[str, Any, Sequence[Any], Callable[[], None]], None]
-"""A function that gets a launch's name, threads and arguments, and the function that launches, to call at least
-once."""
+"""A function of a launch's name, threads and arguments, and of the launching function, which it must call."""
 _watchers: list[Watcher] = []
 
 
 @contextmanager
 def watched(watcher: Watcher) -> Iterator[None]:
-    """Pass every launch of this process in the block to a watcher, which times or counts launches. The launches in a
-    captured graph are passed only during capture."""
+    """Pass every launch of this process in the block to a watcher, except those of a replayed graph."""
     _watchers.append(watcher)
     try:
         yield
@@ -135,15 +129,14 @@ def _perform(name: str, threads: Any, arguments: Sequence[Any], work: Callable[[
 
 @cache
 def starts_at_first(kernel: wp.Kernel) -> bool:
-    """Test if a kernel reads ``first``, the start of its range of particles, from its first argument."""
     return f"{kernel.adj.args[0].label}.first" in kernel.adj.source
 
 
 def launch(
     kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, block: int | None = None, **arguments: Any
 ) -> None:
-    """Launch a kernel, off any tape, with arguments by name. ``threads`` is their number or a shape; ``block`` is the
-    number of GPU threads that share memory."""
+    """Launch a kernel, off any tape; ``threads`` is a number or a shape, ``block`` the GPU threads that share
+    memory."""
     announce(kernel, device)
     inputs, sizes = bound(kernel, groups, arguments), {} if block is None else {"block_dim": block}
     work = partial(wp.launch, kernel, threads, inputs=inputs, device=device, record_tape=False, **sizes)
@@ -197,7 +190,6 @@ class KernelLauncher:
 
     @property
     def capturable(self) -> bool:
-        """True if launches may be captured as a graph, which needs a single range."""
         return self.parts == 1
 
     def __call__(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
@@ -226,8 +218,7 @@ class KernelLauncher:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Launch the kernels of the block in a second GPU stream, concurrently with later launches until `join`. On a
-        CPU `aside` has no effect."""
+        """Launch the block in a second GPU stream, concurrently with later launches until `join`."""
         self._side_is_busy = self._side is not None
         with wp.ScopedStream(self._side):
             yield
@@ -283,8 +274,7 @@ LEAST, LEAST_SHARED_OFTEN = 1_000, 50_000
 
 
 class BandLauncher:
-    """A launcher of kernels with any number of threads on one device, on a CPU in bands. A kernel works on thread
-    ``first + wp.tid()``."""
+    """A launcher of any number of threads, on a CPU in bands; kernels work on thread ``first + wp.tid()``."""
 
     def __init__(self, device: Any):
         self.device, self._compiled = device, set[Any]()
@@ -308,8 +298,7 @@ class BandLauncher:
         self, kernel: wp.Kernel, rounds: int, values: wp.array, other: wp.array, **arguments: Any
     ) -> wp.array:
         """Launch a kernel ``rounds`` times, with a thread for each value; the kernel computes ``found`` from
-        ``values``. Successive launches swap the arrays ``values`` and ``other``; return the array that the last launch
-        wrote."""
+        ``values``. Successive launches swap the two arrays; return the array of the last launch."""
         count, both = len(values), ({"values": values, "found": other}, {"values": other, "found": values})
         if self.device.is_cpu and count > LEAST_SHARED_OFTEN:
             ways: list[Callable[[], None]] = [partial(self, kernel, count, **arguments, **one) for one in both]
@@ -321,8 +310,6 @@ class BandLauncher:
 
 
 class HostCopy:
-    """A reader of a small device array into pinned host memory."""
-
     def __init__(self, array: wp.array):
         self._array = array
         self._copy: Any = array if array.device.is_cpu else None

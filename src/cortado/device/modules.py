@@ -36,7 +36,6 @@ UNUSED = "-DWP_NO_BFLOAT16="
 
 
 def kernel_module(name: str, backward: bool = False) -> Any:
-    """Return the Warp module cortado_``name``; its kernels have Warp's adjoint only if ``backward``."""
     module = wp.get_module(f"cortado_{name}")
     module.options["enable_backward"] = backward
     flags = wp.config.cpu_compiler_flags
@@ -76,9 +75,7 @@ def is_derivative(module: Any) -> bool:
 
 
 _ahead: WeakValueDictionary[int, Any] = WeakValueDictionary()
-"""Objects, by identity, whose kernels have been compiled."""
 _begun: dict[Any, Future[None]] = {}
-"""Futures of modules that another thread compiles, until `_compile` waits for them."""
 _looked_at: set[Any] = set()
 
 
@@ -101,8 +98,7 @@ def compile_ahead_adjoint(owner: Any, device: Any) -> None:
 
 
 def compile_meanwhile(owner: Any, device: Any) -> None:
-    """Start to compile an object's kernels in another thread of a CPU with a spare core; `compile_ahead` waits for the
-    result."""
+    """Start to compile an object's kernels in another thread of a CPU; `compile_ahead` waits for the result."""
     if not device.is_cpu or usable_cores() < 2:
         return
     sizes = _sizes([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)])
@@ -123,7 +119,6 @@ def announce(kernel: wp.Kernel, device: Any) -> None:
 
 
 def kernels_of(owner: Any) -> list[wp.Kernel]:
-    """Return the kernels of an object of Cortado and of its parts."""
     found: dict[int, Any] = {}
     seen: dict[int, Any] = {}
     waiting = [owner]
@@ -146,8 +141,7 @@ def kernels_of(owner: Any) -> list[wp.Kernel]:
 
 
 def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
-    """Compile and load the modules of the kernels that are not in the cache; a single missing module is left to its
-    launch."""
+    """Compile and load the missing modules of the kernels; a single one is left to its launch."""
     sizes = _sizes(kernels)
     wait([_begun.pop(module) for module in sizes if module in _begun])
     missing = _missing(sizes, device)
@@ -165,7 +159,6 @@ def _compile_all(modules: Sequence[Any], device: Any, cores: int) -> None:
 
 
 def _sizes(kernels: Sequence[wp.Kernel]) -> dict[Any, int]:
-    """Return the modules of the kernels, each with an estimate of its relative compile time."""
     found: dict[Any, int] = {}
     for kernel in kernels:
         source = kernel.adj.source
@@ -195,8 +188,7 @@ VERBOSE = "CORTADO_VERBOSE"
 
 @contextmanager
 def silenced() -> Iterator[None]:
-    """Suppress Warp's messages in the block, and afterwards all but warnings and errors. A log level chosen by the user
-    is respected."""
+    """Suppress Warp's messages in the block, and afterwards all but warnings, except if the user chose a log level."""
     chosen = wp.config.log_level
     if os.environ.get(VERBOSE, "0") not in ("", "0") or chosen < wp.LOG_INFO:
         yield
@@ -227,9 +219,7 @@ def c_stderr_to(file: int) -> Iterator[None]:
 
 CACHE_PATH = "WARP_CACHE_PATH"
 _COMPILING = re.compile(r"_p\d+_t\d+$")
-"""Pattern for the end of the name of a folder in which a thread is still compiling."""
 ROOM = 16 * 2**20
-"""Free disk space [bytes] that kernels need."""
 
 
 @cache
@@ -272,7 +262,6 @@ def complaint(error: Exception) -> str | None:
 
 
 def _start() -> str | None:
-    """Start Warp; return the reason if its cache folder cannot be made, otherwise None."""
     try:
         with silenced():
             wp.init()
@@ -299,8 +288,7 @@ def _kernels(folder: str) -> Iterator[Path]:
 
 
 def _is_whole(kernel: Path) -> bool:
-    """Test on Linux if a kernel's object files end with their section table; the loader prints many lines about
-    truncated files."""
+    """Test on Linux if a kernel's object files end with their section table, so that the loader prints no errors."""
     if sys.platform != "linux":
         return True
     for file in kernel.glob("*.o"):
@@ -343,7 +331,6 @@ def why_no_gpu() -> str:
 
 
 def installed_driver() -> Version | None:
-    """Return the CUDA version that this machine's driver supports; None without a driver."""
     with suppress(OSError, AttributeError):
         library = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
         version = ctypes.c_int()
@@ -380,7 +367,6 @@ def device_named(name: str) -> Any:
 
 
 def visible_gpus() -> list[str]:
-    """Return the GPUs of this process under their CUDA names."""
     start_warp()
     given = [name.strip() for name in os.environ.get(VISIBLE, "").split(",") if name.strip()]
     present = wp.get_cuda_device_count()

@@ -24,8 +24,6 @@ from cortado.errors import InputError, shown
 
 @dataclass(frozen=True)
 class Precision:
-    """A floating-point format with its Warp and NumPy types."""
-
     name: str
     real: Any
     vector: Any
@@ -92,8 +90,7 @@ class TypesByName:
         return self._give(function, lambda kind: kind)
 
     def arrays(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Add types to a kernel's parameters: arrays of the types by name, or Warp structs. The arrays that a kernel
-        writes must come last."""
+        """Add array types or Warp structs to a kernel's parameters; arrays that the kernel writes must come last."""
         return self._give(function, lambda kind: wp.array(dtype=kind) if isinstance(kind, type) else kind)
 
     def _give(self, function: Callable[..., Any], whole: Callable[[Any], Any]) -> Callable[..., Any]:
@@ -156,7 +153,6 @@ def _of_the_gpu() -> SimpleNamespace:
 BY_SIZE = ((2_000, 16), (16_000, 8), (48_000, 4))
 """Pairs (greatest number of particles, lanes) on a GPU; above the last, one lane."""
 _OF_MODULES: dict[str, int] = {}
-"""Number of lanes by the name of the Warp module."""
 
 
 def set_lanes(module: Any, lanes: int) -> None:
@@ -170,8 +166,7 @@ def lanes_of(kernel: wp.Kernel) -> int:
 
 @cache
 def check_lanes(kernel: wp.Kernel) -> None:
-    """Raise `TypeError` for a kernel that calls a sum over lanes but is not made for lanes: on a GPU each thread would
-    get part of the sum of a wrong particle."""
+    """Raise `TypeError` for a kernel that calls a sum over lanes without a thread for each lane."""
     source = kernel.adj.source
     if "wp.tid() // LANES" in source and "lane()" in source:
         return
@@ -203,8 +198,7 @@ def checked_lanes(lanes: Any) -> int | None:
 
 
 def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
-    """Return the number of lanes of a particle on a device: on a GPU ``wanted``, or by default a number that suits the
-    number of particles."""
+    """Return the number of lanes on a device; on a GPU ``wanted``, by default one that suits the particles."""
     if device.is_cpu:
         return 1
     return wanted or next((lanes for most, lanes in BY_SIZE if particles <= most), 1)
@@ -222,7 +216,6 @@ def lane_functions(precision: Precision, lanes: int) -> SimpleNamespace:
 
 @cache
 def sum_over_lanes(kind: Any, precision: Precision, lanes: int) -> Any:
-    """Return a Warp function that sums numbers or vectors of type ``kind`` over the lanes."""
     functions = lane_functions(precision, lanes)
     if kind is precision.real:
         return functions.add_up
@@ -275,7 +268,6 @@ def _of_one(precision: Precision) -> SimpleNamespace:
 
 
 def _of_several(precision: Precision, lanes: int) -> SimpleNamespace:
-    """Return CUDA functions of lanes; the threads of a particle are consecutive in one warp."""
     real, vector = precision.real, precision.vector
     first, group = f"(threadIdx.x % 32u / {lanes}u * {lanes}u)", f"{(1 << lanes) - 1}u"
 

@@ -15,10 +15,8 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 BRANCHES = 32
-"""Number of values that a CPU thread adds up."""
 BLOCK = 1024
 EACH = 8
-"""Number of values that a thread of a block adds up before the tree."""
 SHARED = 32 * 1024
 """Greatest shared memory of a block [bytes]."""
 
@@ -27,13 +25,10 @@ SHARED = 32 * 1024
 class ReductionKernel:
     kernel: Any
     threads: int
-    """Number of threads for each partial value."""
     most: int
-    """Greatest number of values in a partial value."""
 
 
 def type_name(dtype: Any) -> str:
-    """Return the name of a Warp type of numbers, vectors or matrices, for the name of a Warp module."""
     shape = getattr(dtype, "_shape_", ())
     return "_".join([getattr(dtype, "_wp_scalar_type_", dtype).__name__, *map(str, shape)])
 
@@ -76,8 +71,7 @@ def _of_threads(name: str, dtype: Any, combine: Any) -> ReductionKernel:
 
 
 def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
-    """Return the kernel of `_of_threads` with a block of threads in place of each thread. ``combine`` is a C++
-    expression in a and b of type T."""
+    """Return the kernel of `_of_threads` with blocks of threads; ``combine`` is a C++ expression in a and b."""
     threads = BLOCK
     while threads * wp.types.type_size_in_bytes(dtype) > SHARED:
         threads //= 2
@@ -112,7 +106,6 @@ def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
 
 
 def _kernel(name: str, module_name: str, function: Any, **options: Any) -> Any:
-    """Return a named kernel in a separate module, because CPU modules cannot contain GPU code."""
     module = kernel_module(module_name)
     function.__qualname__ = name
     return wp.kernel(function, module=module, enable_backward=False, **options)

@@ -1,7 +1,7 @@
 """Cores, threads and processes: the number of usable cores, locks on Warp and on simulations, calls in worker
 processes; and estimates of memory.
 
-Warp has one state per process, such as the graph being captured. So only one thread at a time may use Warp.
+Only one thread at a time may use Warp, because Warp has one state per process, such as the graph being captured.
 
 Memory is estimated before it is allocated, to within a factor of about 1.5, so that a lack of memory is reported as a
 sentence. Estimates leave out checkpoints, because a rollout adapts their number to the free memory.
@@ -46,7 +46,6 @@ def usable_cores() -> int:
 
 
 MOST_CORES = 16
-"""Greatest number of cores in a launch on a CPU."""
 
 
 @cache
@@ -76,8 +75,7 @@ def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int)
 
 
 class WarpLock(ContextDecorator, threading.local):
-    """The lock that a thread holds while it uses Warp; a context or a decorator, which a thread may enter
-    repeatedly."""
+    """The lock that a thread holds while it uses Warp; a reentrant context or decorator."""
 
     _lock = threading.RLock()
     _entries = 0
@@ -94,8 +92,7 @@ class WarpLock(ContextDecorator, threading.local):
 
     @contextmanager
     def lent(self) -> Iterator[None]:
-        """Release the lock in the block, around work that does not use Warp's state or that waits for another
-        thread."""
+        """Release the lock in the block, around work that does not use Warp's state or waits for another thread."""
         entries = self._entries
         if entries:
             self._let_go()
@@ -148,7 +145,6 @@ class Turn:
         self._lock.release()
 
     def forked(self) -> None:
-        """Replace the lock in the child of a fork, in which only the forking thread exists."""
         if self._lock.acquire(blocking=False):
             self._lock.release()
         else:
@@ -193,7 +189,6 @@ if hasattr(os, "register_at_fork"):
 
 
 KEPT = 2
-"""Greatest number of functions that a worker process caches; each may hold a problem with all its memory."""
 _functions: OrderedDict[str, Callable[[Any], Any]] = OrderedDict()
 _one_at_a_time = threading.RLock()
 
@@ -223,15 +218,10 @@ class Lacking:
 
 @dataclass(frozen=True)
 class Answer:
-    """The result or the error of a call in a worker process."""
-
     content: bytes = b""
-    """The result, pickled in the worker so that a failure to pickle is an error of the call."""
     error: BaseException | None = None
     traceback: str = ""
-    """The traceback of an error that is not Cortado's."""
     warnings: tuple[tuple[str, type[Warning]], ...] = ()
-    """(text, category) of each warning."""
 
     def result(self) -> Any:
         """Return the function's result, after repeating its warnings; raise its error."""
@@ -245,8 +235,7 @@ class Answer:
 
 
 def pickled(value: Any, what: str) -> bytes:
-    """Pickle a value, including code of the main module. Raise `InputError` if that is impossible, in a sentence that
-    begins with ``what``."""
+    """Pickle a value with code of the main module; raise `InputError`, which begins with ``what``, if that fails."""
     import cloudpickle
 
     try:
@@ -257,7 +246,6 @@ def pickled(value: Any, what: str) -> bytes:
 
 @cache
 def versions() -> str:
-    """Return in words the versions that determine the bits of a result."""
     return f"Cortado {__version__}, Warp {metadata.version('warp-lang')} and NumPy {metadata.version('numpy')}"
 
 
@@ -318,7 +306,6 @@ def _sendable(error: Exception) -> BaseException:
 
 
 def in_words(error: BaseException) -> str:
-    """Return an error in words, on one line, without the full stop."""
     text = " ".join(str(error).split()).rstrip(".")
     return text if isinstance(error, CortadoError) else ": ".join(filter(None, [type(error).__name__, text]))
 
@@ -391,7 +378,6 @@ def shortage(parts: Mapping[str, float], device: Any = None) -> str:
 
 
 def within(budget: float, device: Any = None) -> int:
-    """Return a memory budget [bytes] for recomputable data: at most half of the free memory."""
     return int(min(budget, 0.5 * available(device)))
 
 
@@ -403,8 +389,7 @@ def available(device: Any = None) -> float:
 
 
 def _of_container() -> float:
-    """Return the control group's memory limit minus its use [bytes], with cached files as free; infinite without a
-    limit."""
+    """Return the control group's memory limit minus its use [bytes], with cached files as free; or infinity."""
     for limit, used in _LIMITS:
         with suppress(OSError, ValueError):
             stat = (_CGROUP / used).with_name("memory.stat").read_text().split()

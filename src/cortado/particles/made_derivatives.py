@@ -1,18 +1,15 @@
 """Derivatives of sums over the fluid, made by Warp from the term of one pair (`cortado.particles.pair_sums`).
 
-For the sums S_i = sum_j T(x_ij, c_i, c_j, v_ij, theta) and their adjoints S_i^, the adjoint of particle i gathers a
-pair's terms from particle i's own sum and from its neighbour's sum:
+For the sums S_i = sum_j T(x_ij, c_i, c_j, v_ij, theta) with adjoints S_i^, particle i gathers
 
-    x_i^ = sum_j d(T_ij . S_i^) / dx_ij - d(T_ji . S_j^) / dx_ji
-    c_i^ = sum_j d(T_ij . S_i^) / dc_i + d(T_ji . S_j^) / dc_i
+    x_i^ = sum_j d<T_ij, S_i^> / dx_ij - d<T_ji, S_j^> / dx_ji
+    c_i^ = sum_j d<T_ij, S_i^> / dc_i + d<T_ji, S_j^> / dc_i
 
-and likewise for all entries of arrays; theta^ is sum_j d(T_ij . S_i^) / dtheta of each particle. The tangent is
-computed from the gradients of the components of T. Both are exact. They are slower than handwritten derivatives, and
-are meant for users' forces and for sums that are seldom computed.
+and likewise for other arrays, with the scalar product <a, b>. The adjoint theta^ of a particle is sum_j d<T_ij, S_i^> /
+dtheta. The tangent comes from the gradients of the components of T. Made derivatives are exact, but slower than
+handwritten ones.
 
-The argument is a function that makes the term for a `Discretisation`. It is called with a ``taped`` one, whose
-functions Warp can differentiate. Call a made derivative only from a kernel: called from a `wp.func` its C++ does not
-compile.
+Call a made derivative only from a kernel: called from a `wp.func`, its C++ does not compile.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -40,9 +37,9 @@ TermMaker = Callable[[Discretisation], Callable[..., Any]]
 
 
 def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
-    """Make the Warp function ``f(i, *arrays, *bars, *others, s)`` of a term's adjoint, given the arrays of the adjoints
-    of its sums. It returns the adjoints of the entries of particle i in each array, and of each of the others.
-    ``module`` is the Warp module of the function, if not that of the file."""
+    """Make the Warp function ``f(i, *arrays, *bars, *others, s)`` of the adjoint of a term's sums, whose adjoints are
+    ``bars``. The function returns the adjoints of particle i's entry of each array, and of each of the others.
+    ``module`` is the function's Warp module, by default that of the term's file."""
     term = _differentiable(make, d)
     arrays = {**term.arrays, **bars_of(term)}
     loop = over_fluid(d, arrays, _adjoint(term), ahead=True, numbered="j" in term.parameters)
@@ -50,8 +47,7 @@ def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
 
 
 def made_tangent(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
-    """Make the Warp function ``f(i, *arrays, *others, s)`` of the tangents of a term's sums, in which each array and
-    each of the others is followed by its tangent."""
+    """Make the Warp function of the tangents of a term's sums; its arguments are each followed by the tangent."""
     term = _differentiable(make, d)
     arrays, others = _with_tangents(term.arrays), _with_tangents(term.others)
     if len(arrays) + len(others) < 2 * len(term.arrays | term.others):
@@ -77,7 +73,7 @@ def _made(
 
 
 def work_of(term: Term, precision: Precision, module: Any) -> Any:
-    """Make the Warp function T . bar; it takes the arguments of a term T and an adjoint for each result of T."""
+    """Make the Warp function of the scalar product of a term T with ``bar``, an adjoint of each result of T."""
     types, bars = {**term.parameters, **bars_of(term)}, bars_of(term)
     products = (
         f"_term_{n} * {bar}" if kind is precision.real else f"_wp.{dot_of(kind)}(_term_{n}, {bar})"
@@ -96,19 +92,16 @@ def _work({", ".join(types)}):
 
 
 def warp_function(function: Callable[..., Any], module: Any) -> Any:
-    """Make a Warp function in a module from a Python function; give its text as ``source`` if no file contains it."""
     if not hasattr(function, "source"):
         return wp.func(function, module=module)
     return wp.Function(function, function.__name__, "", module=module, source=function.source)
 
 
 def dot_of(kind: Any) -> str:
-    """Return Warp's name of the scalar product of two vectors, or of two matrices."""
     return "dot" if len(kind._shape_) == 1 else "ddot"
 
 
 def bars_of(term: Term) -> dict[str, Any]:
-    """Return names and types of the adjoints of a term's results."""
     return {f"_bar_{n}": kind for n, kind in enumerate(term.results)}
 
 
@@ -117,8 +110,6 @@ def _with_tangents(types: Types) -> dict[str, Any]:
 
 
 def _gradient(label: str, term: Term, arguments: str, bars: Iterable[str]) -> str:
-    """Return the source line that assigns the derivative of T . bar with respect to each parameter to
-    ``label_parameter``."""
     names = ", ".join(f"_{label}_{name}" for name in (*term.parameters, *bars_of(term)))
     return f"{names} = _wp.grad(_work)({arguments}, {', '.join(bars)})"
 
@@ -141,8 +132,6 @@ def _adjoint(term: Term) -> Body:
 
 
 def _tangent(term: Term, d: Discretisation) -> Body:
-    """Return a loop's source lines that add, for each component of each result, gradient times tangents of
-    parameters."""
     kinds = {**term.parameters, **bars_of(term)}
 
     def change_of(name: str, of_j: Mapping[str, str]) -> str:
@@ -171,7 +160,6 @@ def _tangent(term: Term, d: Discretisation) -> Body:
 
 
 def _unit(kind: Any, d: Discretisation, k: int) -> str:
-    """Return the source text of a result whose component k is 1 and whose other components are 0."""
     if kind is d.precision.real:
         return "_real(1.0)"
     return f"{type_name(kind, d)}({', '.join(f'_real({float(m == k)})' for m in range(len(kind())))})"

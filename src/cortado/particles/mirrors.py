@@ -1,19 +1,15 @@
-"""Mirrors: flat walls that act on fluid by mirror images of the fluid instead of wall particles.
+"""Mirrors: flat walls that act on fluid by mirror images of the particles instead of by wall particles.
 
-An image of particle j is its reflection by a flat wall, or by two or three sides of the container that meet. A
-reflection of the container has a bit for each side: 1, 2 and 4 for those at the lower ends of the axes, 8, 16 and 32
-for the upper ones. Beyond these numbers, from `FACES` on, are the flat faces of solids that move. A reflection is x ->
-R x + o, with R diagonal at the container. The separation from i to the image of j is the mirrored separation from the
-image of i to j. So every image within reach of i is an image of a neighbour of i, or of i. In lists of neighbours the
-image of j by a reflection has the number ``reflections j + reflection``. A wall mirrors only fluid in front of it, for
-particles in front of it, not the column that waits behind it for an emitter's opening. A face mirrors no particle
-beyond its ends.
+An image of particle j is the reflection x -> R x + o by a flat wall, or by two or three sides of the container that
+meet. The number of a reflection at the container has a bit for each side: 1, 2, 4 at the lower ends of the axes, 8, 16,
+32 at the upper ends. Numbers from `FACES` on are flat faces of moving solids. Every image within reach of particle i is
+an image of a neighbour of i or of i. The image of j has the number ``reflections j + reflection`` in lists of
+neighbours. A wall mirrors only particles in front of it, and a face none beyond its ends.
 
-A solid takes the points x of a face to x' from c_0 + Q (x - c) = x - D(x), with its middle c, at c_0 before the step,
-and Q = R_0 R^T. An image moves by R u + (D(R x + o) - R D(x)) / dt where its particle moves by u: the second part,
-times dt, is what the face has ``swept``. Let the pose of a solid change by c', w' and g' (`MovingWalls`), and let
-t(x) = c' + w' x (x - c) + g' (x - c). Then images change by t(R x + o) - R t(x), mirrored vectors by
-w' x R u - R (w' x u), and D follows the pose.
+In a step a solid with middle c, c_0 before the step, takes the points x of a face from x - D(x) = c_0 + Q (x - c), with
+Q = R_0 R^T. If a particle moves by u, its image moves by R u + (D(R x + o) - R D(x)) / dt; dt times the second part is
+called ``swept``. If the pose of the solid changes by c', w' and g' (`MovingWalls`), with t(x) = c' + w' x (x - c) + g'
+(x - c), images change by t(R x + o) - R t(x), and mirrored vectors by w' x R u - R (w' x u).
 """
 
 from functools import cache
@@ -22,27 +18,22 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import by_name
 from cortado.device.precision import Precision
 
 FACES, MOST_FACES = 64, 64
-"""Number of the first face's reflection, greater than all reflections of the container; and the greatest number of
-faces."""
+"""Number of the first face's reflection, above all reflections at the container; and the greatest number of faces."""
 NUMBERS = 2**31
-"""Numbers of images are below this bound."""
 CONTAINER = -1
-"""Number used for the container in place of a solid's number."""
 NOTHING = ALL_WALLS = -NUMBERS
-"""A number that no solid has. In place of a solid's number it means no solid, or the walls of all solids and the
-container."""
+"""In place of a solid's number: no solid, or the walls of all solids and the container."""
 
 
 def reflections(moving: bool) -> int:
-    """Return a number above those of all reflections, in scenes with or without ``moving`` solids."""
     return FACES + MOST_FACES * moving
 
 
 def most_imaged(moving: bool) -> int:
-    """Return the greatest number of particles whose images can be numbered."""
     return (NUMBERS - 1) // reflections(moving)
 
 
@@ -55,7 +46,6 @@ OVER_IMAGES = """\
         _x_ij = _separation(_x_i, _turned(_R, x[_j]) + _offset, s)
         {body}
 """
-"""Source text of a loop over images, see `cortado.particles.pair_sums`."""
 OF_IMAGES = {
     "direct": "_separation(_x_i, x[_j], s)",
     "direct_dot": "_x_dot_i - x_dot[_j]",
@@ -63,19 +53,17 @@ OF_IMAGES = {
     "swept_dot": "_swept_dot(_one, x[_j], x_dot[_j], _member, s)",
     "owned": "wp.where(_mirrors_by(_one, solid, s), _real(1.0), _real(0.0))",
 }
-"""Names of an image's data in terms of images, with their source texts."""
 
 
 def mirror_functions(precision: Precision, moving: bool, neighbourhood: Any) -> dict[str, Any]:
-    """Make Warp functions of mirrors by name, in scenes with or without moving solids, for positions in scene
-    ``member``.
+    """Make the Warp functions of mirrors by name, for scenes with or without moving solids.
 
     ``sides`` returns the bits of the container's sides that a position is in front of and within reach of. ``sees``
     tests whether a position is in front of, and within reach of, the walls of a reflection; ``shows`` tests only
     whether it is in front of them. ``last_reflection`` is the last reflection that a position may see, or 0.
     ``reflection`` returns R and o, and ``turned`` R a. ``mirror_of`` returns a number of the walls that mirror about a
-    position, ``mirrors_in`` tests whether a wall particle belongs to them, and ``mirrors_by`` whether a reflection is
-    by a solid. ``swept``, ``image_dot``, ``turned_dot`` and ``swept_dot`` exist only if solids move.
+    position, ``mirrors_in`` tests whether a wall particle belongs to these walls, and ``mirrors_by`` whether a
+    reflection is by a solid. ``swept``, ``image_dot``, ``turned_dot`` and ``swept_dot`` exist only if solids move.
     """
     container = _container(precision, neighbourhood)
     own = (_with_faces if moving else _without)(precision, neighbourhood, container)
@@ -84,12 +72,10 @@ def mirror_functions(precision: Precision, moving: bool, neighbourhood: Any) -> 
 
 @cache
 def _container(precision: Precision, neighbourhood: Any) -> SimpleNamespace:
-    """Make Warp functions of the container's sides alone."""
     real, vector = precision.real, precision.vector
 
     @wp.func
     def near_mirrors(x: vector, s: neighbourhood) -> int:
-        """Return the bits of the container's sides within reach of a position, on either side of them."""
         found = int(0)
         for axis in range(3):
             if x[axis] - s.mirror_lower[axis] < s.reach:
@@ -100,7 +86,6 @@ def _container(precision: Precision, neighbourhood: Any) -> SimpleNamespace:
 
     @wp.func
     def before_mirrors(x: vector, s: neighbourhood) -> int:
-        """Return the bits of the container's sides that a position is in front of."""
         found = int(0)
         for axis in range(3):
             if x[axis] >= s.mirror_lower[axis]:
@@ -111,8 +96,7 @@ def _container(precision: Precision, neighbourhood: Any) -> SimpleNamespace:
 
     @wp.func
     def reflects(bits: int, near: int) -> bool:
-        """Test that bits are those of a reflection in near walls; walls at both ends of one axis do not mirror each
-        other's images."""
+        """Test that ``bits`` are a reflection by near walls; opposite walls do not mirror each other's images."""
         return (bits & near) == bits and (bits & (bits >> 3)) == 0
 
     @wp.func
@@ -129,13 +113,7 @@ def _container(precision: Precision, neighbourhood: Any) -> SimpleNamespace:
     def sides(x: vector, s: neighbourhood) -> int:
         return near_mirrors(x, s) & before_mirrors(x, s)
 
-    return SimpleNamespace(
-        near_mirrors=near_mirrors,
-        before_mirrors=before_mirrors,
-        reflects=reflects,
-        side_reflection=side_reflection,
-        sides=sides,
-    )
+    return by_name(near_mirrors, before_mirrors, reflects, side_reflection, sides)
 
 
 def _without(precision: Precision, neighbourhood: Any, container: SimpleNamespace) -> tuple[Any, ...]:
@@ -186,8 +164,7 @@ def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNames
 
     @wp.func
     def place_at(x: vector, f: int, member: int, s: neighbourhood) -> vector:
-        """Return the distance of a position in front of a face, and its distances from the face's middle along the
-        face."""
+        """Return a position's distance in front of a face, and its coordinates along the face from the middle."""
         k = s.face_solids[f]
         own = wp.transpose(s.turns[member, k]) * (x - s.after[member, k])
         return s.face_frames[f] * (own - s.scales[member, k] * s.face_places[f])
@@ -200,7 +177,6 @@ def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNames
 
     @wp.func
     def face_reflection(f: int, member: int, s: neighbourhood):
-        """Return R = I - 2 n n^T and o = 2 n (n . p) of a face."""
         k = s.face_solids[f]
         n = s.turns[member, k] * s.face_frames[f][0]
         p = s.after[member, k] + s.scales[member, k] * (s.turns[member, k] * s.face_places[f])
@@ -241,8 +217,7 @@ def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNames
 
     @wp.func
     def mirror_of(x: vector, member: int, s: neighbourhood) -> int:
-        """Return the sum of 1 near the container's mirrors, and twice the number, counted from 1, of the nearest face
-        in reach."""
+        """Return 1 near the container's mirrors, plus twice the number, from 1 on, of the nearest face in reach."""
         found, face, nearest = wp.where(near_mirrors(x, s) > 0, 1, 0), int(0), real(s.reach)
         for f in range(s.faces):
             if before_face(x, f, nearest, member, s):
@@ -258,7 +233,6 @@ def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNames
 
     @wp.func
     def carried(x: vector, k: int, member: int, s: neighbourhood) -> vector:
-        """Return D, the displacement in the step of the solid's point that is at x now."""
         back = s.turns_before[member, k] * (wp.transpose(s.turns[member, k]) * (x - s.after[member, k]))
         return x - s.before[member, k] - back
 

@@ -1,12 +1,12 @@
-"""Wall particles as arguments of a search for neighbours, and the wall particles of solids that move.
+"""Wall particles as arguments of a search for neighbours, and the wall particles of moving solids.
 
-Wall particles of moving solids have their positions at the end of a step, sorted by cell, and the velocity of the
-surface point above each. If the solid turns, this velocity differs from that of the wall particle.
+Wall particles of moving solids have the positions at the end of a step, and the velocity of the surface point above
+each.
 
-A solid may be stretched about its middle by a scale sigma. Its wall particles keep their depth beneath the surface. In
-the frame of the solid, one has the place r, the foot f = q - r to the point q of the surface, and the weight w. In
-space it is at c + R (sigma q - f) and has the foot R f and the weight sigma^(d - 1) w, as its part of the surface grows
-by that. So flat walls keep the weights that were found for them.
+A solid may be stretched about its middle by a scale sigma, while its wall particles keep their depth. In the solid's
+frame let r be the place of a wall particle, q the nearest point of the surface, f = q - r, and w the weight. In space
+the wall particle is at c + R (sigma q - f), with the vector R f to the surface and the weight sigma^(d - 1) w, because
+its area grows.
 """
 
 from collections.abc import Mapping
@@ -28,29 +28,25 @@ from cortado.particles.state import Layout, zeros
 
 @dataclass(frozen=True)
 class WallArrays(Rows):
-    """Wall particles, in any order."""
-
     positions: np.ndarray
     """(b, 3) [m]; for moving solids in the frame of the solid"""
     weights: np.ndarray
-    """(b,) weight of each in the density, a fluid particle being 1 [-]"""
+    """(b,) weight in the density [-]; that of a fluid particle is 1"""
     grips: np.ndarray
-    """(b,) weights of wall particles without slip, and 0 for wall particles along which fluid slips freely"""
+    """(b,) weight [-] of wall particles without slip; 0 where fluid slips freely"""
     feet: np.ndarray
-    """(b, 3) from each to the surface [m]"""
+    """(b, 3) vector to the nearest point of the surface [m]"""
     slides: np.ndarray
     """(b, 3) velocity with which the surface slides along the solid [m/s]"""
     solid: np.ndarray
-    """(b,) number of each particle's solid: from 0 on for solids that move, from -2 on downwards for solids at rest; -1
-    for the container"""
+    """(b,) number of the solid: from 0 on if it moves, from -2 downwards if it rests; -1 for the container"""
     faces: np.ndarray
-    """(b,) number of the mirroring flat face in front of each wall particle, or -1"""
+    """(b,) number of the mirroring flat face in front of the wall particle, or -1"""
 
 
 def pose_arrays(members: int, solids: int, precision: Precision, device: Any) -> dict[str, wp.array]:
-    """Make arrays (members, solids) of the poses of solids before and after a step, with tangents, by kernels' names:
-    positions of their middles [m], rotations from the frame of a solid to space, and scales. The tangent of a rotation
-    is the rotation vector by which the solid turns further, per unit of the change."""
+    """Make arrays (members, solids) of the poses of solids before and after a step, by argument names: middles [m],
+    rotations, scales, and tangents. The tangent of a rotation is the vector by which the solid turns further."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     kinds = {"before": vector, "turns_before": matrix, "after": vector, "turns": matrix}
     kinds |= dict.fromkeys(("before_dot", "turned_before_dot", "after_dot", "turned_dot"), vector)
@@ -61,7 +57,6 @@ def pose_arrays(members: int, solids: int, precision: Precision, device: Any) ->
 
 
 def resting_pose(layout: Layout) -> dict[str, wp.array]:
-    """Make the arrays (members,) of `pose_arrays` for a solid that rests at the origin and is not turned."""
     made = pose_arrays(layout.members, 1, layout.precision, layout.device)
     for name in ("turns", "turns_before"):
         made[name].fill_(layout.precision.matrix(*np.eye(3).ravel()))
@@ -70,8 +65,7 @@ def resting_pose(layout: Layout) -> dict[str, wp.array]:
 
 @cache
 def turn_functions(precision: Precision) -> tuple[Any, Any]:
-    """Make two Warp functions of a rotation R: the adjoint of a further turn of it, given that of its entries; and, in
-    reverse, an adjoint of R's entries that has a given adjoint of the further turn."""
+    """Make two Warp functions: from the adjoint of a rotation's entries to that of a further turn, and back."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     @wp.func
@@ -88,15 +82,12 @@ def turn_functions(precision: Precision) -> tuple[Any, Any]:
 
 @cache
 def sizes_type(precision: Precision) -> Any:
-    """Make the Warp struct of the scales of solids and their tangents."""
     real = precision.real
 
     class Sizes:
         scales: wp.array2d(dtype=real)
-        """(members, solids) sigma [-]."""
         scales_dot: wp.array2d(dtype=real)
         power: real
-        """The power of sigma by which weights grow: d - 1."""
 
     Sizes.__name__ = Sizes.__qualname__ = f"Sizes_{precision.name}"
     return wp.struct(Sizes)
@@ -104,8 +95,6 @@ def sizes_type(precision: Precision) -> Any:
 
 @cache
 def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
-    """Make kernels that place wall particles, write them in the order of their cells, say where cells begin, and write
-    tangents."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     module = kernel_module(f"moving_walls_{precision.name}")
     vectors = {f"wall_{name}": vector for name in ("positions", "feet", "velocities")}
@@ -123,13 +112,11 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def place_of(b: int, scale: real, of: own_of) -> vector:
-        """Return a wall particle's place in the frame of its scaled solid; with a scale of 1 the unscaled place bit for
-        bit."""
+        """Return a wall particle's place in the frame of its scaled solid; scale 1 retains the bits."""
         return of.own[b] + (scale - real(1.0)) * (of.own[b] + of.own_feet[b])
 
     @wp.func
     def surface_of(b: int, scale: real, of: own_of) -> vector:
-        """Return the point of the surface above a wall particle, in its solid's frame."""
         return scale * (of.own[b] + of.own_feet[b])
 
     @wp.kernel(module=module, enable_backward=False)
@@ -210,21 +197,18 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
 
 
 class MovingWalls:
-    """The moving wall particles of one search for neighbours; in its arrays they follow the wall particles at rest."""
+    """The moving wall particles of a search for neighbours; in its arrays they follow the wall particles at rest."""
 
     def __init__(self, walls: WallArrays, first: int, solids: int, dimension: int, grid: Grid, layout: Layout):
-        """Take the ``walls`` of ``solids`` moving solids; in the search's arrays they have numbers from ``first``
-        on."""
+        """Take the ``walls`` of ``solids`` moving solids, numbered from ``first`` on in the search's arrays."""
         precision, device, count = layout.precision, layout.device, len(walls)
         self.solids, self.named = solids, pose_arrays(layout.members, solids, precision, device)
-        """The number of solids, and their poses by the names of kernel arguments; parts of a step write these poses."""
         self.sizes = sizes_type(precision)()
         self.sizes.scales, self.sizes.scales_dot = self.named["scales"], self.named["scales_dot"]
         self.sizes.power = precision.real(dimension - 1)
         self.each = [{name: array[:, k] for name, array in self.named.items()} for k in range(solids)]
-        """For each solid, views (members,) of these arrays."""
         self.slides = wp.zeros(solids, dtype=precision.vector, device=device)
-        """Velocities with which surfaces of solids slide along the solids, in the solids' own frames [m/s]."""
+        """(solids,) velocities with which surfaces slide along the solids, in the solids' frames [m/s]."""
         slides = np.zeros((solids, 3))
         slides[walls.solid] = walls.slides
         self.slides.assign(slides)
@@ -243,7 +227,7 @@ class MovingWalls:
         }
         self._sort = CellSort(grid, count, precision, device, layout.members)
         self.grid = cell_grid_type(precision)()
-        """The grid for kernels that look for neighbours; its cells begin with indices into the arrays of the search."""
+        """The grid as a kernel argument; its cells start at indices into the search's arrays."""
         for name in ("origin", "frequency", "shape"):
             setattr(self.grid, name, getattr(self._sort.grid, name))
         self.grid.starts = wp.zeros_like(self._sort.grid.starts)
@@ -259,7 +243,6 @@ class MovingWalls:
         launch(write, self._all, self._device, self._own, self.named, known, walls)
 
     def write_tangent(self, time_step: wp.array, time_step_dot: wp.array, walls: Mapping[str, wp.array]) -> None:
-        """Write the tangents of the wall particles of the last `write`."""
         lengths = {"time_step": time_step, "time_step_dot": time_step_dot}
         known = {"first": self._first, "order": self._sort.order, **lengths}
         launch(self._kernels[3], self._all, self._device, self._own, known, self.named, walls)

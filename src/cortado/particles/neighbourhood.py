@@ -1,8 +1,7 @@
-"""The neighbourhood of a particle: other particles, wall particles and images, as one argument of kernels that sum over
-them. Functions here read the entries of particles and of wall particles in a sum.
+"""The neighbourhood of a particle, as one argument of kernels that sum over neighbours, wall particles and images.
 
-Entries are read by functions without Warp's negative indices from an array's end: these need a comparison and an
-addition for every neighbour and every array.
+Warp functions here load array entries without Warp's support of negative indices, which costs a comparison and an
+addition per load.
 """
 
 from dataclasses import dataclass, replace
@@ -21,10 +20,8 @@ from cortado.particles.mirrors import mirror_functions
 
 @cache
 def loads(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Make the Warp functions that read one element of an array, at indices that are not negative: ``load_neighbour``
-    of a list [neighbour, particle], and ``load_vector``, ``load_number`` and ``load_six`` of a contiguous array of
-    vectors, numbers or six numbers. Six numbers take three loads on a GPU. A tape can differentiate ``taped``
-    functions."""
+    """Make the Warp functions that load one element, at indices that are not negative, of a list [neighbour, particle]
+    or of a contiguous array. A tape can differentiate ``taped`` functions."""
     return _of_warp(precision) if taped else _direct(precision)
 
 
@@ -74,53 +71,41 @@ def _direct(precision: Precision) -> SimpleNamespace:
 
 UNROLL = 4
 """Number of fluid neighbours that a loop processes together, so that their loads overlap. Lists are padded to a
-multiple of this with the particle itself, which only adds W(0) to the density."""
+multiple of `UNROLL` with the particle itself, which only adds W(0) to the density."""
 
 
 @dataclass(frozen=True)
 class Discretisation:
-    """A smoothing kernel in a precision with further choices, for which kernels are made."""
-
     smoothing: SmoothingKernel
     precision: Precision
     lanes: int = 1
-    """Number of threads for each particle, in kernels that share a particle's neighbours: see
-    `cortado.device.precision`."""
+    """Number of GPU threads for each particle, see `cortado.device.precision`."""
     periodic: bool = False
-    """True if separations are those of nearest periodic images: see ``period`` in the neighbourhood."""
     moving: bool = False
-    """True if walls move: then sums use the velocities of walls."""
     taped: bool = False
-    """True for forward kernels that a tape can differentiate: they get Warp's own adjoint, which needs a single
-    lane."""
+    """True for forward kernels with Warp's adjoint, for a tape; they need a single lane."""
 
     @property
     def types(self) -> tuple[Any, Any, Any]:
-        """Return the Warp types of numbers, of vectors, and of the neighbourhood, which kernels call ``s``."""
         return self.precision.real, self.precision.vector, neighbourhood_type(self.precision)
 
     @property
     def lane(self) -> Any:
-        """Return the Warp function of a thread's number, from 0 on, among the threads of its particle."""
         return lane_functions(self.precision, self.lanes).lane
 
     @property
     def still(self) -> "Discretisation":
-        """Return a copy of this discretisation for walls at rest, for terms that depend linearly on the fluid's
-        velocities alone."""
+        """A copy with walls at rest, for terms that are linear in the fluid's velocities alone."""
         return replace(self, moving=False)
 
     def module(self, forward: bool, topic: str) -> Any:
-        """Return the Warp module of forward or adjoint kernels; `tangent_module` is for tangent kernels. ``topic``
-        distinguishes the modules of one file or solver from others."""
+        """Return the Warp module of forward or adjoint kernels; ``topic`` is that of a file or solver."""
         return self._module(kind_of(forward, self.taped), topic, forward and self.taped)
 
     def tangent_module(self, topic: str) -> Any:
-        """Return the Warp module of the kernels of forward mode, which no gradient needs."""
         return self._module("tangent", topic, False)
 
     def modules(self, topic: str) -> tuple[Any, Any, Any]:
-        """Return the Warp modules of forward, tangent and adjoint kernels."""
         return self.module(True, topic), self.tangent_module(topic), self.module(False, topic)
 
     def _module(self, kind: str, topic: str, enable_backward: bool) -> Any:
@@ -139,82 +124,71 @@ def neighbourhood_type(precision: Precision) -> Any:
 
     class Neighbourhood:
         first: wp.int32
-        """Particle of a launch's first thread: a launch may be cut into ranges of particles."""
         part: wp.int32
-        """Number of the range."""
         particles: wp.int32
-        """Number of particles of one scene: particle i belongs to scene i // particles of a batch."""
+        """Number of particles of one scene; particle i belongs to scene i // particles of a batch."""
         neighbours: wp.array2d(dtype=wp.int32)
-        """First a particle's fluid neighbours, padded with the particle itself; then its wall neighbours; then images
-        within its reach."""
+        """Fluid neighbours, padded with the particle itself, then wall neighbours, then images within reach."""
         fluid_count: wp.array(dtype=wp.int32)
-        """Length of the filled list, a multiple of `UNROLL`."""
+        """Length of the padded list of fluid neighbours, a multiple of `UNROLL`."""
         filling: wp.array(dtype=wp.int32)
-        """Number of entries of the padded list that are the particle itself."""
         count: wp.array(dtype=wp.int32)
-        """Number of fluid and wall neighbours."""
         all_count: wp.array(dtype=wp.int32)
-        """Number of neighbours, images included."""
         wall_positions: wp.array(dtype=vector)
         """[m]"""
         wall_weights: wp.array(dtype=real)
-        """w_b [-]: weight of a wall particle in the density, a fluid particle being 1."""
+        """w_b [-]: weight of a wall particle in the density; that of a fluid particle is 1."""
         wall_grips: wp.array(dtype=real)
-        """w_b of walls without slip, 0 of those that slip freely [-]."""
+        """w_b of walls without slip, 0 of others [-]."""
         wall_velocities: wp.array(dtype=vector)
-        """Velocity of the point of the surface above a wall particle [m/s]; read where the `Discretisation` is
-        moving."""
+        """Velocity of the surface point above a wall particle [m/s]; used if the `Discretisation` is moving."""
         wall_feet: wp.array(dtype=vector)
-        """From a wall particle to the nearest point of the container's surface [m]."""
+        """Vector from a wall particle to the nearest point of the surface [m]."""
         wall_solids: wp.array(dtype=wp.int32)
-        """Number of a wall particle's solid: from 0 on for solids that move, from -2 on downwards for solids at rest;
-        -1 for the container."""
+        """Number of the solid: from 0 on if it moves, from -2 downwards if it rests; -1 for the container."""
         wall_positions_dot: wp.array(dtype=vector)
-        """Tangents of the walls' positions, which like the next three are there where walls move."""
+        """Tangents of wall particles, only if walls move."""
         wall_velocities_dot: wp.array(dtype=vector)
-        """Tangents of the walls' velocities."""
         wall_turns_dot: wp.array(dtype=vector)
-        """Tangents of the rotation of a wall particle's solid: the rotation vector over the change."""
+        """Tangents of the rotation of a wall particle's solid, rotation vectors."""
         wall_growths_dot: wp.array(dtype=real)
-        """Tangents of the walls' weights and grips, divided by these [-]."""
+        """Relative tangents of weights and grips [-]."""
         support: real
         """Support radius h [m]."""
         per_support: real
         """1 / h [1 / m]."""
         reach: real
-        """Neighbours are listed up to this distance [m], a little beyond the support."""
+        """Search radius [m], a little above the support radius."""
         normalisation: real
         """sigma of the kernel [1 / m^d]."""
         self_weight: real
         """W(0) [1 / m^d]."""
         response_scale: real
-        """(sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], for the relaxation beside walls."""
+        """(sum_j |G_j|^2)^(-1/2) of a filled neighbourhood [m^(d + 1)], for the relaxation beside walls."""
         laplacian_correction: real
         """Correction factor of second derivatives [-], see `cortado.discretise.smoothing`."""
         volume: real
-        """Volume V of a particle on the rest lattice [m^d]: with it that lattice has the rest density."""
+        """Volume V of a particle [m^d] with which the rest lattice has the rest density."""
         period: vector
-        """[m], 0 along an axis that is not periodic; read where the `Discretisation` is periodic."""
+        """[m], 0 along an axis that is not periodic."""
         frequency: vector
         """1 / period [1 / m], or 0."""
         mirror_lower: vector
-        """Coordinates of the flat walls that mirror the fluid [m], -inf along an axis where none does."""
+        """Coordinates of mirroring walls at the lower ends of the axes [m], -inf without one."""
         mirror_upper: vector
-        """Coordinates of mirroring walls at the upper ends, inf where none does."""
         faces: wp.int32
-        """Number of flat faces of moving solids that mirror the fluid; what follows is read where walls move."""
+        """Number of mirroring flat faces of moving solids; the following fields are used only if walls move."""
         face_solids: wp.array(dtype=wp.int32)
-        """Number of each face's solid."""
         face_places: wp.array(dtype=vector)
         """Middles of the faces in the frames of their solids [m]."""
         face_frames: wp.array(dtype=matrix)
-        """Rows: the normal towards the fluid and two unit vectors along a face, in the frame of its solid."""
+        """Rows: the normal towards the fluid and two unit vectors along a face, in the solid's frame."""
         face_sizes: wp.array(dtype=vector)
-        """0, and the half lengths of a face along its two unit vectors [m]."""
+        """0, and half the lengths of a face along its unit vectors [m]."""
         wall_faces: wp.array(dtype=wp.int32)
-        """Number of the face that a wall particle is behind, or -1."""
+        """Number of the face in front of a wall particle, or -1."""
         after: wp.array2d(dtype=vector)
-        """Positions (members, solids) of solids at the end of the step [m], and so on: see `MovingWalls.named`."""
+        """(members, solids), like the following fields: poses of solids, see `pose_arrays`."""
         turns: wp.array2d(dtype=matrix)
         before: wp.array2d(dtype=vector)
         turns_before: wp.array2d(dtype=matrix)
@@ -232,15 +206,14 @@ def neighbourhood_type(precision: Precision) -> Any:
 
 @cache
 def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
-    """Make Warp functions of a separation x in a neighbourhood.
+    """Make the Warp functions of a separation x in a neighbourhood.
 
-    ``separation`` (x_i - x_j, of the nearest image), ``weight``, ``slope`` (a of G = a x), ``slope_change`` (grad a .
-    u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x); ``per_size`` (1
-    / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction per_size x . G, of
-    second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the list of i),
-    ``several`` (the numbers of `UNROLL` of them from the k-th on), and the functions of `loads` and of
-    `mirror_functions`. Three more, ``vectors``, ``numbers`` and ``sixes``, load the values of several neighbours before
-    any of them is used. So the loads do not wait for one another, which saves a tenth of a whole step on a GPU.
+    ``separation`` is x_i - x_j of the nearest image. With the kernel's gradient G = a x, ``slope`` is a,
+    ``slope_change`` u^T grad a, ``slope_gradient`` grad a, and ``hessian_product`` H u = a u + (u^T grad a) x.
+    ``per_size`` is 1 / (|x|^2 + 0.01 h^2). ``factor`` is F = laplacian_correction per_size x^T G, for second
+    derivatives after Brookshaw (1985). ``neighbour`` is the k-th in the list of i, ``several`` the numbers of `UNROLL`
+    neighbours from the k-th on. ``vectors``, ``numbers`` and ``sixes`` load the entries of several neighbours together.
+    The functions of `loads` and `mirror_functions` are included.
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -249,8 +222,8 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     smooth_slope_gradient = smooth.slope_gradient
     reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
     load = loads(discretisation.precision, discretisation.taped)
-    load_neighbour, load_vector, load_number = load.load_neighbour, load.load_vector, load.load_number
-    load_six = load.load_six
+    load_neighbour, load_vector = load.load_neighbour, load.load_vector
+    load_number, load_six = load.load_number, load.load_six
     six, six_rows = discretisation.precision.six, wp.types.matrix(shape=(UNROLL, 6), dtype=real)
     rows = wp.types.matrix(shape=(UNROLL, 3), dtype=real)
     row = wp.types.vector(length=UNROLL, dtype=real)
@@ -330,20 +303,11 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     def sixes(a: wp.array(dtype=six), j: wp.vec4i) -> six_rows:
         return wp.matrix_from_rows(load_six(a, j[0]), load_six(a, j[1]), load_six(a, j[2]), load_six(a, j[3]))
 
-    of_kernel = (
-        weight,
-        slope,
-        slope_change,
-        slope_gradient,
-        gradient,
-        hessian_product,
-        per_size,
-        factor,
-        factor_gradient,
-    )
-    own = by_name(*of_kernel, neighbour, several, vectors, numbers, sixes)
+    of_kernel = by_name(weight, slope, slope_change, slope_gradient, gradient, hessian_product)
+    own = by_name(per_size, factor, factor_gradient, neighbour, several, vectors, numbers, sixes)
     return SimpleNamespace(
         separation=nearest_image if discretisation.periodic else difference,
+        **vars(of_kernel),
         **vars(own),
         **vars(load),
         **mirror_functions(discretisation.precision, discretisation.moving, neighbourhood),

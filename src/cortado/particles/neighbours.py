@@ -1,20 +1,14 @@
-"""Neighbours: particles sorted by cell, and a symmetric list that the step keeps.
+"""Neighbours: particles sorted by cell, and a symmetric list of neighbours for a step.
 
 The list reaches a little beyond the support radius (`SKIN`), because the density is also computed at predicted
-positions. Without this skin a pair that comes within the support during the step would count only if its distance was
-below the support at the start. The next state would depend on the state discontinuously there, and lattices start with
-pairs at just that distance.
+positions. Without the skin the next state would be discontinuous where a pair enters the support during the step, as on
+lattices.
 
-The list holds j for i exactly when it holds i for j, because |x_i - x_j| is computed with the same bits from both
-sides.
+The list contains j for i exactly if it contains i for j, because |x_i - x_j| has the same bits from both sides.
 
-Candidates are the particles in a particle's own cell and in the cells around it. They come in the order of the cells,
-rows along x one after the other. Within a cell they come in the order of the particles, whether one thread or the lanes
-of a particle look for them.
-
-One thread compares 32 candidates, stores a bit for each, and then appends those within reach: on a GPU comparisons of
-threads run in parallel, but appending threads wait for one another. Many lanes treat the candidates of all rows as one
-range, so that no lane is idle at the end of a row.
+Candidates come from the cells around a particle: rows of cells along x, and within a cell in the order of the
+particles. A single thread compares 32 candidates before it appends those within reach, because appending threads of a
+GPU wait for one another. Many lanes treat the candidates of all rows as one range.
 """
 
 from functools import cache
@@ -30,20 +24,16 @@ from cortado.device.precision import TypesByName, lane_functions
 from cortado.errors import InputError
 from cortado.particles.mirrors import most_imaged, reflections
 from cortado.particles.moving_walls import MovingWalls, WallArrays
-from cortado.particles.neighbourhood import UNROLL, Discretisation, loads, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.state import Layout
 
 BITS = 32
-"""Candidates that one thread compares before it appends."""
 ROWS = 9
-"""Most rows of cells to visit."""
 LEAST_AT_ONCE = 8
-"""Least number of lanes that treat all rows as one range; fewer lanes visit rows one by one. Measured on an H200."""
 
 
 @cache
 def append_function(discretisation: Discretisation) -> Any:
-    """Make the Warp function that appends the particles found by the lanes to a list, in the order of the particles."""
     neighbourhood = discretisation.types[2]
     lanes = lane_functions(discretisation.precision, discretisation.lanes)
     vote, ones, before = lanes.vote, lanes.ones, lanes.before
@@ -61,8 +51,6 @@ def append_function(discretisation: Discretisation) -> Any:
 
 @cache
 def scan_types(discretisation: Discretisation) -> TypesByName:
-    """Return by argument name the Warp types of the functions that search cells for neighbours: ``x_i`` is the position
-    of particle i, ``positions`` (n,) are those of all particles, numbers are integers."""
     _, vector, neighbourhood = discretisation.types
     names = {wp.array(dtype=vector): "positions", cell_grid_type(discretisation.precision): "grid", wp.vec3i: "c"}
     return TypesByName(int, {vector: "x", neighbourhood: "s", **names})
@@ -70,10 +58,9 @@ def scan_types(discretisation: Discretisation) -> TypesByName:
 
 @cache
 def scan_by_bits(discretisation: Discretisation) -> Any:
-    """Make the Warp function for one lane that appends particles first ... last - 1 within reach, without particle
-    ``own``."""
-    separation = pair_functions(discretisation).separation
-    load = loads(discretisation.precision, discretisation.taped).load_vector
+    """Make the Warp function, for one lane, that appends near particles ``first`` to ``last`` - 1 except ``own``."""
+    pair = pair_functions(discretisation)
+    separation, load = pair.separation, pair.load_vector
 
     @wp.func
     @scan_types(discretisation)
@@ -114,10 +101,8 @@ def scan_by_bits(discretisation: Discretisation) -> Any:
 
 @cache
 def scan_by_lanes(discretisation: Discretisation) -> Any:
-    """Make the Warp function for several lanes that appends particles first ... last - 1 within reach, without particle
-    ``own``."""
-    separation = pair_functions(discretisation).separation
-    load = loads(discretisation.precision, discretisation.taped).load_vector
+    pair = pair_functions(discretisation)
+    separation, load = pair.separation, pair.load_vector
     LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
 
     @wp.func
@@ -138,14 +123,13 @@ def scan_by_lanes(discretisation: Discretisation) -> Any:
 
 
 def scan_around(discretisation: Discretisation) -> Any:
-    """Make the Warp function that appends the particles within reach in the cells around cell c, without particle
-    ``own``. The cells of the scene begin at layer ``bottom``."""
+    """Make the Warp function that appends the particles within reach of cell c's surroundings, except particle ``own``.
+    The scene's cells begin at layer ``bottom``."""
     return (scan_at_once if discretisation.lanes >= LEAST_AT_ONCE else scan_by_rows)(discretisation)
 
 
 @cache
 def scan_by_rows(discretisation: Discretisation) -> Any:
-    """Make the Warp function of `scan_around` that visits one row of cells after the other."""
     cells = cell_functions(discretisation.precision)
     wrap, below, above = cells.wrap, cells.below, cells.above
     scan = scan_by_bits(discretisation) if discretisation.lanes == 1 else scan_by_lanes(discretisation)
@@ -176,11 +160,11 @@ def scan_by_rows(discretisation: Discretisation) -> Any:
 
 @cache
 def scan_at_once(discretisation: Discretisation) -> Any:
-    """Make the Warp function of `scan_around` that visits all rows as one range, or row by row at the grid's ends."""
+    """Make the Warp function of `scan_around` that visits all rows as one range, except at the grid's ends."""
     cells = cell_functions(discretisation.precision)
     wrap, below, above = cells.wrap, cells.below, cells.above
-    separation = pair_functions(discretisation).separation
-    load = loads(discretisation.precision, discretisation.taped).load_vector
+    pair = pair_functions(discretisation)
+    separation, load = pair.separation, pair.load_vector
     LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
     scan_rows = scan_by_rows(discretisation)
     one_of_each_row = wp.types.vector(length=ROWS, dtype=wp.int32)
@@ -245,8 +229,8 @@ def fill_kernel(discretisation: Discretisation) -> Any:
     @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
     @typed.arrays
     def fill(s, grid, wall_grid, moving_grid, near_walls, bad_step, x, fluid_count, filling, count, all_count, needed):
-        """List neighbours; ``needed`` becomes the greatest length in each range, even without room for it. Scenes that
-        have lost a particle, by ``bad_step``, get empty lists. ``near_walls`` comes from `_near_walls`."""
+        """List neighbours, and write to ``needed`` the greatest length in each range, even without room for it. Scenes
+        with a lost particle (``bad_step`` >= 0) get empty lists."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if bad_step[member] >= 0:
@@ -283,22 +267,17 @@ def fill_kernel(discretisation: Discretisation) -> Any:
 
 @cache
 def image_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel that appends images of particles, and of the particle itself, to lists of neighbours."""
     vector, neighbourhood = discretisation.precision.vector, neighbourhood_type(discretisation.precision)
-    pair, load = pair_functions(discretisation), loads(discretisation.precision, discretisation.taped)
+    pair = pair_functions(discretisation)
     separation, sees, shows, sides = pair.separation, pair.sees, pair.shows, pair.sides
     reflection, turned, last_reflection = pair.reflection, pair.turned, pair.last_reflection
-    load_vector, neighbour, REFLECTIONS = (
-        load.load_vector,
-        pair.neighbour,
-        wp.constant(reflections(discretisation.moving)),
-    )
+    load_vector, neighbour = pair.load_vector, pair.neighbour
+    REFLECTIONS = wp.constant(reflections(discretisation.moving))
     LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
 
     @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
     @TypesByName(wp.int32, {neighbourhood: "s", vector: "x"}).arrays
     def fill_images(s, bad_step, x, all_count, needed):
-        """Append images to lists; ``needed`` becomes the greatest length of a list, as in `fill_kernel`."""
         i = s.first + wp.tid() // LANES
         x_i, limit, found = x[i], s.reach * s.reach, int(s.count[i])
         member = i // s.particles
@@ -328,8 +307,7 @@ def image_kernel(discretisation: Discretisation) -> Any:
 
 
 def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
-    """Return (cells,) True where there are walls in a cell or around it; ``starts`` (cells + 1,) has the first wall
-    particle of each."""
+    """Return (cells,) True for cells with walls in or around them; ``starts`` has the first wall particle of each."""
     near = np.diff(starts).reshape(grid.shape[::-1]) > 0
     for axis in range(3):
         near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
@@ -337,10 +315,10 @@ def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
 
 
 class NeighbourSearch:
-    """A search that sorts particles by cell and lists their neighbours, on one device and without reading from it.
+    """A search that sorts particles by cell and lists their neighbours, on one device, without reads by the host.
 
-    For speed the list is [particle][neighbour] in the memory of a CPU and [neighbour][particle] on a GPU; kernels index
-    it [neighbour, particle] on both.
+    Lists are stored [particle][neighbour] on a CPU and [neighbour][particle] on a GPU; kernels index [neighbour,
+    particle].
     """
 
     def __init__(
@@ -354,9 +332,8 @@ class NeighbourSearch:
         dimension: int = 3,
         mirrored: bool = False,
     ):
-        """Allocate the search. ``walls`` at rest are shared by all scenes of a batch. After them come the walls of
-        ``solids`` moving solids in a ``dimension``, scene by scene, which `MovingWalls.write` writes. Lists include
-        images if fluid is ``mirrored``."""
+        """Allocate the search. All scenes of a batch share the ``walls`` at rest; the walls of ``solids`` moving solids
+        follow, scene by scene. Lists contain images if fluid is ``mirrored``."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         if mirrored and particles > (most := most_imaged(discretisation.moving)):
             raise InputError(
@@ -368,8 +345,10 @@ class NeighbourSearch:
         self._mirrored = mirrored
         self._sort = CellSort(grid, layout.particles, precision, device, layout.members)
         self.order = self._sort.order
-        lists = (wp.zeros(particles, dtype=wp.int32, device=device) for _ in range(4))
-        self.fluid_count, self.filling, self.count, self.all_count = lists
+        names = "fluid_count", "filling", "count", "all_count"
+        self.lists = {name: wp.zeros(particles, dtype=wp.int32, device=device) for name in names}
+        """Lengths (n,) of the lists by kernel argument names."""
+        self.fluid_count, self.filling, self.count, self.all_count = self.lists.values()
         self._launch = KernelLauncher(particles, device, record_tape=False)
         self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
         self._seen = HostCopy(self._needed)
@@ -383,7 +362,7 @@ class NeighbourSearch:
         self.walls = {
             f"wall_{name}": wp.zeros(sizes[name], dtype=kind, device=device) for name, kind in {**kinds, **own}.items()
         }
-        """Arrays of wall particles by kernel arguments' names, those at rest first; tangents only if solids move."""
+        """Arrays of wall particles by kernel argument name, those at rest first; tangents only if solids move."""
         self.walls["wall_faces"].fill_(-1)
         self._write_walls(still)
         self._wall_sort = CellSort(grid, len(still), precision, device)
@@ -403,15 +382,13 @@ class NeighbourSearch:
             self.neighbours = wp.empty(shape[::-1], dtype=wp.int32, device=self.device)
 
     def sort(self, positions: wp.array) -> None:
-        """Find the order of cells (``order``: sorted -> given) of positions (members n,) [m]; ties keep the given
-        order."""
+        """Write the order of the cells to ``order``, for positions (members n,) [m]; ties retain the given order."""
         if self._unsorted_walls is not None:  # once, and not before kernels are compiled side by side
             self._sort_walls(self._unsorted_walls)
             self._unsorted_walls = None
         self._sort(positions)
 
     def _write_walls(self, walls: WallArrays) -> None:
-        """Copy the wall particles at rest to the search's arrays on the device, in the given order."""
         known = {name: getattr(walls, name) for name in ("positions", "weights", "grips", "feet")}
         for name, values in {**known, "solids": walls.solid}.items():
             array = self.walls[f"wall_{name}"]
@@ -425,26 +402,19 @@ class NeighbourSearch:
         self._near_walls.assign(_near_walls(self._grid, self._wall_sort.grid.starts.numpy()))
 
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:
-        """List the neighbours of sorted positions (members n,) [m]. Scenes whose ``bad_step`` (members,) is not -1 get
-        empty lists; `needed` tells whether lists were long enough."""
+        """List the neighbours of sorted positions (members n,) [m]; scenes whose ``bad_step`` (members,) is not -1 get
+        empty lists. Lists are too short if `needed` exceeds the capacity."""
         given = {"s": neighbourhood, "bad_step": bad_step, "x": positions, "needed": self._needed}
         grids = {"grid": self._sort.grid, "wall_grid": self._wall_sort.grid, "near_walls": self._near_walls}
-        lists = {
-            "fluid_count": self.fluid_count,
-            "filling": self.filling,
-            "count": self.count,
-            "all_count": self.all_count,
-        }
         moving = self._wall_sort.grid if self.moving is None else self.moving.grid
-        self._launch(self._fill, given, lists, grids, moving_grid=moving)
+        self._launch(self._fill, given, self.lists, grids, moving_grid=moving)
         if self._mirrored:
-            self._launch(self._fill_images, given, lists)
+            self._launch(self._fill_images, given, self.lists)
 
     @property
     def needed(self) -> int:
-        """Return the length of the longest list since `forget_needed`; a capacity below it was too small."""
+        """Return the length of the longest list since `forget_needed`, even if it exceeded the capacity."""
         return int(self._seen.read().max())
 
     def forget_needed(self) -> None:
-        """Forget the longest list, so that `needed` begins anew."""
         self._needed.zero_()

@@ -7,33 +7,27 @@ inputs.
 
 is the Warp function ``force(i, x, c, s)`` of particle i, the arrays x and c, and the neighbourhood s. Parameters are
 
-    x_ij               the separation x_i - x_j, of the nearest image
-    c_i, c_j, v_ij     an array's entry of the particle, that of its neighbour, and v_i - v_j
-    i, j               their numbers; j is -1 for a particle of a wall
-    foot               of a particle of a wall, from it to the surface of the container; in terms of walls alone
-    mirrored           of a particle of a wall, 1 where the wall mirrors about particle i, or 0; in works of walls
-    turn_dot           of a particle of a wall, the tangent of how its solid is turned; in tangents of terms of walls
-    swept              of an image, how far a step of its mirror takes it, where solids move; and swept_dot, its tangent
-    direct             of an image, the separation from the particle that it mirrors; and direct_dot, its tangent
-    owned              of an image, 1 where it is by the walls of ``solid``, or of all walls, or 0
+    x_ij               the separation x_i - x_j of the nearest image
+    c_i, c_j, v_ij     an array's entry of the particle, of its neighbour, and v_i - v_j
+    i, j               their numbers; j is -1 for a wall particle
+    foot               for walls: the vector from a wall particle to the nearest point of the surface
+    mirrored           for works of walls: 1 if the wall mirrors about particle i, otherwise 0
+    turn_dot           for tangents of terms of walls: the tangent of the rotation of the wall's solid
+    swept, swept_dot   for images by moving solids: the displacement of the mirror in a step, and its tangent
+    direct, direct_dot for images: the separation from the mirrored particle, and its tangent
+    owned              for images: 1 if the image is by the walls of ``solid``, or if ``solid`` means all walls
     s                  the neighbourhood
-    any other          what is the same for all neighbours of a particle, and stands between the arrays and s
+    any other          a value for all neighbours of a particle, which stands between the arrays and s
 
-A term that returns several values makes as many sums in one loop. For a wall particle, which is at rest and has no
-pressure, every value with an index j is 0, and the term is multiplied by w_b. Walls with another effect have a term of
-their own.
+A term with several values makes several sums in one loop. For a wall particle every value with index j is 0, unless
+walls have a separate term, and the term is multiplied by the weight w_b. Sums are source texts of loops that Warp
+compiles. In these texts all names except parameters begin with an underscore; names of parameters must not.
 
-With ``ahead=False`` a neighbour's entries are loaded just before its term is computed. Loading them earlier saves a
-tenth of a step on a GPU, but little if terms take longer than loads.
+With ``ahead=False`` a neighbour's entries are loaded just before its term is computed. Loading them earlier is quicker
+if terms are cheap.
 
-Sums are source texts of loops over a particle's neighbours, which Warp compiles; this module contains all such loops.
-The lanes of a particle share its neighbours (`cortado.device.precision`). In such a text all names except those of
-parameters begin with an underscore; names of parameters must not.
-
-Derivatives of sums are written by hand (`tangent_of`, `adjoint_of`) where a step is faster with them than with the ones
-that Warp makes of a term (`cortado.particles.made_derivatives`); `benchmarks/by_hand.py` measures by how much. A
-derivative takes the sum's arrays and one more for the tangent of each array, or for the adjoint of the sum. `BY_HAND`
-lists all of them, and tests compare each with the derivative made by Warp.
+Derivatives of sums are handwritten (`tangent_of`, `adjoint_of`) where Warp's (`cortado.particles.made_derivatives`)
+would slow down a step; tests compare all derivatives in `BY_HAND` with Warp's.
 """
 
 import inspect
@@ -51,23 +45,18 @@ from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhoo
 NUMBERS = ("i", "j")
 INDICES = ("i", "j", "ij")
 OF_WALLS = {"foot": "_foot", "turn_dot": "_turn_dot", "mirrored": "_mirrored"}
-"""Names of a wall particle's data in terms of walls, with their source texts."""
 
 
 @dataclass(frozen=True)
 class Term:
-    """The parameters and the results of a function of a pair of particles."""
-
     function: Callable[..., Any]
     parameters: Mapping[str, Any]
-    """Types of the function's parameters by name."""
     results: tuple[Any, ...]
-    """Types of the function's results."""
 
     @classmethod
     def of(cls, function: Callable[..., Any]) -> "Term":
-        """Read the term of a function that has an annotation at each parameter, and ``tuple[...]`` if it returns
-        several things. Raises `TypeError` for one without them, or for names that begin with an underscore."""
+        """Read the term of a function with an annotation at each parameter, and ``tuple[...]`` for several results.
+        Raise `TypeError` for missing annotations, or names that begin with an underscore."""
         types, names = inspect.get_annotations(function), (*inspect.signature(function).parameters, "return")
         for name in names:
             if name not in types or isinstance(types[name], str):
@@ -84,27 +73,22 @@ class Term:
 
     @property
     def arrays(self) -> dict[str, Any]:
-        """Return the types of the entries of arrays, by the arrays' names."""
         return {array: self.parameters[name] for name in self.parameters if (array := array_of(name))}
 
     @property
     def of_neighbours(self) -> dict[str, Any]:
-        """Return the types of the entries of arrays that are read for a neighbour, by name."""
         read = {array_of(name) for name in self.parameters if name.endswith(("_j", "_ij"))}
         return {array: kind for array, kind in self.arrays.items() if array in read}
 
     @property
     def others(self) -> dict[str, Any]:
-        """Return the types, by name, of arguments that are equal for all neighbours."""
         known = (*NUMBERS, *OF_WALLS, *OF_IMAGES, "s")
         return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in known}
 
     def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j") -> str:
-        """Return the term's arguments as source text, given the texts of a neighbour's entries and of its number."""
         return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j, **OF_WALLS, **OF_IMAGES})
 
     def seen_from_j(self, of_j: Mapping[str, str]) -> str:
-        """Return the term's arguments as source text, with particle and neighbour exchanged."""
         return self._arguments("-_x_ij", of_j.__getitem__, own_entry, {"i": "_j", "j": "i"})
 
     def _arguments(
@@ -124,13 +108,12 @@ class Term:
 
 
 def array_of(parameter: str) -> str:
-    """Return the name of the array of which a parameter is an entry; an empty text for other parameters."""
+    """Return the array of which a parameter is an entry; an empty text for other parameters."""
     array, _, index = parameter.rpartition("_")
     return array if index in INDICES else ""
 
 
 def own_entry(array: str) -> str:
-    """Return the name of the variable, in generated source, with particle i's entry of an array."""
     return f"_{array}_i"
 
 
@@ -157,23 +140,19 @@ OVER_WALLS = """\
         {body}
 """
 ALL, RUBBING = "_load_number(s.wall_weights, _b)", "_load_number(s.wall_grips, _b)"
-"""Source texts of the weights of wall particles, and of those without slip."""
 PLACE, FOOT = "_load_vector(s.wall_positions, _b)", "_load_vector(s.wall_feet, _b)"
 TURN, GROWTH = "_load_vector(s.wall_turns_dot, _b)", "_load_number(s.wall_growths_dot, _b)"
-"""Source texts of further data of a wall particle: the tangents of its rotation and of its weight."""
 MOVING = {
     "v": "_load_vector(s.wall_velocities, _b)",
     "x_dot": "_load_vector(s.wall_positions_dot, _b)",
     "v_dot": "_load_vector(s.wall_velocities_dot, _b)",
 }
-"""Source texts of the array entries of moving wall particles."""
 
 Function = Callable[..., Any]
 Decorator = Callable[[Function], Any]
 Types = Mapping[str, Any]
-"""Types by name."""
 Body = Callable[[Mapping[str, str]], Iterable[str]]
-"""Returns a loop's lines, given the source of a neighbour's entry of each array. They use _x_ij, add to _total_0 ..."""
+"""A function of the source of a neighbour's entries, which returns the lines of a loop that add to _total_0, ..."""
 
 
 def over_fluid(
@@ -181,8 +160,8 @@ def over_fluid(
 ) -> str:
     """Return the source of a loop over the fluid that reads neighbours' entries of these arrays.
 
-    ``ahead`` loads the entries of `UNROLL` neighbours before using any, so that loads do not wait for one another.
-    ``numbered`` loops define the neighbour's number _j, ``separated`` loops _x_ij.
+    ``ahead`` loads the entries of `UNROLL` neighbours before using any. ``numbered`` loops define the neighbour's
+    number _j, ``separated`` loops _x_ij.
     """
     kinds = {d.precision.vector: "_vectors", d.precision.real: "_numbers", d.precision.six: "_sixes"}
     loads = kinds if ahead else {}
@@ -197,7 +176,7 @@ def over_fluid(
 
 
 def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
-    """Return the source of a loop over the images of the fluid and of the particle itself. Images have their particles'
+    """Return the source of a loop over images of the fluid and of the particle itself. Images have the particles'
     numbers, mirrored vectors, and matrices mirrored from the left."""
 
     def of_j(array: str, kind: Any) -> str:
@@ -213,9 +192,8 @@ def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
 
 
 def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], weight: str) -> str:
-    """Return the source of a loop over the walls. Wall particles have a place, a ``weight``, and the entries ``known``
-    of `OF_WALLS`; moving walls also have a velocity, as their entry of the array v, and tangents of place and
-    velocity."""
+    """Return the source of a loop over the walls, with a ``weight`` and with the entries ``known`` of `OF_WALLS`.
+    Moving walls also have a velocity v, and tangents."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
     of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays}
     turned = TURN if d.moving else zero(d.precision.vector, d)
@@ -237,7 +215,7 @@ def summed(
     scope: Types,
     module: Any,
 ) -> Any:
-    """Make the Warp function ``name(i, *arrays, *others, s)``, which runs ``loops`` and returns sums of given types."""
+    """Make the Warp function ``name(i, *arrays, *others, s)``, which runs ``loops`` and returns the sums."""
     results = tuple(results)
     for kind in results:
         if kind is not d.precision.real and not _is_vector_of(d.precision.real, kind):
@@ -274,19 +252,16 @@ def _is_vector_of(real: Any, kind: Any) -> bool:
 
 
 def scope_of(d: Discretisation) -> dict[str, Any]:
-    """Return the names that sources of loops over neighbours use: types, and the functions of pairs."""
     precision = d.precision
     types = {"_real": precision.real, "_vector": precision.vector, "_neighbourhood": neighbourhood_type(precision)}
     return {**{f"_{name}": function for name, function in vars(pair_functions(d)).items()}, **types}
 
 
 def zero(kind: Any, d: Discretisation) -> str:
-    """Return the source text of a zero of a type."""
     return "_real(0.0)" if kind is d.precision.real else f"{type_name(kind, d)}()"
 
 
 def type_name(kind: Any, d: Discretisation) -> str:
-    """Return the name that a type has in the source text of a loop."""
     known = {d.precision.real: "_real", d.precision.vector: "_vector"}
     return known.get(kind) or f"_vector_{len(kind())}"
 
@@ -302,11 +277,15 @@ def _summing(
     module: Any = None,
     grows: Any = None,
 ) -> Decorator:
-    """Return a decorator that turns a term into the sum over some ``loops``, given that term and that of walls."""
 
     def make(function: Function) -> Any:
         term, wall = Term.of(function), Term.of(walls or function)
-        return _made(term, d, loops(term, wall), wall, module, grows)
+        into = module or wp.get_module(function.__module__)
+        terms = {"_term": term, "_wall_term": wall, "_grown_term": wall if grows is None else grows.wall}
+        functions = {name: wp.func(one.function, module=into) for name, one in terms.items()}
+        made = summed(term.name, d, term.arrays, term.others, term.results, loops(term, wall), functions, into)
+        made.term, made.wall = term, wall
+        return made
 
     return make
 
@@ -315,9 +294,8 @@ def pair_sum(
     d: Discretisation, walls: Function | None = None, ahead: bool = True, rubs: bool = False, grows: Any = None
 ) -> Decorator:
     """Return a decorator that turns the term of a pair into the Warp function of its sum over fluid and walls.
-    ``walls`` is a separate term of walls, if any; the fluid's term must have all of its parameters. A sum that ``rubs``
-    leaves out walls that slip freely. For a tangent ``grows`` is the sum that it belongs to: the tangents of walls'
-    weights are multiplied by the term of that sum."""
+    ``walls`` is a separate term of walls, whose parameters the fluid's term must have. A sum that ``rubs`` excludes
+    walls that slip freely. For a tangent, ``grows`` is the sum whose terms multiply the tangents of weights."""
 
     def loops(term: Term, wall: Term) -> str:
         _check_walls(wall, term)
@@ -327,14 +305,12 @@ def pair_sum(
 
 
 def fluid_sum(d: Discretisation, ahead: bool = True, module: Any = None) -> Decorator:
-    """Return a decorator that turns the term of a pair into its sum over the fluid alone, in a Warp ``module`` or the
-    file's."""
+    """Return a decorator that turns the term of a pair into its sum over the fluid alone."""
     return _summing(d, lambda term, _: _over_fluid(term, d, ahead), module=module)
 
 
 def image_sum(d: Discretisation) -> Decorator:
-    """Return a decorator that turns the term of a pair into its sum over the images of the fluid in mirroring walls
-    (`cortado.particles.neighbourhood`)."""
+    """Return a decorator that turns the term of a pair into its sum over the images of the fluid in mirroring walls."""
     return _summing(d, lambda term, _: over_images(d, term.of_neighbours, _adding_up(term)))
 
 
@@ -354,17 +330,14 @@ def wall_sum(d: Discretisation, grows: Any = None, weight: str = ALL) -> Decorat
 
 
 def solid_sum(d: Discretisation) -> Decorator:
-    """Return a decorator that turns a term into its sum over the walls of one moving ``solid``, given by its number."""
     return wall_sum(d, weight=f"wp.where(s.wall_solids[_b] == solid, {ALL}, _real(0.0))")
 
 
 def mirror_sum(d: Discretisation, grows: Any = None) -> Decorator:
-    """Return a decorator that turns a term into its sum over the walls that mirror about a particle (``mirrors``)."""
     return wall_sum(d, grows, f"wp.where(_mirrors_in(_b, mirrors, s), {ALL}, _real(0.0))")
 
 
 def _check_walls(wall: Term, term: Term) -> None:
-    """Raise `TypeError` for a term of walls that does not fit the term of the fluid."""
     more = [name for name, kind in (wall.arrays | wall.others).items() if (term.arrays | term.others).get(name) != kind]
     if wall.results != term.results or more:
         found = f"has {', '.join(more)}" if more else f"returns {wall.results}"
@@ -372,11 +345,13 @@ def _check_walls(wall: Term, term: Term) -> None:
 
 
 def _adding_up(term: Term) -> Body:
-    def body(of_j: Mapping[str, str]) -> list[str]:
-        called = f"{_terms(term)} = _term({term.seen_from_i(of_j)})"
-        return [called, *(f"_total_{n} += _term_{n}" for n in _numbers(term))]
+    return lambda of_j: _added("_term", term, "", term.seen_from_i(of_j))
 
-    return body
+
+def _added(called: str, term: Term, weight: str, arguments: str) -> list[str]:
+    numbers = range(len(term.results))
+    call = f"{', '.join(f'_term_{n}' for n in numbers)} = {called}({arguments})"
+    return [call, *(f"_total_{n} += {weight}_term_{n}" for n in numbers)]
 
 
 def _over_fluid(term: Term, d: Discretisation, ahead: bool) -> str:
@@ -386,62 +361,36 @@ def _over_fluid(term: Term, d: Discretisation, ahead: bool) -> str:
 
 def _over_walls(wall: Term, d: Discretisation, grows: Any, weight: str) -> str:
     def body(of_b: Mapping[str, str]) -> list[str]:
-        return [*added("_wall_term", wall, "_w_b", of_b), *growth(of_b)]
-
-    def growth(of_b: Mapping[str, str]) -> list[str]:
+        lines = _added("_wall_term", wall, "_w_b * ", wall.seen_from_i(of_b, "-1"))
         if grows is None or not d.moving:
-            return []
-        lines = added("_grown_term", grows.wall, "_w_b * _growth", of_b)
-        return [f"_growth = {GROWTH}", "if _growth != _real(0.0):", *(f"    {line}" for line in lines)]
-
-    def added(called: str, term: Term, weight: str, of_b: Mapping[str, str]) -> list[str]:
-        call = f"{_terms(term)} = {called}({term.seen_from_i(of_b, '-1')})"
-        return [call, *(f"_total_{n} += {weight} * _term_{n}" for n in _numbers(term))]
+            return lines
+        grown = _added("_grown_term", grows.wall, "_w_b * _growth * ", grows.wall.seen_from_i(of_b, "-1"))
+        return [*lines, f"_growth = {GROWTH}", "if _growth != _real(0.0):", *(f"    {line}" for line in grown)]
 
     if "x_ij" not in wall.parameters:
         raise TypeError(f"term {wall.name} has no x_ij, but must have it where it is summed over walls.")
     return over_walls(d, wall.of_neighbours, body, wall.parameters, weight)
 
 
-def _terms(term: Term) -> str:
-    return ", ".join(f"_term_{n}" for n in _numbers(term))
-
-
-def _numbers(term: Term) -> range:
-    return range(len(term.results))
-
-
-def _made(term: Term, d: Discretisation, loops: str, wall: Term, module: Any = None, grows: Any = None) -> Any:
-    module = module or wp.get_module(term.function.__module__)
-    terms = {"_term": term, "_wall_term": wall, "_grown_term": wall if grows is None else grows.wall}
-    functions = {name: wp.func(one.function, module=module) for name, one in terms.items()}
-    made = summed(term.name, d, term.arrays, term.others, term.results, loops, functions, module)
-    made.term, made.wall = term, wall
-    return made
-
-
 @dataclass(frozen=True)
 class ByHand:
-    """A derivative of a sum that was written by hand, as a Warp function."""
+    """A handwritten derivative of a sum, as a Warp function."""
 
     kind: str
-    """"tangent" or "adjoint". An adjoint returns the adjoints of particle i's entries in each array of the sum, in
-    their order, and after them the adjoints of the other arguments or further values that a kernel needs."""
+    """"tangent" or "adjoint". An adjoint returns the adjoints of particle i's entries in each array, in the order of
+    the arrays, and then those of other arguments or further values that a kernel needs."""
     of: Any
     function: Any
 
 
 BY_HAND: list[ByHand] = []
-"""The handwritten derivatives of all sums made so far."""
 
 
 def tangent_of(sum_of: Any) -> Callable[[Any], Any]:
-    """Return a decorator that marks a function as the tangent of a sum over neighbours."""
     return lambda function: _noted("tangent", sum_of, function)
 
 
 def adjoint_of(sum_of: Any) -> Callable[[Any], Any]:
-    """Return a decorator that marks a function as the adjoint of a sum over neighbours."""
     return lambda function: _noted("adjoint", sum_of, function)
 
 

@@ -4,26 +4,23 @@
     def flux(total: fractions, c_i: fractions, m_i: real, time_step: real, scale: real) -> fractions:
         return c_i + (time_step * scale / m_i) * total
 
-is a kernel that sums ``spread`` over the neighbours of particle i, and then writes what the function returns to
-c_new[i]. Parameters of the function are results of its sums; entries c_i of arrays c; the particle's number ``i`` and
-its scene's number ``member``; the neighbourhood ``s``; and numbers and whole arrays of a launch. All others, such as
-``time_step``, are entries of the particle's scene. A sum reads arrays with the names in its term, unless `over` renames
-them. A result "+x_bar" is added to the array's entry; "acceleration:acceleration_in" writes the result plus the entry
-of acceleration_in to acceleration.
+is a kernel that sums ``spread`` over the neighbours of particle i, with m as the array w, and writes the function's
+result to c_new[i]. Parameters are results of sums; entries c_i of arrays c; the particle's number ``i`` and its scene's
+number ``member``; the neighbourhood ``s``; numbers and whole arrays of a launch. All others, such as ``time_step``, are
+entries of the particle's scene. A result "+x_bar" is added to the array's entry; "acceleration:acceleration_in" writes
+the result plus the entry of acceleration_in.
 
-If only a multiple of a sum with known derivatives is computed, no function is needed (`sum_kernels`). For a function of
-a particle's own values Warp makes the derivatives (`pointwise_kernels`). For results r = f(x_i, ..., time_step, ...)
-they are
+`sum_kernels` makes the kernels of a multiple of a sum. `pointwise_kernels` lets Warp differentiate a function r =
+f(x_i, ..., time_step, ...) of a particle's values:
 
     tangent:  r_dot[i] = df/dx x_dot[i] + ... + df/dtime_step time_step_dot[scene]
     adjoint:  x_bar[i] += (df/dx)^T r_bar[i],   time_step_bar[i] += df/dtime_step . r_bar[i]
 
-where each particle stores its share of the adjoint of a scene's parameter; shares are summed later. Both derivatives
-are exact; the tangent is computed from the gradients of the components of r. The tangent of a rotation R is the vector
-w by which R turns further, R_dot u = w x (R u), and the adjoint of R is the adjoint of w.
+Particles store their terms of the adjoint of a scene's parameter, which are summed later. The tangent of a rotation R
+is the vector w with R_dot u = w x (R u), and the adjoint of R is the adjoint of w.
 
 Two traps of Warp: after ``a, b = array[j], c`` writing to a component of ``a`` writes to the array, whereas ``a =
-array[j]`` makes a copy. And ``wp.grad`` does not compile in a function that the kernel's function calls.
+array[j]`` makes a copy; and ``wp.grad`` does not compile in a function that the kernel's function calls.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -48,10 +45,8 @@ def {name}({parameters}):
     {body}
 """
 MADE = "made_"
-"""Prefix of the names of generated kernels."""
 MOST_ARRAYS = 8
-"""Most arrays of particles that a kernel without tape takes as single arguments. More are bundled: each argument adds 2
-us to a launch on a CPU."""
+"""Greatest number of single array arguments; more are bundled, because each argument lengthens a launch."""
 TANGENT = """\
 _total_{n} = _kind_{n}()
     _components = int({components})
@@ -60,8 +55,7 @@ _total_{n} = _kind_{n}()
         {unit}[{entry}] = _one
         {gradient}
         _total_{n} += ({change}) * {unit}"""
-"""Source text of the tangent of a vector or matrix; its number of components is a variable, so that Warp does not
-unroll."""
+"""Source text of the tangent of a vector or matrix. A variable ``_components`` keeps Warp from unrolling the loop."""
 
 
 def made_kernel(name: str, types: Types, body: Iterable[str], scope: Types, module: Any) -> Any:
@@ -76,32 +70,25 @@ def made_kernel(name: str, types: Types, body: Iterable[str], scope: Types, modu
 
 @dataclass(frozen=True)
 class Over:
-    """A sum over neighbours in a kernel, with the names of its results and renamed arguments."""
-
     function: Any
     names: Sequence[str]
-    """Names of the sum's results in the kernel."""
     renamed: Mapping[str, str]
 
     def read(self, types: Types) -> dict[str, Any]:
-        """Return types by the names that arguments have in the kernel."""
         return {self.renamed.get(name, name): kind for name, kind in types.items()}
 
     def call(self, entries: Mapping[str, str], function: str) -> str:
-        """Return the source line that computes the sum, given source texts of arguments equal for all neighbours."""
         names = (*self.read(self.function.arrays), *self.read(self.function.others))
         results = ", ".join(f"_{name}" for name in self.names)
         return f"{results} = {function}(i, {', '.join(entries.get(name, name) for name in names)}, s)"
 
 
 def over(function: Any, names: str, /, **renamed: str) -> Over:
-    """Name a sum over neighbours (`cortado.particles.pair_sums`) for a kernel: its results, one word each, and
-    arguments that have other names in the kernel."""
+    """Name the results of a sum over neighbours for a kernel, one word each, and rename its arguments."""
     return Over(function, names.split(), renamed)
 
 
 def dotted(names: Mapping[str, str]) -> dict[str, str]:
-    """Return the renamed arguments of a sum for their tangents, with _dot behind both names."""
     return {f"{name}_dot": f"{other}_dot" for name, other in names.items()}
 
 
@@ -112,9 +99,8 @@ def particle_kernel(
     numbers: Collection[str] = (),
     name: str | None = None,
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that turns a function of one particle, with a type at each parameter, into a kernel in a Warp
-    module; ``results``: the arrays that it writes, one word each. The kernel is called as the function, unless it has a
-    ``name``."""
+    """Return a decorator that turns a function of one particle, with annotations, into a kernel in a Warp module.
+    ``results`` are the arrays that the kernel writes, one word each; ``name`` replaces the function's name."""
 
     def make(function: Callable[..., Any]) -> Any:
         term, places = Term.of(function), function.__qualname__.split(".")
@@ -142,8 +128,8 @@ def sum_kernel(
     numbers: Collection[str] = (),
     **renamed: str,
 ) -> Any:
-    """Make the kernel of one sum. Each result is multiplied by the source text ``times``, such as "s.volume", divided
-    by the text ``per``, and written or added to an array."""
+    """Make the kernel of one sum, multiplied by the text ``times``, divided by the text ``per``, and written or
+    added."""
     arguments = _Arguments([Over(total, [f"total_{n}" for n in range(len(total.results))], renamed)], numbers)
     for number in numbers:
         arguments.entry(number, total.discretisation.precision.real)
@@ -165,10 +151,10 @@ def sum_kernels(
     written: Collection[str] = (),
     **renamed: str,
 ) -> Kernels:
-    """Make the kernels of a sum over neighbours, of its tangent and of its adjoint, each in its own of the Warp
-    ``modules``; ``sums`` are the three sums that `cortado.particles.pair_sums` records. The first kernel computes
-    ``result`` = ``before`` + ``times`` sum / ``per``: ``before`` is an array, the others are source texts, and all
-    three may be left out. Adjoints of inputs are added to, but those of arrays that are ``written`` are overwritten."""
+    """Make the kernels of a sum over neighbours, of its tangent and of its adjoint, the three ``sums``, in the three
+    Warp ``modules``. The first kernel computes ``result`` = ``before`` + ``times`` sum / ``per``: ``before`` is an
+    array, the others are source texts, all optional. Adjoints of inputs are added to, except those of ``written``
+    arrays."""
     total, tangent, adjoint = sums
     told = {**renamed, **dotted(renamed)}
     known = [*total.arrays, *(name for name in total.others if name not in numbers)][: len(adjoint.results)]
@@ -184,7 +170,6 @@ def sum_kernels(
 
 
 def _arrays(read: Types, written: Types, taped: bool) -> tuple[dict[str, Any], list[str]]:
-    """Return a kernel's arguments for arrays, and source lines that give names to arrays in bundles."""
     if taped or len(read) + len(written) <= MOST_ARRAYS:
         return {each: wp.array(dtype=kind) for each, kind in {**read, **written}.items()}, []
     groups = {label: kinds for label, kinds in (("at", read), ("to", written)) if kinds}
@@ -193,8 +178,6 @@ def _arrays(read: Types, written: Types, taped: bool) -> tuple[dict[str, Any], l
 
 
 class _Arguments:
-    """The arguments of a kernel that is being made, collected as the function's parameters are read."""
-
     def __init__(self, sums: Sequence[Over], numbers: Collection[str]):
         self._sums, self._names = sums, numbers
         self._discretisation: Discretisation | None = sums[0].function.discretisation if sums else None
@@ -209,7 +192,6 @@ class _Arguments:
             self._calls.append(one.call(entries, f"_sum_{n}"))
 
     def entry(self, name: str, kind: Any) -> str:
-        """Return the source expression that reads a parameter in the kernel, and record the argument that it needs."""
         if name == "s":
             self._around = kind
         if name == "member":
@@ -226,7 +208,6 @@ class _Arguments:
     def kernel(
         self, name: str, lines: Iterable[str], writes: Iterable[tuple[str, str, Any]], scope: Types, module: Any
     ) -> Any:
-        """Make the kernel that computes the sums, runs the source ``lines``, and writes values to arrays."""
         stored, written, read = [], {}, {}
         for result, value, kind in writes:
             array, _, other = result.removeprefix("+").partition(":")
@@ -260,13 +241,14 @@ def pointwise_kernels(
     replaced: Mapping[str, str] | None = None,
     **names: Any,
 ) -> Kernels:
-    """Make forward, tangent and adjoint kernels, each in its own of the Warp ``modules``, of the function that ``make``
-    makes for a module.
+    """Make forward, tangent and adjoint kernels, in the three Warp ``modules``, of the function that ``make(module)``
+    returns.
 
-    The function has a type at each parameter, and ``results`` are the arrays that it writes; for
-    "acceleration:acceleration_in" the result plus acceleration_in is written. ``replaced`` maps a result to an input:
-    both adjoints share one array, in which the adjoint kernel replaces the result's adjoint by the input's. Adjoints of
-    other inputs are added to. For all other ``names`` see `Kinds`."""
+    The function has an annotation at each parameter; ``results`` are the arrays that it writes. For
+    "acceleration:acceleration_in" the result plus acceleration_in is written. ``replaced`` maps a result to an input
+    whose adjoints share one array: the adjoint kernel overwrites the result's adjoint with the input's. All other
+    ``names`` are the groups of `Kinds`.
+    """
     functions = [make(module) for module in modules]
     terms = [Term.of(function) for function in functions]
     of = _Pointwise(precision, terms[0], results, replaced or {}, Kinds(**names), modules[0].options["enable_backward"])
@@ -282,30 +264,27 @@ def pointwise_kernels(
 
 @dataclass(frozen=True)
 class Kinds:
-    """Names of parameters and results grouped by their roles in pointwise kernels; all groups may be empty."""
+    """Roles of parameters and results in pointwise kernels; all groups are optional."""
 
     numbers: Collection[str] = ()
     """Parameters that are numbers of a launch, without derivatives."""
     written: Collection[str] = ()
-    """Inputs whose adjoints are written, and not added to."""
+    """Inputs whose adjoints are overwritten instead of added to."""
     known: Collection[str] = ()
-    """Inputs without derivatives."""
     where: str = ""
-    """An array of numbers; where one is 0, results and their tangents are 0."""
+    """An array of numbers; where an entry is 0, tangents of results are 0."""
     told: Collection[str] = ()
-    """Inputs with a column for each step; ``step`` is the number of the column, and each thread is a scene."""
+    """Inputs with a column for each step; ``step`` is the column, and each thread is a scene."""
     summed: Collection[str] = ()
-    """Results whose sums over scenes have adjoints, ``name_sum_bar`` (scenes,)."""
+    """Results whose sums over scenes have adjoints ``name_sum_bar`` (scenes,)."""
     turned: Mapping[str, str] = field(default_factory=dict)
-    """Rotations, and the names of further turns of them."""
+    """Rotations, with the names of their further turns."""
     read: Mapping[str, str] = field(default_factory=dict)
     """Parameters by which a function reads a table (`cortado.sph.own_arrays`), with their source texts in a kernel. The
     adjoint kernel then has ``rows`` threads for each scene, which loop over particles."""
 
 
 class _Pointwise:
-    """The name, the arguments and the lines of each of the three kernels of a pointwise function."""
-
     def __init__(
         self,
         precision: Precision,
@@ -339,7 +318,6 @@ class _Pointwise:
                 self._inputs[array] = kind
         turning, leaning = turn_functions(precision)
         self.scope = {"_turning": turning, "_leaning": leaning, "_one": wp.constant(precision.real(1.0))}
-        """Names that the kernels use: functions of rotations, 1 and 0, and types of results and of their changes."""
         self.scope["_no"] = wp.constant(precision.real(0.0))
         self.scope |= {f"_kind_{n}": self._change(name, kind) for n, (name, kind) in enumerate(self._results.items())}
         self.scope |= {f"_whole_{n}": kind for n, kind in enumerate(term.results)}
@@ -400,24 +378,20 @@ class _Pointwise:
         return name, types, [*body, *start, loop, *(f"    {line}" for line in lines)]
 
     def _kernel(self, others: Types, more: Types, lines: Iterable[str]) -> tuple[Types, Iterable[str]]:
-        """Return types and source lines of a kernel with so many other arrays and ``more`` arguments."""
         own, body = {name: kind for name, kind in self._arrays.items() if name not in others}, ["i = wp.tid()"]
         arrays, names = _arrays(own, others, self._taped)
         body += [*names, *(["_row = -1"] if self._kinds.read else [])]
         return {"particles": int, **self._numbers, **arrays, **more}, [*body, *lines]
 
     def _change(self, name: str, kind: Any) -> Any:
-        """Return the type of a tangent or adjoint."""
         return self._precision.vector if name in self._kinds.turned else kind
 
     def _changed(self, name: str, way: str, index: str = "i") -> str:
-        """Return the source text of an input's tangent or adjoint, with ``way`` "dot" or "bar"."""
         if name in self._kinds.told:
             return f"{name}_{way}[i, step[i]]"
         return f"{way}.{self._kinds.turned.get(name, name)}[{index}]"
 
     def _changes(self, way: str) -> Types:
-        """Return the types of the tangents or adjoints of inputs."""
         kinds, told = {}, {}
         for name, kind in self._inputs.items():
             if name in self._kinds.told:
@@ -436,7 +410,6 @@ class _Pointwise:
         return f"{called}[i] = " + (f"{before}{suffix}[i] + " if before else "")
 
     def _written(self, suffix: str) -> dict[str, Any]:
-        """Return the types of the arrays to which results, or their tangents, are written or added."""
         written = {}
         for result, kind in self._results.items():
             if result in self._before:

@@ -1,16 +1,16 @@
 """Sheets: walls of no thickness, through which particles do not see each other.
 
-Lists of neighbours are first made as if there were no sheets. Once in each step these hidden neighbours are removed:
+Lists of neighbours are first made without sheets. Once in each step these hidden neighbours are removed:
 
-- particle j, where the segment from i to j goes through a sheet;
-- the image of j, where the segment to it goes through a sheet, or that from the image of i to j does;
-- a wall particle of a sheet, where the segment to it does not go through this sheet, or goes through another one;
-- any other wall particle, where the segment to it goes through a sheet.
+- particle j, if the segment from i to j crosses a sheet;
+- the image of j, if the segment to it, or from the image of i to j, crosses a sheet;
+- a wall particle of a sheet, if the segment to it does not cross this sheet, or crosses another;
+- any other wall particle, if the segment to it crosses a sheet.
 
-So the sheet's wall particles fill the part of the support that the sheet hides, and tips and holes need no special
-rule. Positions, also of sheets, are those before the step: a particle that begins a step on one side of a sheet ends it
-there (`cortado.solvers.projection.sides`). Lists are symmetric, because a segment begins at the particle with the lower
-number. Visibility does not change within a step, and has no derivative.
+The sheet's wall particles fill the part of the support that the sheet hides, also at tips and holes. Positions, also of
+sheets, are those before the step: a particle ends a step on the side where it begins
+(`cortado.solvers.projection.sides`). Lists are symmetric, because a segment begins at the particle with the lower
+number. Visibility has no derivative.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,25 +32,19 @@ from cortado.particles.state import Layout
 
 @dataclass(frozen=True)
 class PlacedSheet:
-    """A sheet of a scene."""
-
     number: int
-    """Number that the sheet's wall particles have (`cortado.scene.motions.wall_numbers`): from 0 on for a moving
-    sheet."""
+    """Number of the sheet's wall particles (`cortado.scene.motions.wall_numbers`): from 0 on for a moving sheet."""
     sheet: Sheet
-    """The sheet's geometry: a moving sheet about its middle and not turned, a sheet at rest in its place."""
+    """The sheet's geometry: a moving sheet about its middle without rotation, a sheet at rest in its place."""
 
 
 @cache
 def sheets_type(precision: Precision) -> Any:
-    """Make the Warp struct of the sheets of a scene."""
 
     class Sheets:
         faces: faces_type(precision)
-        """Edges or triangles of the sheets: of moving sheets in the frames of their solids, of other sheets in
-        space."""
+        """Edges or triangles of the sheets: of moving sheets in the frames of their solids."""
         numbers: wp.array(dtype=wp.int32)
-        """Number of the wall particles of each sheet."""
 
     Sheets.__name__ = Sheets.__qualname__ = f"Sheets_{precision.name}"
     return wp.struct(Sheets)
@@ -58,8 +52,8 @@ def sheets_type(precision: Precision) -> Any:
 
 @cache
 def sheet_functions(precision: Precision) -> tuple[Any, Any]:
-    """Make Warp functions: ``scale_of`` sheet k; and ``seen_from``, which returns a place in the frame of the sheet,
-    about its middle and divided by its scale, for solids with the poses ``middles`` and ``turns``."""
+    """Make the Warp functions ``scale_of`` sheet k; and ``seen_from``, a position in the sheet's frame, about its
+    middle and divided by its scale, for the poses ``middles`` and ``turns`` of solids."""
     real, vector, sheets_of = precision.real, precision.vector, sheets_type(precision)
     neighbourhood, poses = neighbourhood_type(precision), wp.array2d(dtype=vector)
     turnings = wp.array2d(dtype=precision.matrix)
@@ -85,7 +79,6 @@ def sheet_functions(precision: Precision) -> tuple[Any, Any]:
 
 @cache
 def hiding_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel that removes neighbours hidden by sheets from the lists, with a thread for each particle."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     sheets_of, (scale_of, seen_from) = sheets_type(precision), sheet_functions(precision)
     query, _, goes_through = face_functions(precision)
@@ -97,8 +90,7 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
 
     @wp.func
     def crossed(p: vector, q: vector, own: int, member: int, s: neighbourhood, sheets: sheets_of) -> int:
-        """Return 1 if a segment crosses the sheet with the wall particles ``own``, 2 if it crosses another sheet, 3 for
-        both."""
+        """Return 1 if a segment crosses the sheet with the wall particles ``own``, 2 for another sheet, 3 for both."""
         found = int(0)
         for k in range(sheets.numbers.shape[0]):
             start = seen_from(p, s.before, s.turns_before, k, member, s, sheets)
@@ -109,7 +101,7 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
 
     @wp.func
     def is_near(x: vector, member: int, reach: real, s: neighbourhood, sheets: sheets_of) -> bool:
-        """Test whether a face of a sheet may be near enough for its wall particles to be within reach."""
+        """Test whether a sheet may be near enough for its wall particles to be within reach."""
         for k in range(sheets.numbers.shape[0]):
             y = seen_from(x, s.before, s.turns_before, k, member, s, sheets)
             face = int(0)
@@ -120,7 +112,6 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
 
     @wp.func
     def place_before(b: int, member: int, s: neighbourhood) -> vector:
-        """Return where a wall particle is before the step."""
         x = s.wall_positions[b]
         if MOVES:
             number = s.wall_solids[b]
@@ -175,13 +166,9 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
 
 
 class Sheets:
-    """The sheets of a scene, in one precision and on one device."""
-
     def __init__(self, placed: Sequence[PlacedSheet], spacing: float, layout: Layout):
-        """Take the ``placed`` sheets, in a fluid with particles a ``spacing`` [m] apart."""
         self.numbers, device = [one.number for one in placed], layout.device
         self.struct = sheets_type(layout.precision)()
-        """The sheets as an argument of kernels."""
         faces = [(one.sheet.pieces, one.sheet.normals) for one in placed]
         self.struct.faces, self._trees = faces_on(faces, spacing, layout.precision, device)
         self.struct.numbers = wp.array(self.numbers, dtype=wp.int32, device=device)
@@ -189,8 +176,5 @@ class Sheets:
     def hide(
         self, launch: Callable[..., None], discretisation: Discretisation, search: NeighbourSearch, **known: Any
     ) -> None:
-        """Remove hidden neighbours from the lists of a search, given the neighbourhood ``s`` and the sorted positions
-        ``x``."""
-        names = "fluid_count", "filling", "count", "all_count"
-        lists = {name: getattr(search, name) for name in names}
-        launch(hiding_kernel(replace(discretisation, lanes=1)), lists, sheets=self.struct, **known)
+        """Remove hidden neighbours from a search's lists, given the neighbourhood ``s`` and sorted positions ``x``."""
+        launch(hiding_kernel(replace(discretisation, lanes=1)), search.lists, sheets=self.struct, **known)

@@ -1,5 +1,4 @@
 """The inputs of a step as Warp arrays by name: the state before the step, the sorted particles, and the parameters.
-Solvers and their parts declare the fields of states.
 
 Vectors have three components on a device; in 2-D z is 0.
 """
@@ -21,8 +20,6 @@ from cortado.scene.parameters import Axis, Parameter
 
 
 class Entry(Enum):
-    """The kind of entry that a field holds for each particle or scene: a number, a vector or another."""
-
     NUMBER = "a number"
     VECTOR = "a vector"
     FRACTIONS = "a number for each phase"
@@ -31,8 +28,8 @@ class Entry(Enum):
 
 @dataclass(frozen=True)
 class StateField:
-    """An array of the state that a step reads and writes, declared by a solver or by a part. Every value that a step
-    reads from the previous step must be such a field, because a run continues and restarts from its state alone."""
+    """An array of the state that a step reads and writes, declared by a solver or a part. Every value that a step reads
+    from the previous step must be such a field, because a run restarts from its state alone."""
 
     name: str
     unit: str
@@ -41,8 +38,7 @@ class StateField:
     axis: Axis = Axis.PARTICLE
     """PARTICLE for an entry per particle, in the scene's order; SCALAR for one entry."""
     first: str | None = None
-    """The parameter that gives the first value, of a parameter over time its first row; None for a field that begins at
-    0."""
+    """Parameter that gives the first value, over time by its first row; None for a field that begins at 0."""
     is_constant: bool = False
     """True if no step changes the field: then all states of a run share its array."""
 
@@ -53,8 +49,7 @@ class StateField:
 
 
 def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -> None:
-    """Raise `TypeError` if two fields have one name, or if the parameter with a field's first value is unknown or lacks
-    a value for each entry."""
+    """Raise `TypeError` for fields of the same name, or with an unknown or unfit parameter of first values."""
     names: set[str] = set()
     for field in fields:
         if field.name in names:
@@ -78,7 +73,7 @@ def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -
 
 
 def first_values(fields: Iterable[StateField], parameters: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """Return, by name, the first values of the fields that begin as one of the given parameters."""
+    """Return by name the first values of the fields that begin as one of the given parameters."""
     found = {}
     for field in fields:
         if field.first is not None and field.first in parameters:
@@ -94,7 +89,7 @@ VELOCITIES = StateField("velocities", "m/s", Entry.VECTOR, first="initial_veloci
 
 
 def padded(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors (n, 2) or (n, 3) as vectors with three components, (n, 3), in float64."""
+    """Return vectors (n, 2) or (n, 3) as vectors (n, 3) in float64."""
     return np.hstack([vectors, np.zeros((len(vectors), 3 - vectors.shape[1]))])
 
 
@@ -104,8 +99,7 @@ def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array
 
 
 def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
-    """Return an array of numbers of a shape that views the memory of an array of numbers, vectors or matrices, and of
-    its adjoint. The view keeps this memory alive."""
+    """Return a view, as numbers of a shape, of an array of numbers, vectors or matrices, and of its adjoint."""
     real = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
     view = wp.array(ptr=array.ptr, dtype=real, shape=shape, device=array.device)
     view._ref = array
@@ -115,8 +109,6 @@ def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
 
 
 class Arrays(Staying):
-    """A collection of Warp arrays by name, with operations on all of them."""
-
     def __init__(self, arrays: Mapping[str, wp.array]):
         self._arrays = dict(arrays)
         self._named: dict[str, dict[str, wp.array]] = {}
@@ -126,64 +118,56 @@ class Arrays(Staying):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the names of the arrays, in their order."""
         return tuple(self._arrays)
 
     def arrays(self) -> list[wp.array]:
-        """Return the arrays, in their order."""
         return list(self._arrays.values())
 
     def named(self, suffix: str = "") -> dict[str, wp.array]:
-        """Return the arrays by the names of kernel arguments, ``drag_k`` for ``drag.k``. The ``suffix`` "_dot" makes
-        names of tangents, "_bar" names of adjoints."""
+        """Return the arrays by argument name, ``drag_k`` for ``drag.k``; a ``suffix`` is "_dot" for tangents, "_bar"
+        for adjoints."""
         if suffix not in self._named:
             self._named[suffix] = {argument(name) + suffix: array for name, array in self._arrays.items()}
         return self._named[suffix]
 
     def assign(self, other: Self) -> None:
-        """Copy the arrays of another collection on this device, without a copy to the host; arrays that both share are
-        left alone."""
         for own, source in zip(self.arrays(), other.arrays(), strict=True):
             if own is not source:
                 wp.copy(own, source)
 
     def gradients(self) -> Self:
-        """Return the adjoints of the arrays that Warp's tape has written."""
         return type(self)({name: array.grad for name, array in self._arrays.items()})
 
     def clear(self) -> None:
-        """Set all arrays to 0."""
         for array in self.arrays():
             array.zero_()
 
 
 def zeros(kinds: Mapping[str, tuple[Any, Any]], device: Any, requires_grad: bool = False) -> dict[str, wp.array]:
-    """Make arrays of zeros by name, each of a size or a shape and a Warp type."""
     options = {"device": device, "requires_grad": requires_grad}
     return {name: wp.zeros(size, dtype=dtype, **options) for name, (size, dtype) in kinds.items()}
 
 
 class Fields(Arrays):
-    """The fields of sorted particles within a step. Tangents and adjoints of them have this type too.
+    """The fields (n,) of sorted particles within a step, or their tangents or adjoints.
 
-    ``x`` (n,) positions [m]; ``v`` (n,) velocities [m / s]; ``n`` (n,) number densities [-], 1 on the rest lattice.
-    ``m`` (n,) masses over the volume on the rest lattice [kg / m3], so that the density is m n. ``rho_0`` (n,) rest
-    densities [kg / m3]; ``mu`` (n,) dynamic viscosities [Pa s].
+    ``x`` positions [m]; ``v`` velocities [m / s]; ``n`` number densities [-], 1 on the rest lattice; ``m`` masses over
+    the volume on the rest lattice [kg / m3], so that the density is m n; ``rho_0`` rest densities [kg / m3]; ``mu``
+    dynamic viscosities [Pa s].
     """
 
     @classmethod
     def zeros(cls, particles: int, precision: Precision, device: Any, requires_grad: bool = False) -> Self:
-        """Allocate fields of zeros for a number of sorted particles."""
         types = dict.fromkeys("xv", precision.vector) | dict.fromkeys(("n", "m", "rho_0", "mu"), precision.real)
         return cls(zeros({name: (particles, dtype) for name, dtype in types.items()}, device, requires_grad))
 
 
 class State(Arrays):
-    """The arrays on which a step depends besides parameters, by the names of the fields that the solver declares.
-    Tangents and adjoints of states have this type too.
+    """The arrays on which a step depends besides parameters, by the names of declared fields; or their tangents or
+    adjoints.
 
-    Every state has ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s] and ``mass_fractions`` (n,) of
-    as many numbers as there are phases [-], in the scene's order of particles. In a batch the scenes are concatenated.
+    Every state has ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s] and ``mass_fractions`` (n,), a
+    number for each phase [-], in the scene's order of particles. In a batch the scenes are concatenated.
     """
 
     def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array], batch: int | None = None):
@@ -193,47 +177,40 @@ class State(Arrays):
 
     @property
     def positions(self) -> wp.array:
-        """Return the positions of particles, (n,) vectors [m]."""
         return self["positions"]
 
     @property
     def velocities(self) -> wp.array:
-        """Return the velocities of particles, (n,) vectors [m / s]."""
         return self["velocities"]
 
     @property
     def mass_fractions(self) -> wp.array:
-        """Return the mass fractions of particles, (n,) vectors with a number for each phase [-]."""
         return self["mass_fractions"]
 
     def like(self) -> Self:
-        """Make a state of the same fields and sizes, all 0."""
         zero = {name: wp.zeros_like(self[name], requires_grad=False) for name in self.names}
         return type(self)(self.fields, zero, self.batch)
 
     def following(self) -> Self:
-        """Make an uninitialised later state of this run; it shares the arrays of constant fields."""
+        """Make an uninitialised later state of this run, which shares the arrays of constant fields."""
         new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
         return type(self)(self.fields, new, self.batch)
 
     def copy(self, earlier: Self | None = None) -> Self:
-        """Copy this state to new arrays; arrays that no step changes are shared with an ``earlier`` state of the run if
-        one is given."""
+        """Copy this state to new arrays, which share constant fields with an ``earlier`` state of the run if given."""
         kept = {} if earlier is None else {f.name: earlier[f.name] for f in self.fields if f.is_constant}
         own = {name: kept[name] if name in kept else wp.clone(self[name], requires_grad=False) for name in self.names}
         return type(self)(self.fields, own, self.batch)
 
     def member(self, number: int) -> Self:
-        """Return one scene of a batch as a state that is a view of these arrays."""
         assert self.batch is not None
         sizes = {name: len(self[name]) // self.batch for name in self.names}
         views = {name: self[name][number * size : (number + 1) * size] for name, size in sizes.items()}
         return type(self)(self.fields, views)
 
     def numbers(self, name: str) -> wp.array:
-        """Return a field as a Warp array of numbers, vectors (n, 3), fractions (n, phases), in a batch (batch, n, ...),
-        that shares the field's memory. Libraries with DLPack, such as PyTorch and JAX, use this array without a
-        copy."""
+        """Return a view of a field as a Warp array of numbers: vectors (n, 3), fractions (n, phases), in a batch
+        (batch, n, ...). Libraries with DLPack, such as PyTorch and JAX, use this array without a copy."""
         field = self[name]
         shape = (len(field),) if self.batch is None else (self.batch, len(field) // self.batch)
         return components(field, (*shape, *getattr(field.dtype, "_shape_", ())))
@@ -247,12 +224,12 @@ class State(Arrays):
                 self[field.name].assign(padded(flat) if field.entry is Entry.VECTOR else flat)
 
     def numpy(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Copy every field, or only those of some names, to new arrays by name: vectors (n, dimension), numbers (n,),
-        fractions (n, phases), in a batch (batch, n, ...)."""
+        """Copy every field, or those named in ``only``, to new arrays: vectors (n, dimension), numbers (n,), fractions
+        (n, phases), in a batch (batch, n, ...)."""
         return {name: array.copy() for name, array in self.views(dimension, only).items()}
 
     def views(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Return fields as `numpy` does; for a state on the host they are views of the state's arrays."""
+        """Return fields as `numpy` does; those of a state on the host are views."""
         names, lead = set(self.names if only is None else only), () if self.batch is None else (self.batch, -1)
         arrays = {f: self[f.name].numpy() for f in self.fields if f.name in names}
         narrow = {f.name: a[:, :dimension] if f.entry is Entry.VECTOR else a for f, a in arrays.items()}
@@ -263,56 +240,48 @@ class StateSeries:
     """States of one run, concatenated in shared arrays, so that one copy per field copies all states."""
 
     def __init__(self, like: State, length: int):
-        """Allocate ``length`` uninitialised states with the fields and sizes of the state ``like``; constant fields are
-        shared."""
         self._like, self._length = like, length
         changed = {field.name: like[field.name] for field in like.fields if not field.is_constant}
         self._whole = {name: wp.empty(length * len(a), dtype=a.dtype, device=a.device) for name, a in changed.items()}
 
     def state(self, k: int) -> State:
-        """Return state k of the series as a view of the arrays."""
         size = {name: len(array) // self._length for name, array in self._whole.items()}
         own = {name: array[k * size[name] : (k + 1) * size[name]] for name, array in self._whole.items()}
         arrays = {field.name: own.get(field.name, self._like[field.name]) for field in self._like.fields}
         return State(self._like.fields, arrays, self._like.batch)
 
     def whole(self, name: str) -> wp.array:
-        """Return one array with a field of all states, one state after the other."""
         return self._whole.get(name, self._like[name])
 
     def like(self) -> Self:
-        """Allocate an uninitialised series of equal length."""
         return type(self)(self._like, self._length)
 
     def assign(self, other: Self) -> None:
-        """Copy another series of this run, of equal length."""
         for name, array in self._whole.items():
             wp.copy(array, other._whole[name])
 
 
 class Parameters(Arrays):
-    """The inputs of steps besides the state, by the names of parameters. Tangents and adjoints of them have this type
-    too.
+    """The inputs of steps besides the state, by the names of parameters; or their tangents or adjoints.
 
     A parameter over time has the shape (members, steps), of vectors or numbers; a parameter of phases (members,
-    phases), an array (members, ...), and any other (members,). There is one member for each scene of a batch.
+    phases), an array (members, ...), and any other (members,). A member is a scene of a batch.
     """
 
     def __init__(self, arrays: Mapping[str, wp.array]):
         super().__init__(arrays)
         self._written: dict[str, np.ndarray | wp.array] = {}
-        """The values that `set` has written last, and need not write again. For values copied on the device this is the
-        copy."""
+        """The last values of `set`, which need not be written again; for values copied on the device, the array."""
 
     @property
     def written(self) -> Mapping[str, np.ndarray | wp.array]:
-        """Return the values that `set` has written, by name; `set_row` writes to it."""
+        """Return the values that `set` has written, by name; `set_row` writes to them."""
         return dict(self._written)
 
     def set(self, values: Mapping[str, Any]) -> None:
-        """Write some parameters by name, for all members or with an axis of members: a vector (d,) or vectors (steps,
-        d); numbers or arrays of numbers; or a Warp array of the parameter's own shape and type. Only `set` and
-        `set_row` may write to arrays that are set again."""
+        """Write parameters by name, for all members or with an axis of members: a vector (d,) or vectors (steps, d),
+        numbers or arrays of numbers, or a Warp array. Only `set` and `set_row` may write to arrays that are set
+        again."""
         for name, value in values.items():
             array, last = self[name], self._written.get(name)
             if isinstance(value, wp.array):
@@ -336,8 +305,7 @@ class Parameters(Arrays):
                 array.assign(np.broadcast_to(given, array.shape))
 
     def set_row(self, row: int, values: Mapping[str, np.ndarray]) -> None:
-        """Write one row of parameters over time, (members, d) vectors or (members,) numbers, all of whose rows `set`
-        has written."""
+        """Write one row, (members, d) vectors or (members,) numbers, of parameters whose rows `set` has written."""
         for name, value in values.items():
             self._written[name][:, row] = value
             vectors = np.reshape(value, (len(value), -1))
@@ -349,26 +317,22 @@ class Parameters(Arrays):
 @dataclass(frozen=True)
 class Layout:
     """The sizes of the arrays of one solver, and their device. Arrays of a batch contain several scenes, one after the
-    other, and one launch has a thread for each particle of all scenes."""
+    other, and a launch has a thread for each particle of all scenes."""
 
     particles: int
-    """Number of particles of one scene."""
     phases: int
     precision: Precision
     device: Any
     batch: int | None = None
     """Number of scenes; None for a single scene, whose arrays have no axis for scenes."""
     known: Known = REGISTRY
-    """The parameters that the scenes have."""
 
     @property
     def members(self) -> int:
-        """Return the number of scenes in the batch."""
         return self.batch or 1
 
     @property
     def all_particles(self) -> int:
-        """Return the number of particles of all scenes."""
         return self.members * self.particles
 
     def sum_of(self, dtype: Any) -> TreeReduction:
@@ -376,12 +340,11 @@ class Layout:
         return sum_of(dtype, self.particles, self.device, self.members)
 
     def arrays(self, suffix: str = "", requires_grad: bool = False, **kinds: Any) -> dict[str, wp.array]:
-        """Make arrays (n,) over all particles, all 0, of Warp types by name, to which a ``suffix`` is added."""
+        """Make arrays (n,) of zeros over all particles, of Warp types by name; a ``suffix`` is added to the names."""
         sizes = {f"{name}{suffix}": (self.all_particles, kind) for name, kind in kinds.items()}
         return zeros(sizes, self.device, requires_grad)
 
     def state(self, fields: tuple[StateField, ...], requires_grad: bool = False) -> State:
-        """Make a state of these fields, all 0."""
         precision = self.precision
         dtypes = {
             Entry.NUMBER: precision.real,
@@ -394,7 +357,6 @@ class Layout:
         return State(fields, zeros(kinds, self.device, requires_grad), self.batch)
 
     def parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
-        """Make the parameters of a run of ``steps`` steps, all 0."""
         real, vector, members = self.precision.real, self.precision.vector, self.members
         sizes: dict[Axis, Any] = {Axis.STEP: (members, max(steps, 1)), Axis.PHASE: (members, self.phases)}
         used = [self.known[name] for name in self.known.run]

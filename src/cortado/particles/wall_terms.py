@@ -1,22 +1,22 @@
-"""The effect of the walls of one solid, or of all walls, on each particle by one term of a step, with its derivatives.
-The adjoint of such a sum also gives derivatives with respect to the pose and the size of moving solids.
+"""The effect of the walls of one solid, or of all walls, on each particle by one term of a step, with derivatives, also
+with respect to the pose and size of moving solids.
 
-A term is defined by its work W, a number that is linear in a vector ``bar`` of particle i. Its sum over wall particles
+A term is defined by its work W, a number that is linear in a vector ``bar`` of particle i. The sum over wall particles
 b, such as the acceleration by walls, is
 
     A_i = sum_b w_b dW / dbar_i.
 
 Warp makes the gradients of W. Component k of the tangent of A is the change of w_b W for the k-th unit vector as
-``bar``, and the adjoint is the gradient of W for the adjoint of A as ``bar``. With that adjoint particle i adds to the
+``bar``; the adjoint is the gradient of W for the adjoint of A as ``bar``. With that adjoint particle i adds to the
 adjoints of wall particle b
 
-    x_b^ = -w_b dW / dx_ib,   foot_b^ = w_b dW / dfoot_b,   v_b^ = w_b dW / dv_b,
+    x_b^ = -w_b dW / dx_ib,   foot_b^ = w_b dW / dfoot_b,   v_b^ = w_b dW / dv_b.
 
-which Warp derives from W. The point of the surface above the wall particle is s_b = c + R q_b, and the wall particle is
-at x_b = s_b - foot_b; R has turned the foot too. The wall particle has the velocity of s_b, (s_b - s_b^0) / dt + R u,
-with s_b^0 = c_0 + R_0 q_b at the start of the step. A scale sigma multiplies q_b by sigma, and w_b by sigma^(d - 1).
-Let a solid move by c', turn further by w' and grow by g' = sigma' / sigma, and let its pose at the start of the step
-change by c_0' and w_0'. Then the work is f . c' + t . w' + f_0 . c_0' + t_0 . w_0' + g g' with
+The surface point above the wall particle is s_b = c + R q_b, and the wall particle is at x_b = s_b - foot_b; R has
+turned the foot too. The velocity of the wall particle is (s_b - s_b^0) / dt + R u, with s_b^0 = c_0 + R_0 q_b at the
+start of the step. A scale sigma multiplies q_b by sigma, and w_b by sigma^(d - 1). Let a solid move by c', turn further
+by w' and grow by g' = sigma' / sigma, and let its pose at the start of the step change by c_0' and w_0'. The work is
+f^T c' + t^T w' + f_0^T c_0' + t_0^T w_0' + g g' with
 
     f = sum x_b^ + v_b^ / dt,    t = sum (x_b - c) x x_b^ + R q_b x v_b^ / dt + foot_b x foot_b^ + R u x v_b^,
     f_0 = -sum v_b^ / dt,        t_0 = -sum R_0 q_b x v_b^ / dt,
@@ -45,7 +45,6 @@ from cortado.particles.state import Layout, zeros
 NAMES = ("force", "torque", "force_before", "torque_before", "growth")
 """f, t, f_0, t_0 and g / sigma."""
 BARS = [f"{name}_bar" for name in ("after", "turned", "before", "turned_before", "scales")]
-"""Names of the adjoints of poses and of the scale to which the values `NAMES` are added."""
 LOOP = """\
 _x_i = at.x[i]
     _mirrors = _mirror_of(_x_i, i // s.particles, s)
@@ -74,15 +73,12 @@ WorkMaker = Callable[[Discretisation], Callable[..., Any]]
 
 @dataclass(frozen=True)
 class _Loop:
-    """Source text of a loop over the wall particles of a term."""
-
     term: Term
     d: Discretisation
     rubs: bool
 
     @property
     def read(self) -> list[str]:
-        """Return the names of the arrays, other than x, whose entry of particle i the loop reads."""
         parameters = self.term.parameters
         return [name for name in self.term.arrays if name != "x" and {f"{name}_i", f"{name}_ij"} & parameters.keys()]
 
@@ -92,13 +88,10 @@ class _Loop:
 
     @property
     def gradients(self) -> str:
-        """Return the source line that assigns the derivative of the work W with respect to each parameter to
-        ``_by_parameter``."""
         return f"{', '.join(f'_by_{name}' for name in self.term.parameters)} = wp.grad(_work)({self.arguments})"
 
     def text(self, given: Iterable[str], own: Iterable[str], body: Iterable[str]) -> str:
-        """Return the source of the loop, with lines before and inside the loop; it reads entries of arrays that are not
-        ``given``."""
+        """Return the source of the loop with lines before and inside it; it reads entries of arrays not ``given``."""
         entries = [f"_{name}_i = at.{name}[i]" for name in self.read if name not in given]
         return LOOP.format(
             own="\n    ".join((*entries, *own)),
@@ -107,7 +100,6 @@ class _Loop:
         )
 
     def known(self, module: Any) -> dict[str, Any]:
-        """Return the values of the names in the text, in a Warp module."""
         return {
             **scope_of(self.d),
             **{"_matrix": self.d.precision.matrix, "_pair": self.d.precision.pair},
@@ -119,27 +111,24 @@ class _Loop:
 
 @dataclass(frozen=True)
 class WallTerm:
-    """A term of the forces by walls in a discretisation; ``make(discretisation)`` returns the function of its work
-    W."""
+    """A term of the forces by walls; ``make(discretisation)`` returns the function of its work W."""
 
     discretisation: Discretisation
     topic: str
-    """Topic of its Warp modules."""
     make: WorkMaker
     bar: str
-    """The array in which the work is linear."""
     rubs: bool = False
-    """True for a term without walls that slip freely."""
+    """True if walls that slip freely are excluded."""
 
     @property
     def kernels(self) -> Kernels:
-        """Return kernels of the sum A, which is ``total``, of its tangent ``total_dot``, and of its adjoint, the array
-        ``bar`` of the term. Their arguments include the ``constants`` of the work and ``solid``, the number of a solid
-        or `ALL_WALLS`."""
+        """Return kernels of the sum A, called ``total``, of its tangent ``total_dot``, and of its adjoint, the array
+        ``bar``. Kernel arguments include the ``constants`` of the work and ``solid``, a solid's number or
+        `ALL_WALLS`."""
         return _kernels(self)
 
     def solid_kernel(self) -> Any:
-        """Return the kernel that turns the sum's adjoint into adjoints of a solid that moves."""
+        """Return the kernel that turns the sum's adjoint into adjoints of a moving solid."""
         return solid_kernel(self.discretisation, self.topic, self.make, self.rubs)
 
 
@@ -208,10 +197,9 @@ def _kernels(of: WallTerm) -> Kernels:
 
 
 class SolidShares:
-    """The particles' shares of the adjoints of the poses of solids in one step."""
+    """The particles' terms of the adjoints of poses of solids in a step."""
 
     def __init__(self, walls: MovingWalls | None, layout: Layout):
-        """Allocate shares for the solids whose ``walls`` move; without any, nothing is added."""
         self._walls, self._pair = walls, layout.precision.pair
         size, kinds, device = layout.all_particles, share_kinds(layout.precision), layout.device
         solids = range(0 if walls is None else walls.solids)
@@ -219,7 +207,6 @@ class SolidShares:
         self._sums = [{name: layout.sum_of(kinds[name]) for name in NAMES} for _ in solids]
         whole = {name: (layout.members, kinds[name]) for name in NAMES}
         self._whole = [zeros(whole, device) for _ in solids]
-        """Terms of the adjoints that were not added by particles."""
 
     def add(
         self,
@@ -230,8 +217,8 @@ class SolidShares:
         over: int = ALL_WALLS,
         **arrays: Any,
     ) -> None:
-        """Add the shares of a sum by the kernel that ``kernel()`` makes; ``kernel`` is called only if solids move. For
-        a sum ``over`` the walls of one solid, add to this solid alone."""
+        """Add the terms of a sum ``over`` one solid or all by the kernel of ``kernel()``, called only if solids
+        move."""
         if self._walls is None:
             return
         own = {"power": self._walls.sizes.power, "slides": self._walls.slides, "constants": self._pair(*constants)}
@@ -241,11 +228,10 @@ class SolidShares:
                 launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
 
     def of(self, solid: int) -> dict[str, wp.array]:
-        """Return the particles' shares (n,) of one solid's adjoints so far, by the names of kernel arguments."""
         return {f"{name}_bar": array for name, array in self._arrays[solid].items()}
 
     def collect(self, solid: int) -> dict[str, wp.array]:
-        """Return the sums (members,) of one solid's shares, adjoints of poses and scale, and set the shares to 0."""
+        """Return the sums (members,) of a solid's terms, adjoints of poses and scale, and set the terms to 0."""
         found = {name: total(self._arrays[solid][name]) for name, total in self._sums[solid].items()}
         for name, given in self._whole[solid].items():
             add(given, found[name])
@@ -253,12 +239,11 @@ class SolidShares:
         return dict(zip(BARS, found.values(), strict=True))
 
     def add_whole(self, solid: int, **given: wp.array) -> None:
-        """Add values (members,) that do not come from particles to adjoints `BARS` of one solid, by name."""
+        """Add values (members,) that do not come from particles to adjoints `BARS` of a solid, by name."""
         for bar, one in given.items():
             add(one, self._whole[solid][NAMES[BARS.index(bar)]])
 
     def clear(self) -> None:
-        """Set the shares of all solids to 0."""
         for solid in range(len(self._arrays)):
             self._forget(solid)
 
@@ -268,7 +253,6 @@ class SolidShares:
 
 
 def share_kinds(precision: Precision) -> dict[str, Any]:
-    """Return the types of a particle's shares, by `NAMES`."""
     return {**dict.fromkeys(NAMES, precision.vector), "growth": precision.real}
 
 
@@ -279,9 +263,8 @@ def solid_kernel(
     """Make the kernel of one sum, for `SolidShares.add`, in the Warp module of a ``topic``.
 
     ``make(discretisation)`` returns W, a term of walls (see `pair_sums`) that returns a number and calls only functions
-    that Warp can differentiate. Its parameters are entries of arrays of particle i, ``v_ij`` or ``v_j``, and
-    ``constants``. A sum that ``rubs`` leaves out walls that slip freely. The kernel of a ``looped`` sum is for
-    iteration k, and skips scenes that make fewer ``rounds``.
+    that Warp can differentiate. Parameters of W are entries of arrays of particle i, ``v_ij`` or ``v_j``, and
+    ``constants``. The kernel of a ``looped`` sum is for iteration k, and skips scenes that make fewer ``rounds``.
     """
     d = replace(discretisation, lanes=1, taped=True)
     precision, term = d.precision, Term.of(make(d))
@@ -340,7 +323,6 @@ def solid_kernel(
 
 
 def _share(loop: _Loop, seen: Any, module: Any) -> Any:
-    """Make the Warp function of the sums over one solid's wall particles, of which particles' shares are made."""
     term = loop.term
     velocity = [name for name in ("v_ij", "v_j") if name in term.parameters]
     by_v = {(): "_vector()", ("v_ij",): "-_w_b * _by_v_ij", ("v_j",): "_w_b * _by_v_j"}[tuple(velocity)]

@@ -1,7 +1,7 @@
-"""Surface tension by curvature: a force across the surface (the continuum surface force of Brackbill et al. 1992) with
+"""Surface tension by curvature: a force across the surface (continuum surface force, Brackbill et al. 1992) with
 smoothed normals and a corrected curvature (Morris 2000; Zorilla et al. 2020).
 
-With g_ij = V grad W_ij, sums over the fluid and the particle itself, the spacing s, and S(a, b) a smoothstep from a to
+With g_ij = V grad W_ij, sums over the fluid and the particle itself, the spacing s, and a smoothstep S(a, b) from a to
 b:
 
     g_i = sum_j g_ij,   z_i = V sum_j W_ij,   q_i = V sum_j W_ij g_j / z_i,
@@ -10,26 +10,19 @@ b:
     a_i = V sum_j W_ij w_j kappa_j,   b_i = V sum_j W_ij w_j,
     k_i = (a_i / b_i) / (1 + delta a_i / b_i),   m_i times the acceleration = (sigma / J) k_i w_i q_i.
 
-g is the gradient of the colour of the fluid, which is 1 in it and 0 outside. Its average q (Shepard 1968) points into
-the fluid and forgets how the particles of a surface lie. The weight w is 1 at the surface and 0 inside, and e is the
-surface's normal. D B^-1 is the gradient of normals, corrected so that it is exact where they are linear (Bonet and Lok
+g is the gradient of the fluid's colour, and its average q (Shepard 1968) points into the fluid. The weight w is 1 at
+the surface and 0 inside; e is the normal. D B^-1 is the gradient of normals, exact where they are linear (Bonet and Lok
 1999). The force acts at a mean depth delta below the surface, where the curvature 1 / R of the surface becomes 1 / (R -
-delta); k is the curvature of the surface. Over the layers of a flat surface w |q| adds up to J. Delta and J were
-computed from surfaces of known curvature. Only the symmetric part of D is computed, because the trace needs no more.
+delta). J is the sum of w |q| over the layers of a flat surface, the mean of two cut lattices. The trace needs only the
+symmetric part of D.
 
-Tangents are computed in the order of the sums, adjoints in reverse order; each adjoint starts from terms that the
-previous one added to the adjoints of q, w, e, c, g and z. J is the mean of two flat surfaces: a lattice cut across an
-axis and across a diagonal of a plane. All particles of a layer are equal, so that sums over a few layers suffice.
-
-The constants in delta were fitted on discs and balls whose particles lie in concentric rings and shells, a spacing
-apart. They are in spacings, and within 0.05 for every kernel with a support of 2.5 spacings or more. The curvature is
-found `DEEP` below the surface, where it is greater. And w |q| adds up to 1 + `EXCESS` / R times J, because more of a
-particle's surroundings is outside of a curved surface. With delta = DEEP / (d - 1) + EXCESS, d - 1 being the number of
-curvatures in the sum, the pressure in a drop is (d - 1) sigma / R. But the force acts `ACTS` below the surface, where a
-wave of the surface moves less. The square of the frequency of the mode n would be n ACTS / R too small in the plane,
-and (n + 1) ACTS / R in space. A smaller delta raises pressures, and twice as much the force that a change of the
-curvature makes. So ACTS d / (3 (d - 1)) is subtracted from delta. Then the errors of pressure and of the squared
-frequency of mode 2 are equal and opposite: 0.5 / R in the plane and 0.75 / R in space, less with finer particles.
+The constants in delta, in spacings, were fitted on discs and balls of concentric rings and shells, and hold within 0.05
+for every kernel with a support of at least 2.5 spacings. The computed curvature belongs to the depth `DEEP`, and the
+sum of w |q| is (1 + `EXCESS` / R) J. With delta = DEEP / (d - 1) + EXCESS the pressure in a drop would be (d - 1) sigma
+/ R. A wave of the surface moves less at the depth `ACTS` where the force acts: the squared frequency of mode n would be
+too small by n ACTS / R in the plane and (n + 1) ACTS / R in space. Subtracting ACTS d / (3 (d - 1)) from delta makes
+the errors of pressure and of the squared frequency of mode 2 equal and opposite: 0.5 / R in the plane and 0.75 / R in
+space.
 """
 
 from dataclasses import dataclass
@@ -49,13 +42,11 @@ from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.sph.moment_functions import cross_terms_function, moment_functions
 
 DEEP, EXCESS, ACTS = 1.05, 0.6, 0.75
-"""In spacings, see above."""
+"""In spacings, see the module."""
 
 
 @dataclass(frozen=True)
 class CurvatureConstants:
-    """The constants of surface tension by curvature for a smoothing kernel and a particle spacing."""
-
     spacing: float
     """[m]"""
     width: float
@@ -65,14 +56,13 @@ class CurvatureConstants:
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "CurvatureConstants":
-        """Compute the constants on a lattice with a spacing [m], for a support radius [m]."""
+        """Compute the constants from a lattice with a spacing [m] and a support radius [m]."""
         width = float(np.mean([_width(kernel, support / spacing, dimension, cut) for cut in ((1, 0), (1, 1))]))
         shared = ACTS * dimension / (3.0 * (dimension - 1))
         return cls(spacing, width, spacing * (DEEP / (dimension - 1) + EXCESS - shared))
 
 
 def _indicator(size: np.ndarray) -> np.ndarray:
-    """Return w, the weight of a particle in the surface, from s |q|: 0 below `FAINT`, 1 above `CLEAR`."""
     t = np.clip((size - FAINT) / (CLEAR - FAINT), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
@@ -94,19 +84,16 @@ def _width(kernel: SmoothingKernel, support: float, dimension: int, cut: tuple[i
 
 
 FAINT, CLEAR = 0.03, 0.1
-"""s |q| below which the weight w of a particle is 0, and above which w is 1."""
 SINGULAR = {2: 1e-3, 3: 1e-4}
 """By dimension, the number added to det B, so that kappa is 0 if neighbours lie on a line or are missing."""
 LONE = 1e-6
-"""The number added to sum V W w, so that the mean curvature is 0 if no neighbour is part of the surface."""
+"""Number added to sum V W w, so that the mean curvature is 0 without neighbours in the surface."""
 HOLLOW = 0.25
-"""-delta kappa above which the divisor 1 + delta kappa of a hollow surface falls by a parabola to a constant above 0.
-Such surfaces are bubbles with a radius below 3 delta."""
+"""-delta kappa above which the divisor 1 + delta kappa falls by a parabola to a positive constant: in small bubbles."""
 
 
 @cache
 def curvature_functions(precision: Precision, dimension: int, module: Any) -> SimpleNamespace:
-    """Make the Warp functions of one particle for the normal and the curvature of a surface, in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     smoothstep = moment_functions(precision, dimension).smoothstep
     faint, clear = wp.constant(real(FAINT)), wp.constant(real(CLEAR))
@@ -114,7 +101,6 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Si
 
     @wp.func
     def normal(q: vector, spacing: real):
-        """Return the surface indicator w and the unit normal e of a particle; e is 0 where w is 0."""
         size, w, e = wp.length(q), real(0.0), vector()
         if size * spacing > faint:
             w = smoothstep(size * spacing, faint, clear)
@@ -123,14 +109,13 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Si
 
     @wp.func(module=module)
     def normal_work(q: vector, spacing: real, w_bar: real, e_bar: vector) -> real:
-        """Return w w_bar + e . e_bar. Its gradient with respect to q is the adjoint of q. With w_bar = 0 the gradient
-        is also the change of e along e_bar, because de / dq is symmetric."""
+        """Return w w_bar + e . e_bar, whose gradient is the adjoint of q. With w_bar = 0 the gradient is also the
+        change of e along e_bar, because de / dq is symmetric."""
         w, e = normal(q, spacing)
         return w * w_bar + wp.dot(e, e_bar)
 
     @wp.func(module=module)
     def curvature(B: matrix, D: matrix) -> real:
-        """Return the curvature kappa = -tr(B^-1 D), by cofactors."""
         a = B[1, 1] * B[2, 2] - B[1, 2] * B[2, 1]
         b = B[0, 2] * B[2, 1] - B[0, 1] * B[2, 2]
         c = B[0, 1] * B[1, 2] - B[0, 2] * B[1, 1]
@@ -143,7 +128,6 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Si
 
     @wp.func(module=module)
     def outermost(a: real, b: real, depth: real) -> real:
-        """Return the curvature k at the surface."""
         mean = a / (b + lone)
         more = depth * mean
         rest = wp.clamp(real(3.0) * hollow + more, real(0.0), real(2.0) * hollow)
@@ -158,8 +142,9 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
     """Make the Warp functions of the curvature's sums over the fluid, with derivatives. Symmetric matrices are
     diagonals and entries yz, xz, xy.
 
-    ``colour``: g and z, without W(0). ``average``: V sum W_ij g_j. ``bend``: B and the symmetric part of D. ``mean``:
-    V sum W_ij c_j and V sum W_ij w_j."""
+    ``colour``: g and z, without W(0). ``average``: V sum W_ij g_j. ``bend``: B and the symmetric part of D. ``mean``: V
+    sum W_ij c_j and V sum W_ij w_j.
+    """
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
     neighbourhood, matrix = neighbourhood_type(precision), precision.matrix
@@ -170,7 +155,6 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
-        """Return the entries yz, xz and xy of the symmetric matrix (a b^T + b a^T) / 2."""
         return real(0.5) * (cross_terms(a, b) + cross_terms(b, a))
 
     @fluid_sum(discretisation)
@@ -198,7 +182,6 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
     @fluid_sum(discretisation)
     @typed
     def average_back(x_ij, g_i, g_j, r_i, r_j, s) -> tuple[vector, vector]:
-        """Return a pair's terms of V sum W_ij r_j for the adjoint r of the average, and of the adjoint of x."""
         both = wp.dot(r_i, g_j) + wp.dot(r_j, g_i)
         return (s.volume * weight(x_ij, s)) * r_j, (s.volume * both) * gradient(x_ij, s)
 
@@ -215,7 +198,6 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
     def bend_tangent(
         x_ij, x_dot_ij, e_i, e_j, e_dot_i, e_dot_j, w_j, w_dot_j, s
     ) -> tuple[vector, vector, vector, vector]:
-        """Return a pair's tangents of B and D; g x^T is symmetric, and so is the sum of its tangent's two terms."""
         g = (s.volume * w_j) * gradient(x_ij, s)
         g_dot = s.volume * (w_dot_j * gradient(x_ij, s) + w_j * hessian_product(x_ij, x_dot_ij, s))
         turn, turn_dot = e_j - e_i, e_dot_j - e_dot_i
@@ -229,7 +211,6 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
     @fluid_sum(discretisation)
     @typed
     def bend_back(x_ij, e_i, e_j, w_i, w_j, B_bar_i, B_bar_j, D_bar_i, D_bar_j, s) -> tuple[vector, real, vector]:
-        """Return a pair's adjoints of e, w and x; its factor is w_j in the sums of i, and w_i in the sums of j."""
         g, turn = s.volume * gradient(x_ij, s), e_j - e_i
         moved = (w_j * B_bar_i + w_i * B_bar_j) * x_ij
         turned = w_j * D_bar_i + w_i * D_bar_j
@@ -264,7 +245,7 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 
 def entries(precision: Precision) -> dict[str, Any]:
-    """Return names and types of the arrays of particles in surface tension by curvature; c is w kappa."""
+    """Return names and types of the particles' arrays; c is w kappa."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     vectors, matrices, numbers = dict.fromkeys("gqe", vector), dict.fromkeys("BD", matrix), dict.fromkeys("zwcab", real)
     return {**vectors, **matrices, **numbers}
@@ -272,9 +253,8 @@ def entries(precision: Precision) -> dict[str, Any]:
 
 @cache
 def curvature_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels of the four sums ``colour``, ``normal``, ``bend`` and ``mean``, in 2 or 3 dimensions, each with
-    its tangent and its adjoint. Adjoints run in reverse order; the adjoint of ``mean`` has a first part without
-    neighbours. ``depth`` is delta and ``per_width`` 1 / J."""
+    """Make the kernels ``colour``, ``normal``, ``bend`` and ``mean`` in 2 or 3 dimensions, with derivatives. The
+    adjoint of ``mean`` is two kernels, the first without neighbours. ``depth`` is delta, ``per_width`` 1 / J."""
     precision, (real, vector, _) = discretisation.precision, discretisation.types
     matrix, sums, typed = precision.matrix, curvature_sums(discretisation), types_of(discretisation)
     moments = moment_functions(precision, dimension)
@@ -321,7 +301,6 @@ def curvature_kernels(discretisation: Discretisation, dimension: int) -> SimpleN
 
 
 def types_of(discretisation: Discretisation) -> TypesByName:
-    """Return the Warp types, by name, of the variables in kernels of tension by curvature."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     vectors = "q g r x e diagonal others turned mixed acceleration"
     return TypesByName(real, {vector: vectors, precision.matrix: "B D", neighbourhood: "s"})
@@ -329,7 +308,6 @@ def types_of(discretisation: Discretisation) -> TypesByName:
 
 @cache
 def curvature_tangents(discretisation: Discretisation, dimension: int, topic: str) -> tuple[Any, ...]:
-    """Make the tangents of the four curvature kernels, in 2 or 3 dimensions, in the Warp module of a topic."""
     precision, (real, vector, _) = discretisation.precision, discretisation.types
     sums, typed = curvature_sums(discretisation), types_of(discretisation)
     even = moment_functions(precision, dimension).change
@@ -392,7 +370,6 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
 
 @cache
 def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: str) -> tuple[Any, ...]:
-    """Make the adjoints of the four curvature kernels; the last has two adjoints, the first one without neighbours."""
     precision, (real, vector, _) = discretisation.precision, discretisation.types
     matrix, sums, typed = precision.matrix, curvature_sums(discretisation), types_of(discretisation)
     module = discretisation.module(False, topic)
@@ -404,7 +381,6 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
     def force_adjoint(
         depth, per_width, surface_tension, m_i, q_i, w_i, a_i, b_i, acceleration_bar_i
     ) -> tuple[real, real, vector, real, real, real]:
-        """Turn the adjoint of the acceleration into the adjoints of a particle's own m, sigma, q, w, a and b."""
         k = outermost(a_i, b_i, depth)
         by_a, by_b, _by_depth = wp.grad(outermost)(a_i, b_i, depth)
         strength, work = surface_tension * per_width / m_i, wp.dot(q_i, acceleration_bar_i)
@@ -424,7 +400,6 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
     def mean_adjoint(
         i: int, c_part, w_part, x_part, w_i, a_bar_i, b_bar_i, B_i, D_i, s
     ) -> tuple[vector, real, matrix, matrix]:
-        """Turn the adjoints of a and b into the adjoints of B and D, and add to the adjoints of x and w."""
         self_weight = real(1 - s.filling[i]) * s.self_weight * s.volume
         c_bar = c_part + self_weight * a_bar_i
         by_B, by_D = wp.grad(curvature_of)(B_i, D_i)
@@ -435,7 +410,6 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
     @particle_kernel(module, "+x_bar r z_bar", [over(sums.bend.adjoint, "e_bar w_part x_part")], numbers=["spacing"])
     @typed
     def bend_adjoint(e_bar, w_part, x_part, spacing, q_i, z_i, w_bar_i, q_bar_i) -> tuple[vector, vector, real]:
-        """Turn the adjoints of B, D, w and q into the adjoint of z, and into r, the adjoint of V sum W_ij g_j."""
         by_q, _spacing, _w, _e = wp.grad(normal_work)(q_i, spacing, w_bar_i + w_part, e_bar)
         r = (q_bar_i + by_q) / z_i
         return x_part, r, -wp.dot(q_i, r)

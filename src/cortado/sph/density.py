@@ -1,19 +1,16 @@
-"""Density by summation, wall particles of calibrated weights included, as a number density:
+"""Density by summation over fluid and wall particles of calibrated weights, as a number density:
 
-n_i = V (W(0) + sum_j W_ij + sum_b w_b W_ib),   rho_i = m_i n_i.
+n_i = V (W(0) + sum_j W_ij + sum_b w_b W_ib), rho_i = m_i n_i.
 
 V is the rest volume on the lattice and m_i a particle's mass over V. Masses of neighbours do not enter (Solenthaler and
 Pajarola 2008), so that the density of a heavy fluid does not smear into a light fluid.
 
-`Density` computes n in a step, with derivatives. A solver that computes further sums over the same neighbours at once
-has a subclass of its own.
-
 For the pressure, walls act on a particle by the sums
 
-g_i = sum_b w_b G_ib,   g_i' = sum_b w_b H_ib x_ib' + w_b' G_ib.
+g_i = sum_b w_b G_ib, g_i' = sum_b w_b H_ib x_ib' + w_b' G_ib.
 
-A particle with the pressure p_i pushes the walls around it with the force V^2 p_i / n_i^2 g_i. H is symmetric, so that
-the sum with H of forward mode also serves reverse mode.
+A particle with pressure p_i pushes the walls around it with the force V^2 p_i / n_i^2 g_i. H is symmetric, so that the
+sum with H serves both forward and reverse mode.
 """
 
 from functools import cache, cached_property, partial
@@ -34,9 +31,8 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 @cache
 def density_sums(discretisation: Discretisation) -> Kernels:
-    """Make the Warp functions of the raw neighbour sums of the density: the sum of W, including the entries that pad
-    the list, and its derivatives. The adjoint of positions, for an adjoint r of every particle's sum, is sum_j (r_i +
-    r_j) G_ij + sum_b w_b r_i G_ib."""
+    """Make the Warp functions of the sum of W over neighbours and padding entries, with derivatives. For an adjoint r
+    of every particle's sum, the adjoint of positions is sum_j (r_i + r_j) G_ij + sum_b w_b r_i G_ib."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, slope, gradient = pair.weight, pair.slope, pair.gradient
@@ -60,8 +56,6 @@ def density_sums(discretisation: Discretisation) -> Kernels:
 
 @cache
 def density_solid_kernel(discretisation: Discretisation, topic: str = "density", looped: bool = False) -> Any:
-    """Make the kernel that turns the adjoint ``bar`` of number densities into adjoints of solids
-    (`SolidShares.add`)."""
     return solid_kernel(discretisation, topic, _density_work, looped=looped)
 
 
@@ -76,8 +70,7 @@ def _density_work(d: Discretisation) -> Any:
 
 @cache
 def density_kernels(discretisation: Discretisation, topic: str = "density") -> Kernels:
-    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the number density, in the Warp modules of a topic;
-    sharing a solver's topic saves loading a module."""
+    """Make the kernels of the number density in the Warp modules of a topic, for example a solver's."""
     real, neighbourhood = discretisation.precision.real, neighbourhood_type(discretisation.precision)
     module, tangent_module, adjoint_module = discretisation.modules(topic)
     sums = density_sums(discretisation)
@@ -94,10 +87,7 @@ def density_kernels(discretisation: Discretisation, topic: str = "density") -> K
 
 
 class Density:
-    """The measurement of the number density n of particles, once their neighbours are listed."""
-
     def __init__(self, discretisation: Discretisation, topic: str, kernels: Kernels | None = None):
-        """Take given ``kernels``, or make those of the density alone, in the Warp modules of a topic."""
         self.discretisation, self.topic = discretisation, topic
         self.kernels = kernels or density_kernels(discretisation, topic)
 
@@ -112,8 +102,6 @@ class Density:
 
 
 class DensityTangent:
-    """The tangent of the measured number density, for forward mode."""
-
     def __init__(self, density: Density):
         self._density = density
 
@@ -122,16 +110,13 @@ class DensityTangent:
 
 
 class DensityAdjoint:
-    """The adjoint of the measured number density, for reverse mode."""
-
     def __init__(self, density: Density):
         self._density = density
 
     def begin(self) -> None:
-        """Set adjoints from an earlier backward step to 0."""
+        """Set adjoints of an earlier backward step to 0."""
 
     def measure(self, context: StepContext, bar: Adjoints) -> None:
-        """Turn the adjoint of the number density n into the adjoints of positions and of solids."""
         density = self._density
         context.launch(density.kernels.adjoint, *bar.named)
         kernel = partial(density_solid_kernel, density.discretisation, density.topic)
@@ -140,8 +125,7 @@ class DensityAdjoint:
 
 @cache
 def wall_slope_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of sums over walls: the ``slope`` g, its ``tangent``, and ``change``, the sum of H times
-    a vector ``along`` of each particle."""
+    """Make the Warp functions of g, its ``tangent``, and ``change``, the sum over walls of H times ``along``."""
     _, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     gradient, hessian_product = pair.gradient, pair.hessian_product
@@ -162,8 +146,6 @@ def wall_slope_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 
 def wall_slope_term(discretisation: Discretisation) -> WallTerm:
-    """Return the wall term g, the weighted sum of kernel gradients over a solid's walls; ``slope_bar`` is its
-    adjoint."""
     return WallTerm(discretisation, "wall_slope", _work, "slope_bar")
 
 
@@ -177,31 +159,28 @@ def _work(d: Discretisation) -> Any:
 
 
 class WallAction(Protocol):
-    """The action of walls on the particles around them by one term of a step, read after the step. ``solid`` is the
-    number of wall particles of a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
+    """The action of walls on the particles around them by one term of a step, read after the step. ``solid`` is a
+    solid's number, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def total(self, step: StepContext, solid: int) -> wp.array:
-        """Return the action (n,) of walls on sorted particles, vectors; for a force these are accelerations [m /
-        s2]."""
+        """Return the action (n,) of walls on sorted particles, vectors; for a force accelerations [m / s2]."""
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
-        """Return the tangents (n,) of the action of walls, after forward mode of the step."""
+        """Return the tangents (n,) of the action, after forward mode of the step."""
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
-        """Turn the adjoints of the action into adjoints of sorted particles, parameters and solids, in ``bar``, and
-        into adjoints (n,) of v* = v + dt a, the velocities after all explicit forces."""
+        """Turn adjoints of the action into adjoints of sorted particles, parameters and solids, in ``bar``, and into
+        adjoints (n,) of v* = v + dt a, the velocities after all explicit forces."""
 
 
 class WallSums:
-    """A `WallAction` that sums a `WallTerm` over walls; its arrays are those of the last step."""
+    """A `WallAction` that sums a `WallTerm` with two ``constants``; its arrays are those of the last step."""
 
     def __init__(self, term: WallTerm, layout: Layout, constants: tuple[float, float] = (0.0, 0.0)):
-        """Take a wall term and the two ``constants`` of its work."""
         self.term, self._layout, self._constants = term, layout, constants
 
     @cached_property
     def _arrays(self) -> dict[str, wp.array]:
-        """Make the arrays of totals on first use, because most runs need none."""
         vector = self._layout.precision.vector
         return self._layout.arrays(total=vector, total_dot=vector)
 
@@ -221,12 +200,10 @@ class WallSums:
     def adjoint(
         self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array, *groups: Named
     ) -> None:
-        """Apply the adjoint of the sums over walls, see `WallAction`; the adjoint of v* is not changed."""
         step.launch(self.term.kernels.adjoint, {self.term.bar: total_bar}, *groups, *bar.named, self._known(solid))
         self.give(step, bar, solid, total_bar, *groups)
 
     def give(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, *groups: Named) -> None:
-        """Add to the adjoints of moving solids, given the adjoint of the sums over walls."""
         given = {self.term.bar: total_bar}
         kernel, factors = self.term.solid_kernel, self._constants
         bar.solids.add(step.launch, kernel, given, *groups, *bar.named, constants=factors, over=solid)

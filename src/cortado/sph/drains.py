@@ -1,21 +1,19 @@
 """Drains, which remove particles that enter them, and sinks, to which fluid flows at a given flow rate.
 
-A particle that is in a drain as a step begins is taken: from the end of the step on it rests at a place of its own, far
-from all others, with ``drained`` = 1, 2, ..., the number of the drain. The choice has no derivative, nor have the
-removed particles.
+A particle inside a drain at the start of a step is removed: from the end of the step on it rests far from all others,
+with the number of the drain as ``drained``. The removal has no derivative.
 
-A sink makes fluid around it flow to its middle c, with y = x - c, r = |y| and the flow rate Q:
+A sink makes fluid flow to its middle c, with y = x - c, r = |y|, the flow rate Q and d dimensions:
 
     v* = (1 - phi) (v + dt a) + phi (u - lambda w),   u = -Q y / (S r^d),
 
-instead of v + dt a, in d dimensions, where S is the part of the unit sphere, or circle, that walls leave open. phi goes
-smoothly from 0 at r_2 to 1 at r_1; within r_0 < r_1 particles are taken. So a particle that is taken has neighbours
-whose motion is given. w is what the pressure added to the velocity in the step before: without it fluid would be
-pressed through the shell from r_0 to r_1, behind which there is none. lambda < 1 lets w forget.
+instead of v + dt a. S is the part of the unit sphere or circle that walls leave open; phi rises smoothly from 0 at r_2
+to 1 at r_1. Particles within r_0 < r_1 are removed, so that a removed particle has neighbours with prescribed motion.
+The velocity change w by pressure in the previous step is damped by lambda < 1; without w, pressure would press fluid
+through the shell from r_0 to r_1.
 
-Fluid in the shell is thinner than elsewhere, so that Q is not all that goes: in its place stands (1 + E / M) Q with the
-whole number E of particles that the sink is behind, at most M / 4 either way, and M particles within r_1. E changes by
-one at a time, and has no derivative.
+Fluid in the shell is thinner than elsewhere, so Q is replaced by (1 + E / M) Q. E is the rounded number of particles
+that the sink is behind, at most M / 4 either way, and M the number of particles within r_1. E has no derivative.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,26 +48,22 @@ from cortado.sph.emitter import Nozzle, nozzle_type, remaining_function
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 
 MEMORY = 0.98
-"""lambda: which part of what pressure did in the step before a sink works against."""
+"""lambda."""
 BOX, PLANE, BALL = 0, 1, 2
 MOST = 0.25
-"""Greatest |E| / M of a sink."""
 DRAINED = StateField("drained", "", Entry.NUMBER)
-"""The number, from 1 on, of the drain that removed a particle; 0 for particles in the fluid."""
+"""Number, from 1 on, of the drain that removed a particle; 0 for particles in the fluid."""
 
 
 def behind(name: str) -> StateField:
-    """Return the field of how many particles a sink is behind, which is no whole number."""
+    """Return the field of the number of particles that a sink is behind, which is not rounded."""
     return StateField(f"{name}.behind", "", Entry.DOUBLE, Axis.SCALAR)
 
 
 @dataclass(frozen=True)
 class Mouth:
-    """The region in which a drain removes particles."""
-
     name: str
     shape: int
-    """`BOX`, `PLANE` or `BALL`."""
     middle: Points
     """(d,) [m]"""
     ends: Points
@@ -80,8 +74,6 @@ class Mouth:
 
 @dataclass(frozen=True)
 class Pull:
-    """How fluid flows to a sink."""
-
     shell: tuple[float, float]
     """r_1 and r_2 [m]"""
     sphere: float
@@ -92,22 +84,19 @@ class Pull:
 
 @dataclass(frozen=True)
 class Drained:
-    """The drains of a scene, the places where particles rest that they took, and those that may wait in a nozzle."""
+    """The drains of a scene, the places of removed particles, and the nozzles, whose particles are not removed."""
 
     mouths: Sequence[Mouth]
     pulls: Mapping[str, Pull]
-    """How fluid flows to the sinks, by their names."""
     places: Points
     """(n, d) [m]"""
     nozzles: Sequence[Nozzle]
-    """Nozzles; no drain removes the particles that wait in them."""
     periods: Points
     """(d,) [m], 0 along an axis that is not periodic"""
 
 
 @cache
 def mouth_type(precision: Precision) -> Any:
-    """Make the Warp struct of where a drain takes particles."""
     real, vector = precision.real, precision.vector
 
     class MouthOf:
@@ -128,7 +117,6 @@ def mouth_type(precision: Precision) -> Any:
 
 @cache
 def nearest_function(precision: Precision, module: Any) -> Any:
-    """Make the Warp function of the nearest periodic image of a distance."""
     vector = precision.vector
 
     @wp.func
@@ -141,8 +129,7 @@ def nearest_function(precision: Precision, module: Any) -> Any:
 
 @cache
 def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels]:
-    """Make the kernels that find the particles which wait in a nozzle, and those which a drain takes; and those that
-    park them, all in scene order."""
+    """Make the kernels that mark waiting particles, mark removed particles, and move removed particles."""
     real, vector, mouth_of = precision.real, precision.vector, mouth_type(precision)
     module = kernel_module(f"drains_{'taped_' * taped}{precision.name}", taped)
     derivatives = kernel_module(f"drains_derivative_{precision.name}")
@@ -197,7 +184,6 @@ def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels]
 
 
 def _period(periods: Points, precision: Precision) -> dict[str, Any]:
-    """Return the vectors of a period and of its inverse, which is 0 along axes without one."""
     lengths = padded(periods[None])[0]
     frequency = np.divide(1.0, lengths, out=np.zeros(3), where=lengths > 0.0)
     return {"period": precision.vector(*lengths), "frequency": precision.vector(*frequency)}
@@ -214,9 +200,9 @@ def _mouth(one: Mouth, number: int, periods: Points, precision: Precision) -> An
 
 @cache
 def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, Kernels]:
-    """Make the kernel that adds up how many particles a drain took, and that of how many a sink is behind; the kernels
-    of the acceleration by a sink, after that by all other forces; and those that read its flow rate in a step, and add
-    to the adjoint of that. All but those of the acceleration have a thread for each scene."""
+    """Make the kernels that count removed particles, count how many a sink is behind, compute the acceleration by a
+    sink after all other forces, and read a sink's flow rate. The kernels except that of the acceleration have a thread
+    for each scene."""
     real, vector = precision.real, precision.vector
     modules = [kernel_module(f"sinks_{'taped_' * taped}{precision.name}", taped)]
     modules += [kernel_module(f"sinks_derivative_{precision.name}")] * 2
@@ -267,7 +253,7 @@ def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, 
     @wp.kernel(module=modules[0], enable_backward=False)
     @of_scene.arrays
     def fall_behind(step, table: rows, time_step, taken_sum, cell: real, holds: real, behind, gain):
-        """Count what a sink is to take in the step and what it took; ``gain`` is 1 + E / M before."""
+        """Add due and subtract removed particles; ``gain`` is the factor 1 + E / M of the flow rate before."""
         m = wp.tid()
         held = wp.float64(holds)
         gain[m] = real(wp.float64(1.0) + wp.round(behind[m]) / held)
@@ -288,23 +274,20 @@ def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, 
 
 
 class Drains(Part):
-    """The part of a step that takes particles out, in one solver, and the force with which sinks make fluid flow to
-    them, after all others."""
+    """The part of a step that removes particles, and the force of sinks, after all other forces."""
 
     batches = is_last = True
 
     def __init__(self, of: Drained, layout: Layout, taped: bool):
         self.layout, precision, device, real = layout, layout.precision, layout.device, layout.precision.real
         self.free = layout.state((POSITIONS, VELOCITIES), taped)
-        """The state at the end of a step if no particle were removed."""
         self.wait, self.take, self.parks = drain_kernels(precision, taped)
         self.tally, self.fall_behind, self.drive, self.flows = pull_kernels(precision, taped)
         self.shares = tuple(f"{name}.position" for name in of.pulls)
         counts = (StateField(count_name(one.name), "", Entry.DOUBLE, Axis.SCALAR) for one in of.mouths)
         self.fields = (DRAINED, *map(behind, of.pulls), *counts)
         self.taken = layout.arrays(taken=real, fresh=real, waits=real)
-        """(n,) by which drain each particle is taken in the step, or was before; 1 for one taken by the last; and 1 for
-        one that waits in a nozzle."""
+        """(n,) number of the drain that removed a particle; 1 if the last drain did; 1 if it waits in a nozzle."""
         self.places = to_device(of.places, precision, device)
         self._nozzles = [(one, one.constants(layout)) for one in of.nozzles]
         self._never = layout.arrays(serial=wp.float64)["serial"]
@@ -319,7 +302,6 @@ class Drains(Part):
         self._between = [layout.arrays(a=precision.vector)["a"] for _ in of.pulls][1:]
         self._still = layout.arrays(kick=precision.vector)["kick"]
         self._found: list[tuple[str, wp.array, wp.array]] = []
-        """Each sink with the accelerations before and after it in the last step."""
 
     @cached_property
     def _bars(self) -> dict[str, wp.array]:
@@ -331,18 +313,15 @@ class Drains(Part):
         return self.layout.sum_of(self.layout.precision.real)
 
     def _middle(self, one: Mouth) -> Any:
-        """Return the name of the parameter for a mouth's middle, or the middle in all scenes."""
         if one.shape == BALL:
             return f"{one.name}.position"
         return to_device(np.tile(one.middle, (self.layout.members, 1)), self.layout.precision, self.layout.device)
 
     def _pull(self, pull: Pull, periods: Points) -> dict[str, Any]:
-        """Return the numbers of a sink by the names of kernel arguments."""
         own = {"inner": pull.shell[0], "outer": pull.shell[1], "sphere": pull.sphere, "holds": pull.holds}
         return {**own, "power": float(len(periods)), **_period(periods, self.layout.precision)}
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Find the particles that are removed, by their positions at the start of the step."""
         wp.copy(self.taken["taken"], state["drained"])
         self.taken["waits"].zero_()
         for nozzle, constants in self._nozzles:
@@ -361,7 +340,6 @@ class Drains(Part):
                 step.launch(self.fall_behind, counted, self._of(step.parameters, one.name), threads=self.layout.members)
 
     def _of(self, parameters: Parameters, name: str) -> dict[str, Any]:
-        """Return kernel arguments about a sink; ``table`` is the flow rate, or its tangent or adjoint."""
         return {**self._pulls[name], "gain": self._gains[name], "table": parameters[f"{name}.flow_rate"]}
 
     def target(self, moved: State) -> State:
@@ -427,8 +405,6 @@ class Drains(Part):
 
 
 class DrainsTangent(PartTangent):
-    """The tangent of particles that drains remove: it is 0."""
-
     def __init__(self, of: Drains):
         self._of = of
 
@@ -438,8 +414,6 @@ class DrainsTangent(PartTangent):
 
 
 class DrainsAdjoint(PartAdjoint):
-    """The adjoint of particles that drains remove: it is 0 before the removal."""
-
     def __init__(self, of: Drains):
         self._of, self._free = of, of.free.like()
 

@@ -1,17 +1,16 @@
-"""Fluid from a nozzle: the motion of particles is prescribed until they pass the nozzle's opening; then they are free.
+"""Fluid from a nozzle: the motion of particles is prescribed until they pass the nozzle's opening.
 
-A particle starts u upstream of the opening, o beside the axis. It is prescribed in step n = 0, 1, ..., while it is s =
-u - l > 0 upstream, where l grows by w dt in each step, w = Q / A:
+A particle starts u upstream of the opening, o beside the axis. The particle is prescribed in steps n = 0, 1, ... while
+s = u - l > 0, where l grows by w dt in each step, w = Q / A:
 
     x = q_n + o - s e,   v = (q_n - q_(n-1)) / dt + w e
 
-q_n is where the opening is after step n (it rests before the first), e its direction, Q the flow rate in the step and A
-its area. Position and velocity do not jump when a particle becomes free. Particles in reserve are further upstream than
-the column is long. They rest at separate places, which have no derivative, until they join the column's end.
+q_n is the position of the opening after step n (at rest before the first), e its direction, Q the flow rate in the step
+and A its area. Position and velocity do not jump when a particle becomes free. Particles further upstream than the
+column is long are in reserve: they rest at separate places, without derivative.
 
-A nozzle fed by drains emits again the particles that the drains removed. Whenever the column has room for a layer at
-its end, available particles join it, with u from places in line behind the first particles. The choice has no
-derivative, nor have the particles' earlier values.
+A nozzle fed by drains emits removed particles again. When the column has room for a layer at its end, available
+particles join it, in line behind the first particles. The choice has no derivative.
 """
 
 from dataclasses import dataclass
@@ -42,16 +41,12 @@ from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tange
 
 @cache
 def nozzle_type(precision: Precision) -> Any:
-    """Make the Warp struct of an emitter's constants; its arrays are of its own particles, from ``first`` on."""
     real, vector = precision.real, precision.vector
 
     class Nozzle:
         first: wp.int32
-        """Number of the emitter's first particle."""
         count: wp.int32
-        """Number of the emitter's particles."""
         layer: wp.int32
-        """Number of particles in a layer."""
         upstream: wp.array(dtype=real)
         """u [m]"""
         offsets: wp.array(dtype=vector)
@@ -59,9 +54,7 @@ def nozzle_type(precision: Precision) -> Any:
         direction: vector
         """e"""
         column: real
-        """Particles further upstream are in reserve [m]."""
         spacing: wp.float64
-        """Length of a layer [m]."""
         area: real
         """A [m^(d - 1)]"""
 
@@ -71,8 +64,8 @@ def nozzle_type(precision: Precision) -> Any:
 
 @cache
 def remaining_function(precision: Precision) -> Any:
-    """Make the Warp function of how far a particle is upstream of an opening, s [m]; 0 or less for one that is out, or
-    no part of the emitter. ``serial`` is its place in line, from 1 on, if it is given out again."""
+    """Make the Warp function of s [m], a particle's distance upstream of the opening; 0 or less for a particle that is
+    out, or not of the emitter. ``serial`` is the place in line, from 1 on, of a particle that is emitted again."""
     real, nozzle_of = precision.real, nozzle_type(precision)
 
     @wp.func
@@ -89,10 +82,9 @@ def remaining_function(precision: Precision) -> Any:
 
 @cache
 def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels]:
-    """Make the kernels of the motion of the column of fluid in a step, with a thread for each scene, and those of
-    particles at its end, in scene order. The adjoint of the motion takes sums of the adjoints of prescribed positions
-    and velocities. Of each scene, (members,), ``outlet`` is q_n [m], ``drift`` the velocity of prescribed particles
-    [m/s], and ``emitted`` l at the end of the step [m]. ``path`` and ``flow`` have a row for each step."""
+    """Make the kernels of the column's motion in a step, with a thread for each scene, and of the column's particles in
+    scene order. For each scene (members,) ``outlet`` is q_n [m], ``drift`` the velocity of prescribed particles [m/s],
+    and ``emitted`` l at the end of the step [m]. ``path`` and ``flow`` have a row for each step."""
     real, vector, nozzle_of = precision.real, precision.vector, nozzle_type(precision)
     module, derivatives = (integration_module(precision, *one, topic="emitter") for one in ((True, taped), (False,)))
     numbers, remaining = ["nozzle", "particles"], remaining_function(precision)
@@ -102,7 +94,6 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
 
     @wp.func
     def advance(flow_rate: real, area: real, time_step: real) -> wp.float64:
-        """Return w dt, how far the column of fluid moves in a step [m]."""
         return wp.float64(flow_rate) / wp.float64(area) * wp.float64(time_step)
 
     @particle_kernel(module, "outlet drift emitted", numbers=["nozzle"])
@@ -215,7 +206,6 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
     def prescribe_adjoint(
         i: int, member: int, particles: int, nozzle, emitted, serial_i, x_bar_i, v_bar_i
     ) -> tuple[vector, vector, vector, vector]:
-        """Split the adjoints of new positions and velocities into those of free and of prescribed particles."""
         s, no = remaining(i - member * particles, nozzle, serial_i, emitted), vector()
         led, free = s > real(0.0) and s <= nozzle.column, s <= real(0.0)
         x_free_bar, v_free_bar = wp.where(free, x_bar_i, no), wp.where(free, v_bar_i, no)
@@ -227,8 +217,8 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
 
 @cache
 def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
-    """Make the kernel that marks, in scene order, the particles which the drains of a nozzle hold, and the kernel that
-    gives those which join its column their places in line. ``before`` counts the marked particles before each."""
+    """Make the kernel that marks the particles in the drains of a nozzle, and the kernel that gives joining particles
+    their places in line. ``before`` counts the marked particles before each."""
     real, nozzle_of, remaining = precision.real, nozzle_type(precision), remaining_function(precision)
     module = integration_module(precision, True, taped, "emitter")
     typed = TypesByName(real, {nozzle_of: "nozzle", wp.float64: "serial emitted", wp.int32: "held before"})
@@ -243,7 +233,6 @@ def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
 
     @wp.func
     def layers(nozzle: nozzle_of, emitted: wp.float64) -> wp.float64:
-        """Return the number of layers that have been in line until then."""
         return wp.floor((emitted + wp.float64(nozzle.column)) / nozzle.spacing + wp.float64(0.5))
 
     @particle_kernel(module, "serial", numbers=["nozzle", "particles"])
@@ -271,28 +260,24 @@ def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class Nozzle:
-    """The particles that wait in a nozzle: how far each is behind the opening and beside the axis, and the direction
-    and the area of the opening."""
+    """The particles that wait in a nozzle, and its opening."""
 
     name: str
-    """Name of the emitter."""
     first: int
-    """Number of the first of them."""
     sample: EmitterSample
     direction: np.ndarray
-    """(d,) of the flow, a unit vector"""
+    """(d,) unit vector of the flow"""
     area: float
     """Area of the opening [m2], in 2-D [m]."""
     places: np.ndarray
-    """Places (n, d) [m] at which the particles in reserve rest."""
+    """(n, d) places of particles in reserve [m]"""
     feeding: np.ndarray
-    """(drains + 1,) true if the nozzle emits again the particles that the drain with this number removed."""
+    """(drains + 1,) true if the nozzle emits particles again that the drain with this number removed"""
 
     def part(self, layout: Layout, requires_grad: bool) -> "Emitter":
         return Emitter(self, layout, requires_grad)
 
     def constants(self, layout: Layout) -> Any:
-        """Return the Warp struct of the emitter's constants."""
         precision, device, sample = layout.precision, layout.device, self.sample
         constants = nozzle_type(precision)()
         constants.first, constants.area, constants.layer = self.first, self.area, sample.layer
@@ -305,7 +290,7 @@ class Nozzle:
 
 
 class Emitter(Part):
-    """The part of a step that prescribes the particles which wait in a nozzle, in one solver."""
+    """The part of a step that prescribes the particles waiting in a nozzle."""
 
     def __init__(self, nozzle: Nozzle, layout: Layout, requires_grad: bool = False):
         self.nozzle, self.layout, name = nozzle, layout, nozzle.name
@@ -313,22 +298,18 @@ class Emitter(Part):
             StateField(outlet_name(name), "m", Entry.VECTOR, Axis.SCALAR, first=path_name(name)),
             StateField(emitted_name(name), "m", Entry.DOUBLE, Axis.SCALAR),
         )
-        """Fields that the emitter carries from step to step."""
         is_fed = nozzle.feeding.any()
         if is_fed:
             self.fields += (StateField(again_name(name), "", Entry.DOUBLE),)
         self.free = layout.state((POSITIONS, VELOCITIES), requires_grad)
-        """Room for the end of a step if no particle were prescribed."""
         precision, device = layout.precision, layout.device
         self.begins, self.ends = emitter_kernels(precision, requires_grad)
         self.feeds = feeding_kernels(precision, requires_grad)
         drift = wp.zeros(layout.members, dtype=precision.vector, device=device, requires_grad=requires_grad)
         places = to_device(nozzle.places, precision, device)
         self.own = layout.state(self.fields, requires_grad)
-        """The emitter's fields at the end of a step."""
         serial = wp.zeros(layout.all_particles, dtype=wp.float64, device=device)
         self.constants = {"nozzle": nozzle.constants(layout), "drift": drift, "places": places, "serial": serial}
-        """Kernel arguments: constants of the nozzle, and after `begin` those of the step."""
         self.constants |= {"outlet": self.own[outlet_name(name)], "emitted": self.own[emitted_name(name)]}
         if is_fed:
             self.constants["serial"] = self.own[again_name(name)]
@@ -336,12 +317,11 @@ class Emitter(Part):
             self._pool = {**drains, **layout.arrays(held=wp.int32, before=wp.int32)}
 
     def parameters(self, parameters: Parameters, suffix: str = "") -> dict[str, wp.array]:
-        """Return the rows of its path and its flow rate, or of their tangents or adjoints, for kernels."""
         name = self.nozzle.name
         return {f"path{suffix}": parameters[path_name(name)], f"flow{suffix}": parameters[f"{name}.flow_rate"]}
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Compute the motion of the column in the step from the state before the step, which `end` may overwrite."""
+        """Compute the column's motion from the state before the step, which `end` may overwrite."""
         name = self.nozzle.name
         before = {"outlet_in": state[outlet_name(name)], "emitted_in": state[emitted_name(name)]}
         known = self.constants, self.parameters(step.parameters)
@@ -350,7 +330,6 @@ class Emitter(Part):
             self._feed(step, before, state)
 
     def _feed(self, step: StepContext, before: dict[str, wp.array], state: State) -> None:
-        """Let particles that drains hold join the end of the column, where it has room in the step."""
         held, joined = self.feeds
         known = {**self.constants, **before, **self._pool, "serial_in": state[again_name(self.nozzle.name)]}
         step.launch(held, {**known, "serial": known["serial_in"]}, drained=state["drained"])
@@ -374,12 +353,12 @@ class Emitter(Part):
 
 
 class EmitterTangent(PartTangent):
-    """The tangent of prescribed particles and of the nozzle, for forward mode."""
-
     def __init__(self, emitter: Emitter):
         self._emitter = emitter
         known = emitter.constants
-        self._dot = {f"{name}_dot": wp.zeros_like(known[name], requires_grad=False) for name in FOLLOWED}
+        self._dot = {
+            f"{name}_dot": wp.zeros_like(known[name], requires_grad=False) for name in ("outlet", "drift", "emitted")
+        }
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         emitter, name = self._emitter, self._emitter.nozzle.name
@@ -392,35 +371,21 @@ class EmitterTangent(PartTangent):
         wp.copy(state_dot[emitted_name(name)], self._dot["emitted_dot"])
 
 
-FOLLOWED = ("outlet", "drift", "emitted")
-"""Names of the values that have derivatives."""
-
-
 class EmitterAdjoint(PartAdjoint):
-    """The adjoint of prescribed particles and of the nozzle, for reverse mode."""
-
     def __init__(self, emitter: Emitter):
         self._emitter = emitter
         self._free = emitter.free.like()
-        """Adjoint of the end of a step if no particle were prescribed."""
         self._prescribed = emitter.free.like()
         layout = emitter.layout
         self._sums = [layout.sum_of(layout.precision.vector) for _ in range(2)]
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
-        """Return the adjoint of free particles; add that of prescribed ones to ``bar`` and to the adjoint of the
-        nozzle, which becomes that before the step."""
+        """Return the adjoint of free particles; add that of prescribed ones to ``bar`` and the nozzle's adjoint."""
         emitter, free, prescribed = self._emitter, self._free, self._prescribed
-        step.launch(
-            emitter.ends.adjoint,
-            emitter.constants,
-            x_bar=moved_bar.positions,
-            v_bar=moved_bar.velocities,
-            x_free_bar=free.positions,
-            v_free_bar=free.velocities,
-            x_prescribed_bar=prescribed.positions,
-            v_prescribed_bar=prescribed.velocities,
-        )
+        parts = {"x_free_bar": free.positions, "v_free_bar": free.velocities}
+        parts |= {"x_prescribed_bar": prescribed.positions, "v_prescribed_bar": prescribed.velocities}
+        bars = {"x_bar": moved_bar.positions, "v_bar": moved_bar.velocities}
+        step.launch(emitter.ends.adjoint, emitter.constants, bars, parts)
         x_total, v_total = (add_up(x) for add_up, x in zip(self._sums, prescribed.arrays(), strict=True))
         name, known = emitter.nozzle.name, (emitter.constants, emitter.parameters(step.parameters))
         own = {"outlet_bar": state_bar[outlet_name(name)], "emitted_bar": state_bar[emitted_name(name)]}

@@ -1,5 +1,5 @@
-"""A user's Python function, compiled by Warp in either precision, with its derivatives. Kernels pass its parameters as
-one vector theta, in which time, numbers and vectors are concatenated."""
+"""A user's Python function, compiled by Warp in either precision, with derivatives. Kernels pass its parameters as one
+vector theta, in which time, numbers and vectors are concatenated."""
 
 import ast
 import inspect
@@ -39,30 +39,26 @@ from cortado.sph.parts import Adjoints, StepContext
 
 
 class Packed:
-    """The parameters of a user's function as one vector theta for every scene, with its tangent and its adjoint."""
+    """The parameters of a user's function as one vector theta for every scene, with tangent and adjoint."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
         own = [one for one in parameters if one.axis is not Axis.ARRAY]
         self._numbers, members = Numbers(own, layout, taped), layout.members
         self.dtype = theta_of(layout.precision, [one.rank for one in own])
-        """A Warp vector."""
         options = {"dtype": self.dtype, "device": layout.device}
         self._theta = wp.zeros(members, **options, requires_grad=taped)
         self._theta_dot = wp.zeros(members, **options)
         self.shares = wp.zeros(layout.all_particles, **options)
-        """(n,) the terms that every particle adds to the adjoint of theta in a step."""
+        """(n,) each particle's term of the adjoint of theta in a step."""
         self._sum = layout.sum_of(self.dtype) if own else None
 
     def theta(self, step: StepContext) -> wp.array:
-        """Return theta (members,), the packed parameters in a step."""
         return self._packed(step, step.parameters, self._theta)
 
     def theta_dot(self, step: StepContext, parameters_dot: Parameters) -> wp.array:
-        """Return the tangent (members,) of theta, the packed parameters in a step."""
         return self._packed(step, parameters_dot, self._theta_dot)
 
     def collect(self, step: StepContext, bar: Adjoints) -> None:
-        """Add up the particles' shares in the adjoint of theta, the packed parameters, into parameters' adjoints."""
         if self._sum is not None:
             self._numbers.add(step, self._table(self._sum(self.shares)), bar.parameters)
 
@@ -75,67 +71,48 @@ class Packed:
 
 
 def theta_of(precision: Precision, ranks: Sequence[int]) -> Any:
-    """Return the Warp vector type that holds parameters of these ranks. Without parameters the vector has one
-    number."""
+    """Return the Warp vector type of parameters of these ranks, with at least one number."""
     return precision.fractions(max(sum(WIDTH[rank] for rank in ranks), 1))
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """The first arguments of a kind of user functions, before the parameters; the time among them may be left out."""
-
     names: tuple[str, str]
-    """Names of the inputs in messages."""
     kind: str = "vector"
-    """"vector" or "number": the type of the inputs and of the function's result."""
     fields: tuple[str, ...] = ()
-    """Names of further quantities of a particle that a function may take after the inputs and time."""
     arrays: bool = False
-    """Whether parameters may be arrays."""
 
 
 TIME = "t", "time"
-"""Names of an argument that is the time."""
 MOST_TURNS, MOST_AXES = 256, 3
-"""Greatest number of iterations of a loop, because loops are unrolled, and greatest number of axes of an array."""
 TYPES = re.compile(r"'[^']*' \(aka '[^']*'\)")
-"""Pattern that finds the types of vectors and numbers in a compiler's messages."""
 INPUTS = {
     "Body": Inputs(("x", "v"), fields=("density", FRACTIONS, "shear_rate", "velocity_gradient"), arrays=True),
     "Pair": Inputs(("x_ij", "v_ij")),
     "Rheology": Inputs(("shear_rate", "viscosity"), "number"),
 }
-"""The first arguments of each kind of force, by the kind's name in messages."""
 
 
 @dataclass(frozen=True)
 class Formula:
-    """A user's function in the form that kernels call. Two formulas are equal if their texts and the outside numbers
-    they use are equal."""
+    """A user's function in the form that kernels call. Formulas with the same texts and outside numbers are equal."""
 
     name: str
     text: str
-    """Source text of the function, in which types of the precision and numbers from outside are written out."""
+    """Source text of the function, with the precision's types and outside numbers written out."""
     inputs: tuple[str, ...]
-    """Names of the function's first arguments: two vectors or numbers, and possibly time as the third."""
+    """Names of the first arguments: two vectors or numbers, and optionally time."""
     fields: tuple[str, ...]
-    """Names of the arguments between inputs and parameters: further quantities of a particle."""
     kind: str
-    """"vector" or "number": the type of the first two inputs and of the result."""
     parameters: tuple[str, ...]
-    """Names of the arguments after the inputs, without arrays."""
     arrays: tuple[str, ...]
-    """Names of the arguments that are arrays, which the text reads from a table (`cortado.sph.own_arrays`)."""
     outside: str
-    """A text of everything that `text` refers to: values, and functions under ``@wp.func``."""
+    """A text of all values and Warp functions that `text` refers to."""
     scope: Mapping[str, Any] = field(compare=False, repr=False)
-    """Values of the names in the text."""
     phases: int = 0
-    """Number of mass fractions that the function takes."""
 
     def of_phases(self, what: str, phases: int) -> "Formula":
-        """Return the formula for a scene with so many phases. Raise `InputError` if it takes mass fractions that the
-        scene lacks."""
+        """Return the formula for a number of phases; raise `InputError` if it takes mass fractions of others."""
         if FRACTIONS not in self.fields:
             return self
         if phases == 1:
@@ -148,8 +125,6 @@ class Formula:
         return replace(self, phases=phases)
 
     def function(self, precision: Precision, types: tuple[Any, ...], module: Any) -> Any:
-        """Make the Warp function in a precision, with the types of its parameters, under the name of the user's
-        function."""
         real, vector = precision.real, precision.vector
         scope = {**self.scope, **meanings(precision), REAL: real, VECTOR: vector}
         if self.arrays:
@@ -164,25 +139,21 @@ class Formula:
         return wp.Function(func=made, key=self.name, namespace="", module=module, source=self.text)
 
     def fractions(self, precision: Precision) -> Any:
-        """Return the vector type of mass fractions. If the function takes no mass fractions, the vector has one
-        number."""
         return precision.fractions(max(self.phases, 1))
 
     def takes(self, precision: Precision) -> dict[str, Any]:
-        """Return the types of the formula's `fields` by name."""
         kinds = {"velocity_gradient": precision.matrix, FRACTIONS: self.fractions(precision)}
         return {name: kinds.get(name, precision.real) for name in self.fields}
 
     def reads(self, precision: Precision) -> dict[str, Any]:
-        """Return the types, by name, of the last arguments of the compiled function; it uses them to read arrays."""
         return dict(zip(READ_OF, (precision.real, table_type(precision), int, int), strict=True)) if self.arrays else {}
 
 
 def formula(
     kind: str, function: FunctionType, source: str, parameters: Mapping[str, Any]
 ) -> tuple[Formula, dict[str, Any]]:
-    """Read a user's function with its text, called ``kind`` in messages. Return it with the values of its parameters:
-    those given, otherwise the function's defaults. Raises `InputError`."""
+    """Read a user's function, called ``kind`` in messages. Return it with the values of its parameters, given or
+    default. Raise `InputError` if the function is invalid."""
     what = f"{kind} function {function.__name__}"
     taken, values = _arguments(what, function, parameters, INPUTS[kind])
     inputs = tuple(name for name in taken if name not in INPUTS[kind].fields)
@@ -209,8 +180,6 @@ def formula(
 
 
 def _shapes(what: str, function: FunctionType, values: Mapping[str, Any], inputs: Inputs) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the parameters that are arrays: those annotated as arrays, and those whose values are not
-    vectors."""
     found = {}
     for name, value in values.items():
         annotation = function.__annotations__.get(name)
@@ -236,9 +205,8 @@ def _shapes(what: str, function: FunctionType, values: Mapping[str, Any], inputs
 def _arguments(
     what: str, function: FunctionType, given: Mapping[str, Any], first: Inputs
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return names of the inputs, and the parameters' values in the order of the function's arguments. The first two
-    inputs may have any names; the names in ``first``, and t, are reserved for inputs. A third input is the time only if
-    its name says so: it may be a parameter whose value was forgotten."""
+    """Return names of the inputs and fields, and the parameters' values in the order of the arguments. The first two
+    inputs may have any names. A third input must have a name of time, because it may be a parameter without value."""
     signature, known = inspect.signature(function, follow_wrapped=False).parameters, (*first.names, "t")
     for argument in signature.values():
         if argument.kind is not argument.POSITIONAL_OR_KEYWORD:
@@ -269,8 +237,7 @@ def _arguments(
 
 
 def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> None:
-    """Compile a module with a user's function, which returns a vector or a number. If that fails, raise `InputError`
-    with the first message of Warp's compiler."""
+    """Compile a module with a user's function; raise `InputError` with the first message of Warp's compiler."""
     with TemporaryFile() as said:
         try:
             with c_stderr_to(said.fileno()):
@@ -291,8 +258,8 @@ def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> N
 
 
 def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
-    """Make the Warp function that calls a user's function. It takes two vectors or numbers, theta, and the arguments of
-    `Formula.takes` and `Formula.reads`; in 2-D it drops the z of vectors."""
+    """Make the Warp function that calls a user's function, with two vectors or numbers, theta, and the arguments of
+    `Formula.takes` and `Formula.reads`. In 2-D z of the result is 0."""
     timed, of_numbers = len(text.inputs) == 3, text.kind == "number"
     types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
     terms, first = [], 0
@@ -305,13 +272,9 @@ def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimensi
     result = called if dimension == 3 or of_numbers else f"wp.cw_mul(vector(one, one, zero), {called})"
     source = f"def applied(x, v, theta{''.join(f', {name}' for name in more)}):\n    return {result}\n"
     own_type = precision.real if of_numbers else precision.vector
-    scope = {
-        "vector": precision.vector,
-        "one": wp.constant(precision.real(1.0)),
-        "zero": wp.constant(precision.real(0.0)),
-        "wp": wp,
-        "own": text.function(precision, types, module),
-    }
+    one, zero = (wp.constant(precision.real(value)) for value in (1.0, 0.0))
+    own = text.function(precision, types, module)
+    scope = {"vector": precision.vector, "one": one, "zero": zero, "wp": wp, "own": own}
     exec(source, scope)
     made: Any = scope["applied"]
     made.__annotations__ = {"x": own_type, "v": own_type, "theta": theta_of(precision, ranks), **more}

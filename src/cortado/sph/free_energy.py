@@ -1,4 +1,4 @@
-"""Helmholtz free energies F(c) = alpha f(c) of a mixture, and how mobile its phases are (Yang et al. 2015).
+"""Helmholtz free energies F(c) = alpha f(c) of a mixture, and mobilities of its phases (Yang et al. 2015).
 
     double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: the mixture separates into pure phases (Lee and Kim 2015)
     miscible     f = sum_k c_k^2 / 2: phases mix, by Fick's law
@@ -6,24 +6,20 @@
     constant     m = 1
     degenerate   m = (z + sqrt(z^2 + delta^2)) / 2,   z = sum_(k<l) c_k c_l: where phases touch
 
-For two phases the double well is c_1^2 c_2^2. The other generalisation, sum_(k < l) c_k^2 c_l^2, pulls a third phase
-into the interface of two phases, and leaves equal parts of three or more phases mixed.
+delta keeps the mobility positive and smooth if a fraction strays out of [0, 1].
 
-delta keeps the mobility positive and smooth if a fraction strays out of [0, 1]: a negative mobility would amplify the
-excursion. A pure phase has the mobility delta / 2; mixtures of two phases, with z <= 1 / 4, are hardly affected.
-
-With energy and mobility the phases of a mixture diffuse (Cahn-Hilliard diffusion, after Yang et al. 2015):
+The phases diffuse (Cahn-Hilliard diffusion, after Yang et al. 2015):
 
     chi_k,i = alpha P f'(c_i)_k - (eps^2 / m_i) B(m; c_k)_i,         P u = u - (1 / phases) sum_l u_l
     c'_k,i  = c_k,i + (dt / m_i) B(m M; chi_k)_i,                    M_i = M_0 m(c_i)
-    B(w; u)_i = V sum_j (w_i / n_j + w_j / n_i) (u_i - u_j) F_ij,    F = x . G / (|x|^2 + 0.01 h^2)
+    B(w; u)_i = V sum_j (w_i / n_j + w_j / n_i) (u_i - u_j) F_ij,    F = x^T G / (|x|^2 + 0.01 h^2)
 
 chi is the chemical potential. The terms of B are antisymmetric in i and j, so that each phase keeps its mass, sum_i m_i
-c_k,i, to round-off. P keeps sum_k c_k constant. The same B in both lines makes the discrete free energy
+c_k,i, to round-off. P keeps sum_k c_k constant. The discrete free energy
 
     E = V sum_i m_i alpha f(c_i) - (eps^2 V^2 / 4) sum_ij (m_i / n_j + m_j / n_i) F_ij |c_i - c_j|^2
 
-decrease in time on particles at rest (F <= 0). Fractions are not clipped: that would break conservation and decrease.
+decreases on particles at rest (F <= 0). Clipping fractions would break conservation and decrease.
 """
 
 from collections.abc import Callable
@@ -49,24 +45,22 @@ from cortado.sph.formula import compiled
 from cortado.sph.function_text import code_words
 
 FLOOR = 1e-3
-"""delta of the degenerate mobility."""
 
 
 @public
 @dataclass(frozen=True)
 class FreeEnergy:
-    """A free energy f(c) of mass fractions c (phases,), for kernels and for NumPy. Users may define their own
-    energies."""
+    """A free energy f(c) of mass fractions c (phases,), for kernels and for NumPy. Users may define energies."""
 
     name: str
-    """Name by which kernels of different energies are told apart."""
     value: Callable[[np.ndarray], np.ndarray]
     """Function f of fractions (n, phases) -> (n,)."""
     curvature: float
-    """The greatest eigenvalue of the Hessian of f, without its part along (1, ..., 1), for fractions in [0, 1]. This
+    """The greatest eigenvalue, for fractions in [0, 1], of the Hessian of f without its part along (1, ..., 1); the
     eigenvalue bounds the time step."""
     functions: Callable[[Precision, int], Any]
-    """Warp functions of fractions, for a number of phases: ``gradient`` (grad f) and ``hessian_product`` (H u)."""
+    """Returns, for a precision and a number of phases, an object with the Warp functions ``gradient`` (grad f) and
+    ``hessian_product`` (H u)."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -77,7 +71,7 @@ class FreeEnergy:
             raise InputError(f"FreeEnergy {self.name}'s curvature is {self.curvature}, but must be at least 0.")
 
     def check(self, precision: Precision, phases: int, device: Any) -> None:
-        """Raise `InputError` if the energy's ``functions`` fail, or do not return functions of so many fractions."""
+        """Raise `InputError` if ``functions`` fails, or does not return functions of that many fractions."""
         what = f"FreeEnergy {self.name}'s functions"
         try:
             found = self.functions(precision, phases)
@@ -101,11 +95,8 @@ class FreeEnergy:
 
 @dataclass(frozen=True)
 class Mobility:
-    """A mobility m(c) of mass fractions, from 0 to 1."""
-
     name: str
     greatest: Callable[[int], float]
-    """The greatest m of so many phases."""
     functions: Callable[[Precision, int], Any]
     """Warp functions ``value`` and ``gradient`` (grad m) of fractions."""
 
@@ -170,7 +161,6 @@ def _degenerate(precision: Precision, phases: int) -> SimpleNamespace:
 
     @wp.func
     def products(c: fractions) -> real:
-        """Return sum_(k < l) c_k c_l over all pairs of phases."""
         t = total(c)
         return real(0.5) * (t * t - wp.dot(c, c))
 
@@ -210,7 +200,6 @@ MOBILITIES = {mobility.name: mobility for mobility in (CONSTANT, DEGENERATE)}
 
 @cache
 def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) -> Kernels:
-    """Make the Warp functions of the raw sums of B / V over the neighbours, with their derivatives."""
     real, vector, neighbourhood = discretisation.types
     fractions = discretisation.precision.fractions(phases)
     pair = pair_functions(discretisation)
@@ -251,11 +240,8 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
 
 
 SAFETY = 0.5
-"""The ratio of a substep of diffusion to its stability limit on the lattice. The margin is for particles off the
-lattice and for fractions that stray out of [0, 1]. On random particles eigenvalues were at most 1.08 times those of the
-lattice."""
+"""Ratio of a substep of diffusion to its stability limit on the lattice."""
 MOST_SUBSTEPS = 10_000
-"""Most explicit substeps of diffusion in a time step; if more are needed, the mobility is refused as a mistake."""
 
 
 def stable_substeps(
@@ -266,14 +252,15 @@ def stable_substeps(
     interface_width: float,
     rest_density: np.ndarray,
 ) -> int:
-    """Return how many substeps of diffusion are stable in a scene of several phases with a time step [s], a mobility
-    [m2/s], an interface width [m] and rest densities (phases,) [kg/m3]. Each is at most
+    """Return the number of stable substeps of diffusion in a time step [s], given a mobility [m2/s], an interface width
+    [m] and rest densities (phases,) [kg/m3]. The length of a substep is at most
 
-    dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian on the lattice,
+        dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian on the lattice,
 
-    with the mobility M, the width eps and the curvature max f'' of the free energy. Beside a particle that is
-    ``ratio`` times as heavy, a light one diffuses up to (1 + ratio) / 2 times as fast. Raises `OutOfRangeError`
-    for more than `MOST_SUBSTEPS`."""
+    with the mobility M, the width eps and the curvature max f'' of the free energy. Beside a particle that is ``ratio``
+    times as heavy, a light one diffuses up to (1 + ratio) / 2 times as fast. Raise `OutOfRangeError` for more than
+    `MOST_SUBSTEPS`.
+    """
     mixture, cut, densities = scene.mixture, scene.discretisation, rest_density
     rate = laplacian_rate(smoothing_kernel(cut.kernel), cut.spacing, cut.support_radius, scene.dimension)
     rate *= 0.5 * (1.0 + float(np.max(densities) / np.min(densities)))
@@ -291,23 +278,15 @@ def stable_substeps(
 
 @dataclass(frozen=True)
 class Diffusion:
-    """The choices for which kernels of a mixture's diffusion are made: discretisation, phases, energy and mobility."""
-
     discretisation: Discretisation
     phases: int
     energy: FreeEnergy
     mobility: Mobility
 
-    @property
-    def modules(self) -> tuple[Any, Any, Any]:
-        """Return the Warp modules of forward, tangent and adjoint kernels."""
-        return self.discretisation.modules(f"diffusion_{self.phases}_{self.energy.name}_{self.mobility.name}")
-
 
 @cache
 def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
-    """Make the kernels of a substep of diffusion: ``potential`` and ``flux``. The adjoint of ``flux`` is two kernels:
-    of the factor of its sum, and of the sum itself."""
+    """Make the kernels ``potential`` and ``flux`` of a substep of diffusion; the adjoint of ``flux`` is two kernels."""
     discretisation, phases = diffusion.discretisation, diffusion.phases
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     fractions = precision.fractions(phases)
@@ -317,9 +296,9 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
     energy_gradient, energy_hessian_product = energy.gradient, energy.hessian_product
     mobile, mobile_gradient = form.value, form.gradient
 
-    module, tangent_module, adjoint_module = diffusion.modules
+    topic = f"diffusion_{phases}_{diffusion.energy.name}_{diffusion.mobility.name}"
+    module, tangent_module, adjoint_module = discretisation.modules(topic)
     of_c, of_chi = {"w": "m", "u": "c"}, {"u": "chi"}
-    """Arrays that the sums of the potential and of the flux read as w and u."""
 
     @wp.func
     def project(u: fractions) -> fractions:
@@ -337,7 +316,6 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
     @particle_kernel(module, "chi w", [over(spread, "total", **of_c)], numbers=["strength"])
     @typed
     def potential(total, strength, interface_width, mobility, m_i, c_i, s) -> tuple[fractions, real]:
-        """Return the chemical potential chi of a particle, and m M as ``w``."""
         stiffness = interface_width * interface_width * s.volume / m_i
         return strength * project(energy_gradient(c_i)) - stiffness * total, m_i * mobility * mobile(c_i)
 
@@ -384,7 +362,6 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
     @particle_kernel(adjoint_module, "y", numbers=["substeps"])
     @typed
     def scale_adjoint(substeps: int, time_step, m_i, c_bar_i, s) -> fractions:
-        """Return the adjoint y of the flux's raw sum from the adjoint of the new fractions."""
         return (time_step / real(substeps) * s.volume / m_i) * c_bar_i
 
     @particle_kernel(
@@ -397,7 +374,6 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
     def flux_adjoint(
         x_sum, n_sum, w_bar, chi_bar, own, strength, time_step, interface_width, mobility, m_i, c_i, s
     ) -> tuple[vector, real, real, fractions, real, real, fractions]:
-        """Add to the adjoints of the flux's inputs, and return z, the adjoint of the potential's raw sum."""
         m_part = w_bar * mobility * mobile(c_i) - own / m_i
         c_part = (w_bar * m_i * mobility) * mobile_gradient(c_i)
         c_part += strength * energy_hessian_product(c_i, project(chi_bar))

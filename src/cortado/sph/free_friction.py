@@ -1,18 +1,16 @@
-"""Free bodies without slip in the implicit viscous solve, with derivatives: see `cortado.sph.friction_kernels`.
+"""Free bodies without slip in the implicit viscous solve, with derivatives; see `cortado.sph.friction_kernels`.
 
 The velocities of bodies are further unknowns of the solve (Weiler, Koschier, Brand and Bender 2018). With the momenta M
-of a body, a force F(u, U) on it and the velocities U of the start of the step with gravity and contact,
+of a body, the force F(u, U) on the body, and its velocities U at the start of the step with gravity and contact,
 
     U' = U + M^-1 J,   J = dt F(u', U'),
 
 are further rows of the operator B (`cortado.sph.viscous_stress`), which is symmetric in the product weighted with the
-masses of particles and M. J is added to the momenta by contact before pressures act. So a light body neither oscillates
-nor needs smaller steps.
+masses of particles and M. J is added to the momenta by contact before pressures act, so that light bodies neither
+oscillate nor need smaller steps.
 
-Friction resists velocities before pressures act on them, but pressures hold fluid and bodies against gravity. So
-gravity is left out of u, and U includes the change by the pressures of the previous step. Adding these pressures' kicks
-to u as well would be better if they were right. But pressure iterations recover less in a step of pressures that
-viscosity smooths away: a disc 24 particles across, at nu dt = 11 s^2, got ever faster.
+Friction resists velocities before pressures act, but pressures hold fluid and bodies against gravity. Therefore u
+excludes gravity, and U includes the change by the pressures of the previous step.
 """
 
 from collections.abc import Iterator
@@ -35,16 +33,12 @@ Arrays = dict[str, wp.array]
 VELOCITIES = ("V", "L", "W", "faster", "turned_faster")
 
 
-SUMS = ("pulled_sum", "twisted_sum")
-
-
 def begun(body: FreeBody | Changes) -> Arrays:
-    """Return the velocities at the start of a step, or their changes, by the argument names of `move_kernels`."""
     return {f"{name[0]}_0{name[1:]}": array for name, array in body.before.items()}
 
 
 class BodyFriction:
-    """The arrays of the friction with one body, or with a ``suffix`` of names their tangents or adjoints."""
+    """Arrays of the friction with one body; with a ``suffix`` of names, their tangents or adjoints."""
 
     def __init__(self, layout: Layout, suffix: str = ""):
         precision = layout.precision
@@ -56,47 +50,35 @@ class BodyFriction:
         self._sum = layout.sum_of(six)
         kinds = {f"{name}{suffix}": (layout.members, vector) for name in VELOCITIES}
         self.motion = zeros(kinds, layout.device)
-        """V and W at the start of the step with gravity and contact added; after the solve V and W at its end."""
+        """V and W at the start of the step with gravity and contact, and after the solve at its end."""
         self.turned = wp.zeros(layout.members, dtype=vector, device=layout.device)
-        """The adjoint of a further turn of the body."""
         self.none_total = wp.zeros(layout.members, dtype=real, device=layout.device)
-        """A total that nobody reads."""
-        self.momenta = {
-            f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=layout.device) for name in SUMS
-        }
-        """Momenta of the body from contact, friction, and pressures of the previous step, by the argument names of
-        `move_kernels`."""
+        sums = {f"{name}{suffix}": (layout.members, vector) for name in ("pulled_sum", "twisted_sum")}
+        self.momenta = zeros(sums, layout.device)
+        """Momenta of the body from contact, friction and previous pressures, by argument names."""
         self.impulse = {"impulse": wp.zeros(layout.members, dtype=six, device=layout.device)}
         """J."""
 
     def add_up(self, body: FreeBody | Changes) -> None:
-        """Add up the momenta that a body gets, or their tangents."""
-        for total, given, pressed in zip(
-            self.momenta.values(), body.given.values(), body.pressed.values(), strict=True
-        ):
-            wp.copy(total, given)
+        given = zip(self.momenta.values(), body.given.values(), body.pressed.values(), strict=True)
+        for total, one, pressed in given:
+            wp.copy(total, one)
             add(pressed, total)
 
     def whole(self) -> wp.array:
-        """Return the sum (members,) of the load over the particles of a scene."""
         return self._sum(self.load[f"load{self.suffix}"])
 
 
 class BodyRows:
-    """The rows of one body in a solve: `cortado.sph.moment_functions.Rows`."""
-
     def __init__(self, layout: Layout):
         six, vector = layout.precision.six, layout.precision.vector
         kinds = {**dict.fromkeys(("r", "rise", "p", "y", "product", "first"), six), "V": vector, "W": vector}
         self.arrays = zeros({name: (layout.members, kind) for name, kind in kinds.items()}, layout.device)
         self.kernels, self._members = row_kernels(layout.precision), layout.members
         self.known: tuple[Named, ...] = ()
-        """Kernel arguments that describe the body in the present step."""
         self.load: Any = None
-        """The load by p that the particles have written."""
 
     def launch(self, step: StepContext, kernel: Any, *groups: Named, **arrays: Any) -> None:
-        """Launch a kernel with a thread for each scene."""
         step.launch(kernel, self.arrays, *groups, *self.known, threads=self._members, **arrays)
 
     def begin(self, step: StepContext, total: wp.array) -> None:
@@ -115,11 +97,9 @@ class BodyRows:
 
 
 class FreeFriction:
-    """The friction between the fluid and all free bodies without slip of one solver, forward; without any it does
-    nothing."""
+    """The friction between the fluid and all free bodies without slip; without them it does nothing."""
 
     def __init__(self, setting: Setting, constants: Named):
-        """Prepare the friction with the ``constants`` of the viscous stress."""
         layout, scene = setting.layout, setting.scene
         self.layout, self.constants = layout, constants
         names = [table.name for table in free(scene.solid) if table.sticks]
@@ -137,13 +117,11 @@ class FreeFriction:
         self.dots, self.bars = FrictionTangent(self), FrictionAdjoint(self)
 
     def each(self, step: StepContext) -> Iterator[tuple[FreeBody, BodyFriction, BodyRows]]:
-        """Yield the bodies without slip, with their arrays and rows."""
         for body in step.bodies:
             if body.table.sticks:
                 yield body, self.own[body.table.name], self._rows[body.table.name]
 
     def begin(self, step: StepContext) -> None:
-        """Write H, Y, N and r of a step, and the lift, which keeps the value of this step."""
         if self.rows:
             step.launch(self.lifts.forward, self.lift, threads=self.layout.members)
         for body, own, rows in self.each(step):
@@ -151,26 +129,21 @@ class FreeFriction:
             step.launch(self.kernels.hold.forward, own.known, self.constants, *rows.known)
 
     def gather(self, step: StepContext, sums: Named) -> None:
-        """Add to M, A and R of the velocities at the start."""
         for body, own, _ in self.each(step):
             step.launch(self.kernels.thicken.forward, own.known, sums)
             step.launch(self.kernels.lean.forward, own.known, sums, body.before)
 
     def hang(self, step: StepContext, u: wp.array) -> None:
-        """Subtract the step's velocity change by gravity from the velocities u of particles, because pressures balance
-        gravity."""
+        """Subtract the velocity change by gravity from the particles' velocities u: pressures balance gravity."""
         if self.rows:
             step.launch(self.kernels.hang.forward, self.lift, u=u)
 
     def start(self, step: StepContext) -> None:
-        """Compute and store the velocities of bodies from gravity, the momenta given to them so far, and the pressures
-        of the previous step."""
         for body, own, _ in self.each(step):
             own.add_up(body)
             self.launch(step, self.move.forward, own, body)
 
     def launch(self, step: StepContext, kernel: Any, own: BodyFriction, body: FreeBody, *groups: Named) -> None:
-        """Launch a kernel of the motion of a body, with a thread for each scene."""
         known = *groups, own.motion, own.momenta, begun(body), *body.known(step)
         step.launch(kernel, *known, threads=self.layout.members)
 
@@ -192,28 +165,27 @@ class FreeFriction:
         step.launch(self.kernels.rub.forward, own.known, own.found, own.motion, self.constants, *known, v=v)
 
     def multiply(self, step: StepContext, known: tuple[Named, ...], p: wp.array, found: Named) -> None:
-        """Add to B p and to each particle's share of the product p . B p, and write the loads of the bodies' rows."""
+        """Add to B p and to the particles' terms of p^T B p, and write the loads of the bodies' rows."""
         for _, own, rows in self.each(step):
             velocities = {"v": p, **{name: rows.arrays[name] for name in "VW"}}
             step.launch(self.kernels.push, own.known, own.load, self.constants, found, *known, velocities)
             rows.load = own.whole()
 
     def lean(self, step: StepContext, known: tuple[Named, ...], p: wp.array) -> None:
-        """Add to A and T of p the terms of bodies that move with the rows of p."""
+        """Add to A and T of p the terms of bodies that move with the velocities V and W of their rows."""
         for _, own, rows in self.each(step):
             velocities = {"v": p, **{name: rows.arrays[name] for name in "VW"}}
             step.launch(self.kernels.pull, own.known, self.constants, *known, velocities)
 
     def finish(self, step: StepContext) -> None:
-        """Add the impulses found by the solve to the bodies' momenta, and write the bodies' velocities at the end of
-        the step."""
+        """Add the impulses of the solve to the bodies' momenta, and write the velocities at the end of the step."""
         for body, own, rows in self.each(step):
             rows.launch(step, rows.kernels.give, body.given, own.impulse)
         self.start(step)
 
     def act(self, step: StepContext, solid: int, name: str, total: wp.array, now: Named) -> None:
         """Add the action of bodies on particles after the step, ``rub`` or ``couple``, to the sum over the walls of a
-        solid, or of all solids. ``now`` has the arrays of the resisted velocities."""
+        solid or of all solids. ``now`` contains the arrays of the resisted velocities."""
         for body, own, _ in self.each(step):
             if solid in (ALL_WALLS, body.table.number):
                 self.rub(step, own, now, v=now["v"])
@@ -221,8 +193,6 @@ class FreeFriction:
 
 
 class FrictionChanges:
-    """Tangents or adjoints of the friction with free bodies, whose names end in ``suffix``."""
-
     suffix: str
 
     def __init__(self, friction: FreeFriction):
@@ -230,32 +200,26 @@ class FrictionChanges:
 
     @cached_property
     def _own(self) -> dict[str, BodyFriction]:
-        """Make the tangents or adjoints of arrays on first use, because runs without derivatives need none."""
         return {name: BodyFriction(self._friction.layout, self.suffix) for name in self._friction.own}
 
     def _each(
         self, step: StepContext, of: Tangents | Adjoints
     ) -> Iterator[tuple[Changes, BodyFriction, BodyFriction, BodyRows]]:
-        """Yield, for each body without slip: tangents or adjoints of the body and of its arrays, its arrays, and its
-        rows."""
+        """Yield for each body without slip: its changes, those of its arrays, its arrays, and its rows."""
         changes = (one for one in of.bodies if one.body.table.sticks)
         for (body, own, rows), change in zip(self._friction.each(step), changes, strict=True):
             yield change, self._own[body.table.name], own, rows
 
 
 class FrictionTangent(FrictionChanges):
-    """The tangent of the friction with free bodies, for forward mode."""
-
     suffix = "_dot"
 
     def begin(self, step: StepContext, dot: Tangents) -> None:
-        """Write the tangents of H, Y, N and r."""
         of = self._friction
         for change, dots, _, _ in self._each(step, dot):
             step.launch(of.kernels.hold.tangent, dots.known, *dot.named, of.constants, *change.body.known(step))
 
     def hang(self, step: StepContext, dot: Tangents, u_dot: wp.array) -> None:
-        """Apply the tangent of `FreeFriction.hang`."""
         of = self._friction
         if of.rows:
             known = self._lift, of.lift, *dot.named
@@ -267,7 +231,6 @@ class FrictionTangent(FrictionChanges):
         return {"lift_dot": wp.zeros_like(self._friction.lift["lift"])}
 
     def gather(self, step: StepContext, dot: Tangents, sums: Named) -> None:
-        """Add to the tangents of M, A and R of the velocities at the start."""
         kernels = self._friction.kernels
         for change, dots, own, _ in self._each(step, dot):
             known = sums, dots.known, own.known, *dot.named
@@ -275,7 +238,6 @@ class FrictionTangent(FrictionChanges):
             step.launch(kernels.lean.tangent, *known, change.before, change.body.before)
 
     def start(self, step: StepContext, dot: Tangents) -> None:
-        """Write the tangents of the bodies' velocities at the end, from the tangents of the momenta given so far."""
         of = self._friction
         for change, dots, own, _ in self._each(step, dot):
             dots.add_up(change)
@@ -284,13 +246,11 @@ class FrictionTangent(FrictionChanges):
             of.launch(step, of.move.tangent, own, change.body, *known)
 
     def lean(self, step: StepContext, dot: Tangents, A_dot: wp.array, *known: Named) -> None:
-        """Add to the tangent of A of the velocities at the end."""
         for _, dots, own, _ in self._each(step, dot):
             groups = *known, dots.known, own.known, dots.motion, own.motion, *dot.named
             step.launch(self._friction.kernels.lean.tangent, *groups, A_dot=A_dot)
 
     def push(self, step: StepContext, dot: Tangents, acceleration_dot: wp.array, *known: Named) -> None:
-        """Add to the tangent of the accelerations, and write the residual of the bodies' rows."""
         kernels, time_step_dot = self._friction.kernels, dot.parameters["time_step"]
         for _, dots, own, rows in self._each(step, dot):
             self._rub(step, dot, dots, own, *known)
@@ -307,14 +267,11 @@ class FrictionTangent(FrictionChanges):
         step.launch(self._friction.kernels.rub.tangent, dots.found, *groups)
 
     def finish(self, step: StepContext, dot: Tangents) -> None:
-        """Write the tangents of the impulses that bodies get by the solution, and of the bodies' velocities at the
-        end."""
         for change, dots, _, rows in self._each(step, dot):
             given = {name.removesuffix("_dot"): array for name, array in change.given.items()}
             rows.launch(step, rows.kernels.give, given, dots.impulse)
 
     def act(self, step: StepContext, dot: Tangents, solid: int, name: str, total_dot: wp.array, *known: Named) -> None:
-        """Add the tangents of the terms of `FreeFriction.act` to the tangent of the sum."""
         for change, dots, own, _ in self._each(step, dot):
             if solid in (ALL_WALLS, change.body.table.number):
                 self._rub(step, dot, dots, own, *known)
@@ -322,13 +279,10 @@ class FrictionTangent(FrictionChanges):
 
 
 class FrictionAdjoint(FrictionChanges):
-    """The adjoint of the friction with free bodies, for reverse mode."""
-
     suffix = "_bar"
 
     @cached_property
     def _shares(self) -> dict[str, wp.array]:
-        """Make arrays of particles' shares of the adjoints of V and W."""
         vector = self._friction.layout.precision.vector
         return self._friction.layout.arrays("_bar", V=vector, W=vector)
 
@@ -337,25 +291,22 @@ class FrictionAdjoint(FrictionChanges):
         return self._friction.layout.sum_of(self._friction.layout.precision.vector)
 
     def begin(self, step: StepContext, bar: Adjoints) -> None:
-        """Set the adjoints of the bodies' arrays to 0."""
         for _, bars, _, _ in self._each(step, bar):
             for group in (bars.known, bars.found, bars.motion):
                 for array in group.values():
                     array.zero_()
 
     def take(self, step: StepContext, bar: Adjoints) -> None:
-        """Begin the solve from the adjoints of the impulses on bodies; these adjoints are velocities."""
+        """Start the solve from the adjoints of the impulses on bodies, which are velocities."""
         for change, _, _, rows in self._each(step, bar):
             rows.launch(step, rows.kernels.take, change.given)
 
     def heed(self, step: StepContext, bar: Adjoints) -> None:
-        """Write the residual that these velocities leave in the bodies' rows, given the loads by the velocities."""
+        """Write the residual of these velocities in the bodies' rows, given the loads by the velocities."""
         for _, _, _, rows in self._each(step, bar):
             rows.launch(step, rows.kernels.heed, load=rows.load)
 
     def push(self, step: StepContext, bar: Adjoints, acceleration_bar: wp.array, *known: Named) -> None:
-        """Apply the adjoint of `FreeFriction.push`, given the adjoint of the accelerations and the solution of the
-        rows."""
         kernels, sizes = self._friction.kernels, {"time_step_bar": bar.parameters["time_step"]}
         for _, bars, own, rows in self._each(step, bar):
             solution = {"load_sum_bar": rows.arrays["first"]}
@@ -369,7 +320,6 @@ class FrictionAdjoint(FrictionChanges):
             self._rub(step, bar, bars, own, *known)
 
     def act(self, step: StepContext, bar: Adjoints, solid: int, name: str, total_bar: wp.array, *known: Named) -> None:
-        """Apply the adjoint of `FreeFriction.act`."""
         for change, bars, own, _ in self._each(step, bar):
             if solid in (ALL_WALLS, change.body.table.number):
                 wp.copy(bars.found[f"{name}_bar"], total_bar)
@@ -380,7 +330,6 @@ class FrictionAdjoint(FrictionChanges):
         self._shared(step, self._friction.kernels.rub.adjoint, bars.motion, *groups)
 
     def _shared(self, step: StepContext, kernel: Any, motion_bar: Named, *known: Named) -> None:
-        """Launch an adjoint kernel, and add the sums of particles' shares to the adjoints of a body's V and W."""
         for array in self._shares.values():
             array.zero_()
         step.launch(kernel, self._shares, *known)
@@ -388,14 +337,11 @@ class FrictionAdjoint(FrictionChanges):
             add(self._sum(share), motion_bar[name])
 
     def lean(self, step: StepContext, bar: Adjoints, A_bar: wp.array, *known: Named) -> None:
-        """Apply the adjoint of `FreeFriction.lean`, given the adjoint of A of the velocities at the end."""
         for _, bars, own, _ in self._each(step, bar):
             groups = *known, bars.known, *bar.named, own.known, own.motion
             self._shared(step, self._friction.kernels.lean.adjoint, bars.motion, {"A_bar": A_bar}, *groups)
 
     def gather(self, step: StepContext, bar: Adjoints, sums_bar: Named) -> None:
-        """Apply the adjoint of `FreeFriction.gather`, given the adjoints of M, A and R of the velocities at the
-        start."""
         kernels = self._friction.kernels
         for change, bars, own, _ in self._each(step, bar):
             groups = sums_bar, bars.known, *bar.named, own.known

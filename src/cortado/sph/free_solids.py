@@ -1,18 +1,16 @@
-"""Rigid bodies that fluid and gravity move, as a part of a step, with their rotation and motion.
+"""Rigid bodies that fluid and gravity move, as a part of a step.
 
 The part puts walls at the poses that bodies would reach with their present velocities, and writes the poses at the end
 of the step. In between the solver accelerates the bodies and stores V, W and L of the end in `FreeBody.moved`.
 
-A body's rotation is R = Q R(w_0) for the rotation w_0 that it began with. A state stores the columns of Q - I: how far
-the tips of the three unit axes of its frame have moved since the start.
+A body's rotation is R = Q R(w_0), with the initial rotation w_0. A state stores the columns of Q - I.
 
-Kernels of a step have a thread for each scene. At the start of the step the centre of mass of a body with the density
-rho is at c, and the body is turned by R. It has the velocities V and W and the angular momentum L = rho R I R^T W,
-where I is its inertia at a density of 1. Volumes are in units of a particle's volume. If the scene gives a mass, rho is
-the mass and I the inertia of a mass of 1. The step first puts the walls at the predicted pose, c' = c + dt V and R' =
-R(dt W) R. Fluid, gravity and contact then change V and L to V_1 and L_1. The body ends at c + dt V_1, turned by R(dt
-W_1) R, with W_1 = R' I^-1 R'^T L_1 / rho, the angular velocity that belongs to L_1 at the predicted pose. So both
-momenta are conserved.
+Kernels of a step have a thread for each scene. At the start of the step a body with density rho has its centre of mass
+at c, the rotation R, the velocities V and W, and the angular momentum L = rho R I R^T W, where I is its inertia at a
+density of 1. Volumes are in units of a particle's volume. If the scene gives a mass, rho is the mass and I the inertia
+of a mass of 1. The step first puts the walls at the predicted pose, c' = c + dt V and R' = R(dt W) R. Fluid, gravity
+and contact change V and L to V_1 and L_1. The body ends at c + dt V_1 with the rotation R(dt W_1) R. The choice W_1 =
+R' I^-1 R'^T L_1 / rho, which belongs to L_1 at the predicted pose, conserves momentum and angular momentum.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,12 +37,15 @@ from cortado.scene.parameters import Axis
 from cortado.sph.moving_solids import free_module, hold_functions, hold_numbers, rotations
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 
+MOTION = ("V", "W", "L")
+GIVEN = ("pushed", "twisted")
+
 
 @cache
 def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
-    """Make the kernels of a free body in 2 or 3 dimensions, with a thread for each scene. The first kernels compute the
-    pose of its walls, with V, W and L; the second compute the state after the step from V_1, W_1 and L_1. The adjoint
-    of the state before the step overwrites the adjoint of this state."""
+    """Make the kernels of a free body in 2 or 3 dimensions: of the pose of its walls with V, W and L, and of the state
+    after the step from V_1, W_1 and L_1. The adjoint of the state before the step overwrites that of the state after
+    it."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     flat, rotation, hold = rotations(precision, dimension), rotations(precision, 3).rotation, hold_functions(precision)
     rate, freed, spin, held = hold.rate, hold.freed, hold.spin, hold.kind
@@ -76,7 +77,7 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
 
     @wp.func
     def evened(Q: matrix) -> matrix:
-        """Return Q - I after correcting round-off in Q, by which its axes would change their lengths or angles."""
+        """Return Q - I after correcting round-off of Q, by which its axes would change their lengths or angles."""
         return real(0.5) * Q * (real(3.0) * wp.identity(n=3, dtype=real) - wp.transpose(Q) * Q) - wp.identity(
             n=3, dtype=real
         )
@@ -135,27 +136,12 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
 
     turned = {"turns": "turned", "turns_before": "turned_before"}
     poses, kept = ["before", "turns_before", "after", "turns"], ["position", "turn_x", "turn_y", "turn_z", "rotation"]
-    begins = pointwise_kernels(
-        precision,
-        modules,
-        lambda _: predict,
-        [*poses, "V", "W", "L"],
-        numbers=["volume", "inertia", "hold"],
-        written=["velocity", "angular_velocity"],
-        told=["gravity"],
-        turned=turned,
-    )
-    ends = pointwise_kernels(
-        precision,
-        modules,
-        lambda _: end,
-        [f"{name}_new" for name in (*kept, "velocity", "angular_velocity")],
-        {f"{name}_new": name for name in kept},
-        numbers=["inertia", "inverse", "hold"],
-        written=["V", "W", "L", "turns_before"],
-        turned=turned,
-    )
-    return begins, ends
+    moves = ["velocity", "angular_velocity"]
+    at_start: dict[str, Any] = {"numbers": ["volume", "inertia", "hold"], "written": moves, "told": ["gravity"]}
+    begins = pointwise_kernels(precision, modules, lambda _: predict, [*poses, *MOTION], turned=turned, **at_start)
+    at_end: dict[str, Any] = {"numbers": ["inertia", "inverse", "hold"], "written": [*MOTION, "turns_before"]}
+    new, replaced = [f"{name}_new" for name in (*kept, *moves)], {f"{name}_new": name for name in kept}
+    return begins, pointwise_kernels(precision, modules, lambda _: end, new, replaced, turned=turned, **at_end)
 
 
 NAMES = {
@@ -164,37 +150,28 @@ NAMES = {
     "velocity": velocity_name,
     "angular_velocity": angular_velocity_name,
 }
-"""Names of the body's state fields whose first values are parameters, by the names of kernel arguments."""
-MOTION = ("V", "W", "L")
-GIVEN = ("pushed", "twisted")
 
 
 @dataclass(frozen=True)
 class FreeTable:
-    """A free body of a scene, by its number, its name and its mass."""
-
     name: str
     number: int
-    """Number of the body among the solids that move."""
     weight: str
     """Name of the parameter for the body's density or mass."""
     mass: Mass
-    """Mass and inertia of the body for a value 1 of this parameter, in units of a particle's volume."""
+    """Mass and inertia for a value 1 of this parameter, in units of a particle's volume."""
     hold: Hold
-    """How the body is held."""
     sticks: bool = False
-    """True if fluid has no slip along the body."""
 
     @property
     def inertia(self) -> np.ndarray:
-        """Return the inertia (3, 3) about the hinge of the body, or about its centre of mass if it has no hinge."""
+        """Return the inertia (3, 3) about the body's hinge, or without a hinge about its centre of mass."""
         return inertia_about(self.hold, self.mass)
 
     @property
     def bounds(self) -> dict[str, float]:
-        """Return two numbers by the names of kernel arguments: the volume by which pressures push the body, infinite if
-        its middle is held, and the greatest inverse of its inertia, 0 if it does not turn. Both are bounds of the
-        values of a held body."""
+        """Return bounds of a held body by kernel argument names: the volume by which pressures push the body, infinite
+        if its middle is held, and the greatest inverse of its inertia, 0 if it does not turn."""
         goes, turns = any((*self.hold.moving, *self.hold.arm)), self.hold.turning > 0
         greatest = np.linalg.eigvalsh(np.linalg.pinv(self.mass.inertia)).max()
         return {"pushed_volume": self.mass.volume if goes else np.inf, "greatest": float(greatest) if turns else 0.0}
@@ -202,20 +179,14 @@ class FreeTable:
 
 @dataclass(frozen=True)
 class FreeSolids:
-    """A maker of the part that moves free bodies in a solver."""
-
     tables: Sequence[FreeTable]
     dimension: int
     search: NeighbourSearch
-    """The search for neighbours that has the walls of the bodies."""
     pushes: "Sequence[Callable[[FreeSolidsPart], Push]]"
-    """Make the objects that push bodies besides fluid and gravity: contacts, springs."""
     joints: Sequence[Joint] = ()
-    """The hinges between bodies and other solids; the solver enforces these constraints."""
 
     @property
     def walls(self) -> MovingWalls:
-        """Return the wall particles in which the search finds neighbours."""
         assert self.search.moving is not None
         return self.search.moving
 
@@ -226,30 +197,26 @@ class FreeSolids:
 
 
 class Push(Protocol):
-    """An object that pushes free bodies besides fluid and gravity, once poses are known: it adds to
-    `FreeBody.given`."""
+    """An object that pushes free bodies besides fluid and gravity: it adds to `FreeBody.given`."""
 
     def look(self, step: StepContext) -> None:
         """Add the momenta that bodies get."""
 
     def tangent(self, changes: "Sequence[Changes]") -> Any:
-        """Return the tangent of this object; its method ``look(step, dot)`` adds to `Changes.given`."""
+        """Return the tangent, whose method ``look(step, dot)`` adds to `Changes.given`."""
 
     def adjoint(self, changes: "Sequence[Changes]") -> Any:
-        """Return the adjoint of this object; its method ``look(step, bar)`` reads the adjoints in `Changes.given`."""
+        """Return the adjoint, whose method ``look(step, bar)`` reads the adjoints in `Changes.given`."""
 
 
 def given_to(each: "Sequence[FreeBody | Changes]", body: int, other: int) -> dict[str, wp.array]:
-    """Return the momenta that two bodies get, or the tangents or adjoints of these: the second body's ``pushed_bar`` is
-    called ``pushed_other_bar``. If ``other`` is -1, kernels give the second body 0, and the first body's own arrays
-    take its place."""
+    """Return the momenta that two bodies get, or their tangents or adjoints, the second's as in ``pushed_other``. If
+    ``other`` is -1, the first body's arrays take the second's place, and kernels add 0 there."""
     others = each[body if other < 0 else other].given
     return {**each[body].given, **{name.replace("ed", "ed_other", 1): array for name, array in others.items()}}
 
 
 class FreeBody:
-    """One free body in a step, with its arrays on the device."""
-
     def __init__(self, table: FreeTable, poses: Named, dimension: int, layout: Layout):
         self.table, vector = table, layout.precision.vector
         angle = Entry.NUMBER if dimension == 2 else Entry.VECTOR
@@ -257,7 +224,7 @@ class FreeBody:
         units = {"position": "m", "rotation": "rad", "velocity": "m/s", "angular_velocity": "rad/s"}
         self.names = {label: name(table.name) for label, name in NAMES.items()}
         self.names |= {label: f"{table.name}.{label}" for label in AXES}
-        """Names of the body's fields of a state, by the names of kernel arguments."""
+        """Names of the body's state fields by kernel argument names."""
         begun = (
             StateField(self.names[label], unit, angles.get(label, Entry.VECTOR), Axis.SCALAR, self.names[label])
             for label, unit in units.items()
@@ -268,33 +235,26 @@ class FreeBody:
         matrix = layout.precision.matrix
         inertia, inverse = table.inertia, np.linalg.pinv(table.inertia)
         self.constants: dict[str, Any] = {**poses, "inertia": matrix(*inertia.ravel())}
-        """Constants of the body, and its poses, which a step overwrites."""
         self.constants |= {"inverse": matrix(*inverse.ravel()), "volume": table.mass.volume}
         self.constants |= {"solid": table.number, "hold": hold_numbers(table.hold, layout.precision)}
         self.constants |= table.bounds
         self.given = {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in GIVEN}
-        """Momentum, and its moment, that the body gets from contacts, springs and friction with fluid."""
+        """Momentum, and its moment, from contacts, springs and friction with fluid."""
         self.pressed = {name: wp.zeros_like(array) for name, array in self.given.items()}
-        """Momentum and moment that the pressures of the previous step would give the body; only for bodies without
-        slip."""
+        """Momentum and moment by the pressures of the previous step, only for bodies without slip."""
         self.before, self.moved = (
             {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in MOTION} for _ in range(2)
         )
-        """V, W and L at the start of a step, and V_1, W_1 and L_1."""
 
     def state(self, state: State, suffix: str = "") -> dict[str, wp.array]:
-        """Return the body's fields of a state by the names of kernel arguments."""
         return {f"{label}{suffix}": state[name] for label, name in self.names.items()}
 
     def known(self, step: StepContext) -> tuple[Named, ...]:
-        """Return the arrays and constants of the body that all kernels take."""
         density = step.parameters[self.table.weight]
         return self.constants, self.state(self.begun), {"density": density}
 
 
 class FreeSolidsPart(Part):
-    """The part of a step that moves the free bodies of one solver."""
-
     def __init__(self, made_of: FreeSolids, layout: Layout):
         self.made_of, self.layout = made_of, layout
         poses = made_of.walls.each
@@ -329,26 +289,21 @@ class FreeSolidsPart(Part):
 
 
 class Changes:
-    """Tangents or adjoints of one free body in a step."""
-
     def __init__(self, body: FreeBody, layout: Layout, suffix: str):
         vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
         self.body = body
         self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
         self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
         self.turned_end = wp.zeros(**vectors)
-        """The part, from the end of the step, in the adjoint of a further turn of R."""
+        """The term, from the end of the step, of the adjoint of a further turn of R."""
 
     def clear(self) -> None:
-        """Set all of the body's tangents or adjoints to 0."""
         groups = self.before, self.moved, self.given, self.pressed
         for array in (*(array for group in groups for array in group.values()), self.turned_end):
             array.zero_()
 
 
 class FreeSolidsTangent(PartTangent):
-    """The tangent of free bodies in a step, for forward mode."""
-
     def __init__(self, part: FreeSolidsPart):
         self._part = part
         self.bodies = [Changes(body, part.layout, "_dot") for body in part.bodies]
@@ -379,8 +334,6 @@ class FreeSolidsTangent(PartTangent):
 
 
 class FreeSolidsAdjoint(PartAdjoint):
-    """The adjoint of free bodies in a step, for reverse mode."""
-
     def __init__(self, part: FreeSolidsPart):
         self._part = part
         self.bodies = [Changes(body, part.layout, "_bar") for body in part.bodies]

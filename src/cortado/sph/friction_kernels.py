@@ -1,21 +1,21 @@
-"""Viscous friction between fluid and a free body without slip, by sums of each particle over the body's walls.
+"""Viscous friction between fluid and a free body without slip, by each particle's sums over the body's walls.
 
 As with other walls without slip (`cortado.sph.stress_forces`), the body acts like a neighbour at the point of its
-surface below particle i, here with the velocity of the body. Its wall particles b have weights s_b, y_b is the vector
-from the surface to particle i, and r the vector from the body's middle c' to particle i. So the surface point is at c'
-+ r - y_b and has the velocity V + W x (r - y_b). Then the body's whole effect on the particle follows from three sums,
+surface below particle i, with the velocity of the body. Let y_b be the vector from the surface at wall particle b, with
+weight s_b, to particle i, and r the vector from the body's middle c' to particle i. The surface point is at c' + r -
+y_b and has the velocity V + W x (r - y_b). The body's effect on the particle follows from three sums,
 
     H = sum_b s_b,   Y = sum_b s_b y_b,   N = sum_b s_b y_b y_b^T,
 
-and from z = v_i - V - W x r. With the matrix [W] of the cross product, M_i gets N, R_i gets tr N / mu_i, A_i gets
-z Y^T + [W] N, and the acceleration and its couple about the particle are
+and from z = v_i - V - W x r. With the matrix [W] of the cross product, M_i gets N, R_i gets tr N / mu_i, A_i gets z Y^T
++ [W] N, and the acceleration and its couple about the particle are
 
     m_i a_i = -(T_i Y + C mu_i (H z + W x Y)),
     m_i c_i = -(ax(T_i N) + C mu_i (Y x z + (tr N - N) W)),   ax(B) = (B_zy - B_yz, B_xz - B_zx, B_yx - B_xy).
 
-The body gets the force F = -sum_i m_i a_i and the torque -sum_i m_i (r x a_i - c_i) about c'. F and the torque are
-minus half the derivatives of the dissipation with respect to V and W, as m_i a_i is with respect to v_i. So momentum
-and angular momentum are conserved, and rigid rotation of body and fluid together dissipates nothing.
+The body gets the force F = -sum_i m_i a_i and the torque -sum_i m_i (r x a_i - c_i) about c'. Force and torque are
+minus half the derivatives of the dissipation with respect to V and W. Momentum and angular momentum are conserved, and
+rigid rotation of body and fluid together dissipates nothing.
 """
 
 from functools import cache
@@ -38,8 +38,8 @@ from cortado.sph.stress_kernels import fluidity_function, traction_function
 
 @cache
 def friction_functions(precision: Precision) -> SimpleNamespace:
-    """Make three Warp functions: ``lean``, a body's term in A; ``rub``, acceleration and couple of a particle; and
-    ``bear``, which turns these two into force and torque on the body, six numbers."""
+    """Make functions ``lean`` of a body's term in A, ``rub`` of a particle's acceleration and couple, and ``bear`` of
+    force and torque on the body, six numbers."""
     real, vector, matrix, six = precision.real, precision.vector, precision.matrix, precision.six
     typed = TypesByName(real, {vector: "v arm Y V W rub couple", matrix: "T N"})
 
@@ -65,25 +65,19 @@ def friction_functions(precision: Precision) -> SimpleNamespace:
 
 @cache
 def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels of friction with a body in 2 or 3 dimensions. The kernels ``hold`` give the sums H, Y and N and
-    r, ``hang`` a ``lift`` that is added to velocities u, and ``thicken`` the parts in M and R. ``lean``, ``rub`` and
-    ``bear`` apply `friction_functions`. ``pull`` adds to A and T of given velocities. In a solve ``push`` adds to B v
-    of the implicit viscosity and to the particles' shares in the product with v, and writes the load of the body."""
+    """Make the kernels of friction with a body in 2 or 3 dimensions. ``hold`` computes H, Y, N and r; ``hang`` adds a
+    ``lift`` to u; ``thicken`` adds to M and R; ``lean``, ``rub`` and ``bear`` are `friction_functions`. ``pull`` adds
+    to A and T. ``push`` adds to B v and to its product with v in a solve, and writes the load of the body."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     matrix, six, known = precision.matrix, precision.six, moment_functions(precision, dimension)
     contact, cross_terms = contact_functions(discretisation), cross_terms_function(precision)
-    fall, fall_change, hold_weight, hold_gradient = (
-        contact.fall,
-        contact.fall_change,
-        contact.hold,
-        contact.hold_gradient,
-    )
+    fall, fall_change = contact.fall, contact.fall_change
+    hold_weight, hold_gradient = contact.hold, contact.hold_gradient
     fluidity, separation = fluidity_function(precision), pair_functions(discretisation).separation
     modules = module, tangent_module, adjoint_module = discretisation.modules(f"free_friction_{dimension}d")
     traction, whole = traction_function(precision, dimension, module), known.change
-    typed = TypesByName(
-        real, {vector: "x v foot turn arm Y V W after", matrix: "T M N", neighbourhood: "s", wp.int32: "solid"}
-    )
+    vectors = "x v foot turn arm Y V W after led diagonal others total"
+    typed = TypesByName(real, {vector: vectors, matrix: "T M N", neighbourhood: "s", wp.int32: "solid"})
     four = tuple[real, vector, vector, vector]
 
     @solid_sum(discretisation)
@@ -96,10 +90,8 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     @typed
     def grip_tangent(x_ij, x_dot_ij, least, foot, turn_dot, solid, s) -> four:
         w, y, rest = hold_weight(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
-        u, w_dot = (
-            fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y),
-            wp.dot(hold_gradient(x_ij, foot, least, s), rest),
-        )
+        u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
+        w_dot = wp.dot(hold_gradient(x_ij, foot, least, s), rest)
         others = w_dot * cross_terms(y, y) + w * (cross_terms(y, u) + cross_terms(u, y))
         return w_dot, w_dot * y + w * u, wp.cw_mul(w_dot * y + real(2.0) * w * u, y), others
 
@@ -114,38 +106,20 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     numbers = ["solid", "least"]
 
     @particle_kernel(module, "H Y N arm", [over(grip, "held led diagonal others")], numbers=numbers)
-    def hold(
-        solid: int,
-        held: real,
-        led: vector,
-        diagonal: vector,
-        others: vector,
-        x_i: vector,
-        after: vector,
-        s: neighbourhood,
-    ) -> tuple[real, vector, matrix, vector]:
+    @typed
+    def hold(solid, held, led, diagonal, others, x_i, after, s) -> tuple[real, vector, matrix, vector]:
         return held, led, whole(diagonal, others), separation(x_i, after, s)
 
     changes = over(grip_tangent, "held led diagonal others")
 
     @particle_kernel(tangent_module, "H_dot Y_dot N_dot arm_dot", [changes], numbers=numbers)
-    def hold_tangent(
-        solid: int, held: real, led: vector, diagonal: vector, others: vector, x_dot_i: vector, after_dot: vector
-    ) -> tuple[real, vector, matrix, vector]:
+    @typed
+    def hold_tangent(solid, held, led, diagonal, others, x_dot_i, after_dot) -> tuple[real, vector, matrix, vector]:
         return held, led, whole(diagonal, others), x_dot_i - after_dot
 
     @particle_kernel(adjoint_module, "+x_bar +force_bar +torque_bar", [over(grip_back, "total")], numbers=numbers)
-    def hold_adjoint(
-        solid: int,
-        total: vector,
-        arm_i: vector,
-        Y_i: vector,
-        N_i: matrix,
-        Y_bar_i: vector,
-        N_bar_i: matrix,
-        arm_bar_i: vector,
-    ) -> tuple[vector, vector, vector]:
-        """Apply the adjoint of the sums and of r; turning the body turns Y and N."""
+    @typed
+    def hold_adjoint(solid, total, arm_i, Y_i, N_i, Y_bar_i, N_bar_i, arm_bar_i) -> tuple[vector, vector, vector]:
         B = N_i * (N_bar_i + wp.transpose(N_bar_i))
         turned = vector(B[1, 2] - B[2, 1], B[2, 0] - B[0, 2], B[0, 1] - B[1, 0])
         return total + arm_bar_i, -total - arm_bar_i, wp.cross(Y_i, Y_bar_i) + turned - wp.cross(arm_i, total)
@@ -159,7 +133,6 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     @wp.kernel(module=module, enable_backward=False)
     @arrays.arrays
     def pull(particles: int, control: real, v, M, eta, body, V, W, A, T):
-        """Leave out particles that the body does not rub."""
         i, member = wp.tid(), wp.tid() // particles
         if body.H[i] == real(0.0):
             return
@@ -204,7 +177,7 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
 
 @cache
 def lift_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of minus the velocity change by gravity in a step, -dt g, with a thread for each scene."""
+    """Make the kernels of -dt g, minus the velocity change by gravity in a step."""
     real, vector = precision.real, precision.vector
 
     def lift(time_step_i: real, gravity_i: vector) -> vector:
@@ -216,14 +189,13 @@ def lift_kernels(precision: Precision) -> Kernels:
 @cache
 def row_kernels(precision: Precision) -> SimpleNamespace:
     """Make the kernels of a body's rows in a solve, with a thread for each scene; a row is a momentum of six numbers.
-    ``rise`` are the velocities that the momenta in r give the body, which may be held (`cortado.sph.moving_solids`),
-    and V and W are the velocities that p gives the body.
+    ``rise`` are the velocities that the momenta r give the body, which may be held (`cortado.sph.moving_solids`); V and
+    W are the velocities by p.
 
     `Rows` of `cortado.sph.moment_functions` need ``lift``, ``begin``, ``multiply``, ``descend`` and ``turn``. ``give``
-    adds the impulse of the solution to the momenta that a body gets. ``lengthen`` adds the time step's tangent to the
-    tangent of a load. ``take`` begins the adjoint solve from velocities, which are the adjoint of the impulse, and
-    ``heed`` writes the residual r that they leave. ``answer`` adds the velocities of the solution, and adds to the
-    adjoint of the time step.
+    adds the impulse of the solution to the body's momenta; ``lengthen`` adds the time step's tangent to that of a load.
+    ``take`` starts the adjoint solve from velocities, the adjoint of the impulse, and ``heed`` writes their residual r.
+    ``answer`` adds the velocities of the solution, and adds to the adjoint of the time step.
     """
     real, vector, matrix, six = precision.real, precision.vector, precision.matrix, precision.six
     module, hold = free_module(precision, "rows"), hold_functions(precision)
@@ -240,7 +212,6 @@ def row_kernels(precision: Precision) -> SimpleNamespace:
 
     @kernel
     def lift(r, density, volume: real, inertia: matrix, inverse: matrix, hold, turns, rise, total):
-        """Write the velocities that belong to the momenta r, and add the product of both to a total."""
         b = wp.tid()
         P, arm = vector(r[b][0], r[b][1], r[b][2]), turns[b] * hold.arm
         L = vector(r[b][3], r[b][4], r[b][5]) - wp.cross(arm, P)
@@ -297,7 +268,6 @@ def row_kernels(precision: Precision) -> SimpleNamespace:
 
     @kernel
     def take(time_step, pushed_bar, twisted_bar, first, V, W):
-        """Write the velocities, and their negatives as V and W."""
         b = wp.tid()
         first[b] = time_step[b] * both(pushed_bar[b], twisted_bar[b])
         V[b] = -time_step[b] * pushed_bar[b]

@@ -1,6 +1,7 @@
-"""Rewrites a user's function so that it computes the same in Warp as in Python. Numbers get the precision of the run.
-Operators with another meaning in Warp are replaced by Warp functions with Python's meaning; what cannot be replaced is
-refused.
+"""Rewrites a user's function so that Warp computes the same as Python, in the precision of the run.
+
+Operators with another meaning in Warp are replaced by Warp functions with Python's meaning; code that cannot be
+replaced is refused.
 """
 
 import ast
@@ -25,7 +26,7 @@ REMAINDER, QUOTIENT, NEAREST, WHOLE = "cortado_remainder", "cortado_quotient", "
 
 @cache
 def meanings(precision: Precision) -> dict[str, Any]:
-    """Make Warp functions of Python's operators, by name; a % b, with the sign of b, and a // b have CPython's bits."""
+    """Make Warp functions of Python's operators, by name. a % b, with the sign of b, and a // b have CPython's bits."""
     real, module = precision.real, kernel_module(f"python_{precision.name}")
     none, one, half = (wp.constant(real(value)) for value in (0.0, 1.0, 0.5))
 
@@ -56,36 +57,28 @@ def meanings(precision: Precision) -> dict[str, Any]:
 
 
 REAL, VECTOR = "cortado_real", "cortado_vector"
-"""Names, in compiled texts, of the types of a number and of a vector."""
 PLACE, READ, READ_OF = "cortado_place", "cortado_read", ("cortado_e", "cortado_w", "cortado_member", "cortado_row")
-"""Names, in compiled texts, of the functions that read arrays, and the arguments of these functions before an index."""
+"""Names, in compiled texts, of the functions that read arrays, and of their arguments before an index."""
 _TYPES = {float: REAL, wp.float32: REAL, wp.float64: REAL, wp.vec3f: VECTOR, wp.vec3d: VECTOR}
 _OPERATORS: Mapping[type[ast.operator], str] = {ast.Mod: REMAINDER, ast.FloorDiv: QUOTIENT}
 _CALLS = {"round": NEAREST, "int": WHOLE}
 FRACTIONS = "mass_fractions"
-"""The argument with as many numbers as the scene has phases; this count is known once a force is made for a scene."""
 Lines = ast.AST | list[ast.stmt]
 
 
 class InPrecision(ast.NodeTransformer):
-    """A rewriting of a function's text for a precision: numbers and types become those of the precision, and values
-    from outside are written out, so that the text is complete. Whole numbers remain only as indices; loops are unrolled
-    with the value of each index."""
+    """A rewriting of a function's text for a precision: outside values are written out, loops are unrolled."""
 
     def __init__(
         self, what: str, scope: Mapping[str, Any], local: set[str], arrays: Mapping[str, tuple[int, ...]] | None = None
     ):
-        """Take the function's name for messages, the values of outside names, the function's own names, and the shapes
-        of its arrays."""
         self._what, self._scope, self._local = what, scope, local
         shapes = arrays or {}
         sizes = [prod(shape) for shape in shapes.values()]
         self._arrays = {name: (sum(sizes[:k]), shape) for k, (name, shape) in enumerate(shapes.items())}
-        """Arrays, each with the index of its first number in the table of all arrays."""
+        """Arrays, each with the index of its first number in the table of all arrays, and its shape."""
         self._counts: dict[str, int] = {}
-        """Values of the loop counters at the present place of the text."""
         self._given = set[str]()
-        """Arguments; vectors among them have three components."""
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
         self._given = {one.arg for one in node.args.args} - {FRACTIONS}
@@ -121,8 +114,7 @@ class InPrecision(ast.NodeTransformer):
         return node
 
     def _read(self, node: ast.Subscript, first: int, shape: tuple[int, ...]) -> ast.AST:
-        """Return the call that reads a number of an array. Indices known here are checked now, others during the
-        run."""
+        """Return the call that reads a number of an array; indices unknown here are checked during the run."""
         parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         if len(parts) != len(shape) or any(isinstance(part, (ast.Slice, ast.Starred)) for part in parts):
             found = f"{self._what} has {ast.unparse(node)}"
@@ -134,7 +126,6 @@ class InPrecision(ast.NodeTransformer):
         return ast.Call(ast.Name(READ, ast.Load()), [*(ast.Name(name, ast.Load()) for name in READ_OF), place], [])
 
     def _place(self, node: ast.Subscript, part: ast.expr, size: int) -> ast.expr:
-        """Return a number's place along an axis of an array."""
         number = self._whole(part)
         if number is None:
             given = ast.Call(ast.Name(REAL, ast.Load()), [self.visit(part)], [])
@@ -200,7 +191,6 @@ class InPrecision(ast.NodeTransformer):
         return number
 
     def _whole(self, node: ast.expr) -> int | None:
-        """Return the whole number of an expression as Python computes it; None where it is known only in the run."""
         known = {one.id: one for one in ast.walk(node) if isinstance(one, ast.Name)}
         values = {name: self._counts.get(name, self._scope.get(name)) for name in known if name not in self._local}
         values |= {name: count for name, count in self._counts.items() if name in known}
@@ -213,7 +203,6 @@ class InPrecision(ast.NodeTransformer):
         return None
 
     def _resolved(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        """Replace an outside name by its number or its type in the precision, if it refers to one."""
         try:
             value = self._value(node)
         except (KeyError, AttributeError):
@@ -231,7 +220,6 @@ class InPrecision(ast.NodeTransformer):
 
 
 def _number(node: ast.expr, value: Any) -> ast.AST:
-    """Return a call that makes a number or a vector of the precision from a value; truth values stay as they are."""
     if type(value) in (wp.vec3f, wp.vec3d):
         return ast.Call(ast.Name(VECTOR, ast.Load()), [ast.Constant(float(part)) for part in value], [])
     if isinstance(value, (bool, np.bool_)):
@@ -244,17 +232,14 @@ def _number(node: ast.expr, value: Any) -> ast.AST:
 
 
 BUILTINS = ("abs", "float", "int", "max", "min", "pow", "range", "round")
-"""Python functions that a user's function may call."""
 MATH = (
     *("acos", "asin", "atan", "atan2", "ceil", "cos", "cosh", "degrees", "exp", "floor", "isfinite", "isinf", "isnan"),
     *("log", "log10", "log2", "pow", "radians", "sin", "sinh", "sqrt", "tan", "tanh", "trunc"),
 )
-"""Functions of the module math that a user's function may call."""
 
 
 def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
-    """Raise `InputError` for a call of anything but Warp's functions and types: Warp would call its own function of
-    that name."""
+    """Raise `InputError` for calls of anything but Warp's functions and types, and those in `BUILTINS` and `MATH`."""
     for node in ast.walk(function):
         if not isinstance(node, ast.Call):
             continue
@@ -273,7 +258,7 @@ def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
 
 
 def check_truths(what: str, function: ast.FunctionDef) -> None:
-    """Raise `InputError` for ``and`` and ``or`` used as numbers: Python returns an operand, and Warp a truth value."""
+    """Raise `InputError` for ``and`` and ``or`` used as numbers: Python returns an operand, Warp a truth value."""
     tests: set[ast.AST] = set()
     for node in ast.walk(function):
         if isinstance(node, (ast.If, ast.IfExp, ast.While, ast.Assert)):
@@ -290,8 +275,7 @@ def check_truths(what: str, function: ast.FunctionDef) -> None:
 
 
 def check_helper(what: str, function: ast.FunctionDef) -> None:
-    """Raise `InputError` for code in a function under ``@wp.func`` that has another meaning in Python. Numbers in such
-    a function have types of their own."""
+    """Raise `InputError` for code in a function under ``@wp.func`` that has another meaning in Python."""
     check_truths(what, function)
     wholes = set(counts_of(function))
     for node in ast.walk(function):

@@ -1,8 +1,8 @@
 """A user's function as two texts: the source, which Warp compiles, and the meaning, which differs if the function
-computes something else. The source is checked against the function itself, with the values of outside names at the time
-when the force is made. Code that Warp cannot differentiate is refused.
+computes something else. The meaning consists of the code and of the numbers, functions and objects that the code reads.
 
-The meaning, also that of an object, consists of the code and of the numbers, functions and objects that the code reads.
+The source is checked against the function, with the values of outside names when the force is made. Code that Warp
+cannot differentiate is refused.
 """
 
 import ast
@@ -28,9 +28,7 @@ from cortado.device.modules import kernel_module
 from cortado.errors import InputError, shown
 
 _SENT: WeakKeyDictionary[FunctionType, str] = WeakKeyDictionary()
-"""Source texts of functions that were received from other processes."""
 _LEFT_OUT = ("CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "PUSH_NULL", "RESUME")
-"""Bytecode instructions that do not change what code computes."""
 
 
 def plain_function(kind: str, function: Any) -> FunctionType:
@@ -45,7 +43,6 @@ def plain_function(kind: str, function: Any) -> FunctionType:
 
 
 def check_bare(what: str, function: Any) -> None:
-    """Raise `InputError` for a function that a decorator has wrapped around another function."""
     if hasattr(function, "__wrapped__"):
         found = f"{what} is one that a decorator has put around another, which Warp would compile without it"
         raise InputError(f"{found}, but must have no decorator other than wp.func.")
@@ -63,13 +60,12 @@ def source_of(what: str, function: FunctionType) -> str:
 
 
 def keep_source(function: FunctionType, source: str) -> None:
-    """Store the source text that another process sent with a function, because no file may contain it."""
     _SENT[function] = source
 
 
 def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDef:
-    """Parse the text of a function, without annotations, defaults and decorators. Raises `InputError` if the text
-    defines another function, for example if its file has changed since the import."""
+    """Parse the text of a function, without annotations, defaults and decorators. Raise `InputError` if the text
+    defines another function, for example because its file has changed since the import."""
     try:
         found: ast.AST = ast.parse(source).body[0]
     except (SyntaxError, IndexError):  # a lambda on one of several lines, or lines that have moved
@@ -92,8 +88,7 @@ def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDe
 
 
 def _compiled(found: ast.FunctionDef, of: CodeType) -> CodeType | None:
-    """Compile a definition inside a function that defines the names of the enclosing scope; None if Python finds no
-    such code."""
+    """Compile a definition inside a function that defines the names of the enclosing scope; None without such code."""
     doc = found.body[0]
     if isinstance(doc, ast.Expr) and isinstance(doc.value, ast.Constant) and isinstance(doc.value.value, str):
         doc.value.value = of.co_consts[0] if of.co_consts else None  # its indentation is no matter
@@ -108,7 +103,6 @@ def _compiled(found: ast.FunctionDef, of: CodeType) -> CodeType | None:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Test whether two code objects or constants compute the same."""
     if not isinstance(one, CodeType) or not isinstance(other, CodeType):
         return type(one) is type(other) and repr(one) == repr(other)
     found, wanted = _instructions(one), _instructions(other)
@@ -118,7 +112,6 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _instructions(code: CodeType) -> list[tuple[str, Any]]:
-    """Return the instructions of a code object, without those that depend on which names are imported modules."""
     steps = [step for step in dis.get_instructions(code) if step.opname not in _LEFT_OUT]
     places = [step.offset for step in steps]
     found = []
@@ -130,19 +123,14 @@ def _instructions(code: CodeType) -> list[tuple[str, Any]]:
 
 
 class Frozen:
-    """The frozen scope of a function and of all functions that it calls. Numbers, vectors, attributes read from modules
-    and objects, and functions under ``@wp.func`` are copied; the scopes of these functions are frozen too."""
+    """The frozen scope of a function and of all functions that it calls: copies of numbers, vectors, attributes of
+    modules and objects, and functions under ``@wp.func`` with their frozen scopes."""
 
     def __init__(self, what: str, function: FunctionType):
-        """Freeze the scope of a function; raise `InputError` if a function that it calls differs from its source
-        text."""
         self._what, self._made = what, dict[Any, Any]()
         self.helpers: list[Any] = []
-        """Copies of the user's functions under ``@wp.func``, one for each overload."""
         self.scope = self._scope(function)
-        """Values of the names, by name."""
         self.words = "\n".join(words(self.scope))
-        """The whole frozen scope as a text that is the same in every process."""
 
     def _scope(self, function: FunctionType) -> dict[str, Any]:
         return {name: self._value(value, names_in(function)) for name, value in read_by(function).items()}
@@ -183,7 +171,6 @@ class Frozen:
         return made
 
     def _function(self, helper: Any) -> FunctionType:
-        """Return the Python function of a Warp helper with a frozen scope."""
         function, what = helper.func, f"the function {helper.func.__name__} that {self._what} calls"
         check_bare(what, function)
         definition(what, function, helper.adj.source)
@@ -195,11 +182,10 @@ class Frozen:
 
 
 class DerivativeCheck(ast.NodeVisitor):
-    """A check that refuses code which Warp would silently differentiate wrongly: loops that Warp does not unroll, and
-    vectors of which single components are changed."""
+    """A check that refuses code with silently wrong derivatives: loops that are not unrolled, changes of single
+    components."""
 
     def __init__(self, what: str, most: int = wp.config.max_unroll):
-        """Take the function's name for messages, and the greatest number of iterations of a loop."""
         self._what, self._most = what, most
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
@@ -253,8 +239,7 @@ def _returns(body: list[ast.stmt]) -> bool:
 
 
 def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
-    """Raise `InputError` for an unknown name, and for the name of an array or list from outside: Warp functions cannot
-    read them."""
+    """Raise `InputError` for unknown names, and for outside arrays and lists, which Warp functions cannot read."""
     for node in ast.walk(function):
         if not isinstance(node, ast.Name) or node.id in own:
             continue
@@ -266,7 +251,6 @@ def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
 
 
 def counts_of(function: ast.FunctionDef) -> list[str]:
-    """Return the names of a function's loop counters."""
     targets = [node.target for node in ast.walk(function) if isinstance(node, ast.For)]
     return [target.id for target in targets if isinstance(target, ast.Name)]
 
@@ -294,20 +278,16 @@ class SizesWritten(ast.NodeTransformer):
 KEPT = ("builtins", "jax", "math", "numpy", "scipy", "torch", "warp")
 """Packages that do not change: only the names of their functions and objects enter the meaning."""
 PYTHON = sysconfig.get_path("stdlib")
-"""Folder of Python's standard modules, and sometimes of installed ones."""
 SNIPPETS = ("native_snippet", "adj_native_snippet", "replay_snippet")
-"""Attributes of Warp functions that contain C++ source."""
 
 
 def code_words(value: Any) -> str:
-    """Return a checksum of the `words` of a value."""
     return sha256("\n".join(words(value)).encode()).hexdigest()[:16]
 
 
 def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | None = None) -> list[str]:
-    """Return lines that are equal in every process, and that differ if the value computes something else. Of objects
-    and of a user's modules only the attributes in ``names``, those that the reading code names, are included; by
-    default all are."""
+    """Return lines that are equal in every process, and that differ if the value computes something else. For objects
+    and a user's modules they include only attributes in ``names``, by default all."""
     value, seen = _parts(value), set() if seen is None else seen
     if isinstance(value, (bool, int, float, complex, str, bytes, range, slice, type(None))):
         return [repr(value)]
@@ -329,7 +309,6 @@ def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | Non
 
 
 def _parts(value: Any) -> Any:
-    """Return the parts by which a value differs from others: the value itself, or a list of its contents."""
     if isinstance(value, wp.Function) and value.func:
         forms = [*value.user_overloads.values(), *value.user_templates.values()] or [value]
         more = ("func", "custom_grad_func", "custom_replay_func", *SNIPPETS)
@@ -351,7 +330,6 @@ def _parts(value: Any) -> Any:
 
 
 def _is_told_by_name(value: Any) -> bool:
-    """Test if a value is a module or a function of Cortado's or Python's own."""
     file = value.__code__.co_filename if isfunction(value) else ""
     is_python = file.startswith(PYTHON) and "site-packages" not in file
     return is_python or (package_of(value) == "cortado" and (ismodule(value) or isfunction(value)))
@@ -363,21 +341,18 @@ def _of_code(code: CodeType) -> list[str]:
 
 
 def read_by(function: FunctionType) -> dict[str, Any]:
-    """Return the values that a function reads from outside itself, by name."""
     cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
     found = {name: function.__globals__[name] for name in names_in(function) if name in function.__globals__}
     return dict(sorted({**found, **{name: cell.cell_contents for name, cell in cells if cell != CellType()}}.items()))
 
 
 def names_in(function: Any) -> tuple[str, ...]:
-    """Return all names that a function, or a code, may read from outside or as attributes."""
     code = getattr(function, "__code__", function)
     inner = [name for one in code.co_consts if isinstance(one, CodeType) for name in names_in(one)]
     return tuple(dict.fromkeys([*code.co_names, *inner]))
 
 
 def package_of(value: Any) -> str:
-    """Return the name of the package of a module, a function or a class, or of an object's class."""
     name = (
         value.__name__
         if ismodule(value)

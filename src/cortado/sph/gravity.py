@@ -14,7 +14,6 @@ from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents, integrat
 
 @cache
 def gravity_kernels(precision: Precision, taped: bool) -> Kernels:
-    """Make the kernels of gravity; the tangent is the acceleration kernel with another table."""
     vector = precision.vector
 
     # acceleration[i] = acceleration_in[i] + what is returned; ``gravity`` is the whole table, and ``step`` the entry of
@@ -33,8 +32,6 @@ def gravity_kernels(precision: Precision, taped: bool) -> Kernels:
 
 
 class Gravity:
-    """The force of gravity on the particles of one solver."""
-
     shares: tuple[str, ...] = ()
     batches = True
 
@@ -43,7 +40,6 @@ class Gravity:
 
     @cached_property
     def _sum(self) -> TreeReduction:
-        """Return the sum over particles for the adjoint; its kernel is not compiled for a run forward."""
         return self._layout.sum_of(self._layout.precision.vector)
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
@@ -60,5 +56,4 @@ class Gravity:
 
 
 def force(setting: Setting) -> Gravity:
-    """Make the force of gravity, which acts in every scene."""
     return Gravity(setting.layout, setting.discretisation.taped)

@@ -2,13 +2,11 @@
 
     1 / rho_0i = sum_k c_k,i / rho_0k,    ln mu_i = sum_k c_k,i ln mu_k    (Arrhenius 1887)
 
-A particle's mass is constant and its rest volume follows from its rest density (Yang et al. 2015 leave open which of
-the two is constant; with mass fractions it is the mass). The logarithms keep the viscosity positive if fractions stray
-out of [0, 1].
+A particle's mass is constant; its rest volume follows from its rest density. The logarithms keep the viscosity positive
+if fractions stray out of [0, 1].
 
-In the mixture step phases diffuse into one another, and each particle gets the density and viscosity of its new
-fractions. The mixture step comes first in a step, with particles fixed at x(t); the rest of the step uses the new
-values.
+The mixture step comes first in a step, with particles fixed at x(t): phases diffuse into one another, and particles get
+new densities and viscosities.
 """
 
 from contextlib import nullcontext
@@ -28,22 +26,19 @@ from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepCont
 
 
 def mixture_module(precision: Precision, phases: int, forward: bool, taped: bool = False) -> Any:
-    """Return the Warp module of kernels for a number of phases that need no smoothing kernel; ``taped`` forward kernels
-    get Warp's own adjoint."""
     return kernel_module(f"mixture_{kind_of(forward, taped)}_{phases}_{precision.name}", forward and taped)
 
 
 @cache
 def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNamespace:
     """Make the kernels of a number of phases: ``order`` sorts and unsorts mass fractions, ``blend`` computes densities
-    and viscosities. Materials are arrays (members, phases). A tape can differentiate ``taped`` kernels."""
+    and viscosities. Materials are arrays (members, phases)."""
     real, fractions = precision.real, precision.fractions(phases)
     tiny, numbers = wp.constant(real(precision.tiny)), wp.array2d(dtype=real)
 
     @wp.func
     def logarithm(viscosity: real) -> real:
-        """Return ln(mu + tiny) of a viscosity mu: any amount of a phase with viscosity 0 makes the mixture's viscosity
-        nearly 0."""
+        """Return ln(mu + tiny), finite for a viscosity mu of 0."""
         return wp.log(viscosity + tiny)
 
     materials = {numbers: "rest_density viscosity", wp.array(dtype=fractions): "c_scene"}
@@ -78,8 +73,6 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNam
     def blend_adjoint(
         member: int, order_i, c_i, rest_density, viscosity, rho_0_i, mu_i, rho_0_bar_i, mu_bar_i, c_scene_bar
     ) -> tuple[fractions, fractions, fractions]:
-        """Return adjoints of densities, viscosities and fractions; ``c_scene_bar`` is the adjoint of the new
-        fractions."""
         c_bar = fractions(c_scene_bar[order_i])  # a copy: what follows writes to its components
         rest_density_bar, viscosity_bar = fractions(), fractions()
         power_bar = mu_bar_i * mu_i
@@ -96,16 +89,12 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNam
 
 MASS_FRACTIONS = StateField("mass_fractions", "", Entry.FRACTIONS, first="mass_fractions")
 REFERENCE_DENSITY = StateField("reference_density", "kg/m³", Entry.NUMBER, is_constant=True)
-"""A particle's mass over its volume on the rest lattice, which follows from its first fractions."""
 
 
 @dataclass(frozen=True)
 class Phases:
-    """The maker of a mixture's part: the number of phases, and how they diffuse into one another."""
-
     count: int
     diffusion: Diffusion | None
-    """None where phases do not diffuse."""
     strength: float
     """alpha of the free energy [-]."""
 
@@ -114,36 +103,31 @@ class Phases:
 
 
 class Mixture(Part):
-    """The part of a step that carries the composition of one solver's particles; every step reuses its arrays."""
+    """The part of a step for the composition of particles."""
 
     def __init__(self, phases: Phases, layout: Layout, requires_grad: bool = False):
         self.phases = phases
         self.fields = (replace(MASS_FRACTIONS, is_constant=phases.count == 1), REFERENCE_DENSITY)
-        """Fields carried from step to step; the fractions of a single phase are constant."""
         self.kernels = mixture_kernels(layout.precision, phases.count, requires_grad)
         if phases.diffusion and phases.diffusion.energy not in FREE_ENERGIES.values():
             phases.diffusion.energy.check(layout.precision, phases.count, layout.device)
         self.diffusion = diffusion_kernels(phases.diffusion) if phases.diffusion else None
         self.shares = ("rest_density", "viscosity", *(("mobility", "interface_width") if phases.diffusion else ()))
-        """Parameters, numbers or per phase, to whose adjoints every particle adds a share."""
         self.substeps = 0
-        """Explicit steps of diffusion within a time step."""
         self._layout = layout
         self._options = {"device": layout.device, "requires_grad": requires_grad}
         self.c: list[wp.array] = []
-        """Sorted fractions (n,) before each substep, and after the last one; the rest of the step uses the latter."""
+        """Sorted fractions (n,) before each substep of diffusion."""
         self.chi: list[wp.array] = []
         """Chemical potentials (n,) of each substep [-]."""
         self.w: list[wp.array] = []
         """m M (n,) of each substep [kg / (m s)]."""
 
     def fractions(self) -> wp.array:
-        """Make an array (n,) of zero vectors with one number for each phase."""
         dtype = self._layout.precision.fractions(self.phases.count)
         return wp.zeros(self._layout.all_particles, dtype=dtype, **self._options)
 
     def numbers(self) -> wp.array:
-        """Make an array (n,) of zeros."""
         return wp.zeros(self._layout.all_particles, dtype=self._layout.precision.real, **self._options)
 
     def set_substeps(self, substeps: int) -> None:
@@ -154,11 +138,9 @@ class Mixture(Part):
             self.w.append(self.numbers())
 
     def course(self, step: StepContext) -> list[wp.array]:
-        """Return the sorted fractions (n,) before each substep, and after the last."""
         return [*self.c[: self.substeps], step.fractions]
 
     def sort(self, step: StepContext, state: State) -> None:
-        """Sort the mass fractions, and without diffusion compute the materials."""
         with step.aside():
             if self.phases.count > 1:
                 step.launch(self.kernels.order.sort, a_scene=state.mass_fractions, a=self.course(step)[0])
@@ -166,7 +148,6 @@ class Mixture(Part):
                 self._blend(step)
 
     def settle(self, step: StepContext) -> None:
-        """Take the substeps of diffusion and compute the materials after them."""
         course = self.course(step)
         for k in range(self.substeps):
             assert self.diffusion is not None
@@ -177,11 +158,9 @@ class Mixture(Part):
             self._blend(step)
 
     def _blend(self, step: StepContext) -> None:
-        """Compute rest densities and viscosities from the mass fractions."""
         step.launch(self.kernels.blend.forward, c=step.fractions)
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
-        """Write the mass fractions after the last substep of diffusion to the new state."""
         if self.phases.count > 1:
             step.launch(self.kernels.order.unsort, a=step.fractions, a_scene=state.mass_fractions)
 
@@ -193,15 +172,12 @@ class Mixture(Part):
 
 
 class MixtureAdjoint(PartAdjoint):
-    """The adjoint of a mixture's step, by gathers, for reverse mode."""
-
     def __init__(self, mixture: Mixture):
         self._mixture = mixture
         self._y, self._z = (mixture.fractions() for _ in range(2))
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Replace the adjoint of the new fractions, in scene order, by the adjoint of the old fractions, including
-        terms from materials and forces."""
+        """Turn the adjoint of the new fractions, in scene order, into that of the old fractions."""
         with step.aside() if not self._mixture.substeps else nullcontext():
             self._unmix(step, bar, state_bar.mass_fractions)
 
@@ -222,8 +198,6 @@ class MixtureAdjoint(PartAdjoint):
 
 
 class MixtureTangent(PartTangent):
-    """The tangent of a mixture's step, for forward mode."""
-
     def __init__(self, mixture: Mixture):
         self._mixture = mixture
         self._c_dot = [mixture.fractions() for _ in range(2)]
@@ -231,7 +205,6 @@ class MixtureTangent(PartTangent):
         self._w_dot = mixture.numbers()
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Compute the tangents of the materials from the tangent of the old fractions, in scene order."""
         mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, dot.named
         substeps, now = mixture.substeps, {"chi_dot": self._chi_dot, "w_dot": self._w_dot}
         course = [*(self._c_dot[k % 2] for k in range(substeps)), dot.fractions]
@@ -240,19 +213,12 @@ class MixtureTangent(PartTangent):
         for k in range(substeps):
             assert diffusion is not None
             c_dot, c_new_dot = course[k : k + 2]
-            step.launch(
-                diffusion.potential.tangent,
-                *known,
-                strength=mixture.phases.strength,
-                c=mixture.c[k],
-                c_dot=c_dot,
-                **now,
-            )
+            given = {"strength": mixture.phases.strength, "c": mixture.c[k], "c_dot": c_dot}
+            step.launch(diffusion.potential.tangent, *known, **given, **now)
             flux = {"chi": mixture.chi[k], "w": mixture.w[k], "c_dot": c_dot, "c_new_dot": c_new_dot}
             step.launch(diffusion.flux.tangent, *known, substeps=substeps, **flux, **now)
         step.launch(kernels.blend.tangent, *known, c=step.fractions, c_dot=dot.fractions)
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Write the tangent of the new fractions."""
         if self._mixture.phases.count > 1:
             step.launch(self._mixture.kernels.order.unsort, a=dot.fractions, a_scene=state_dot.mass_fractions)

@@ -1,13 +1,13 @@
 """The second moment M = -V sum_j grad W_ij x_ij^T of a particle's neighbours, whose inverse corrects gradients (Bonet
-and Lok 1999), and a measure computed from M of how full the neighbourhood is.
+and Lok 1999), the fullness of a neighbourhood, and conjugate gradients.
 
-With the invariants of M, I_2 and I_3, fullness is H = 3 I_3 / I_2, in the plane 2 det M / tr M. It is 1 inside, about
-0.6 at a flat surface, and 0 where neighbours lie on a line or are missing. On a line I_2 and I_3 are pure round-off. So
-`ROUNDING` (tr M)^2 is added to I_2, and H is 0 there in float32 too.
+With the invariants I_2 and I_3 of M, the fullness is H = 3 I_3 / I_2, in the plane 2 det M / tr M: 1 inside, about 0.6
+at a flat surface, and 0 where neighbours lie on a line or are missing. On a line I_2 and I_3 are pure round-off;
+`ROUNDING` (tr M)^2 is added to I_2 so that H is 0.
 
-The method of conjugate gradients (Hestenes and Stiefel 1952) here solves B y = r for numbers or vectors of particles. B
-is symmetric and positive definite in the product sum_i w_i a_i . b_i with weights w, which defines all norms here. Each
-scene of a batch iterates until |r| has fallen to a given part of the first |r|, and is not changed after that.
+Conjugate gradients (Hestenes and Stiefel 1952) solve B y = r for numbers or vectors of particles. B is symmetric and
+positive definite in the product sum_i w_i a_i . b_i with weights w, which defines all norms here. A scene of a batch
+iterates until |r| has fallen to a given part of the first |r|.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,12 +26,11 @@ from cortado.particles.state import Layout, zeros
 from cortado.sph.parts import StepContext
 
 ROUNDING = 64.0
-"""The part of (tr M)^2 that is added to I_2, in units of the last place of 1."""
+"""Multiple of (tr M)^2 that is added to I_2, in units of the last place of 1."""
 
 
 @cache
 def cross_terms_function(precision: Precision) -> Any:
-    """Make the Warp function of the entries yz, xz and xy of a b^T, given a and b."""
     vector = precision.vector
 
     @wp.func
@@ -43,8 +42,8 @@ def cross_terms_function(precision: Precision) -> Any:
 
 @cache
 def symmetric(precision: Precision) -> SimpleNamespace:
-    """Make types and functions for symmetric matrices stored as six numbers: diagonal and entries yz, xz and xy.
-    ``kind`` is the Warp type, ``pack`` converts a 3 x 3 matrix to it, ``times`` is the product with a vector."""
+    """Make functions of symmetric matrices stored as six numbers: diagonal and entries yz, xz and xy. ``kind`` is the
+    Warp type, ``pack`` converts a 3 x 3 matrix, ``times`` is the product with a vector."""
     vector, matrix, six = precision.vector, precision.matrix, precision.six
 
     @wp.func
@@ -64,27 +63,23 @@ def symmetric(precision: Precision) -> SimpleNamespace:
 
 @cache
 def moment_functions(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make the Warp functions of a particle's moment matrix, in a precision and in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     plane, tiny = wp.constant(real(float(dimension == 2))), wp.constant(real(1e-12))
     rounding = wp.constant(real(ROUNDING * float(np.finfo(precision.numpy).eps) * (dimension == 3)))
 
     @wp.func
     def change(diagonal: vector, others: vector) -> matrix:
-        """Return a tangent of M, or any symmetric matrix, from its diagonal and its entries yz, xz and xy."""
         x, y, z = others[0], others[1], others[2]
         return matrix(diagonal[0], z, y, z, diagonal[1], x, y, x, diagonal[2])
 
     @wp.func
     def whole(diagonal: vector, others: vector) -> matrix:
-        """Return M from its diagonal and its other entries; in the plane M_zz is 1, which has no effect on in-plane
-        results."""
+        """Return M from its diagonal and its other entries; in the plane M_zz is 1, without effect in the plane."""
         return change(diagonal + vector(real(0.0), real(0.0), plane), others)
 
     @wp.func
     def fullness(M: matrix) -> real:
-        """Return the fullness H from the moments M; ``tiny`` avoids 0 / 0 for particles without neighbours, where H is
-        0."""
+        """Return H; ``tiny`` avoids 0 / 0 for particles without neighbours, where H is 0."""
         product = M[0, 0] * M[1, 1] + M[1, 1] * M[2, 2] + M[2, 2] * M[0, 0]
         I_2 = product - M[0, 1] * M[0, 1] - M[1, 2] * M[1, 2] - M[0, 2] * M[0, 2]
         I_3, trace = wp.determinant(M), wp.trace(M)
@@ -104,7 +99,6 @@ def moment_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.func
     def smoothstep(value: real, first: real, second: real) -> real:
-        """Return 0 below the first number, 1 above the second, and a cubic between them."""
         t = wp.clamp((value - first) / (second - first), real(0.0), real(1.0))
         return t * t * (real(3.0) - real(2.0) * t)
 
@@ -113,9 +107,9 @@ def moment_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
 @cache
 def solve_kernels(precision: Precision, kind: Any) -> SimpleNamespace:
-    """Make the kernels of conjugate gradients for numbers or vectors; ``going`` (members,) is 1 for a scene that still
-    iterates. ``begin`` and ``start`` begin a solve, ``descend`` takes a step along p, ``turn`` computes the next p, and
-    ``decide`` finds the scenes that go on."""
+    """Make the kernels of conjugate gradients for numbers or vectors; ``going`` (members,) is 1 for scenes that
+    iterate. ``begin`` and ``start`` begin a solve, ``descend`` takes a step along p, ``turn`` computes the next p,
+    ``decide`` ends scenes."""
     real = precision.real
     module = kernel_module(f"conjugate_gradients_{type_name(kind)}")
     typed = TypesByName(real, {kind: "r p y product", wp.int32: "count going active"})
@@ -132,7 +126,6 @@ def solve_kernels(precision: Precision, kind: Any) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def start(total, first, size, count, going, active):
-        """Begin the solve of each scene that has a residual; ``active`` becomes the number of scenes that go on."""
         b = wp.tid()
         first[b] = total[b]
         size[b] = total[b]
@@ -179,34 +172,31 @@ def solve_kernels(precision: Precision, kind: Any) -> SimpleNamespace:
 
 
 def round_off(precision: Precision) -> float:
-    """Return the ratio |r| / first |r| below which a solve in a precision improves no further."""
+    """Return the ratio |r| / first |r| below which a solve improves no further."""
     return 3e-7 if precision is FLOAT32 else 1e-14
 
 
 class Rows(Protocol):
-    """Further unknowns of a solve, a few for each scene, beside those of particles. Each method except `begin` acts in
-    scenes that are ``going``, and adds the rows' terms to a sum (members,) over particles."""
+    """Further unknowns of a solve, a few for each scene. All methods except `begin` act in scenes that are ``going``,
+    and add the rows' terms to a sum (members,) over particles."""
 
     def begin(self, step: StepContext, total: wp.array) -> None:
-        """Begin with the unknowns at 0, and add the square of the residual."""
+        """Set the unknowns to 0, and add the square of the residual."""
 
     def multiply(self, step: StepContext, curvature: wp.array) -> None:
-        """Write the rows of B p, and add their part of the product p . B p."""
+        """Write the rows of B p, and add their part of the product p^T B p."""
 
     def descend(self, step: StepContext, scene: Named, total: wp.array) -> None:
-        """Take a step along p, and add the square of the new residual; ``scene`` has kernel arguments with a value per
-        scene."""
+        """Take a step along p, and add the square of the new residual; ``scene`` has kernel arguments per scene."""
 
     def turn(self, step: StepContext, scene: Named, total: wp.array) -> None:
         """Write the next p."""
 
 
 class ConjugateGradients:
-    """A solver by conjugate gradients for the particles, or other entries, of a layout, with arrays of its own."""
-
     def __init__(self, layout: Layout, kind: Any, tolerance: float, most: int):
-        """Prepare solves for numbers or vectors, a Warp ``kind``, which end when |r| has fallen to ``tolerance`` of the
-        first, or after ``most`` iterations."""
+        """Prepare solves for a Warp ``kind`` that end at |r| <= ``tolerance`` |first r|, or after ``most``
+        iterations."""
         real = layout.precision.real
         self._kernels, self._layout = solve_kernels(layout.precision, kind), layout
         self._limits = {"tolerance": tolerance, "most": most}
@@ -215,7 +205,6 @@ class ConjugateGradients:
         kinds = {"first": real, "size": real, "count": wp.int32, "going": wp.int32}
         self._scenes = zeros({name: (layout.members, one) for name, one in kinds.items()}, layout.device)
         self.count = self._scenes["count"]
-        """(members,) iterations of the last solve."""
         self._active = wp.zeros(1, dtype=wp.int32, device=layout.device)
         self._sums = layout.sum_of(real), layout.sum_of(real)
 
@@ -230,8 +219,8 @@ class ConjugateGradients:
     ) -> None:
         """Write to ``y`` the solution of B y = r, (n,) both, with weights ``w``, and overwrite ``r``.
 
-        ``multiply`` takes p and a dictionary of arrays: it launches kernels that write B p to ``product`` and each
-        particle's w p B p to ``share``. Further ``rows`` of B are part of the same system.
+        ``multiply`` takes p and a dictionary of arrays: it writes B p to ``product`` and each particle's w p B p to
+        ``share``. Further ``rows`` of B belong to the same system.
         """
         kernels, members, (sum_shares, sum_curvatures) = self._kernels, self._layout.members, self._sums
         n = self._layout.all_particles

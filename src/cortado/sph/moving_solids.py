@@ -1,22 +1,21 @@
-"""Solids that move. A part of a step puts the walls of solids with prescribed paths where they are at its end. Kernels
-here also compute how free bodies move and turn by their momenta, also if axes are fixed or the body has a hinge.
+"""Solids that move: a part of a step that puts walls of solids with prescribed paths where they are at its end; and the
+motion of free bodies by their momenta, with held axes and hinges.
 
 A free body's velocities are V = D (V_0 + dt g + F / (rho K)) + W x s and W = G L. D is 0 along held axes. A hinge is at
 the arm a from the centre of mass in the body's frame, so that the centre is at s = - R a from the hinge. The hinge does
-not move: D is 0, L is the angular momentum about the hinge, and I the inertia about it. Without a hinge s is 0.
+not move: D is 0, L is the angular momentum and I the inertia about the hinge. Without a hinge s is 0.
 
-G is the inverse of the inertia J = R I R^T on the free axes A, G = A (A^T J A)^-1 A^T: J^-1 if all are free; a a^T / (a
-. J a) for one axis a; J^-1 - (J^-1 b) (J^-1 b)^T / (b . J^-1 b) where b alone is held; 0 if none is free. Of an angular
-velocity given in a scene only the part along the free axes is used. So the effect of pressures on the body, -G and D /
-(rho K), is the transpose of the effect of its velocity on the fluid, as for a body that nothing holds.
+G is the inverse of the inertia J = R I R^T on the free axes A, G = A (A^T J A)^-1 A^T: J^-1 if all are free; a a^T /
+(a^T J a) for one axis a; J^-1 - (J^-1 b) (J^-1 b)^T / (b^T J^-1 b) if only b is held; 0 if none is free. The part of an
+initial angular velocity along held axes is ignored.
 
 A solid begins at the position c_0 with the rotation R(w_0). At the end of a step it is displaced by d and turned by w.
-A wall particle with the place r in its frame is then at c_0 + d + R(w) R(w_0) r. Its velocity is the way from its
-previous place to this one, divided by the time step. States have the position c, the turn w, w_0, and the scale by
-which it is stretched (`cortado.particles.moving_walls`).
+A wall particle with the place r in its frame is then at c_0 + d + R(w) R(w_0) r. The velocity of the wall particle is
+its displacement in the step divided by the time step. States contain the position c, the turn w, w_0, and the scale
+(`cortado.particles.moving_walls`).
 
 A rotation R(w) by the vector w, in the plane by an angle, turns by |w| about w (Rodrigues). If w changes by w', the
-rotation turns further by J(w) w': R(w + w') = R(J(w) w') R(w) to first order, with
+rotation turns further by J(w) w', as R(w + w') = R(J(w) w') R(w) to first order, with
 
     J(w) = I + (1 - cos |w|) / |w|^2 [w] + (|w| - sin |w|) / |w|^3 [w]^2,
 
@@ -46,25 +45,22 @@ from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepCont
 
 @cache
 def hold_type(precision: Precision) -> Any:
-    """Make the Warp struct of how a body is held."""
     vector = precision.vector
 
     class HoldNumbers:
         moving: vector
-        """1 along the axes along which the body may move, 0 along the others."""
+        """1 along the axes along which the body may move, 0 along others."""
         arm: vector
         """a, from the centre of mass to the hinge, in the body's frame [m]."""
         axis: vector
-        """If the body turns about one axis: that axis. If it turns about two: the axis about which it does not turn."""
+        """The only free axis of rotation, or with two free axes the held one."""
         turning: wp.int32
-        """Number of axes about which the body turns."""
 
     HoldNumbers.__name__ = HoldNumbers.__qualname__ = f"HoldNumbers_{precision.name}"
     return wp.struct(HoldNumbers)
 
 
 def hold_numbers(hold: Hold, precision: Precision) -> Any:
-    """Return a ``hold`` as a Warp struct of `hold_type`."""
     made = hold_type(precision)()
     for name in ("moving", "arm", "axis"):
         setattr(made, name, precision.vector(*getattr(hold, name)))
@@ -122,16 +118,15 @@ def hold_functions(precision: Precision) -> SimpleNamespace:
 
 
 def free_module(precision: Precision, topic: str = "bodies") -> Any:
-    """Return the Warp module of kernels of free bodies that need no smoothing kernel. Kernels that not all bodies need
-    have a ``topic`` of their own, because Warp recompiles a whole module if its kernels differ."""
+    """Return the Warp module of kernels of free bodies that need no smoothing kernel. Kernels for some bodies need a
+    separate ``topic``, because Warp recompiles a module if its kernels differ."""
     return kernel_module(f"free_{topic}_derivative_{precision.name}")
 
 
 @cache
 def move_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of V, L and W of a body by gravity and by the sums of momenta that it gets, with a thread for
-    each scene. They also compute the velocity changes V - V_0 and W - W_0, ``faster`` and ``turned_faster``. Adjoints
-    of the sums are written."""
+    """Make the kernels of V, L and W of a body by gravity and by the momenta it gets, with a thread for each scene. The
+    kernels also compute the changes V - V_0 and W - W_0, ``faster`` and ``turned_faster``."""
     real, vector, matrix, hold = precision.real, precision.vector, precision.matrix, hold_functions(precision)
     spin, vectors = hold.spin, "gravity V W L pulled twisted"
 
@@ -158,26 +153,18 @@ def move_kernels(precision: Precision) -> Kernels:
         V = wp.cw_mul(hold.moving, V) - wp.cross(W, arm)
         return V, L, W, V - V_0_i, W - W_0_i
 
-    return pointwise_kernels(
-        precision,
-        [free_module(precision)] * 3,
-        lambda _: move,
-        ["V", "L", "W", "faster", "turned_faster"],
-        numbers=["volume", "inertia", "inverse", "hold"],
-        written=["pulled_sum", "twisted_sum"],
-        told=["gravity"],
-        turned={"turns": "turned"},
-    )
+    names: dict[str, Any] = {"numbers": ["volume", "inertia", "inverse", "hold"], "told": ["gravity"]}
+    names |= {"written": ["pulled_sum", "twisted_sum"], "turned": {"turns": "turned"}}
+    results = ["V", "L", "W", "faster", "turned_faster"]
+    return pointwise_kernels(precision, [free_module(precision)] * 3, lambda _: move, results, **names)
 
 
 SMALL = 1e-3
-"""|w|^2 below which the factors of J are computed by series; three terms are enough."""
 
 
 @cache
 def rotations(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make the type ``angle`` of angles, numbers in 2 dimensions and vectors in 3, and the Warp function ``rotation``,
-    R(w), whose derivative Warp takes from J."""
+    """Make the type ``angle``, numbers in 2 dimensions and vectors in 3, and the Warp function ``rotation``, R(w)."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     @wp.func
@@ -210,7 +197,7 @@ def rotations(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.func_grad(rotation)
     def rotation_adjoint(turn: vector, adj_ret: matrix):
-        """Apply J(w)^T, which is J(-w): Warp's own adjoint would be 0 at 0."""
+        """Apply J(w)^T, which is J(-w): Warp's adjoint would be 0 at 0."""
         wp.adjoint[turn] += further(-turn, turning(rotation(turn), adj_ret))
 
     angle, found = (real, about_z) if dimension == 2 else (vector, rotation)
@@ -218,13 +205,12 @@ def rotations(precision: Precision, dimension: int) -> SimpleNamespace:
 
 
 FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_name, "scale": scale_name}
-"""Names of a solid's state fields, by the names of kernel arguments."""
 
 
 @cache
 def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
-    """Make kernels of one moving solid in 2 or 3 dimensions, with a thread for each scene: one computes its poses
-    before and after a step, the other its state at the end. Adjoints of the two states share their arrays."""
+    """Make kernels of a moving solid in 2 or 3 dimensions, with a thread for each scene: its poses before and after a
+    step, and its state at the end. Adjoints of the two states share their arrays."""
     real, vector, matrix, of = precision.real, precision.vector, precision.matrix, rotations(precision, dimension)
     angle, rotation = of.angle, of.rotation
 
@@ -254,17 +240,12 @@ def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
 
 @dataclass(frozen=True)
 class MovingSolids:
-    """A maker of the part that moves solids along given paths in a solver."""
-
     numbers: Mapping[str, int]
-    """Numbers of the solids with given paths, by name, among all solids that move."""
     dimension: int
     search: NeighbourSearch
-    """The search for neighbours that has the walls of the solids."""
 
     @property
     def walls(self) -> MovingWalls:
-        """Return the wall particles in which the search finds neighbours."""
         assert self.search.moving is not None
         return self.search.moving
 
@@ -280,20 +261,16 @@ class MovingSolidsPart(Part):
     def __init__(self, made_of: MovingSolids, layout: Layout):
         self.made_of, self.layout = made_of, layout
         angle = Entry.NUMBER if made_of.dimension == 2 else Entry.VECTOR
-        self.fields = tuple(
-            field
-            for name in made_of.numbers
-            for field in (
+        self.fields: tuple[StateField, ...] = ()
+        for name in made_of.numbers:
+            self.fields += (
                 StateField(position_name(name), "m", Entry.VECTOR, Axis.SCALAR, position_name(name)),
                 StateField(turn_name(name), "rad", angle, Axis.SCALAR),
                 StateField(rotation_name(name), "rad", angle, Axis.SCALAR, rotation_name(name)),
                 StateField(scale_name(name), "", Entry.NUMBER, Axis.SCALAR, scale_name(name)),
             )
-        )
-        """Positions, turns since the start, rotations at the start, and scales of the solids."""
         self.poses, self.ends = pose_kernels(layout.precision, made_of.dimension)
         self.begun = layout.state(self.fields)
-        """Values at the start of the step."""
 
     def begin(self, step: StepContext, state: State) -> None:
         walls, search = self.made_of.walls, self.made_of.search
@@ -310,11 +287,9 @@ class MovingSolidsPart(Part):
             step.launch(self.ends.forward, *known, threads=self.layout.members)
 
     def state(self, state: State, name: str, suffix: str = "") -> dict[str, wp.array]:
-        """Return a solid's fields of a state by the names of kernel arguments."""
         return {f"{label}{suffix}": state[name_of(name)] for label, name_of in FIELDS.items()}
 
     def told(self, parameters: Parameters, name: str, suffix: str = "") -> dict[str, wp.array]:
-        """Return the parameters of a solid's given path by the names of kernel arguments."""
         told = {"place": position_name(name), "displacements": displacement_name(name), "turns_told": turn_name(name)}
         return {f"{label}{suffix}": parameters[parameter] for label, parameter in told.items()}
 
@@ -326,8 +301,6 @@ class MovingSolidsPart(Part):
 
 
 class MovingSolidsTangent(PartTangent):
-    """The tangent of walls of solids with given paths, for forward mode."""
-
     def __init__(self, part: MovingSolidsPart):
         self._part = part
 
@@ -349,9 +322,6 @@ class MovingSolidsTangent(PartTangent):
 
 
 class MovingSolidsAdjoint(PartAdjoint):
-    """The adjoint of solids with given paths, computed from the terms that particles have added to the adjoints of
-    poses."""
-
     def __init__(self, part: MovingSolidsPart):
         self._part = part
 

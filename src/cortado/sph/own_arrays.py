@@ -1,13 +1,9 @@
-"""Arrays as parameters of a user's function, such as the weights of a network or a field on a grid, which kernels read
-number by number.
+"""Arrays as parameters of a user's function, such as the weights of a network or a field on a grid.
 
-All arrays of a force are concatenated in a table w (members, numbers). The value read for a particle is
-
-    w_k + e w_dot_k,   with e = 0,
-
-so that the tangent along w_dot is the derivative with respect to e, which is treated as a number of the particle. The
-adjoint of w is a sum over particles without atomics: a thread takes every so manieth particle of a scene, one after the
-other, and adds to a row of its own. The rows are summed in a fixed order.
+All arrays of a force are concatenated in a table w (members, numbers). The value read for a particle is w_k + e w_dot_k
+with e = 0, so that the tangent along w_dot is the derivative with respect to e, which is treated as a number of the
+particle. The adjoint of w needs no atomics: each thread goes through every ROWS-th particle of a scene and adds to a
+separate row. The rows are summed in a fixed order.
 """
 
 from collections.abc import Sequence
@@ -26,41 +22,34 @@ from cortado.scene.parameters import Axis, Parameter
 from cortado.sph.parts import Adjoints, StepContext
 
 WIDTH = (1, 3)
-"""By rank, the count of numbers in a parameter that is not an array."""
 MOST_NUMBERS = 2**24
-"""Greatest total size of a force's arrays: float32 represents every whole index up to it exactly."""
+"""Greatest total size of a force's arrays: float32 represents every index up to it exactly."""
 ROWS, MOST_PARTIAL = {"cpu": 16, "cuda": 2**15}, 2**24
-"""Rows of a scene on a device, and the number of numbers in all rows above which there are fewer."""
 
 READ_AS = {"e": "_no", "member": "i // particles", "row": "_row"}
-"""Source texts, in pointwise kernels, of the arguments of `Reading.read` besides the table and the place."""
 
 
 @cache
 def table_type(precision: Precision) -> Any:
-    """Return the Warp struct of a force's arrays: w, and w_dot or the rows of w's adjoint, (numbers, members x rows),
-    where there are any."""
+    """Return the Warp struct of a force's arrays: w, w_dot, and the rows of w's adjoint, (numbers, members x rows)."""
     numbers = wp.array2d(dtype=precision.real)
     fields = {"__annotations__": dict.fromkeys(("values", "dots", "rows"), numbers), "__module__": __name__}
     return wp.struct(type(f"Table_{precision.name}", (), fields))
 
 
 def arrays_module(precision: Precision, forward: bool, taped: bool = False) -> Any:
-    """Return the Warp module of kernels and functions of tables; ``taped`` forward ones get Warp's own adjoint."""
     return kernel_module(f"arrays_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 
 @cache
 def reading(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Make the functions by which a user's function reads arrays; Warp's tape differentiates ``taped`` ones."""
     real, table = precision.real, table_type(precision)
     module = arrays_module(precision, True, taped)
     none, nothing = wp.constant(real(0.0)), wp.constant(real(float("nan")))
 
     @wp.func(module=module)
     def place(k: real, size: real) -> real:
-        """Return an index into an axis of a size. A negative index counts from the end; an index out of range gives
-        NaN."""
+        """Return an index into an axis of a size. A negative index counts from the end; one out of range gives NaN."""
         found = k
         if k < none:
             found = k + size
@@ -70,7 +59,6 @@ def reading(precision: Precision, taped: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def read(e: real, w: table, member: int, row: int, k: real) -> real:
-        """Return a number of the table; NaN if the index is out of range."""
         found = nothing
         if k >= none:
             found = w.values[member, int(k)]
@@ -90,8 +78,8 @@ def reading(precision: Precision, taped: bool) -> SimpleNamespace:
 
 @cache
 def packing_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Make the kernels that write a parameter's values in a step into a table, and add the adjoint of a table to that
-    of the parameter. Values are numbers (members, steps x size), or the same in all steps (members, size)."""
+    """Make the kernels that write a parameter's values in a step into a table, and add a table's adjoint to that of the
+    parameter. Values are (members, steps x size), or the same in all steps (members, size)."""
     typed = TypesByName(wp.array2d(dtype=precision.real), {wp.int32: "step"})
 
     @wp.kernel(module=arrays_module(precision, True, taped))
@@ -112,7 +100,7 @@ def packing_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
 
 
 class Numbers:
-    """The numbers of some parameters, one parameter behind the other in a table (members, numbers)."""
+    """The numbers of some parameters, one parameter after the other in a table (members, numbers)."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
         self._kernels = packing_kernels(layout.precision, taped) if parameters else None
@@ -122,11 +110,9 @@ class Numbers:
         self.size = sum(sizes)
 
     def pack(self, step: StepContext, values: Parameters, table: wp.array) -> None:
-        """Write the parameters' values in a step to a table."""
         self._launch("pack", step, values, table)
 
     def add(self, step: StepContext, table: wp.array, bar: Parameters) -> None:
-        """Add the adjoint of a table to those of the parameters."""
         self._launch("add", step, bar, table)
 
     def _launch(self, kernel: str, step: StepContext, values: Parameters, table: wp.array) -> None:
@@ -138,7 +124,7 @@ class Numbers:
 
 
 class Tables:
-    """One table for each scene that holds all arrays of a user's function, with its tangent and its adjoint."""
+    """A table for each scene with all arrays of a user's function, with tangent and adjoint."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
         self._layout = layout
@@ -146,31 +132,26 @@ class Tables:
         self._size = self._arrays.size
         most = min(ROWS["cpu" if layout.device.is_cpu else "cuda"], layout.particles)
         self.rows = max(min(most, MOST_PARTIAL // (layout.members * max(self._size, 1))), 1)
-        """Number of threads that share the particles of a scene in the adjoint."""
         self._table = self._new(values=self._numbers(layout.members, self._size, requires_grad=taped))
 
     @property
     def threads(self) -> int | None:
-        """Return the number of threads of the adjoint, None where there is one for each particle."""
+        """Return the number of threads of the adjoint; None for one per particle."""
         return self._layout.members * self.rows if self._size else None
 
     def now(self, step: StepContext) -> dict[str, Any]:
-        """Return the arguments of a forward kernel for the arrays of a step; none without arrays."""
         return self._packed(step, self._table) if self._size else {}
 
     def along(self, step: StepContext, parameters_dot: Parameters) -> dict[str, Any]:
-        """Return the arguments of a tangent kernel: the arrays in a step, and the tangents of these arrays."""
         if not self._size:
             return {}
         self._arrays.pack(step, parameters_dot, self._along.dots)
         return self._packed(step, self._along)
 
     def back(self, step: StepContext) -> dict[str, Any]:
-        """Return the arguments of an adjoint kernel, which adds to rows of the arrays' adjoints."""
         return {**self._packed(step, self._back), "rows": self.rows} if self._size else {}
 
     def collect(self, step: StepContext, bar: Adjoints) -> None:
-        """Add the rows up into the adjoints of the arrays, and set them to 0."""
         if self._size:
             total = self._sum(self._back.rows.flatten()).reshape((self._size, self._layout.members))
             self._arrays.add(step, total.transpose((1, 0)), bar.parameters)

@@ -1,10 +1,10 @@
 """Forces and viscosity laws that a user gives as one Python function.
 
-`Body` is the acceleration a_i = f(x_i, v_i, t, theta) [m/s2] of each particle. Both derivatives are exact. The adjoint
-is Warp's gradient of the product f . a_bar. The tangent is the sum of the gradients of the components of f.
+`Body` is the acceleration a_i = f(x_i, v_i, t, theta) [m/s2] of each particle. The exact adjoint is Warp's gradient of
+the scalar product of f and a_bar; the exact tangent is the sum of the gradients of the components of f.
 
-`Pair` is a force between neighbours: the force [N], in 2-D per metre, on a particle from each
-neighbour within the support is (W(x_ij) / W(0)) f(x_ij, v_ij, t, theta), so that
+`Pair` is a force between neighbours: the force [N], in 2-D per metre, on a particle from each neighbour within the
+support is (W(x_ij) / W(0)) f(x_ij, v_ij, t, theta), so that
 
 a_i = 1 / (m_i s^d) sum_j (W_ij / W_0) f(x_ij, v_ij, t, theta)
 
@@ -82,7 +82,7 @@ class OverTime:
 
 @fixed
 class OwnFunction(ABC):
-    """A force, for `Simulation`, whose formula is one Python function of a user's; see `cortado.forces`."""
+    """A force, for `Simulation`, whose formula is one Python function; see `cortado.forces`."""
 
     kind: ClassVar[str]
     """Name of the kind of force in messages."""
@@ -100,10 +100,8 @@ class OwnFunction(ABC):
         self._values = {argument: self._value(argument, value) for argument, value in values.items()}
         own = tuple(self._parameter(argument, value) for argument, value in self._values.items())
         self.parameters = ((TIME,) if len(self._formula.inputs) == 3 else ()) + own
-        """The parameters of the function in its order. If the function takes time, time comes first."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the force by the arguments that it was made from, with the text of the function."""
         return _made_again, (type(self), self._function, self._source, self.name, self._values, self.fingerprint)
 
     def __repr__(self) -> str:
@@ -118,11 +116,7 @@ class OwnFunction(ABC):
         return sha256("\n".join(words).encode()).hexdigest()
 
     def _value(self, argument: str, value: Any) -> Any:
-        """Return a parameter's value as a read-only array, or an `OverTime` as it is."""
-        if isinstance(value, OverTime):
-            return value
-        what = f"parameter {self.name}.{argument}"
-        return read_only(what, value)
+        return value if isinstance(value, OverTime) else read_only(f"parameter {self.name}.{argument}", value)
 
     def _parameter(self, argument: str, value: Any) -> Parameter:
         name, meaning = f"{self.name}.{argument}", f"{argument} of the force {self.name}"
@@ -130,16 +124,9 @@ class OwnFunction(ABC):
             return Parameter(name, "", meaning, Axis.ARRAY, lambda source: value, change=_usual, shape=value.shape)
         course = value if isinstance(value, OverTime) else None
         first = value if course is None else course.values[0]
-        return Parameter(
-            name,
-            "",
-            meaning,
-            Axis.STEP if course else Axis.SCALAR,
-            lambda source: first,
-            components=_dimension if first.ndim else None,
-            change=_length if first.ndim else _size,
-            course=course,
-        )
+        axis, components = Axis.STEP if course else Axis.SCALAR, _dimension if first.ndim else None
+        own: dict[str, Any] = {"components": components, "change": _length if first.ndim else _size, "course": course}
+        return Parameter(name, "", meaning, axis, lambda source: first, **own)
 
     @abstractmethod
     def force(self, setting: Setting) -> Force:
@@ -151,19 +138,16 @@ class OwnFunction(ABC):
 
     @property
     def _ranks(self) -> tuple[int, ...]:
-        """Return the ranks of the parameters that are not arrays, and the rank of time if the function takes time."""
+        """The ranks of time, if the function takes time, and of the parameters except arrays."""
         return tuple(p.rank for p in self.parameters if p.axis is not Axis.ARRAY)
 
 
 class OwnForce(OwnFunction):
-    """A user's function that returns a force or an acceleration; it has kernels of its own."""
-
     @abstractmethod
     def kernels(self, discretisation: Discretisation, dimension: int, phases: int = 1) -> Kernels:
-        """Make the kernels of the force in a precision, in a scene of 2 or 3 dimensions and so many phases."""
+        """Make the kernels of the force in a scene of 2 or 3 dimensions with a number of phases."""
 
     def force(self, setting: Setting) -> "FunctionForce":
-        """Make the force in a solver; raise `InputError` for a function that Warp cannot compile."""
         kernels = self.kernels(setting.discretisation, setting.scene.dimension, setting.layout.phases)
         made = FunctionForce(self._what, kernels, self.parameters, self._formula.fields, setting)
         made.compile(kernels.forward)
@@ -171,8 +155,6 @@ class OwnForce(OwnFunction):
 
 
 class FunctionForce:
-    """A force by a user's function, in one solver."""
-
     shares: tuple[str, ...] = ()
     batches = True
 
@@ -186,7 +168,6 @@ class FunctionForce:
         self._gradients = VelocityGradients(setting) if takes_gradients else None
 
     def compile(self, kernel: Any) -> Any:
-        """Compile a kernel and return it; raise `InputError` if Warp cannot compile it."""
         compiled(self._what, kernel.module, self._device)
         return kernel
 
@@ -221,7 +202,6 @@ class FunctionForce:
 
 
 def topic(kind: str, text: Formula, ranks: tuple[int, ...], dimension: int) -> str:
-    """Return the part of a Warp module's name that tells one user function from another."""
     words = "\n".join((text.text, text.outside, str(ranks), str(dimension), str(text.phases)))
     return f"{kind}_{text.name}_{sha256(words.encode()).hexdigest()[:12]}"
 
@@ -242,24 +222,19 @@ def _dimension(dimension: int, phases: int) -> int:
 
 
 def _size(source: Source, value: np.ndarray) -> np.ndarray:
-    """Return the absolute values of numbers, used as scales; 1 for numbers that are 0."""
     return np.where(value == 0.0, 1.0, np.abs(value))
 
 
 def _usual(source: Source, value: np.ndarray) -> float:
-    """Return the root mean square of numbers; 1 where all are 0."""
     return float(np.sqrt(np.mean(value**2))) or 1.0
 
 
 def _length(source: Source, value: np.ndarray) -> float:
-    """Return the length of a vector, or the greatest length of several vectors; 1 where it is 0."""
     return float(np.linalg.norm(np.atleast_2d(value), axis=-1).max()) or 1.0
 
 
 @cache
 def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int) -> Kernels:
-    """Make the kernels of a user's force on each particle in 2 or 3 dimensions; ranks are 0 (numbers) or 1
-    (vectors)."""
     precision, modules = discretisation.precision, discretisation.modules(topic("body", text, ranks, dimension))
     gradient, rate = gradient_functions(precision, dimension)
     types: dict[str, Any] = {"x_i": precision.vector, "v_i": precision.vector, "theta": theta_of(precision, ranks)}
@@ -273,11 +248,8 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
     types |= reads
 
     def make(module: Any) -> Callable[..., Any]:
-        scope: dict[str, Any] = {
-            "force": applied(text, precision, ranks, dimension, module),
-            "gradient": gradient,
-            "rate": rate,
-        }
+        force = applied(text, precision, ranks, dimension, module)
+        scope: dict[str, Any] = {"force": force, "gradient": gradient, "rate": rate}
         source = f"def body({', '.join(types)}):\n    return force({', '.join([*given, *reads])})\n"
         exec(source, scope)
         body: Any = scope["body"]
@@ -296,8 +268,7 @@ FIELDS = {
     "velocity_gradient": ("gradient(M_i, A_i)", ("M_i", "A_i")),
     "shear_rate": ("rate(M_i, A_i)", ("M_i", "A_i")),
 }
-"""Quantities of a particle that a function may take, each with its source text in a kernel and the array entries in
-this text."""
+"""A particle's quantities that a function may take, with source texts in a kernel, and the array entries therein."""
 
 
 class Body(OwnForce):
@@ -323,8 +294,6 @@ class Body(OwnForce):
 def term(
     discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int, module: Any
 ) -> Callable[..., Any]:
-    """Make the Warp function of one pair's term in a particle's acceleration times its volume, from a user's
-    function."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     theta_type, weight = theta_of(precision, ranks), pair_functions(discretisation).weight
     force = applied(text, precision, ranks, dimension, module)
@@ -340,22 +309,13 @@ def term(
 
 @cache
 def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int) -> Kernels:
-    """Make the kernels of a force between neighbours by a user's function, with the arguments of `body_kernels`."""
     own, modules = (text, ranks, dimension), discretisation.modules(topic("pair", text, ranks, dimension))
     module, tangent_module, adjoint_module = modules
     accelerations = fluid_sum(discretisation, module=module)(term(discretisation, *own, module))
     tangents = made_tangent(discretisation, lambda taped: term(taped, *own, tangent_module), tangent_module)
     adjoints = made_adjoint(discretisation, lambda taped: term(taped, *own, adjoint_module), adjoint_module)
-    return sum_kernels(
-        "pair_force",
-        modules,
-        (accelerations, tangents, adjoints),
-        "acceleration",
-        before="acceleration_in",
-        per="cell",
-        numbers=["cell"],
-        written=["theta"],
-    )
+    sums, named = (accelerations, tangents, adjoints), {"before": "acceleration_in", "per": "cell"}
+    return sum_kernels("pair_force", modules, sums, "acceleration", **named, numbers=["cell"], written=["theta"])
 
 
 class Pair(OwnForce):
@@ -380,8 +340,8 @@ class Pair(OwnForce):
 
 class Rheology(OwnFunction):
     """A law of viscosity: ``function(shear_rate, viscosity, ...)`` returns the viscosity [Pa s] at a shear rate sqrt(2
-    D : D) [1/s]. Here ``viscosity`` [Pa s] is the viscosity of the phase and D the symmetric velocity gradient. The
-    force by this law replaces the viscous force of the scene, whose key ``viscosity`` must be "stress".
+    D : D) [1/s]. The argument ``viscosity`` [Pa s] is the viscosity of the phase; D is the symmetric velocity gradient.
+    The force by this law replaces the viscous force of the scene, whose key ``viscosity`` must be "stress".
 
     Example::
 
@@ -421,8 +381,7 @@ class Rheology(OwnFunction):
         check_law(self._what, self._law(scene), viscosities, thetas, precision, device)
 
     def _thetas(self, values: Arrays, time_step: float) -> np.ndarray:
-        """Return the function's parameters (k, numbers) at every time at which one of them changes. Values with a row
-        for each step change at the beginning of each step."""
+        """Return the function's parameters (k, numbers) at every time at which one of them changes."""
         known = {one.name: one for one in self.parameters}
         own = {name: values.get(f"{self.name}.{name}", value) for name, value in self._values.items()}
         steps = max((len(v) for n, v in values.items() if n in known and v.ndim > known[n].rank), default=0)
@@ -438,7 +397,6 @@ class Rheology(OwnFunction):
 
 
 def check_form(scene: Scene) -> None:
-    """Raise `InputError` for a scene whose key ``viscosity`` is not "stress"."""
     if scene.forces.viscosity != "stress":
         found = f"forces.viscosity is {scene.forces.viscosity!r}"
         raise InputError(f"{found}, but must be 'stress' where the viscosity depends on the shear rate.")

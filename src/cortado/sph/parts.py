@@ -1,22 +1,18 @@
 """The parts of a step, such as forces, the mixture and the nozzle: their arguments, and the order in which a step calls
 them.
 
-A part reads the sorted particles and the parameters, and adds to adjoints. It never overwrites its arguments.
+A part reads the sorted particles and the parameters, adds to adjoints, and never overwrites its arguments. Besides
+accelerating particles, a part may keep fields from step to step, and act at the beginning and end of a step. A part may
+omit any method.
 
-Besides accelerating particles a part may keep fields from step to step, and work at the beginning and at the end of a
-step. The mixture, the emitter, and forces with state are parts; a solver only has a list of parts.
+For each method a step calls all parts in their order, reverse mode in reverse order. In `begin` kernels can read the
+parameters and the number of the step; from `sort` on also the order of particles and x, v and m; from `settle` on
+neighbours and n; in `end` all arrays of the step. A derivative replays a step from its state without `end`, so the
+other methods must store all values that tangent or adjoint need.
 
-For each method below a step calls all parts in their order; reverse mode calls them in the reverse order. A part may
-omit any method. In `begin` kernels can read the parameters and the number of the step, in `sort` also the order of
-particles and x, v and m. From `settle` on neighbours and n exist as well, and in `end` all arrays of the step.
-
-A derivative replays a step from its state, without calling `end`. So `begin`, `sort` or `settle` must store all values
-that the tangent or the adjoint needs.
-
-A solver too carries fields of particles from step to step, such as the pressure that the next step begins with. A state
-stores particles in the scene's order, and a step works on sorted particles. The adjoint of sorting is unsorting.
-
-At the end of this module are the kernels of time integration (semi-implicit Euler) and of sorting, with derivatives.
+A state stores particles in the scene's order, and a step works on sorted particles. The adjoint of sorting is
+unsorting. At the end of this module are the kernels of time integration (semi-implicit Euler) and of sorting, with
+derivatives.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -46,10 +42,9 @@ from cortado.scene.scene import Scene
 
 @dataclass(frozen=True)
 class StepContext:
-    """A step as its parts see it. Kernels find in it, by name, the fields of the particles, the parameters, ``s`` (what
-    lies around each particle) and ``order`` (sorted -> scene). They find ``step`` (members,), the number of the step,
-    and ``cell``, the volume of a particle [m^d]. ``particles`` is the number of particles of one scene: in a batch
-    particle i belongs to scene i // particles."""
+    """A step as its parts see it. Kernels find in the context, by name, the fields of the particles, the parameters,
+    the neighbourhood ``s``, ``order`` (sorted -> scene), the number ``step`` (members,) of the step, and ``cell``, the
+    volume of a particle [m^d]. In a batch particle i belongs to scene i // ``particles``."""
 
     launcher: KernelLauncher
     particles: int
@@ -59,13 +54,10 @@ class StepContext:
     cell: float
     fields: Fields
     fractions: wp.array
-    """Mass fractions of the sorted particles after the step's diffusion; the rest of the step uses them."""
     parameters: Parameters
     bodies: Sequence[Any] = ()
-    """The free bodies of the solver, each a `cortado.sph.free_solids.FreeBody`."""
     kick: wp.array | None = None
-    """(n,) vectors: the velocity change of sorted particles by pressure in the previous step [m/s]; None if the solver
-    does not carry it."""
+    """(n,) velocity changes of sorted particles by pressure in the previous step [m/s]; None if not carried."""
 
     @cached_property
     def _known(self) -> tuple[Named, ...]:
@@ -73,8 +65,7 @@ class StepContext:
         return {**own, "cell": self.cell, "fractions": self.fractions}, self.fields.named(), self.parameters.named()
 
     def launch(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
-        """Launch a kernel over the particles; arguments missing from ``arguments`` and ``groups`` are taken from the
-        step by name.
+        """Launch a kernel over the particles; the step has the arguments missing from ``arguments`` and ``groups``.
 
         A kernel that takes ``s`` takes it first and works on particle ``s.first + wp.tid()``, because its launch may be
         split into ranges of particles. ``threads`` is for kernels without ``s``.
@@ -82,8 +73,7 @@ class StepContext:
         self.launcher(kernel, *groups, *self._known, threads=threads, **arguments)
 
     def aside(self) -> AbstractContextManager[None]:
-        """Let the launches inside run concurrently with later launches until `join`; the two groups must be
-        independent."""
+        """Let the launches inside run concurrently with later launches until `join`; both must be independent."""
         return self.launcher.aside()
 
     def join(self) -> None:
@@ -93,29 +83,25 @@ class StepContext:
 
 @dataclass(frozen=True)
 class Tangents:
-    """Tangents of the sorted particles and of the parameters."""
-
     fields: Fields
     fractions: wp.array
     parameters: Parameters
     bodies: Sequence[Any] = ()
-    """Tangents of free bodies in the step, each a `cortado.sph.free_solids.Changes`."""
     kick: wp.array | None = None
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """Return the tangents under the names of kernel arguments: ``x_dot``, ``viscosity_dot`` and so on."""
+        """Return the tangents by kernel argument name, such as ``x_dot`` and ``viscosity_dot``."""
         return self.fields.named("_dot"), {"fractions_dot": self.fractions}, self.parameters.named("_dot")
 
 
 class Shares(Arrays):
-    """Adjoints of parameters to which every particle adds a share, stored per particle until they are summed. They are
-    (n,) numbers or vectors; for a parameter of phases each entry has one number for each phase."""
+    """Terms (n,) of the particles in the adjoints of parameters, stored until they are summed: numbers or vectors, and
+    for a parameter of phases a number for each phase."""
 
     def __init__(self, names: Iterable[str], layout: Layout):
-        """Allocate shares of the parameters of these names, all 0; raise `TypeError` for one that cannot be shared."""
+        """Allocate terms of the parameters ``names``, all 0; raise `TypeError` for a parameter without such terms."""
         precision, self.known = layout.precision, layout.known
-        """The parameters of the simulation, some of which are shared."""
         of_phases = precision.fractions(layout.phases)
         dtypes = {Axis.SCALAR: (precision.real, precision.vector), Axis.PHASE: (of_phases, of_phases)}
         used = [self.known[name] for name in self.known.run]
@@ -129,7 +115,6 @@ class Shares(Arrays):
         self._sums = {name: layout.sum_of(dtype) for name, (_, dtype) in kinds.items()}
 
     def collect(self, bar: Parameters) -> None:
-        """Add the particles' shares up into the parameters' adjoints ``bar``, and set them to 0."""
         for name, total in self._sums.items():
             add(total(self[name]).view(bar[name].dtype).flatten(), bar[name].flatten())
         self.clear()
@@ -137,25 +122,19 @@ class Shares(Arrays):
 
 @dataclass(frozen=True)
 class Adjoints:
-    """The adjoints to which parts of a step add: those of sorted particles and of parameters, and each particle's
-    shares of the latter."""
-
     fields: Fields
     fractions: wp.array
-    """Forces add to this adjoint of `StepContext.fractions`; the mixture then turns it into that of the old fractions
-    and sets it to 0."""
+    """Adjoint of `StepContext.fractions`, which the mixture turns into that of the old fractions and sets to 0."""
     parameters: Parameters
     shares: Shares
     solids: SolidShares
-    """Adjoints of the poses of solids that move."""
     bodies: Sequence[Any] = ()
-    """Adjoints of free bodies in the step, each a `cortado.sph.free_solids.Changes`."""
     kick: wp.array | None = None
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """Return adjoints under the names of kernel arguments, such as ``x_bar``. Parameters over time have sums,
-        (members, steps); parameters in a part's ``shares`` have the particles' shares."""
+        """Return adjoints by kernel argument name, such as ``x_bar``: sums (members, steps) of parameters over time,
+        and the particles' terms of parameters in a part's ``shares``."""
         over_time = [name for name in self.parameters.names if self.shares.known[name].axis is Axis.STEP]
         whole = {f"{argument(name)}_bar": self.parameters[name] for name in over_time}
         fractions = {"fractions_bar": self.fractions}
@@ -165,7 +144,7 @@ class Adjoints:
 @dataclass(frozen=True)
 class Setting:
     """The arguments from which a force is made. A module named in the registry of parameters has a function
-    ``force(setting)``, which makes its force, or returns None where none acts."""
+    ``force(setting)``, which returns its force, or None without one."""
 
     scene: Scene
     discretisation: Discretisation
@@ -180,9 +159,8 @@ class Force(Protocol):
     particles."""
 
     shares: tuple[str, ...]
-    """Parameters, numbers or per phase, to whose adjoints every particle adds a share. An adjoint kernel gets these
-    adjoints with an entry for each particle, (n,), those of parameters over time as sums, (members, steps), and no
-    others."""
+    """Parameters, numbers or per phase, to whose adjoints every particle adds a term. An adjoint kernel gets these
+    adjoints per particle, (n,), those of parameters over time as sums, (members, steps), and no others."""
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         """Write ``after`` = ``before`` + this force's acceleration, both (n,) vectors."""
@@ -191,95 +169,89 @@ class Force(Protocol):
         """Write ``after`` = ``before`` + the tangent of this force's acceleration along ``dot``, both (n,) vectors."""
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array | None:
-        """Add to the adjoints ``bar`` of the force's inputs, given the adjoint of the acceleration, (n,) vectors. A
-        force whose acceleration depends on ``before`` has ``is_last = True``, comes after all others, and returns the
-        adjoint of ``before``. A force that solves a system of equations has the solver as its attribute ``solve``, see
-        `cortado.solvers.loop`. A force by which walls act on fluid has this action, a `cortado.sph.density.WallAction`,
-        as ``wall_action``; without it loads on solids lack this force. If walls act at x_i - y instead of at the
-        particle, ``wall_couple`` is a second `WallAction`: the sum of y x a."""
+        """Add to the adjoints ``bar`` of the force's inputs, given the adjoint of the acceleration, (n,) vectors.
+
+        A force whose acceleration depends on ``before`` has ``is_last = True``, comes after all others, and returns the
+        adjoint of ``before``. A force that solves a system has the solver as its attribute ``solve``, see
+        `cortado.solvers.loop`. A force by which walls act on fluid has a `cortado.sph.density.WallAction` as
+        ``wall_action``; without it, loads on solids lack this force. If walls act at x_i - y instead of at the
+        particle, ``wall_couple`` is a second `WallAction`: the sum of y x a.
+        """
 
 
 class PartTangent:
-    """The tangent of a part of a step, for forward mode."""
-
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Apply the tangent of `Part.begin` to the state's tangent before the step; ``dot`` has the parameters'
-        tangents."""
+        """Apply the tangent of `Part.begin` to the tangent of the state before the step."""
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Apply the tangents of `Part.sort` and `Part.settle`, given the tangent ``state_dot`` of the state before the
-        step; ``dot`` has those of the sorted particles."""
+        """Apply the tangents of `Part.sort` and `Part.settle`; ``state_dot`` is the tangent of the state before the
+        step."""
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Apply the tangent of `Part.end`: ``state_dot`` has the tangents of positions and velocities at the end of the
-        step, and becomes the tangent of the whole state there."""
+        """Apply the tangent of `Part.end`: ``state_dot`` contains the tangents of positions and velocities at the end
+        of the step, and becomes the tangent of the state there."""
 
 
 class PartAdjoint:
-    """The adjoint of a part of a step, for reverse mode."""
-
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
         """Apply the adjoint of a part with a `Part.target`: turn the adjoint of positions and velocities after the part
-        into the adjoint before the part, return that, and add to ``bar``. Sorted particles have no adjoints yet."""
+        into that before the part, return it, and add to ``bar``. Sorted particles have no adjoints yet."""
         return moved_bar
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Apply the adjoints of `Part.settle` and `Part.sort`, and of the sorted particles in `Part.end`. ``state_bar``
-        has the adjoint of the part's fields after the step, which is replaced by the adjoint before it."""
+        """Apply the adjoints of `Part.settle` and `Part.sort`, and of the sorted particles in `Part.end`. Replace in
+        ``state_bar`` the adjoint of the part's fields after the step by the adjoint before it."""
 
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Apply the adjoint of `Part.begin`, after all others; a part without fields changed there needs none."""
+        """Apply the adjoint of `Part.begin`, after all others."""
 
 
 class Part:
-    """A part of a step, in one solver. A `Force` may be one too."""
+    """A part of a step, in one solver. A `Force` may be a part too."""
 
     fields: tuple[StateField, ...] = ()
     """Fields that the part keeps from step to step, as arrays of the state."""
     shares: tuple[str, ...] = ()
-    """Parameters to whose adjoints every particle adds a share; see `Force.shares`."""
+    """Parameters to whose adjoints every particle adds a term; see `Force.shares`."""
 
     def set_substeps(self, substeps: int) -> None:
-        """Take ``substeps`` explicit substeps of diffusion in each step from now on."""
+        """Take this number of substeps of diffusion in each later step."""
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Begin a step, before anything else, from its first state, which must not change. Copy the arrays of this
-        state that `end` needs: the state at the end of the step may be in the same arrays."""
+        """Begin a step from its first state, which must not change. Copy the arrays of this state that `end` needs: the
+        state at the end of the step may be in the same arrays."""
 
     def sort(self, step: StepContext, state: State) -> None:
-        """Take part in the step once the order of the sorted particles is known."""
+        """Act once the order of the sorted particles is known."""
 
     def settle(self, step: StepContext) -> None:
-        """Take part in the step once neighbours and densities are known."""
+        """Act once neighbours and densities are known."""
 
     def target(self, moved: State) -> State:
-        """Return the state from which the part's `end` reads positions and velocities, given the state to which it
-        writes them. A part that changes any returns a state of its own, because nothing is changed in place."""
+        """Return the state from which the part's `end` reads positions and velocities; `end` writes them to ``moved``.
+        A part that changes them returns a separate state, because nothing is changed in place."""
         return moved
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
-        """Write the part's fields of ``state``, the state at the end of the step. If the part has a `target` of its
-        own, read positions and velocities from the target and write them all to ``moved``."""
+        """Write the part's fields of ``state``, the state at the end of the step. A part with a separate `target` reads
+        positions and velocities there and writes them all to ``moved``."""
 
     def new_tangent(self) -> PartTangent:
-        """Make the tangent of the part, with arrays of its own; raise `MissingDerivativeError` if it has none."""
+        """Make the tangent of the part, with its arrays; raise `MissingDerivativeError` without forward mode."""
         raise MissingDerivativeError(f"{type(self).__name__} has no forward mode: let it have a method new_tangent.")
 
     def new_adjoint(self) -> PartAdjoint:
-        """Make the adjoint of the part, with arrays of its own; raise `MissingDerivativeError` if it has none."""
+        """Make the adjoint of the part, with its arrays; raise `MissingDerivativeError` without reverse mode."""
         raise MissingDerivativeError(f"{type(self).__name__} has no reverse mode: let it have a method new_adjoint.")
 
 
 class PartMaker(Protocol):
-    """A maker of a part of a step, for each solver."""
-
     def part(self, layout: Layout, requires_grad: bool) -> Part:
-        """Make the part; with ``requires_grad`` its arrays have gradients, for Warp's tape."""
+        """Make the part for a solver; with ``requires_grad`` its arrays have gradients, for Warp's tape."""
 
 
 class Carried:
-    """Fields of sorted particles that a solver carries from step to step, such as a pressure; or the tangents or
-    adjoints of such fields."""
+    """Fields of sorted particles, such as a pressure, that a solver carries from step to step, or their derivatives."""
 
     def __init__(self, fields: Iterable[StateField], layout: Layout, requires_grad: bool = False):
         """Allocate the fields' arrays; raise `TypeError` for a field without an entry for each particle."""
@@ -292,17 +264,14 @@ class Carried:
         self._arrays = layout.state(fields, requires_grad)
 
     def __getitem__(self, name: str) -> wp.array:
-        """Return a field's array (n,) in sorted order, as it was at the start of the step."""
+        """Return a field's array (n,) in sorted order, as at the start of the step."""
         return self._arrays[name]
 
     def sort(self, step: StepContext, state: State) -> None:
-        """Read the fields from a state and sort them."""
         for name in self._arrays.names:
-            a = self._arrays[name]
-            step.launch(_kernels(a).sort, a_scene=state[name], a=a)
+            sort(step, state[name], self._arrays[name])
 
     def unsort(self, step: StepContext, values: Mapping[str, wp.array], state: State) -> None:
-        """Write sorted values, one array for each field, to a state."""
         if values.keys() != set(self._arrays.names):
             raise TypeError(f"the step carries {', '.join(self._arrays.names)}, but was given {', '.join(values)}.")
         for name, a in values.items():
@@ -326,7 +295,6 @@ def _kernels(a: wp.array) -> Any:
 
 @cache
 def order_kernels(dtype: Any, module: Any) -> SimpleNamespace:
-    """Make the kernels that ``sort`` an array of entries of a Warp type from the scene's order, and ``unsort`` it."""
     typed = TypesByName(dtype, {wp.int32: "order"})
 
     @wp.kernel(module=module)
@@ -345,9 +313,7 @@ def order_kernels(dtype: Any, module: Any) -> SimpleNamespace:
 
 
 def integration_module(precision: Precision, forward: bool, taped: bool = False, topic: str = "integration") -> Any:
-    """Return the Warp module of kernels without a smoothing kernel; ``taped`` forward kernels get Warp's own adjoint.
-    Kernels that only some scenes need have a ``topic`` of their own, because Warp recompiles a whole module if its
-    kernels differ."""
+    """Return the Warp module of kernels without a smoothing kernel, for a ``topic`` that only some scenes need."""
     return kernel_module(f"{topic}_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 
@@ -364,24 +330,7 @@ def prediction_share(precision: Precision) -> Any:
 
 
 @cache
-def new_state_adjoint(precision: Precision) -> Any:
-    """Make the Warp function from the adjoints of x' = x + dt v' and of v' to those of x and of the last prediction of
-    v'. It adds to the adjoint of the time step, too."""
-    real, vector = precision.real, precision.vector
-    adjoin_prediction = prediction_share(precision)
-
-    @wp.func
-    def adjoint(x_new_bar: vector, v_new_bar: vector, dt_bar: real, v: vector, v_star: vector, dt: real):
-        speed_bar = v_new_bar + dt * x_new_bar
-        return x_new_bar, speed_bar, dt_bar + adjoin_prediction(x_new_bar, speed_bar, v, v_star, dt)
-
-    return adjoint
-
-
-@cache
 def integration_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Make kernels that ``sort`` and ``unsort`` a state and ``predict`` without pressure, with derivatives; a tape can
-    differentiate ``taped`` ones."""
     real, vector = precision.real, precision.vector
     typed = TypesByName(real, {wp.int32: "order", vector: "x v acceleration"})
 
@@ -415,7 +364,6 @@ def integration_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
 
     @particle_kernel(integration_module(precision, False), "acceleration_bar")
     def acceleration_adjoint(time_step: real, v_bar_i: vector) -> vector:
-        """Return the adjoint of the acceleration, dt times that of v, as all predictions of a step used v + dt a."""
         return time_step * v_bar_i
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
@@ -430,9 +378,9 @@ def integration_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
 
 @cache
 def begin_adjoint_kernel(precision: Precision) -> Any:
-    """Make the kernel that turns the adjoint of the new state, in scene order, into the prediction's."""
+    """Make the kernel that turns the adjoint of the new state, in scene order, into that of the prediction."""
     real, vector = precision.real, precision.vector
-    adjoin_new_state = new_state_adjoint(precision)
+    adjoin_prediction = prediction_share(precision)
     vectors = wp.array(dtype=vector)
     typed = TypesByName(real, {wp.int32: "order", vector: "v", vectors: "x_scene v_scene"})
 
@@ -441,10 +389,10 @@ def begin_adjoint_kernel(precision: Precision) -> Any:
     def begin_adjoint(
         order_i, time_step, v_i, v_star_i, x_scene_bar, v_scene_bar, time_step_bar_i
     ) -> tuple[vector, vector, real, real, real, real, real]:
-        x_bar, v_bar, dt_bar = adjoin_new_state(
-            x_scene_bar[order_i], v_scene_bar[order_i], time_step_bar_i, v_i, v_star_i, time_step
-        )
         no = real(0.0)
+        x_bar = x_scene_bar[order_i]
+        v_bar = v_scene_bar[order_i] + time_step * x_bar
+        dt_bar = time_step_bar_i + adjoin_prediction(x_bar, v_bar, v_i, v_star_i, time_step)
         return x_bar, v_bar, no, no, no, no, dt_bar
 
     return begin_adjoint

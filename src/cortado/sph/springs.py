@@ -1,24 +1,21 @@
-"""Springs that pull free bodies, and springs and motors that turn bodies about hinges, as momenta that a step gives to
-bodies.
+"""Springs that pull free bodies, and springs and motors that turn bodies about hinges.
 
-A spring leads from the point q = c + R p of a body to the point q' of another solid, or of the world. With its length l
-= |q' - q|, the unit vector n along it and its stiffness k, rest length l_0 and damping C, it pulls with
+A spring leads from the point q = c + R p of a body to the point q' of another solid, or of the world. With the length l
+= |q' - q|, the unit vector n along the spring, the stiffness k, rest length l_0 and damping C, the tension is
 
     t = k (l - l_0) + C n . (w' - w),
 
-where w and w' are the velocities of both points by the present motion of the solids. The body gets the momentum dt t n
-and its moment about the body's middle; the other solid gets the opposite. Forces use the poses at the start of a step,
-and the new velocities then move the bodies: symplectic Euler. Without damping a spring of the frequency omega has the
-period of arccos(1 - (omega dt)^2 / 2) / dt, within (omega dt)^2 / 24. Its energy oscillates without drift, and the only
-bound on dt is 2 / omega.
+where w and w' are the velocities of both points. The body gets the momentum dt t n and its moment about the body's
+middle; the other solid gets the opposite. Forces use the poses at the start of a step, and the new velocities then move
+the bodies: symplectic Euler. Without damping, a spring of frequency omega has the period of arccos(1 - (omega dt)^2 /
+2) / dt, within (omega dt)^2 / 24, and dt must be at most 2 / omega.
 
 A slack spring only pulls: t = max(k (l - l_0) + s C n . (w' - w), 0), with s from 0 at l_0 to 1 at 1.01 l_0, and t = 0
 below l_0. At the corner the derivative is one-sided.
 
-About its hinge with the axis a, a body that is turned by the angle phi from how the scene begins gets the torque T -
-k (phi - phi_0) - C (a . (W - W') - s), with the motor's torque T and speed s, and the other solid the opposite. Of a
-hinge to another solid, which turns with W', a is an axis of that one, and phi is seen from it. At a half turn phi goes
-on from -pi.
+A body turned by the angle phi about a hinge with axis a gets the torque T - k (phi - phi_0) - C (a . (W - W') - s),
+with the motor's torque T and speed s; the other solid gets the opposite. If the hinge is at another solid, which turns
+with W', a and phi belong to the frame of that solid. At a half turn phi jumps from pi to -pi.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,11 +32,10 @@ from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout, Parameters, padded
 from cortado.scene.hinges import Joint
 from cortado.scene.springs import Ends
-from cortado.sph.free_solids import Changes, FreeSolidsPart, given_to
+from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart, given_to
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 TAUT = 0.01
-"""Relative extension of a slack spring from which on the damping is full."""
 OWN = ("before", "turns_before", "after", "turns")
 NUMBERS = ("stiffness", "rest_length", "damping")
 TURNING = ("stiffness", "rest_angle", "damping", "torque", "speed")
@@ -47,8 +43,8 @@ TURNING = ("stiffness", "rest_angle", "damping", "torque", "speed")
 
 @cache
 def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
-    """Make the kernels of springs and hinges, with a thread for each scene. They compute the momenta by a spring, its
-    force and length as the first two components of a vector, and the angular momentum by a hinge."""
+    """Make the kernels of springs and hinges, with a thread for each scene: the momenta by a spring, its force and
+    length as components of a vector, and the angular momentum by a hinge."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     taut, tiny, no, one = (wp.constant(real(value)) for value in (TAUT, precision.tiny, 0.0, 1.0))
     places = "before after other_before other_after own anchor"
@@ -56,8 +52,7 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
 
     @wp.func
     def tension(k: real, rest: real, c: real, dt: real, d: vector, moved: vector, slack: bool) -> real:
-        """Return t for the way d between the ends, and by how much it changes in the step; ``tiny`` is for ends that
-        meet, where n is 0."""
+        """Return t for the vector d between the ends; ``moved`` is its change, ``tiny`` is for ends that meet."""
         length = wp.sqrt(wp.dot(d, d) + tiny)
         longer, rate = length - rest, wp.dot(d, moved) / (length * dt)
         found = k * longer + c * rate
@@ -119,7 +114,6 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
 
     @wp.func
     def about(Q: matrix) -> vector:
-        """Return twice the sine of the angle of a rotation, along its axis."""
         return vector(Q[2, 1] - Q[1, 2], Q[0, 2] - Q[2, 0], Q[1, 0] - Q[0, 1])
 
     matrices = "turns_before other_turns_before other_turns begun other_begun"
@@ -151,10 +145,8 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
         found = (time_step_i * torque / cell) * a
         return found, wp.where(is_free, -one, no) * found
 
-    modules, poses = (
-        [kernel_module(f"springs_derivative_{precision.name}")] * 3,
-        [*OWN, *(f"other_{name}" for name in OWN)],
-    )
+    modules = [kernel_module(f"springs_derivative_{precision.name}")] * 3
+    poses = [*OWN, *(f"other_{name}" for name in OWN)]
     turned = {"turns": "turned", "turns_before": "turned_before"}
     turned |= {f"other_{name}": f"other_{turn}" for name, turn in turned.items()}
     ends = ["own", "anchor", "slack"]
@@ -165,22 +157,14 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
     reads = pointwise_kernels(
         precision, modules, lambda _: read, ["reading"], numbers=ends, written=poses, turned=turned
     )
-    twists = pointwise_kernels(
-        precision,
-        modules,
-        lambda _: twist,
-        ["twisted:twisted", "twisted_other:twisted_other"],
-        numbers=["axis", "begun", "other_begun", "cell", "is_free"],
-        written=["turns_before", "other_turns_before", "other_turns"],
-        told=["torque", "speed"],
-        turned=turned,
-    )
+    names: dict[str, Any] = {"numbers": ["axis", "begun", "other_begun", "cell", "is_free"], "turned": turned}
+    names |= {"written": ["turns_before", "other_turns_before", "other_turns"], "told": ["torque", "speed"]}
+    results = ["twisted:twisted", "twisted_other:twisted_other"]
+    twists = pointwise_kernels(precision, modules, lambda _: twist, results, **names)
     return pulls, reads, twists
 
 
 class Springs:
-    """The springs and turned hinges of one solver, which push its free bodies."""
-
     def __init__(self, part: FreeSolidsPart, springs: Sequence[Ends], turned: Sequence[Joint], layout: Layout):
         self.part, self.springs, self.turned, self.layout = part, springs, turned, layout
         self.pull, self.read, self.twist = spring_kernels(layout.precision)
@@ -188,77 +172,62 @@ class Springs:
         self._rest = resting_pose(layout)
 
     def ends(self, of: Ends | Joint) -> Named:
-        """Return the poses of both solids, with their tangents, by the names of kernel arguments."""
         each = self.part.made_of.walls.each
         other = self._rest if of.against < 0 else each[of.against]
         return {**each[self.number(of.body)], **{f"other_{name}": array for name, array in other.items()}}
 
     def poses(self, spring: Ends) -> tuple[Named, ...]:
-        """Return the poses of both solids of a spring, and its constants, by the names of kernel arguments."""
         vector = self.layout.precision.vector
         own, anchor = (vector(*padded(place[None])[0]) for place in (spring.point, spring.anchor))
         return self.ends(spring), {"own": own, "anchor": anchor, "slack": spring.slack, "is_free": spring.other >= 0}
 
     def number(self, body: int) -> int:
-        """Return the number of a free body among the solids that move."""
         return self.part.bodies[body].table.number
 
     def known(self, of: Joint) -> tuple[Named, ...]:
-        """Return kernel arguments about a body that is turned about a hinge."""
         matrix, body = self.layout.precision.matrix, self.part.bodies[of.body]
         begun, other_begun = (matrix(*one.turn.ravel()) for one in of.begun)
         constants = {"axis": self.layout.precision.vector(*of.axis), "begun": begun, "other_begun": other_begun}
         return self.ends(of), constants, {"is_free": of.other >= 0}, body.before
 
-    def look(self, step: StepContext) -> None:
-        """Add the momenta that bodies get in a step."""
-        bodies, threads = self.part.bodies, self.layout.members
+    def each(
+        self, step: StepContext, bodies: Sequence[FreeBody | Changes]
+    ) -> Iterator[tuple[Kernels, Ends | Joint, Sequence[str], tuple[Named, ...]]]:
+        """Yield kernels, spring or hinge, names of its parameters, and kernel arguments with momenta of ``bodies``."""
         for spring in self.springs:
             known = numbers_of(step.parameters, spring.name, NUMBERS), *self.poses(spring)
-            step.launch(self.pull.forward, given_to(bodies, spring.body, spring.other), *known, threads=threads)
+            yield self.pull, spring, NUMBERS, (given_to(bodies, spring.body, spring.other), *known)
         for of in self.turned:
             known = numbers_of(step.parameters, of.name, TURNING), *self.known(of)
-            step.launch(self.twist.forward, given_to(bodies, of.body, of.other), *known, threads=threads)
+            yield self.twist, of, TURNING, (given_to(bodies, of.body, of.other), *known)
+
+    def look(self, step: StepContext) -> None:
+        for kernels, _, _, known in self.each(step, self.part.bodies):
+            step.launch(kernels.forward, *known, threads=self.layout.members)
 
     def tangent(self, changes: Sequence[Changes]) -> "SpringsTangent":
-        """Return forward mode of `look`."""
         return SpringsTangent(self, changes)
 
     def adjoint(self, changes: Sequence[Changes]) -> "SpringsAdjoint":
-        """Return reverse mode of `look`."""
         return SpringsAdjoint(self, changes)
 
 
 def numbers_of(parameters: Parameters, name: str, ends: Sequence[str], suffix: str = "") -> Named:
-    """Return the parameters of a spring or a hinge by the names of kernel arguments."""
     return {f"{end}{suffix}": parameters[f"{name}.{end}"] for end in ends}
 
 
 class SpringsTangent:
-    """The tangent of springs, for forward mode."""
-
     def __init__(self, springs: Springs, changes: Sequence[Changes]):
         self._springs, self._changes = springs, changes
 
     def look(self, step: StepContext, dot: Tangents) -> None:
-        """Add the tangents of the momenta that bodies get."""
-        own, threads = self._springs, self._springs.layout.members
-        sizes = {"time_step_dot": dot.parameters["time_step"]}
-        for spring in own.springs:
-            known = numbers_of(step.parameters, spring.name, NUMBERS), *own.poses(spring)
-            dots = numbers_of(dot.parameters, spring.name, NUMBERS, "_dot"), sizes
-            given = given_to(self._changes, spring.body, spring.other)
-            step.launch(own.pull.tangent, given, *dots, *known, threads=threads)
-        for of in own.turned:
-            known = numbers_of(step.parameters, of.name, TURNING), *own.known(of)
-            rates = numbers_of(dot.parameters, of.name, TURNING, "_dot"), sizes, self._changes[of.body].before
-            given = given_to(self._changes, of.body, of.other)
-            step.launch(own.twist.tangent, given, *rates, *known, threads=threads)
+        own, sizes = self._springs, {"time_step_dot": dot.parameters["time_step"]}
+        for kernels, of, ends, known in own.each(step, self._changes):
+            dots = numbers_of(dot.parameters, of.name, ends, "_dot"), sizes, self._changes[of.body].before
+            step.launch(kernels.tangent, *dots, *known, threads=own.layout.members)
 
 
 class PoseBars:
-    """Adjoints of the poses of both ends of a spring or a hinge, which go to those of the solids."""
-
     def __init__(self, springs: Springs):
         names = [f"{name}_bar" for name in ("before", "turned_before", "after", "turned")]
         self._springs, self._names = springs, names
@@ -266,7 +235,6 @@ class PoseBars:
         self.named = {f"{way}{name}": wp.zeros(members, **vectors) for way in ("", "other_") for name in names}
 
     def add(self, of: Ends | Joint, bar: Adjoints) -> None:
-        """Add the values written by a kernel to the adjoints of the solids' poses, and set these values to 0."""
         for way, number in (("", self._springs.number(of.body)), ("other_", of.against)):
             if number >= 0:
                 bar.solids.add_whole(number, **{name: self.named[f"{way}{name}"] for name in self._names})
@@ -275,31 +243,18 @@ class PoseBars:
 
 
 class SpringsAdjoint:
-    """The adjoint of springs, for reverse mode."""
-
     def __init__(self, springs: Springs, changes: Sequence[Changes]):
         self._springs, self._changes, self._poses = springs, changes, PoseBars(springs)
 
     def look(self, step: StepContext, bar: Adjoints) -> None:
-        """Go on from the adjoints of the momenta that bodies get to those of their poses and of all numbers."""
-        own, threads = self._springs, self._springs.layout.members
-        sizes = {"time_step_bar": bar.parameters["time_step"]}
-        for spring in own.springs:
-            known = numbers_of(step.parameters, spring.name, NUMBERS), *own.poses(spring)
-            bars = numbers_of(bar.parameters, spring.name, NUMBERS, "_bar"), sizes, self._poses.named
-            given = given_to(self._changes, spring.body, spring.other)
-            step.launch(own.pull.adjoint, given, *bars, *known, threads=threads)
-            self._poses.add(spring, bar)
-        for of in own.turned:
-            known = numbers_of(step.parameters, of.name, TURNING), *own.known(of)
-            shares = numbers_of(bar.parameters, of.name, TURNING, "_bar"), sizes, self._changes[of.body].before
-            given = given_to(self._changes, of.body, of.other)
-            step.launch(own.twist.adjoint, given, *shares, self._poses.named, *known, threads=threads)
+        own, sizes = self._springs, {"time_step_bar": bar.parameters["time_step"]}
+        for kernels, of, ends, known in own.each(step, self._changes):
+            bars = numbers_of(bar.parameters, of.name, ends, "_bar"), sizes, self._changes[of.body].before
+            step.launch(kernels.adjoint, *bars, self._poses.named, *known, threads=own.layout.members)
             self._poses.add(of, bar)
 
 
 def springs_in(solver: Any) -> Iterator[tuple[Springs, Ends]]:
-    """Return the springs of a solver's parts, each with the object that computes it."""
     for part in solver.parts:
         for pushes in part.pushes if isinstance(part, FreeSolidsPart) else ():
             if isinstance(pushes, Springs):

@@ -1,19 +1,18 @@
-"""The sum over neighbours m_i a_i in `cortado.sph.stress_kernels`, for viscosity as a stress with that module's mu. A
-wall without slip acts like a neighbour at rest at the point of its surface below the particle.
+"""The sum over neighbours m_i a_i of the viscous stress (`cortado.sph.stress_kernels`), and laws of viscosity.
 
-With the normal n of the wall, the distance d of particle i from its surface, and a particle b of the wall at x_b,
+A wall without slip acts like a neighbour at rest at the point of its surface below the particle. With the normal n of
+the wall, the distance d of particle i from its surface, and a wall particle b at x_b,
 
     y_ib = d n,   s_w = w_b s_ib max(n . x_ib, 0) / max(d, e),
 
-for the weight s_ib of two particles of the fluid (`cortado.sph.stress_kernels`), as if velocities continued behind the
-wall with opposite sign (Morris, Fox and Zhu 1997). Behind the surface d is 0. Below the distance e, called ``least``,
-the pull of a wall does not increase further. The product n . x_ib is negative if b belongs to the other side of a thin
-wall, or to another face at an edge. Such particles b are left out: a negative weight would accelerate the particle. At
-these three limits the derivative jumps. Functions compute n from the ``foot``, the vector from x_b to the surface.
+for the weight s_ib of two fluid particles, as if velocities continued behind the wall with opposite sign (Morris, Fox
+and Zhu 1997). Behind the surface d is 0. Below the distance e, called ``least``, the pull of a wall does not increase
+further. The product n . x_ib is negative if b belongs to the other side of a thin wall, or to another face at an edge:
+such b are left out, because a negative weight would accelerate the particle. At these three limits the derivative
+jumps. n comes from the ``foot``, the vector from x_b to the surface.
 
-A viscosity law returns the viscosity of a fluid from its shear rate. It is a user's function, a law named in a scene
-(`cortado.scene.model`), or the constant of a Newtonian fluid. Before a run each law, compiled by Warp, is evaluated at
-usual shear rates.
+A viscosity law returns the viscosity of a fluid from its shear rate: a user's function, a law named in a scene
+(`cortado.scene.model`), or the constant of a Newtonian fluid.
 """
 
 import inspect
@@ -38,30 +37,26 @@ from cortado.sph.function_text import plain_function
 
 @cache
 def contact_functions(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of the viscous contact between a particle and a wall, by x_ib and the foot on the
-    surface."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     slope, slope_gradient = pair.slope, pair.slope_gradient
 
     @wp.func
     def weight(x: vector, s: neighbourhood) -> real:
-        """Return s of a separation of two particles, -V a of grad W = a x."""
+        """Return s = -V a of a separation, with grad W = a x."""
         return -s.volume * slope(x, s)
 
     @wp.func
     def rise(x_ib: vector, foot: vector) -> real:
-        """Return n . x_ib, the distance of a particle from a wall particle along the wall's normal."""
+        """Return n . x_ib."""
         return wp.dot(x_ib, foot) / wp.length(foot)
 
     @wp.func
     def height(x_ib: vector, foot: vector) -> real:
-        """Return the distance d of a particle from the surface of a wall, negative behind it."""
         return rise(x_ib, foot) - wp.length(foot)
 
     @wp.func
     def fall(x_ib: vector, foot: vector) -> vector:
-        """Return the vector y from the surface to the particle."""
         return (wp.max(height(x_ib, foot), real(0.0)) / wp.length(foot)) * foot
 
     @wp.func
@@ -89,9 +84,8 @@ def contact_functions(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace:
-    """Make four sums: ``force`` and ``force_tangent`` of the viscous acceleration; ``traction_back`` and ``force_back``
-    turn its adjoint into adjoints of T's rows and mu, and of x, v and m. Walls have no slip if fluid ``sticks``;
-    ``control`` is C."""
+    """Make the sums ``force`` and ``force_tangent`` of the viscous acceleration; and ``traction_back`` and
+    ``force_back``, which turn its adjoint into adjoints of T's rows and mu, and of x, v and m. ``control`` is C."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
@@ -114,7 +108,6 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
     def wall_force_tangent(
         x_ij, x_dot_ij, v_ij, v_dot_ij, m_i, m_dot_i, T_i, T_dot_i, mu_i, mu_dot_i, control, least, foot, turn_dot, s
     ) -> vector:
-        """Return the tangent of a wall's viscous pull; if the wall turns, the pull turns too."""
         w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
         u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
         w_dot = wp.dot(hold_gradient(x_ij, foot, least, s), rest) - w * m_dot_i / m_i
@@ -160,7 +153,6 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
     @summed(wall_traction_back)
     @typed
     def traction_back(x_ij, v_ij, m_i, m_j, bar_i, bar_j, control, least, s) -> tuple[vector, vector, vector, real]:
-        """Return a pair's part in the adjoints of the rows of T and of mu."""
         z = -weight(x_ij, s) * (bar_i / m_i - bar_j / m_j)
         return z[0] * x_ij, z[1] * x_ij, z[2] * x_ij, control * wp.dot(z, v_ij)
 
@@ -176,7 +168,6 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
     def force_back(
         x_ij, v_ij, m_i, m_j, T_i, T_j, mu_i, mu_j, bar_i, bar_j, control, least, s
     ) -> tuple[vector, vector, real]:
-        """Return a pair's part in the adjoints of x, v and m of i, for an adjoint of the acceleration."""
         w, T, mu, own_u = weight(x_ij, s), T_i + T_j, control * (mu_i + mu_j), bar_i / m_i
         u, pull = own_u - bar_j / m_j, T * x_ij + mu * v_ij
         x_part = (s.volume * wp.dot(u, pull)) * slope_gradient(x_ij, s) - w * (wp.transpose(T) * u)
@@ -186,13 +177,12 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
 
 
 def work_types(precision: Precision) -> TypesByName:
-    """Return the Warp types, by name, of the variables in the work functions of viscous stress on solids."""
     kinds = {precision.vector: "x v foot acceleration couple", precision.matrix: "T M A"}
     return TypesByName(precision.real, {**kinds, precision.pair: "constants", neighbourhood_type(precision): "s"})
 
 
 def stress_work(d: Discretisation) -> Any:
-    """Make the work function of the viscous sum over solids, for the adjoint ``acceleration_bar``, with ``constants``
+    """Make the work function of the viscous sum over solids for the adjoint ``acceleration_bar``, with ``constants``
     ``least`` and ``control`` (`cortado.particles.wall_terms.solid_kernel`)."""
     precision, real, contact = d.precision, d.precision.real, contact_functions(d)
     fall, hold = contact.fall, contact.hold
@@ -206,7 +196,6 @@ def stress_work(d: Discretisation) -> Any:
 
 
 def stress_couple_work(d: Discretisation) -> Any:
-    """Make the Warp function of a wall's viscous couple on a particle, y_ib x a_ib, times its adjoint."""
     real, fall, force = d.precision.real, contact_functions(d).fall, wp.func(stress_work(d))
 
     @work_types(d.precision)
@@ -223,27 +212,23 @@ class Law:
     text: Formula
     ranks: tuple[int, ...]
     topic: str
-    """Name that tells the Warp modules of one law from those of others; empty for Newtonian fluids."""
+    """Name that distinguishes the Warp modules of laws; empty for Newtonian fluids."""
 
     @property
     def is_newtonian(self) -> bool:
-        """Return True for a viscosity that does not depend on the shear rate."""
         return not self.topic
 
     def applied(self, precision: Precision, module: Any) -> Any:
-        """Make the Warp function of the shear rate [1/s], the particles' viscosity [Pa s] and theta that returns the
-        viscosity [Pa s]."""
+        """Make the Warp function of shear rate [1/s], viscosity [Pa s] and theta that returns the viscosity [Pa s]."""
         return applied(self.text, precision, self.ranks, 3, module)
 
 
 def newtonian(shear_rate, viscosity):
-    """Return the viscosity unchanged: it does not depend on the shear rate."""
     return viscosity
 
 
 @cache
 def newtonian_law() -> Law:
-    """Return the law of fluids that have no other law of viscosity."""
     return Law(formula("Rheology", plain_function("Rheology", newtonian), inspect.getsource(newtonian), {})[0], (), "")
 
 
@@ -281,7 +266,6 @@ def herschel_bulkley(shear_rate, viscosity, yield_stress, regularisation, flow_i
 
 
 LAWS: dict[str, Callable[..., Any]] = {law.__name__: law for law in (power_law, carreau, bingham, herschel_bulkley)}
-"""Functions of the viscosity laws by the ``kind`` of a scene's key ``rheology``."""
 
 
 SHEAR_RATES = np.logspace(-6.0, 6.0, 601)
@@ -290,7 +274,6 @@ SHEAR_RATES = np.logspace(-6.0, 6.0, 601)
 
 @cache
 def trial_kernel(precision: Precision, law: Law) -> Any:
-    """Make the kernel that applies a law at each shear rate, for each viscosity and each theta."""
     module = kernel_module(f"{law.topic}trial_{precision.name}")
     real, theta_type, apparent = precision.real, theta_of(precision, law.ranks), law.applied(precision, module)
 
@@ -306,8 +289,8 @@ def trial_kernel(precision: Precision, law: Law) -> Any:
 def check_law(
     what: str, law: Law, viscosities: Mapping[str, float], thetas: np.ndarray, precision: Precision, device: Any
 ) -> None:
-    """Raise `InputError` if a law returns an invalid viscosity for any of the ``viscosities`` [Pa s], by names of
-    phases, and parameters ``thetas`` (k, numbers)."""
+    """Raise `InputError` if a law returns an invalid viscosity for a phase of ``viscosities`` or a row of
+    ``thetas``."""
     kernel, rows = trial_kernel(precision, law), np.zeros((len(thetas), theta_of(precision, law.ranks)._length_))
     rows[:, : thetas.shape[1]] = thetas
     given = {"shear_rates": SHEAR_RATES, "viscosities": np.array(list(viscosities.values()))}

@@ -4,17 +4,17 @@ With s_ij = -V a_ij of grad W = a x, so that s_ij is not negative, the sums of p
 
     M_i = sum_j s_ij x_ij x_ij^T,   A_i = sum_j s_ij v_ij x_ij^T,   R_i = sum_j s_ij |x_ij|^2 / mu_j,
 
-and G = A M^-1 is the velocity gradient, corrected so that it is exact for linear velocity fields (Bonet and Lok 1999).
-It is also the least-squares fit to the velocities of the neighbours with weights s_ij. The remainders v_ij - G_i x_ij
-are damped (as by Ganzenmueller 2015, against modes that the gradient does not contain):
+and G = A M^-1 is the velocity gradient, exact for linear velocity fields (Bonet and Lok 1999). G is also the
+least-squares fit to the velocities of the neighbours with weights s_ij. The remainders v_ij - G_i x_ij are damped (as
+by Ganzenmueller 2015, against modes that the gradient does not contain):
 
     m_i a_i = -sum_j s_ij ((T_i + T_j) x_ij + C (mu_i + mu_j) v_ij),   T_i = 2 mu_i D_i M_i^-1 - C mu_i G_i.
 
-That is minus half the derivative with respect to v_i of the dissipation sum_i mu_i (2 D_i : D_i + C sum_j s_ij |v_ij -
-G_i x_ij|^2), because the weighted sum of the remainders times x_ij is 0. So the force never adds energy. Both parts are
-0 in rigid rotation for any arrangement of particles, so that linear and angular momentum are conserved. On a lattice a
-shear wave of wave number k decays with mu k^2 (1 + (C / 4 - 1 / (3 m_2)) k^2 m_4 + ...). With the moments m_2 and m_4
-of s_ij along k, C = 4 / (3 m_2) cancels the second term, in every direction and for every kernel.
+The right-hand side is minus half the derivative with respect to v_i of the dissipation sum_i mu_i (2 D_i : D_i + C
+sum_j s_ij |v_ij - G_i x_ij|^2), so that the force never adds energy. The force is 0 in rigid rotation, so that momentum
+and angular momentum are conserved. On a lattice a shear wave of wave number k decays with mu k^2 (1 + (C / 4 - 1 / (3
+m_2)) k^2 m_4 + ...), with the moments m_2 and m_4 of s_ij along k; C = 4 / (3 m_2) cancels the second term in every
+direction and for every kernel.
 
 From M, A and R of one particle (`stress_of_particle`) follow
 
@@ -22,20 +22,18 @@ From M, A and R of one particle (`stress_of_particle`) follow
     mu = S law(sqrt(2 D : D), mu_m).
 
 mu_m is the harmonic mean of the viscosities between i and its neighbours, by which the shear stress is equal on both
-sides of an interface of fluids. For a Newtonian fluid the law returns mu_m.
+sides of an interface. For a Newtonian fluid the law returns mu_m.
 
-S(M) is 1 if neighbours lie on all sides or on one side, and falls smoothly to 0 if they lie on a line or are missing. M
-has no inverse there, and the particle has no viscous stress. With the invariants of M, I_2 and I_3,
+S(M) is 1 if neighbours lie on all sides or on one side, and falls smoothly to 0 if they lie on a line or are missing,
+where M has no inverse. With the invariants I_2 and I_3 of M,
 
     H = 3 I_3 / I_2 (in the plane 2 det M / tr M),   S = smoothstep((H - 0.2) / 0.3).
 
-H is 1 inside, about 0.6 at a flat surface and 0 on a line. Wherever S > 0, det M is at least 0.008, so that the inverse
-needs no guard of its own.
+H is 1 inside, about 0.6 at a flat surface and 0 on a line. Where S > 0, det M is at least 0.008, so that the inverse
+needs no guard.
 
-Users' functions may take velocity gradients S G, with sums over fluid alone. They are exact for linear velocity fields,
-also at a free surface, and 0 in spray.
-
-Walls without slip: `cortado.sph.stress_forces`.
+Users' functions may take velocity gradients S G, with sums over fluid alone. Walls without slip:
+`cortado.sph.stress_forces`.
 """
 
 from collections.abc import Callable
@@ -50,24 +48,20 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernel
-from cortado.particles.wall_terms import solid_kernel
 from cortado.sph.formula import theta_of
 from cortado.sph.moment_functions import cross_terms_function, moment_functions
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.stress_forces import Law, contact_functions, newtonian_law, stress_sums, stress_work, work_types
+from cortado.sph.stress_forces import Law, contact_functions, newtonian_law, stress_sums, work_types
 
 LEAST_VISCOSITY = 1e-12
-"""The number added to viscosities [Pa s], so that the mean of their reciprocals is finite if a viscosity is 0."""
+"""Number added to viscosities [Pa s], so that the mean of their reciprocals is finite."""
 SLOWEST = 1e-6
-"""Shear rate [1/s] whose square is added to the squared shear rate of the fluid, so that a law has a derivative at
-rest."""
+"""Shear rate [1/s] whose square is added to the squared shear rate, so that a law has a derivative at rest."""
 EMPTY, FULL = 0.2, 0.5
-"""H below which a particle has no viscous stress (S = 0), and above which it has the full stress (S = 1)."""
 
 
 @cache
 def fluidity_function(precision: Precision) -> Any:
-    """Make the Warp function 1 / mu of a viscosity mu, kept finite by `LEAST_VISCOSITY`."""
     real = precision.real
     least = wp.constant(real(LEAST_VISCOSITY))
 
@@ -80,14 +74,12 @@ def fluidity_function(precision: Precision) -> Any:
 
 @cache
 def part_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
-    """Make the Warp functions of S, a particle's part in the stress, and of M where S is not 0."""
     real, matrix, moments = precision.real, precision.matrix, moment_functions(precision, dimension)
     fullness, smoothstep = moments.fullness, moments.smoothstep
     empty, full = wp.constant(real(EMPTY)), wp.constant(real(FULL))
 
     @wp.func
     def part(M: matrix) -> real:
-        """Return S, a particle's part in the viscous stress by its moments M: 0 in spray and 1 within the fluid."""
         return smoothstep(fullness(M), empty, full)
 
     @wp.func
@@ -103,7 +95,6 @@ def part_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
 
 @cache
 def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
-    """Make the Warp function of the traction T by M, A, mu and C, in a Warp module."""
     real, matrix, regular = precision.real, precision.matrix, part_functions(precision, dimension)[1]
     inverse = moment_functions(precision, dimension).inverse
 
@@ -117,8 +108,8 @@ def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
 
 
 def stress_of_particle(precision: Precision, dimension: int, law: Law, module: Any) -> Callable[..., Any]:
-    """Make the function of T and mu of a particle, in 2 or 3 dimensions, with a law of viscosity. mu follows from A,
-    and T from ``A_u``, the sum A of the resisted velocities; ``control`` is C."""
+    """Make the function of T and mu of a particle in 2 or 3 dimensions. The function computes mu from A, and T from
+    ``A_u``, the sum A of the resisted velocities; ``control`` is C."""
     real, matrix, fluidity = precision.real, precision.matrix, fluidity_function(precision)
     part, regular = part_functions(precision, dimension)
     inverse, traction = moment_functions(precision, dimension).inverse, traction_function(precision, dimension, module)
@@ -144,8 +135,7 @@ def stress_of_particle(precision: Precision, dimension: int, law: Law, module: A
 @cache
 def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
     """Make the Warp functions of the sums over neighbours of the diagonal of M, its entries yz, xz and xy, the rows of
-    A, and R, with walls without slip if fluid ``sticks``. The adjoint function turns adjoints of M, A and R into
-    adjoints of a particle's x, v and mu."""
+    A, and R, with derivatives. Walls have no slip if fluid ``sticks``."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
@@ -158,18 +148,15 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
-        """Return the entries yz, xz and xy of the symmetric matrix a b^T + b a^T."""
         return cross_terms(a, b) + cross_terms(b, a)
 
     @wp.func
     def terms(w: real, y: vector, v: vector, thin: real):
-        """Return the terms of M in two parts, of the rows of A, and of R, for a weight w and a fluidity."""
         z = w * y
         return wp.cw_mul(z, y), cross_terms(z, y), v[0] * z, v[1] * z, v[2] * z, wp.dot(z, y) * thin
 
     @wp.func
     def changes(w: real, w_dot: real, y: vector, u: vector, v: vector, v_dot: vector, thin: real, thin_dot: real):
-        """Return the changes of the terms if y changes by u."""
         z, z_dot, even = w * y, w_dot * y + w * u, w_dot * y + real(2.0) * w * u
         others = w_dot * cross_terms(y, y) + w * even_terms(y, u)
         x_row, y_row, z_row = v[0] * z_dot + v_dot[0] * z, v[1] * z_dot + v_dot[1] * z, v[2] * z_dot + v_dot[2] * z
@@ -188,8 +175,6 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
 
     @typed
     def wall_moments_tangent(x_ij, x_dot_ij, v_ij, v_dot_ij, mu_i, mu_dot_i, least, foot, turn_dot, s) -> six:
-        """Return the tangent of a wall particle's terms. The tangent of y comes from the wall's rotation and from
-        relative motion."""
         w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
         u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
         w_dot, thin = wp.dot(hold_gradient(x_ij, foot, least, s), rest), fluidity(mu_i)
@@ -217,7 +202,6 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
     def moments_back(
         x_ij, v_ij, mu_i, mu_j, M_bar_i, M_bar_j, A_bar_i, A_bar_j, R_bar_i, R_bar_j, least, s
     ) -> tuple[vector, vector, real]:
-        """Return a pair's part in the adjoints of x, v and mu of i, for adjoints of M, of A and of R."""
         w, square, thin_i = weight(x_ij, s), wp.dot(x_ij, x_ij), fluidity(mu_i)
         A_bar, rub = A_bar_i + A_bar_j, R_bar_i * fluidity(mu_j) + R_bar_j * thin_i
         turned, pulled = (M_bar_i + M_bar_j) * x_ij, A_bar * x_ij
@@ -246,12 +230,11 @@ def moments_work(d: Discretisation) -> Any:
 
 @cache
 def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> SimpleNamespace:
-    """Make the kernels of the viscous stress in 2 or 3 dimensions, with a law of viscosity; with ``sticks`` walls have
-    no slip. The kernels ``moments`` compute M, A and R. From these ``stress`` computes T and mu: mu follows from A, and
-    T from ``A_u`` of resisted velocities. ``force`` computes the acceleration, and has two adjoints: of T and mu, and
-    of particles.
+    """Make the kernels of the viscous stress in 2 or 3 dimensions, with a law of viscosity. ``moments`` computes M, A
+    and R; ``stress`` computes T and mu. ``force`` computes the acceleration, and has two adjoints: of T and mu, and of
+    particles.
 
-    In kernels ``control`` is C, and ``theta`` are the parameters of the law. ``eta`` is the mu of the formulas above,
+    In kernels ``control`` is C, and ``theta`` the parameters of the law. ``eta`` is the mu of the formulas above,
     because ``mu`` in a step is the viscosity of the fluid.
     """
     precision = discretisation.precision
@@ -295,16 +278,9 @@ def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sti
     return SimpleNamespace(moments=moments, stress=stress, force=force)
 
 
-def stress_solid_kernels(discretisation: Discretisation) -> list[Callable[[], Any]]:
-    """Return makers of the kernels that add viscous adjoints to those of moving solids without slip."""
-    works = (moments_work, stress_work)
-    return [partial(solid_kernel, discretisation, "viscous_stress", work, rubs=True) for work in works]
-
-
 @cache
 def gradient_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
-    """Make the Warp functions of a particle's velocity gradient [1/s] and shear rate [1/s]. The functions take sums
-    over the particle's neighbours, M = sum s_ij x_ij x_ij^T and A = sum s_ij v_ij x_ij^T."""
+    """Make the Warp functions of a particle's velocity gradient [1/s] and shear rate [1/s] from its sums M and A."""
     real, matrix = precision.real, precision.matrix
     part, regular = part_functions(precision, dimension)
     inverse, slowest = moment_functions(precision, dimension).inverse, wp.constant(real(SLOWEST**2))
@@ -324,29 +300,23 @@ def gradient_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
 
 
 class VelocityGradients:
-    """The sums M and A of the particles of one solver, with their tangents and adjoints."""
-
     def __init__(self, setting: Setting):
         self._setting = setting
         self._kernels = stress_kernels(setting.discretisation, setting.scene.dimension, newtonian_law(), False).moments
         self._sums = self._arrays("", setting.discretisation.taped)
 
     def measure(self, step: StepContext) -> dict[str, wp.array]:
-        """Write the sums of a step, and return them by the names of kernel arguments."""
         step.launch(self._kernels.forward, self._sums, least=0.0)
         return self._sums
 
     def tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
-        """Write the tangents of the sums, and return the tangents together with the sums."""
         step.launch(self._kernels.tangent, self._sums, self._dots, *dot.named, least=0.0)
         return {**self._sums, **self._dots}
 
     def known(self) -> dict[str, wp.array]:
-        """Return the sums of the last step, and arrays for their adjoints."""
         return {**self._sums, **self._bars}
 
     def adjoint(self, step: StepContext, bar: Adjoints) -> None:
-        """Add to the adjoints of particles, given the adjoints of the sums."""
         step.launch(self._kernels.adjoint, self._bars, *bar.named, least=0.0)
 
     @cached_property

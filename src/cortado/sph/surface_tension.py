@@ -1,23 +1,19 @@
-"""Surface tension: by curvature (`cortado.sph.curvature`), and with PCISPH as a force of pairs, a stress (the
-continuum surface stress of Lafaurie et al. 1994, between particles):
+"""Surface tension: by curvature (`cortado.sph.curvature`), and with PCISPH as a force of pairs, a stress (continuum
+surface stress, Lafaurie et al. 1994):
 
     n_i = (1 / N) sum_j (1 - s)^2 x_ij,   s = |x|^2 / h^2
     S_i = (|n_i|^2 1 - PART n_i n_i) / sqrt(1 + |n_i|^2)
     m_i s^d a_i = -(sigma / Gamma) sum_j s (1 - s)^2 (S_i + S_j) x_ij
 
-The mass of a particle is m_i s^d, with the spacing s of the lattice at rest. The vector n points out of the fluid. Its
-size is 1 in the outermost layer of a cut lattice, and about 0 inside. S pulls along the surface, and with PART below 1
-also a little across it. With a stress only along the surface particles detach, and with an isotropic stress the fluid
-acts like a solid. The force of a pair grows with its distance up to 0.65 h, so that particles of the surface do not
-clump.
+The mass of a particle is m_i s^d, with the spacing s of the lattice at rest. The vector n points out of the fluid; |n|
+is 1 in the outermost layer of a cut lattice, by the choice of N, and about 0 inside. S pulls along the surface, and
+with PART below 1 a little across it, so that particles do not detach. The force of a pair grows with distance up to
+0.65 h, so that particles of the surface do not clump. Gamma is the tension of the cut lattice without Gamma, times
+`RELAXED`.
 
-N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis. Gamma is the tension of
-that surface without it, times `RELAXED`.
-
-Forces of a pair are opposite, so that momentum is conserved; they are not parallel to the pair, so that angular
-momentum is conserved only approximately. Neither these forces nor the force by curvature is the gradient of an energy:
-fluids with very low viscosity gain energy from them, see `LEAST_VISCOSITY`. Walls do not take part in either force, as
-if air were between: a surface meets walls at 180 degrees.
+Forces of a pair are opposite, but not parallel to the pair: momentum is conserved, angular momentum only approximately.
+Neither this force nor that by curvature is the gradient of an energy: fluids with very low viscosity gain energy, see
+`LEAST_VISCOSITY`. Walls do not take part in either force: a surface meets walls at 180 degrees.
 """
 
 from collections.abc import Callable
@@ -42,7 +38,6 @@ from cortado.sph.curvature import CurvatureConstants, curvature_kernels, entries
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 
 PART = 2.0 / 3.0
-"""The relative amount by which the stress across the surface is less than along the surface; see above."""
 
 
 def tension_term(discretisation: Discretisation) -> Callable[..., Any]:
@@ -52,7 +47,6 @@ def tension_term(discretisation: Discretisation) -> Callable[..., Any]:
 
     @wp.func
     def pull(x: vector, h2: real) -> real:
-        """Return s (1 - s)^2, where ``h2`` is h^2."""
         s = wp.dot(x, x) / h2
         d = wp.max(one - s, real(0.0))
         return s * d * d
@@ -77,25 +71,18 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
     total = fluid_sum(discretisation)(tension_term(discretisation))
     tangent = made_tangent(discretisation, tension_term, modules[1])
     adjoint = made_adjoint(discretisation, tension_term, modules[2])
-    given: dict[str, Any] = {
-        "before": "acceleration_in",
-        "times": "scale",
-        "numbers": ["scale"],
-        "written": ["normals"],
-    }
-    sums = total, tangent, adjoint
-    return sum_kernels("accelerate", modules, sums, "acceleration", **given, sigma="surface_tension")
+    sums, named = (total, tangent, adjoint), {"before": "acceleration_in", "times": "scale", "sigma": "surface_tension"}
+    return sum_kernels("accelerate", modules, sums, "acceleration", numbers=["scale"], written=["normals"], **named)
 
 
 @cache
 def normal_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the surface normals n of particles; ``inverse`` is 1 / N."""
+    """Make the kernels of the surface normals n; ``inverse`` is 1 / N."""
     real, vector, neighbourhood = discretisation.types
     one = wp.constant(real(1.0))
 
     @fluid_sum(discretisation)
     def arrows(x_ij: vector, s: neighbourhood) -> vector:
-        """Return a pair's term (1 - s)^2 x in the normal of a particle."""
         d = wp.max(one - wp.dot(x_ij, x_ij) / (s.support * s.support), real(0.0))
         return (d * d) * x_ij
 
@@ -103,8 +90,7 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
     @tangent_of(arrows)
     @fluid_sum(discretisation)
     def change(x_ij: vector, v_ij: vector, s: neighbourhood) -> vector:
-        """Return the derivative of a pair's term along v. The derivative is symmetric, so it serves both the tangent
-        and the adjoint."""
+        """Return the derivative of a pair's term along v, which is symmetric and serves both tangent and adjoint."""
         h2 = s.support * s.support
         d = wp.max(one - wp.dot(x_ij, x_ij) / h2, real(0.0))
         return (d * d) * v_ij - (real(4.0) * d * wp.dot(x_ij, v_ij) / h2) * x_ij
@@ -119,8 +105,6 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
 
 
 class CurvatureTension:
-    """The force of surface tension by curvature; its arrays are those of the last step."""
-
     shares: tuple[str, ...] = ("surface_tension",)
     batches = True
 
@@ -130,7 +114,6 @@ class CurvatureTension:
         kinds = entries(layout.precision)
         self._of = layout.arrays(requires_grad=discretisation.taped, **kinds)
         self._change = layout.arrays(**kinds, r=kinds["g"])
-        """Arrays of tangents or adjoints, and r."""
         self._dot, self._bar = ({f"{name}_{kind}": self._change[name] for name in kinds} for kind in ("dot", "bar"))
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
@@ -154,19 +137,14 @@ class CurvatureTension:
 
 
 RELAXED = {2: 1.1, 3: 1.25}
-"""By dimension: the ratio of the tension of a surface after flow, measured in drops, to the tension of a cut lattice;
-see docs/records/surface_tension.md."""
+"""By dimension: ratio of the surface's tension after flow to that of a cut lattice; docs/records/surface_tension.md."""
 LEAST_SUPPORT = {"pairs": 1.8, "curvature": 2.5}
 """In spacings: with a smaller support drops fall apart into pairs, and curvatures are too noisy."""
 LEAST_VISCOSITY = 0.05
-"""Over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid. With the force of pairs, drops 16 to 64
-particles across are stable with this viscosity. With the force by curvature, drops 24 and 48 across lose energy, but
-with 0.03 not all of them do."""
+"""Least viscosity of stable drops, over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid."""
 
 
 class SurfaceTension:
-    """The force of surface tension by pairs; its arrays are those of the last step."""
-
     shares: tuple[str, ...] = ("surface_tension",)
     batches = True
 
@@ -215,7 +193,7 @@ def tension_constants(spacing: float, support: float, dimension: int) -> tuple[f
 
 
 def force(setting: Setting) -> Force:
-    """Make the surface tension of a scene, None without any; warn if it is likely to tear the fluid apart."""
+    """Make the surface tension of a scene; warn if it is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
     form = "pairs" if scene.solver.kind == "pcisph" else "curvature"
     support, least = scene.discretisation.support, LEAST_SUPPORT[form]

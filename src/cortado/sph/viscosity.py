@@ -4,11 +4,10 @@ stress:
     a_i = kappa / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + mu_i sum_b V w_b phi(x_ib, v_ib)),
     phi(x, v) = v . x / (|x|^2 + 0.01 h^2) G(x),   kappa = 2 (d + 2).
 
-The gradient of the smoothing kernel is G = a x. Functions call a the ``slope``, and 1 / (|x|^2 + 0.01 h^2) ``per_size``
-(`cortado.particles.neighbourhood.pair_functions`). A pair has the dynamic viscosity mu_ij = 2 mu_i mu_j / (mu_i + mu_j)
-[Pa s]. This harmonic mean keeps the shear stress continuous between fluids (Cleary and Monaghan 1999). The sum over b
-is over walls without slip; v_ib is the velocity relative to the wall. phi is odd in (x, v) together and central, so
-that momentum and angular momentum are conserved.
+The kernel's gradient is G = a x; functions call a the ``slope``, and 1 / (|x|^2 + 0.01 h^2) ``per_size``. A pair has
+the dynamic viscosity mu_ij = 2 mu_i mu_j / (mu_i + mu_j) [Pa s], which keeps the shear stress continuous between fluids
+(Cleary and Monaghan 1999). The sum over b is over walls without slip; v_ib is the velocity relative to the wall. The
+function phi is odd in (x, v) together and central, so that momentum and angular momentum are conserved.
 """
 
 from functools import cache
@@ -31,8 +30,8 @@ from cortado.sph.viscous_stress import ViscousStress, stress_of
 
 @cache
 def pairwise(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of the pair force phi(x, v): ``force``, ``tangent``, and ``adjoint_x`` and ``adjoint_v``,
-    the transposed derivatives with respect to x and v applied to a vector."""
+    """Make the Warp functions of phi(x, v): ``force``, ``tangent``, and ``adjoint_x`` and ``adjoint_v``, the transposed
+    derivatives with respect to x and v applied to a vector."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     slope, slope_change, per_size = pair.slope, pair.slope_change, pair.per_size
@@ -65,9 +64,8 @@ def pairwise(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
-    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration; all walls slip freely unless
-    fluid ``sticks`` to some. The derivatives are those of the sum over the fluid: `viscosity_term` has those of
-    walls."""
+    """Make the kernels of the viscous acceleration; without ``sticks`` all walls slip freely. The derivatives are those
+    of the sum over the fluid; `viscosity_term` has those of walls."""
     real, vector, neighbourhood = discretisation.types
     phi = pairwise(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
@@ -77,7 +75,6 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
 
     @wp.func
     def part(a: real, b: real) -> real:
-        """Return b / (a + b), and half where both are 0."""
         return wp.where(a + b > tiny, b * reciprocal(a + b), real(0.5))
 
     @wp.func
@@ -141,7 +138,6 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
     def force_adjoint(
         x_ij, v_ij, n_i, n_j, m_i, m_j, mu_i, mu_j, bar_i, bar_j, kappa, s
     ) -> tuple[vector, vector, real, real, real]:
-        """Return a pair's terms in the adjoints of x, v, n, m and mu of i, from the sums of i and of j."""
         w_i = bar_i * reciprocal(m_i)
         w_ij = w_i - bar_j * reciprocal(m_j)
         per_volume = kappa * s.volume * reciprocal(n_i) * reciprocal(n_j)
@@ -162,7 +158,6 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
 
 @cache
 def viscosity_term(discretisation: Discretisation) -> WallTerm:
-    """Make the wall term of the viscous acceleration by a solid's walls; kappa is its first constant."""
 
     def made(d: Discretisation) -> Any:
         (real, vector, neighbourhood), phi = d.types, pairwise(d).force
@@ -179,8 +174,6 @@ def viscosity_term(discretisation: Discretisation) -> WallTerm:
 
 
 class Viscosity:
-    """A viscous force between neighbours, and with walls."""
-
     shares: tuple[str, ...] = ()  # viscosities reach particles through the mixture, which has the phases' adjoints
     batches = True
 

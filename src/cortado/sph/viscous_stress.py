@@ -1,18 +1,14 @@
-"""The viscous force as a stress (`cortado.sph.stress_kernels`): explicit, or implicit at the end of a step, which does
-not limit the time step.
-
-T_i and mu_i of a particle are computed from sums over its neighbours, so that reverse mode goes from T_i and mu_i to
-these sums.
+"""The viscous force as a stress (`cortado.sph.stress_kernels`): explicit, or implicit at the end of a step without
+limit of the time step.
 
 Let a be the acceleration by all other forces, and g(v) the acceleration by the stress of fluid with velocities v, with
 M and mu of the velocities at the start. The acceleration at the end of a step is a' of
 
     a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y),
 
-which `cortado.sph.moment_functions` solves to round-off. B is symmetric and positive with respect to the product sum_i
-m_i a_i . b_i. mu belongs to the velocities v at the start, the stress to u = v + dt a' at the end. Derivatives are
-those of the exact solution and do not depend on the iterations. Tangent and adjoint are one more solve with B each,
-because B is symmetric in the product weighted with masses.
+which `cortado.sph.moment_functions` solves to round-off. B is symmetric and positive in the product sum_i m_i a_i .
+b_i. The viscosity mu belongs to the velocities v at the start, the stress to u = v + dt a' at the end. Derivatives are
+those of the exact solution: tangent and adjoint are one more solve with B each.
 """
 
 from collections.abc import Sequence
@@ -33,7 +29,7 @@ from cortado.errors import MissingDerivativeError
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.particles.state import Layout
-from cortado.particles.wall_terms import WallTerm, WorkMaker
+from cortado.particles.wall_terms import WallTerm, WorkMaker, solid_kernel
 from cortado.scene.parameters import Parameter
 from cortado.scene.scene import Scene
 from cortado.scene.stability import is_implicit
@@ -43,11 +39,10 @@ from cortado.sph.free_friction import FreeFriction
 from cortado.sph.moment_functions import ConjugateGradients, round_off
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import Law, newtonian_law, stress_couple_work, stress_sums, stress_work
-from cortado.sph.stress_kernels import moment_sums, stress_kernels, stress_solid_kernels, traction_function
+from cortado.sph.stress_kernels import moment_sums, moments_work, stress_kernels, traction_function
 
 CLOSEST = 0.25
-"""In spacings: distance below which the pull of walls without slip does not increase, see
-`cortado.sph.stress_forces`."""
+"""In spacings: distance below which the pull of walls without slip is constant (`cortado.sph.stress_forces`)."""
 
 
 class ViscousStress:
@@ -57,27 +52,23 @@ class ViscousStress:
     batches = True
 
     def __init__(self, setting: Setting, law: Law | None = None, parameters: Sequence[Parameter] = ()):
-        """Prepare the force with a ``law`` of viscosity and its parameters; by default a Newtonian fluid's."""
+        """Prepare the force with a ``law`` of viscosity and its parameters, by default Newtonian."""
         scene, discretisation, layout = setting.scene, setting.discretisation, setting.layout
         cut, self._law = scene.discretisation, law or newtonian_law()
         self._made_for = (discretisation, scene.dimension, self._law, scene.sticks)
-        """The choices for which the kernels are made."""
         self._kernels, self._layout = stress_kernels(*self._made_for), layout
         control = stress_control(discretisation.smoothing, cut.spacing, cut.support_radius, scene.dimension)
         self.constants: dict[str, Any] = {"control": control, "least": CLOSEST * cut.spacing}
         self.free = FreeFriction(setting, self.constants)
-        """Friction with free bodies; only an implicit solve has it."""
         self._packed = Packed(parameters, layout, discretisation.taped)
         self._of = self.arrays("M", "A", "R", "T", "eta", taped=discretisation.taped)
         self._change = self.arrays("M", "A", "A_u", "R", "T", "eta")
-        """Tangents or adjoints."""
         sums = (stress_work, "acceleration_bar", "rub"), (stress_couple_work, "couple_bar", "couple")
         self.wall_action, self.wall_couple = (
             StressWalls(setting, self, *one) if scene.sticks else None for one in sums
         )
 
     def arrays(self, *names: str, taped: bool = False) -> dict[str, wp.array]:
-        """Make arrays (n,) of particles by name, all 0: R and eta are numbers, and all others matrices."""
         precision = self._layout.precision
         kinds = {name: precision.real if name in ("R", "eta") else precision.matrix for name in names}
         return self._layout.arrays(requires_grad=taped, **kinds)
@@ -104,8 +95,8 @@ class ViscousStress:
         step.launch(self._kernels.force.tangent, *known, acceleration_in_dot=before, acceleration_dot=after)
 
     def _stress_along(self, step: StepContext, dot: Tangents, resisted: Named | None = None) -> dict[str, wp.array]:
-        """Write the tangents of T and mu. Velocities other than those at the start may be ``resisted``, given as ``v``
-        with their tangent, and their A as ``A_u``."""
+        """Write the tangents of T and mu; ``resisted`` has other resisted velocities ``v``, their tangent and
+        ``A_u``."""
         change, known = {f"{name}_dot": a for name, a in self._change.items()}, (*dot.named, self.constants, self._of)
         free = self.free.dots
         free.begin(step, dot)
@@ -136,9 +127,9 @@ class ViscousStress:
         self._give(step, bar, 1, *known)
 
     def back_to_sums(self, step: StepContext, bar: Adjoints, bars: dict[str, wp.array], now: Named) -> None:
-        """Turn the adjoints of T and mu into adjoints of the sums, and these into adjoints of particles and solids;
-        ``now`` has the arrays of `resisted`. ``bars`` has ``v_bar``, to which the adjoint of its velocities is added,
-        and arrays for the adjoints of M, R, A and A_u."""
+        """Turn the adjoints of T and mu into adjoints of the sums, and these into adjoints of particles and solids.
+        ``now`` has the arrays of `resisted`, ``bars`` those of the adjoints of M, R, A and A_u and of the resisted
+        velocities."""
         theta = {"theta": self._packed.theta(step), "theta_bar": self._packed.shares}
         step.launch(self._kernels.stress.adjoint, theta, bars, now, *bar.named, self.constants, self._of)
         at_the_start, A_bar = now["v"] is step.fields["v"], bars["A_u_bar"]
@@ -160,26 +151,21 @@ class ViscousStress:
         return {f"{name}_bar": array for name, array in self.arrays("M", "R").items()}
 
     def _give(self, step: StepContext, bar: Adjoints, which: int, *known: Named) -> None:
-        """Add to the adjoints of moving solids, given adjoints of the sums (``which`` 0) or of the acceleration
-        (``which`` 1)."""
+        """Add to adjoints of moving solids, given adjoints of the sums (``which`` 0) or accelerations (1)."""
         if self._made_for[-1]:
-            constants, kernels = (
-                (self.constants["least"], self.constants["control"]),
-                stress_solid_kernels(self._made_for[0]),
-            )
-            bar.solids.add(step.launch, kernels[which], *known, self._of, constants=constants)
+            work = (moments_work, stress_work)[which]
+            kernel = partial(solid_kernel, self._made_for[0], "viscous_stress", work, rubs=True)
+            constants = self.constants["least"], self.constants["control"]
+            bar.solids.add(step.launch, kernel, *known, self._of, constants=constants)
 
     def resisted(self, step: StepContext) -> dict[str, wp.array]:
-        """Return T, eta, the velocities ``v`` that friction resists in the step, and the sums A of these velocities as
-        ``A_u``."""
+        """Return T, eta, the velocities ``v`` that friction resists in the step, and their sums A as ``A_u``."""
         return {**{name: self._of[name] for name in ("T", "eta")}, "A_u": self._of["A"], "v": step.fields["v"]}
 
     def resisted_tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
-        """Return the tangents of T, eta and the resisted velocities, after forward mode of the step."""
         return {**{f"{name}_dot": self._change[name] for name in ("T", "eta")}, "v_dot": dot.fields["v"]}
 
     def resisted_adjoint(self, step: StepContext, v_bar: wp.array, bar: Adjoints, v_star_bar: wp.array) -> None:
-        """Add the adjoint of the resisted velocities to the adjoint of the velocities at the start."""
         add(v_bar, bar.fields["v"])
 
 
@@ -187,8 +173,8 @@ class StressWalls:
     """The sums by which walls act on particles through viscous stress: a `cortado.sph.density.WallAction`."""
 
     def __init__(self, setting: Setting, stress: ViscousStress, work: WorkMaker, bar: str, name: str):
-        """Take ``work`` and ``bar``, the arguments of a `WallTerm`: `stress_work` for accelerations,
-        `stress_couple_work` for their couples; and the ``name`` of this action in the friction with free bodies."""
+        """Take ``work`` and ``bar`` of a `WallTerm`, and the ``name`` of the action in the friction with free
+        bodies."""
         self._stress, self._layout, self._name = stress, setting.layout, name
         term = WallTerm(setting.discretisation, "viscous_stress", work, bar, rubs=True)
         self._sums = WallSums(term, setting.layout, (stress.constants["least"], stress.constants["control"]))
@@ -217,7 +203,6 @@ class StressWalls:
 
     @cached_property
     def _bars(self) -> dict[str, wp.array]:
-        """Make arrays of adjoints on first use, because runs without derivatives need none."""
         own = self._stress.arrays("M", "A", "A_u", "R", "T", "eta")
         v_bar = self._layout.arrays("_bar", v=self._layout.precision.vector)
         return {**{f"{name}_bar": array for name, array in own.items()}, **v_bar}
@@ -225,8 +210,6 @@ class StressWalls:
 
 @cache
 def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> tuple[Any, Any]:
-    """Make the kernel of the stress T for given velocities with fixed M and mu, and the kernel of the implicit operator
-    B."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     module = discretisation.module(False, f"implicit_viscosity_{law.topic}{dimension}d" + "_no_slip" * sticks)
@@ -243,7 +226,6 @@ def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, s
 
     @particle_kernel(module, "product share", [over(force, "total", mu="eta")], numbers=constants)
     def multiply(total: vector, time_step: real, v_i: vector, m_i: real) -> tuple[vector, real]:
-        """Return B v of the implicit viscosity, and each particle's share in the product with v."""
         found = v_i - time_step * total
         return found, m_i * wp.dot(v_i, found)
 
@@ -252,12 +234,11 @@ def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, s
 
 @cache
 def implicit_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of implicit viscosity that need no neighbours, in a precision."""
     real, vector, module = precision.real, precision.vector, kernel_module(f"implicit_step_derivative_{precision.name}")
 
     @particle_kernel(module, "u")
     def predict(time_step: real, v_i: vector, acceleration_i: vector) -> vector:
-        """Return u = v + dt a. Given the tangents of v and dt instead, it returns the tangent of u for constant a."""
+        """Return u = v + dt a; given the tangents of v and dt, the tangent of u for constant a."""
         return v_i + time_step * acceleration_i
 
     @particle_kernel(module, "r")
@@ -270,56 +251,46 @@ def implicit_kernels(precision: Precision) -> SimpleNamespace:
 
     @particle_kernel(module, "+v_bar +time_step_bar")
     def end_adjoint(acceleration_i: vector, u_bar_i: vector) -> tuple[vector, real]:
-        """Return the adjoints of v and dt, given the adjoint of u."""
         return u_bar_i, wp.dot(u_bar_i, acceleration_i)
 
     return by_name(predict, weigh, unweigh, end_adjoint)
 
 
 MOST = 1_000
-"""Greatest number of iterations of a solve."""
 
 
 class Solve(ConjugateGradients):
-    """A solve by conjugate gradients for the implicit viscosity of one solver's particles."""
-
     name, most = "viscous_iterations", MOST
 
     def __init__(self, layout: Layout, operator: tuple[Any, Any], free: FreeFriction):
-        """Prepare solves with an ``operator``: the kernels that `operator_kernels` gives, and the friction with free
-        bodies."""
         precision = layout.precision
         super().__init__(layout, precision.vector, round_off(precision), MOST)
         (self._pull, self._multiply), self._free = operator, free
 
     def __call__(self, step: StepContext, known: Any, r: wp.array, y: wp.array) -> None:
-        """Write to ``y`` the solution of B y = r, (n,) vectors both, and overwrite ``r``; ``known`` has arguments of
-        B's kernels. The system includes the rows of bodies."""
+        """Solve B y = r, (n,) vectors both, and overwrite ``r``; ``known`` has arguments of B's kernels."""
 
         self.solve(step, partial(self._apply, step, known), step.fields["m"], r, y, self._free.rows)
 
     def _apply(self, step: StepContext, known: Any, p: wp.array, found: Named) -> None:
-        """Write B p."""
         step.launch(self._pull, *known, v=p)
         self._free.lean(step, known, p)
         step.launch(self._multiply, *known, found, v=p)
         self._free.multiply(step, known, p, found)
 
     def respond(self, step: StepContext, known: Any, still: wp.array, r: wp.array) -> None:
-        """Add to ``r`` the product of B with velocities of bodies alone; velocities of particles are 0, given as
-        ``still``."""
+        """Add to ``r`` the product of B with velocities of bodies alone; ``still`` are zero velocities of particles."""
         found = {name: self._own[name] for name in ("product", "share")}
         self._apply(step, known, still, found)
         add(found["product"], r)
 
 
 class ImplicitViscousStress(ViscousStress):
-    """The viscous stress of the velocities at the end of a step; this force comes after all others."""
+    """The viscous stress of the velocities at the end of a step, which comes after all other forces."""
 
     is_last = True
 
     def __init__(self, setting: Setting, law: Law | None = None, parameters: Any = ()):
-        """Prepare the force with the arguments of `ViscousStress`."""
         if setting.discretisation.taped:
             raise MissingDerivativeError("implicit viscosity has no tape: try gradients.Exact.")
         super().__init__(setting, law, parameters)
@@ -330,19 +301,14 @@ class ImplicitViscousStress(ViscousStress):
         vectors = layout.arrays(**dict.fromkeys(("u", "r", "y", "still"), layout.precision.vector))
         self._u, self._r, self._y, self._still = vectors.values()
         self._at_end = self.arrays("A", "T")
-        """The sums A and stresses T of the velocities u at the end."""
         self._after: Any = None
-        """The acceleration a' of the last step."""
         self._after_dot: Any = None
-        """The tangent of a', after forward mode of the step."""
 
     @property
     def iterations(self) -> NDArray:
-        """Return the iterations (members,) of the last solve, of a run or of a derivative."""
         return np.asarray(self.solve.count.numpy())
 
     def _known(self, *more: Any) -> tuple[Any, ...]:
-        """Return arguments of the kernels of B, with A and T of the velocities u."""
         return *more, self.constants, self._at_end, self._of
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
@@ -362,7 +328,7 @@ class ImplicitViscousStress(ViscousStress):
         self._after = after
 
     def _find_end(self, step: StepContext) -> None:
-        """Write the velocities u = v + dt a' at the end of the step, and their velocity sum A and stress T."""
+        """Write the velocities u = v + dt a' at the end of the step, and their A and T."""
         step.launch(self._implicit.predict, acceleration=self._after, u=self._u)
         self.free.hang(step, self._u)
         step.launch(self._pull, *self._known(), v=self._u)
@@ -404,7 +370,7 @@ class ImplicitViscousStress(ViscousStress):
         self.free.bars.finish(step, bar, v_bar)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array:
-        """Apply the adjoint of the force, and return the adjoint of the acceleration by all other forces."""
+        """Apply the adjoint of the force, and return that of the acceleration by all other forces."""
         step.launch(self._implicit.weigh, acceleration_bar=acceleration_bar, r=self._r)
         if self.free.rows:
             self.free.bars.take(step, bar)
@@ -422,5 +388,4 @@ class ImplicitViscousStress(ViscousStress):
 
 
 def stress_of(scene: Scene) -> type[ViscousStress]:
-    """Return the class of the viscous stress in a scene, explicit or implicit."""
     return ImplicitViscousStress if is_implicit(scene) else ViscousStress
