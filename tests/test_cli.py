@@ -563,7 +563,7 @@ def test_another_precision_or_picture_is_not_resumed(optimise):
 
 def test_run_and_optimise_do_not_go_on_with_each_other(run, optimise):
     run("--steps", 1)
-    assert_refused(optimise("--resume", out="dam"), "`cortado run` wrote", "`cortado optimise` cannot go on")
+    assert_refused(optimise("--resume", out="dam"), "a run of `cortado run`", "`cortado optimise` cannot resume")
     _, _, err = optimise(out="dam")
     assert "--overwrite" in err and "--resume" not in err
 

@@ -187,7 +187,7 @@ def test_the_error_is_that_at_the_measured_times(recorded, cortado_command, head
         ("time [ms],gauge.height\n0,1\n", "but must have time [s]"),
         ("gauge.height\n1\n", "but must have time [s], and some of gauge.height"),
         ("time;gauge.height\n0,5;1\n", "has semicolons between its columns, but must have commas"),
-        ("time\n1\n", "has times alone"),
+        ("time\n1\n", "has only times"),
         ("time,gauge.height\n2,1\n", "has no value of gauge.height within the run"),
         ("time,gauge.height\n0.1,x\n", "line 2, gauge.height is 'x'"),
         ("", "must have a line of different names"),

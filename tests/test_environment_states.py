@@ -252,11 +252,11 @@ def test_states_of_others_are_refused_in_a_sentence(batches):
         (lambda: FluidEnv(wider()).restore(own), "state is of another scene than that of 1 scene of the task Carry"),
         (lambda: single.restore({"positions": 0}), "state is a table, but must be one that the save of an"),
         (lambda: single.reset(options={"state": 3}), "state is 3, but must be one that the save of an"),
-        (lambda: single.reset(seed=1, options={"state": own}), "seed is given, but must be left out beside a state"),
+        (lambda: single.reset(seed=1, options={"state": own}), "seed is given, but must be left out with a state"),
         (lambda: single.reset(options={"goal": 0.3}), "options has 'goal', but must have state alone"),
         (lambda: envs.reset(options={"state": state, "reset_mask": np.ones(2, bool)}), "reset_mask is given, but must"),
         (lambda: splash.save(), r"save is called before the first reset\(\), but must come after it"),
-        (lambda: state[[2]], r"numbers are \[2\], but must be from 0 to 1, at least one"),
+        (lambda: state[[2]], r"numbers are \[2\], but must be one or more from 0 to 1"),
         (lambda: state[[]], "numbers are"),
         (lambda: state[1.5], "numbers are 1.5"),
     ]:

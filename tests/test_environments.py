@@ -297,7 +297,7 @@ class OfOtherSteps(Carry):
 @pytest.mark.parametrize(("length", "said"), [("auto", "'auto'"), (0.001, "0.001")])
 def test_steps_of_another_length_than_those_of_actuators_are_refused(length, said):
     """A cup that was sent on with 0.6 m/s went with 0.3 m/s where steps were chosen."""
-    sentence = f"Carry has solver.time_step = {said}, but must have the task's own, 0.0025 s"
+    sentence = f"Carry has solver.time_step = {said}, but must have the time_step of the task, 0.0025 s"
     with pytest.raises(InputError, match=sentence):
         cortado.environments.FluidEnv(OfOtherSteps(length))
 
@@ -306,7 +306,7 @@ def test_steps_before_the_first_episode_and_other_bad_calls(environments):
     env, make = environments("Carry").unwrapped, cortado.environments.make_vec
     envs = make("Carry", 2, autoreset_mode="Disabled")
     task = cortado.environments.FluidEnv("Carry").scenes.task
-    own = "size is 'large', but must be left out, as the task is one of your own"
+    own = "size is 'large', but must be left out, as the task is a Task object"
     for call, words in [
         (lambda: make("Juggle"), "task is 'Juggle', but must be one of Carry"),
         (lambda: cortado.environments.FluidEnv(task, size="large"), own),

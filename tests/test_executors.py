@@ -287,7 +287,7 @@ def test_warnings_and_observers_of_workers_are_heard(problem, workers):
     heard, alone = [], EnsembleMean(estimator=Exact(), executor=workers)
     found = problem.estimate(POINTS[0], alone, lambda step, bar: heard.append(step))
     assert heard == [4, 3, 2, 1, 0] * 4 and bits(found) == bits(problem.estimate(POINTS[0], alone))
-    with pytest.raises(InputError, match="An executor cannot be used within what an executor computes"):
+    with pytest.raises(InputError, match="An executor cannot be used within a computation of another executor"):
         cortado.evaluate(problem, POINTS[:2], alone, workers)
 
 
@@ -327,7 +327,7 @@ def test_a_scheduler_without_workers_is_left_in_the_end():
 @pytest.mark.parametrize(
     "address, words",
     [
-        ("tcp://127.0.0.1:1", "nothing there answers as one within 0.2 s"),
+        ("tcp://127.0.0.1:1", "no scheduler answers there within 0.2 s"),
         ("here", "missing port"),
         (3, "scheduler is 3"),
     ],
@@ -468,8 +468,8 @@ def test_no_more_processes_than_items(monkeypatch):
         (0, "cpu", "number is 0"),
         (1.5, "cpu", "number is 1.5"),
         (None, "cuda:1", "device is 'cuda:1'"),
-        (None, "cuda", "1 worker processes need a GPU each, but there are 0"),
-        (3, "cuda", "3 worker processes need a GPU each, but there are 0"),
+        (None, "cuda", "1 worker processes need a GPU each, but there are 0 GPUs"),
+        (3, "cuda", "3 worker processes need a GPU each, but there are 0 GPUs"),
     ],
 )
 def test_wrong_local_workers_are_a_sentence(monkeypatch, number, device, words):

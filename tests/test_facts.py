@@ -15,6 +15,7 @@ from cortado.cli.arguments import STEPS
 from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import COURANT
+from program_texts import sources
 
 ROOT = Path(__file__).parents[1]
 OUTER = ("README.md", "CONTRIBUTING.md", "RELEASE.md", "NOTICE.md", "validation/README.md")
@@ -28,15 +29,6 @@ OPTIONS_OF_OTHERS = {"--editable", "--exclude-editable", "--find-links", "--igno
 OPTIONS_OF_OTHERS |= {"--no-deps", "--platform", "--strict"}
 COMMANDS = ("compare", "completion", "convergence", "dataset", "describe", "examples", "export", "fit")
 COMMANDS += ("gradients check", "new", "optimise", "picture", "run", "schema", "sweep", "view")
-
-
-def sources(place: Path) -> str:
-    """The text of a program: of a file and those beside it that it imports, or of all files of a package."""
-    files = [place] if place.is_file() else sorted(place.rglob("*.py"))
-    if place.is_file():
-        beside = re.findall(r"^from (\w+) import", place.read_text("utf-8"), re.MULTILINE)
-        files += [file for file in (place.with_name(f"{name}.py") for name in beside) if file.exists()]
-    return "".join(file.read_text("utf-8") for file in files)
 
 
 def has(text: str, option: str) -> bool:

@@ -10,7 +10,7 @@ from bad_scenes import one_sentence
 from cortado.errors import InputError
 from cortado.losses import Series
 from cortado.losses.distances import SensorMatch
-from cortado.runs.particle_sums import Carrier
+from cortado.runs.particle_sums import Ride
 from cortado.runs.sensor import value_of
 from cortado.scene.motions import matrix
 from cortado.sensors import BodyMotion, PressureProbe, SolidLoad, WallForce, WaveGauge
@@ -273,8 +273,7 @@ def test_axes_of_the_body_are_those_of_the_world_turned_with_it(dimension):
     make, point, _ = fields(dimension)
     for on in ("solid 0", "solid 1"):
         each, at = riding(dimension, on), make(point)
-        solid = next(one for one in at.solids if one.name == on)
-        turn = Carrier.of(solid, at).turn
+        turn = Ride(on, False).carrier(at).turn
         world, body = (each[name].value(at) for name in ("force", "force in the body"))
         force, torque = (body[:2], body[2:]) if dimension == 2 else (body[:3], body[3:])
         np.testing.assert_allclose(world[:dimension], turn[:dimension, :dimension] @ force, rtol=1e-12)

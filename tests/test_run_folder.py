@@ -99,12 +99,12 @@ def test_files_of_somebody_else_are_never_overwritten(tmp_path):
 
 def test_a_folder_of_several_runs_or_of_the_user_is_refused(tmp_path, monkeypatch):
     new_run(tmp_path / "runs" / "a")
-    with pytest.raises(InputError, match="holds other runs, such as a; choose another --out"):
+    with pytest.raises(InputError, match="contains other runs, such as a; choose another --out"):
         new_run(tmp_path / "runs", overwrite=True)
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
     for path in (".", "", "..", tmp_path):
-        with pytest.raises(InputError, match="is the current folder, or one that it is in; choose another --out"):
+        with pytest.raises(InputError, match="is the current folder, or contains it; choose another --out"):
             new_run(path)
     assert sorted(os.listdir(tmp_path)) == ["runs", "work"] and not os.listdir(tmp_path / "work")
 
@@ -154,7 +154,7 @@ def test_a_refused_resume_names_the_setting(tmp_path):
     words = r"problem\.target\.gravity = \[0\.0, -9\.5\] and is now given problem\.target\.gravity = \[0\.0, -9\.8\]"
     with pytest.raises(InputError, match=words):
         RunFolder.resume(folder.path, SCENE, COMMAND, kind="optimise", settings=settings)
-    with pytest.raises(InputError, match=r"`cortado optimise` wrote, with which `cortado run` cannot go on"):
+    with pytest.raises(InputError, match=r"a run of `cortado optimise`, which `cortado run` cannot resume"):
         RunFolder.resume(folder.path, SCENE, COMMAND, kind="run")
 
 

@@ -110,7 +110,7 @@ def test_attributes_and_methods_of_single_environments(envs):
     assert np.array_equal(env.restore(state), envs.envs._observations[2])
     assert envs.env_is_wrapped(Monitor) == [False] * 3 and len(pickle.dumps(envs)) > 0
     for call, words in [
-        (lambda: envs.set_attr("goal", 1.0), "goal cannot be set, as the batch decides it"),
+        (lambda: envs.set_attr("goal", 1.0), "goal cannot be set, as it belongs to the batch"),
         (lambda: envs.get_attr("goal", 3), "indices is 3, but must be whole numbers below 3"),
         (lambda: made(autoreset_mode="Disabled"), "autoreset_mode is given, but must be left out"),
         (lambda: envs.step_wait(), r"step_wait is called without actions, but must come after step_async"),

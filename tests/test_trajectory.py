@@ -317,9 +317,9 @@ def test_a_frame_is_taken_by_its_number():
     assert trajectory[np.int64(2)].time == 0.2
     assert [frame.time for frame in trajectory] == [*trajectory.times]
     assert [frame.time for frame in reversed(trajectory)] == [*trajectory.times[::-1]]
-    with pytest.raises(IndexError, match=r"^frame 4 is asked for, but there are 4 frames\.$"):
+    with pytest.raises(IndexError, match=r"^There is no frame 4, as the trajectory has 4 frames\.$"):
         trajectory[4]
-    with pytest.raises(InputError, match=r"^a frame is asked for by 0.5, but must be by a whole number or a slice\.$"):
+    with pytest.raises(InputError, match=r"^The number of a frame is 0.5, but must be a whole number or a slice\.$"):
         trajectory[0.5]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from test_facts import sources
+from program_texts import sources
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "validation"

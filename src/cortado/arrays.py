@@ -1,4 +1,4 @@
-"""Convert numbers that users give to float64 arrays; anything else raises an error in a sentence."""
+"""Convert numbers that users give to float64 arrays, and check arguments."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -18,13 +18,11 @@ REFUSED = {
     "M": "dates",
     "m": "spans of time",
 }
-"""Words for array entries that are not real numbers, by the ``kind`` of the array's dtype."""
 GREATEST_NUMBER = 10**18
-"""Greatest allowed number of steps, which fits a 64-bit integer."""
 
 
 def as_number(value: Any) -> float | None:
-    """Return a finite number as a float, or None for anything else, including a bool."""
+    """Return a finite number as a float; None for anything else, including a bool."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         return None
     try:
@@ -35,11 +33,10 @@ def as_number(value: Any) -> float | None:
 
 
 def as_numbers(what: str, value: Any) -> np.ndarray:
-    """Return a real number or an array as float64; raises `InputError`, in a sentence that begins with ``what``.
+    """Return real numbers, lists or arrays of other libraries as float64, without copying float64.
 
-    Accepts anything that NumPy converts to an array: numbers, lists, arrays of other libraries. A float64 array is not
-    copied. Complex numbers, text, bools and masked entries raise, because NumPy would convert them silently and lose
-    information.
+    Raise `InputError`, in a sentence that begins with ``what``, for complex numbers, text, bools and masked entries,
+    which NumPy would convert with a loss of information.
     """
     try:
         array = np.asarray(value)
@@ -58,8 +55,7 @@ def as_numbers(what: str, value: Any) -> np.ndarray:
 
 
 def as_precise_numbers(what: str, value: Any) -> np.ndarray:
-    """Return real numbers of float32, float64 or integers as float64; raises `InputError` for other types, and for
-    float16, which has only three digits."""
+    """Return real numbers as float64; raise `InputError` for other types, and for float16."""
     kind = str(getattr(value, "dtype", ""))
     if kind.endswith("float16"):  # bfloat16 too
         raise InputError(f"{what} is {kind}, but must be float32 or float64, as half precision rounds to three digits.")
@@ -67,14 +63,13 @@ def as_precise_numbers(what: str, value: Any) -> np.ndarray:
 
 
 def read_only(what: str, value: Any) -> np.ndarray:
-    """Return a real number or an array as a new read-only float64 array."""
     array = as_numbers(what, value).copy()
     array.setflags(write=False)
     return array
 
 
 def as_one_number(what: str, value: Any) -> float:
-    """Return a real number, or an array of shape (), as a float; raises `InputError` for anything else."""
+    """Return one real number as a float; raise `InputError` for anything else."""
     array = as_numbers(what, value)
     if array.shape:
         raise InputError(f"{what} has shape {array.shape}, but must be one number.")
@@ -82,25 +77,23 @@ def as_one_number(what: str, value: Any) -> float:
 
 
 def is_whole(value: object) -> bool:
-    """Test if a value is a whole number of Python or NumPy, other than a truth value."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 def require_whole(what: str, value: object, least: int) -> None:
-    """Raise `InputError`, in a sentence that begins with ``what``, unless a value is a whole number of at least
-    ``least``."""
+    """Raise `InputError` unless a value is a whole number of at least ``least``."""
     if not is_whole(value) or value < least:  # type: ignore[operator]
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
 
 
 def require_at_most(what: str, value: Any, most: int) -> None:
-    """Raise `InputError`, in a sentence that begins with ``what``, where a number exceeds ``most``."""
     if value > most:
         raise InputError(f"{what} is {shown(value)}, but must be at most {most:,}.")
 
 
 def whole_number(what: str, value: Any, least: int) -> int:
-    """Return an int of at least ``least`` from an int or a whole float; raises `InputError` for anything else."""
+    """Return a whole number, such as 3 or 3.0, as an int of at least ``least``; raise `InputError` for anything
+    else."""
     whole = is_whole(value) or (isinstance(value, (float, np.floating)) and value.is_integer())
     if not whole or value < least:
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
@@ -110,15 +103,14 @@ def whole_number(what: str, value: Any, least: int) -> int:
 
 
 def require_function(what: str, value: Any, *arguments: str) -> None:
-    """Raise `InputError`, in a sentence that begins with ``what``, unless a value is None or callable with these
-    ``arguments``, which are words for the sentence."""
+    """Raise `InputError` unless a value is None or callable with these ``arguments``."""
     if value is not None:
         require_arguments(what, value, arguments, "; or leave it out")
 
 
 def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
     """Raise `InputError` unless ``function`` is callable with the ``wanted`` arguments, as far as Python can tell.
-    ``other`` names other accepted values in the sentence."""
+    ``other`` names other accepted values."""
     if not callable(function) or isinstance(function, type):
         raise InputError(
             f"{what} is {shown(function)}, but must be a function of {', '.join(wanted) or 'nothing'}{other}."
@@ -136,31 +128,27 @@ def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str
 
 
 def require_truth(what: str, value: object) -> None:
-    """Raise `InputError`, in a sentence that begins with ``what``, unless a value is True or False."""
     if not isinstance(value, (bool, np.bool_)):
         raise InputError(f"{what} is {shown(value)}, but must be True or False.")
 
 
 def require_methods(what: str, value: object, names: tuple[str, ...], wanted: str) -> None:
-    """Raise `InputError`, in a sentence that begins with ``what`` and ends with ``wanted``, unless a value is an object
-    with these methods."""
+    """Raise `InputError`, in a sentence that ends with ``wanted``, unless a value is an object with these methods."""
     if isinstance(value, type) or not all(callable(getattr(value, name, None)) for name in names):
         raise InputError(f"{what} is {shown(value)}, but must be {wanted}.")
 
 
 def require_table(what: str, value: object, example: str) -> None:
-    """Raise `InputError`, in a sentence that begins with ``what``, unless a value is a mapping."""
     if not isinstance(value, Mapping):
         raise InputError(f"{what} is {shown(value)}, but must be given by name, as {example}.")
 
 
 def check_steps(steps: int, least: int = 1) -> int:
-    """Return a number of steps; raises `InputError` unless it is whole and at least ``least``."""
     return whole_number("steps", steps, least)
 
 
 def check_step_numbers(steps: Iterable[int], most: int) -> list[int]:
-    """Return a list of numbers of steps from 0 to ``most``; raises `InputError` for anything else."""
+    """Return numbers of steps from 0 to ``most`` as a list; raise `InputError` for anything else."""
     if not isinstance(steps, Iterable) or isinstance(steps, (str, bytes)):
         raise InputError(f"steps is {shown(steps)}, but must be a list of numbers of steps.")
     found = [whole_number("a number of steps", step, 0) for step in steps]
@@ -170,7 +158,6 @@ def check_step_numbers(steps: Iterable[int], most: int) -> list[int]:
 
 
 def _is_masked(value: Any) -> bool:
-    """Test if a value is a masked array with masked entries, or a list that contains such an array."""
     if isinstance(value, np.ma.MaskedArray):
         return bool(np.ma.is_masked(value))
     return isinstance(value, (list, tuple)) and any(map(_is_masked, value))
@@ -181,8 +168,7 @@ def _is_real(value: Any) -> bool:
 
 
 def require_names(what: str, names: Any) -> list[Any]:
-    """Return several names as a list; raises `InputError` for a single string, because its letters would be taken for
-    names."""
+    """Return several names as a list; raise `InputError` for a single string."""
     if isinstance(names, (str, bytes)) or not isinstance(names, Iterable):
         raise InputError(f"{what} is {shown(names)}, but must be a list of names.")
     return list(names)

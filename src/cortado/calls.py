@@ -1,8 +1,4 @@
-"""Make public functions raise one clear sentence when a call lacks an argument or has an unknown or unsuitable one.
-
-Changing an unchangeable object (`fixed`) and pickling an object with device arrays (`Staying`) raise a sentence too.
-Sentences and a ``repr`` show arrays by their number and shape, never by their entries.
-"""
+"""Make public functions raise one clear sentence for wrong arguments, and make objects unchangeable (`fixed`)."""
 
 import os
 import sys
@@ -29,20 +25,17 @@ _WORDS: dict[Any, str] = {
     Mapping: "a table",
     Iterable: "a list",
 }
-"""Words for types of arguments in sentences. A class that is not listed has the words of its first listed base
-class."""
 
 
 def face(module: dict[str, Any]) -> Callable[[], list[str]]:
-    """Return the ``__dir__`` of a public module, and make the names of its ``__all__`` `public`."""
+    """Make the names in ``__all__`` of a module `public`, and return its ``__dir__``."""
     names: list[str] = module["__all__"]
     module.update({name: public(module[name]) for name in names})
     return lambda: names
 
 
 def public(value: T) -> T:
-    """Apply `told` to a function, or to a class and its methods; return anything else unchanged. Use it as a decorator
-    if public modules import the name late."""
+    """Apply `told` to a function, or to the public methods of a class; return anything else unchanged."""
     if not str(getattr(value, "__module__", "")).startswith("cortado"):
         return value
     made: Any = value
@@ -65,8 +58,7 @@ def public(value: T) -> T:
 
 @cache
 def told(function: F) -> F:
-    """Wrap a function, or a class's ``__init__``, so that wrong arguments raise `InputError` in a sentence instead of
-    `TypeError`."""
+    """Wrap a function so that wrong arguments raise `InputError` in a sentence instead of `TypeError`."""
     if hasattr(function, "is_told"):
         return function
     takes = signature(function)
@@ -99,7 +91,6 @@ def told(function: F) -> F:
 
 
 def _misfit(function: Any, bound: BoundArguments) -> str | None:
-    """Return a sentence about the first argument whose type contradicts the function's type hints, or None."""
     try:
         hints = get_type_hints(function)
     except NameError:  # of types that are imported for the check of types alone
@@ -147,7 +138,6 @@ def _takes(function: Any, number: int) -> bool:
 
 
 def _words(hint: Any) -> str:
-    """Return the words that describe a type hint in a sentence."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return " or ".join(dict.fromkeys(map(_words, inner)))
@@ -164,15 +154,11 @@ def _words(hint: Any) -> str:
 
 
 _OWN = "_made_with"
-"""Name of the attribute that holds the names set by the constructor."""
 
 
 def fixed(made: type[T]) -> type[T]:
-    """Decorate a class so that public attributes of its objects cannot be changed or added after construction. A
-    derived class may add attributes, and methods may be assigned to an object.
-
-    Setting or deleting an attribute, or calling the class with wrong arguments, raises `InputError`.
-    """
+    """Decorate a class: after construction, setting or deleting public attributes raises `InputError`. A derived class
+    may add attributes, and methods may be assigned to an object."""
     begin: Callable[..., None] = told(made.__init__)
 
     @wraps(begin)
@@ -180,52 +166,40 @@ def fixed(made: type[T]) -> type[T]:
         begin(self, *arguments, **named)
         object.__setattr__(self, _OWN, frozenset(name for name in vars(self) if not name.startswith("_")))
 
-    def is_fixed(self: Any, name: str) -> bool:
-        if name.startswith("_") or _OWN not in vars(self):
-            return False
-        unknown = type(self) is made and not callable(getattr(made, name, None))
-        return unknown or name in vars(self)[_OWN]
+    def refuse_if_fixed(self: Any, name: str, done: str) -> None:
+        if not name.startswith("_") and _OWN in vars(self):
+            unknown = type(self) is made and not callable(getattr(made, name, None))
+            if unknown or name in vars(self)[_OWN]:
+                kind = made.__name__
+                raise InputError(f"{name} cannot be {done}, as a {kind} does not change; make another {kind}.")
 
     def set_attribute(self: Any, name: str, value: Any) -> None:
-        if is_fixed(self, name):
-            _refuse(made, name, "set")
+        refuse_if_fixed(self, name, "set")
         object.__setattr__(self, name, value)
 
     def delete_attribute(self: Any, name: str) -> None:
-        if is_fixed(self, name):
-            _refuse(made, name, "deleted")
+        refuse_if_fixed(self, name, "deleted")
         object.__delattr__(self, name)
 
-    for name, method in {
-        "__init__": construct,
-        "__setattr__": set_attribute,
-        "__delattr__": delete_attribute,
-    }.items():
-        setattr(made, name, method)
+    changed: Any = made
+    changed.__init__, changed.__setattr__, changed.__delattr__ = construct, set_attribute, delete_attribute
     return made
 
 
-def _refuse(made: type, name: str, done: str) -> NoReturn:
-    kind = made.__name__
-    raise InputError(f"{name} cannot be {done}, as a {kind} does not change; make another {kind}.")
-
-
 class FixedDict(dict[Any, Any]):
-    """An unchangeable copy of a dict, with the ``repr`` of that dict."""
+    """An unchangeable copy of a dict."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle or copy the table as a plain dict."""
         return FixedDict, (dict(self),)
 
     def _refuse(self, *arguments: Any, **named: Any) -> NoReturn:
-        raise InputError("A setting cannot be changed within an object that was made with it; make another object.")
+        raise InputError("A setting of an object cannot be changed; make another object with another setting.")
 
     __setitem__ = __delitem__ = __ior__ = _refuse
     clear = pop = popitem = setdefault = update = _refuse
 
 
 def keep_own(made: object, name: str) -> None:
-    """Give a frozen dataclass a copy of a setting that is a table or a list, so that nobody changes it later."""
     value = getattr(made, name)
     if isinstance(value, Mapping):
         object.__setattr__(made, name, FixedDict(value))
@@ -237,7 +211,7 @@ class Staying:
     """A base class for objects with arrays on a device: pickling or copying them raises `InputError`."""
 
     instead: ClassVar[str] = "but NumPy arrays of what it holds can"
-    """End of the error sentence: what can be pickled in its place."""
+    """End of the error sentence: what can be pickled instead."""
 
     def __reduce__(self) -> NoReturn:
         name = type(self).__name__
@@ -251,12 +225,10 @@ def counted(number: int, noun: str) -> str:
 
 
 def quoted(names: Iterable[str]) -> str:
-    """Return names as a sentence shows them: ``'gravity', 'viscosity'``."""
     return ", ".join(f"'{name}'" for name in names) or "none"
 
 
 def point_in_words(point: Iterable[float]) -> str:
-    """Write the coordinates of a point, in brackets."""
     return f"({', '.join(f'{value:g}' for value in point)})"
 
 

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from typing import Any
 
 LONGEST = 90
-"""Greatest number of characters of a value in a sentence."""
 
 
 class CortadoError(Exception):
@@ -15,19 +14,18 @@ class CortadoError(Exception):
 
 
 class CortadoWarning(UserWarning):
-    """A warning of something that works but is probably not meant."""
+    """A warning of something that works but is probably a mistake."""
 
 
 class MassWarning(CortadoWarning):
-    """A warning that the fluid's mass differs from the mass asked for; printed when a scene or run is described."""
+    """A warning that the fluid's mass differs from the mass that the scene describes."""
 
 
 _INSIDE = ("cortado", "pydantic", "contextlib", "functools")
-"""Packages whose code is skipped when a warning looks for the user's line."""
 
 
 def warn(sentence: str, category: type[Warning] = CortadoWarning) -> None:
-    """Issue a warning that points to the line of the user's code which led here."""
+    """Issue a warning that points to the line of the user's code."""
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
         level, frame = level + 1, frame.f_back
@@ -35,15 +33,15 @@ def warn(sentence: str, category: type[Warning] = CortadoWarning) -> None:
 
 
 @contextmanager
-def unwarned() -> Iterator[None]:
-    """Suppress Cortado's warnings in the block."""
+def unwarned(category: type[Warning] = CortadoWarning) -> Iterator[None]:
+    """Suppress Cortado's warnings of a category in the block."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CortadoWarning)
+        warnings.simplefilter("ignore", category)
         yield
 
 
 class InputError(CortadoError):
-    """An error in the user's input, with a sentence that explains it. Exit code 2."""
+    """An error in the user's input. Exit code 2."""
 
 
 class OutOfRangeError(InputError):
@@ -52,8 +50,7 @@ class OutOfRangeError(InputError):
 
 
 class Words(str):
-    """Our own words in an error's sentence, printed without quotes; a plain ``str`` is the user's text and is
-    quoted."""
+    """Words in an error's sentence that are printed without quotes; a plain ``str`` is quoted."""
 
 
 class MissingDerivativeError(InputError):
@@ -69,11 +66,10 @@ class SceneError(CortadoError):
         self.file = file
         """Path of the scene file as the user gave it; None for a scene built in Python."""
         self.field = field
-        """Key of the scene, such as ``fluid[0].upper``; empty for the scene as a whole."""
+        """Key of the scene, such as ``fluid[0].upper``; empty for the whole scene."""
         self.found = found
-        """The wrong value, or `Words` that describe it."""
+        """Wrong value, or `Words` that describe it."""
         self.wanted = wanted
-        """Words that describe a correct value."""
         self.sentence = sentence or f"is {shown(found)}, but must be {wanted}."
 
     def in_file(self, file: str) -> "SceneError":
@@ -91,31 +87,29 @@ class ComputationError(CortadoError):
 
 
 class DivergedError(ComputationError):
-    """An error for a lost particle: it left its container, or its position is not finite or too far away."""
+    """An error for a lost particle, which left its container, or whose position is not finite or too far away."""
 
     def __init__(
         self, step: int, particle: int, advice: str, where: str = "was lost", others: int = 0, preface: str = ""
     ):
         super().__init__(step, particle, advice, where, others, preface)
         self.step = step
-        """The step in which the particle was lost, counted from 1."""
+        """Step in which the particle was lost, counted from 1."""
         self.particle = particle
         """Number of the first lost particle, in the scene's order."""
         self.advice = advice
-        """Advice for the user, in words."""
         self.where = where
-        """Words that say how the particle was lost, and where it was at the end of the step."""
+        """How the particle was lost, and where it was at the end of the step, in words."""
         self.others = others
         """Number of further particles lost in the same step."""
         self.preface = preface
-        """A sentence about all runs, if this run is one of several."""
+        """Sentence about all runs, if this run is one of several."""
 
     def with_advice(self, advice: str) -> "DivergedError":
-        """Return a copy of this error with different advice."""
         return DivergedError(self.step, self.particle, advice, self.where, self.others, self.preface)
 
     def among_others(self, preface: str) -> "DivergedError":
-        """Return a copy of this error whose message begins with ``preface``, a sentence about all runs."""
+        """Return a copy of this error whose message begins with ``preface``."""
         return DivergedError(self.step, self.particle, self.advice, self.where, self.others, preface)
 
     def __str__(self) -> str:
@@ -125,7 +119,7 @@ class DivergedError(ComputationError):
 
 
 def shown(value: Any) -> str:
-    """Return a value on one short line, for a sentence."""
+    """Return a value on one short line."""
     if isinstance(value, Words):
         return str(value)
     if isinstance(value, Mapping):
@@ -165,11 +159,9 @@ class LibraryMissingError(CortadoError, ImportError):
     """An error for a missing library that Cortado can do without."""
 
     def __init__(self, name: str, package: str, module: str | None = None):
-        """Store the library's ``name`` and ``package``; ``module`` is the part of Cortado that needs it, by default
-        ``package``."""
+        """Store the library's ``name`` and ``package``, and the ``module`` of Cortado that needs it."""
         super().__init__(name, package, module)
         self.package = package
-        """Name of the package to install."""
 
     def __str__(self) -> str:
         name, package, module = self.args

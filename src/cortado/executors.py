@@ -1,7 +1,7 @@
-"""Executors: where work is computed whose parts do not depend on one another, such as the members of an ensemble.
+"""Executors compute work whose parts are independent, such as the members of an ensemble.
 
-`InProcess`, one after the other, is the default. `Distributed` has the workers of a scheduler of Dask's distributed, on
-any number of machines; `local_workers` starts some on this one, such as one for each GPU.
+`InProcess`, the default, computes one part after the other. `Distributed` uses the workers of a scheduler of Dask's
+distributed, on any number of machines; `local_workers` starts workers on this machine, such as one for each GPU.
 """
 
 import asyncio
@@ -36,9 +36,9 @@ OnResult = Callable[[int, Any], None]
 
 
 class Executor(ABC):
-    """The base class of executors of a function of many independent items, which change no bit of a result.
+    """The base class of executors, which compute a function of many independent items.
 
-    Where an executor computes changes no bit of a result on the same kind of processor.
+    The choice of an executor changes no bit of a result on the same kind of processor.
     """
 
     def threads(self) -> int:
@@ -49,11 +49,8 @@ class Executor(ABC):
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
-        """Return the function's result for every item, in the order of the items.
-
-        The function keeps what is large, such as a problem, and items are small. Items are taken as they are needed.
-        Raises what the function raised for the first item, in their order, for which it raised anything.
-        """
+        """Return the function's result for every item, in the order of the items. Large data, such as a problem, belong
+        into the ``function``, and ``items`` should be small. Raise the error of the first item that fails."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,6 @@ class InProcess(Executor):
 
 
 def _check_call(function: Any, items: Any, on_result: Any) -> None:
-    """Raise `InputError` for arguments of `Executor.map` that it cannot work with."""
     require_arguments("function", function, ("an item",))
     if not isinstance(items, Iterable):
         raise InputError(f"items is {shown(items)}, but must be a list of them.")
@@ -83,7 +79,6 @@ def _check_call(function: Any, items: Any, on_result: Any) -> None:
 
 
 def checked_executor(executor: Any) -> Executor:
-    """Return the executor; raises `InputError` for anything else, such as a client of Dask."""
     if not isinstance(executor, Executor):
         is_class = isinstance(executor, type)
         found = f"the class {executor.__name__}" if is_class else f"of the type {type(executor).__name__}"
@@ -97,30 +92,25 @@ def checked_executor(executor: Any) -> Executor:
 # ---- workers of a scheduler --------------------------------------------------------------------------------------
 
 REACHED = 10.0
-"""Seconds within which a scheduler answers."""
 LOOK = 1.0
-"""Seconds after which workers are counted again."""
 WAIT = 0.1
-"""Seconds after which the first worker is looked for again."""
 AHEAD = 2
-"""Number of items sent ahead for each thread of a worker: one computed and others that wait, against idling."""
+"""Number of items sent to each thread of a worker, so that it is never idle."""
 
 
 class Distributed(Executor):
     """An executor on the workers of a scheduler of Dask's distributed.
 
-    What a lost worker was computing is computed again by another one. Results arrive in the order of the items, with
-    the bits that they have in one process, and errors are raised here as they were there. A worker computes one item
-    at a time, and keeps the last functions that it was sent, with their problems.
+    Another worker computes again what a lost worker was computing. Results have the order of the items and the bits
+    that they have in one process, and errors are raised as in one process. A worker computes one item at a time, and
+    keeps the last functions that it received, with their problems.
     Example: ``workers = cortado.executors.Distributed("tcp://10.0.0.1:8786")``
     """
 
     def __init__(self, scheduler: "str | distributed.Client", patience: float = 60.0):
-        """Connect to ``scheduler``, an address such as "tcp://10.0.0.1:8786" or a client; ``patience`` [s]: how long to
-        wait where there is no worker left.
-
-        Raises `InputError` where distributed is not installed, or where there is no scheduler.
-        """
+        """Connect to ``scheduler``, an address such as "tcp://10.0.0.1:8786" or a client. ``patience`` [s] is how long
+        to wait when no worker is left. Raises `InputError` if distributed is not installed, or if there is no
+        scheduler."""
         module = _distributed()
         self.patience = patience
         self._owned = isinstance(scheduler, str)
@@ -134,7 +124,7 @@ class Distributed(Executor):
         return f"Distributed({self.address!r})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        raise InputError("An executor cannot be used within what an executor computes: leave one of the two out.")
+        raise InputError("An executor cannot be used within a computation of another executor: leave out one of them.")
 
     def __enter__(self) -> Self:
         return self
@@ -143,23 +133,20 @@ class Distributed(Executor):
         self.close()
 
     def close(self) -> None:
-        """Leave the scheduler, unless with a client that was given."""
+        """Leave the scheduler; a client of the user stays connected."""
         if self._owned:
             self.client.close()
 
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
-        """Return the function's results for all items; see `Executor.map`. ``function``, items and results are pickled.
-
-        Waits for the first worker. Raises `InputError` for what cannot be pickled, `ComputationError` where the
-        scheduler or all workers are lost for good, or an item ends its process.
-        """
+        """Return the function's results for all items, which are pickled; see `Executor.map`. Wait for the first
+        worker. Raise `InputError` for what cannot be pickled, and `ComputationError` without scheduler or workers."""
         _check_call(function, items, on_result)
         return _Map(self, Payload.of(function), on_result).results(items)
 
     def threads(self) -> int:
-        """Return how many items workers compute at a time; raises `ComputationError` where the scheduler is lost."""
+        """Return the number of items computed at a time; raise `ComputationError` if the scheduler is lost."""
         if self.client.status != "running":
             raise self.lost()
         try:
@@ -168,15 +155,12 @@ class Distributed(Executor):
             raise self.lost() from error
 
     def replace_workers(self) -> None:
-        """Start workers in the place of those that have ended, where they are processes of this machine; called every
-        second while there is something to compute."""
+        """Replace ended workers that are processes of this machine; called every second during a computation."""
 
     def lost(self) -> ComputationError:
-        """Return the error for a scheduler that is not there any more."""
         return ComputationError(f"The scheduler {self.address} was lost, and what is computed there with it.")
 
     def deserted(self, seconds: float) -> ComputationError:
-        """Return the error for a lack of workers over so many seconds."""
         return ComputationError(
             f"The scheduler {self.address} has had no worker for {seconds:.0f} s; start some, such as by "
             f"`dask worker {self.address} --nthreads 1`."
@@ -184,8 +168,6 @@ class Distributed(Executor):
 
 
 class _Map:
-    """A mapping of one function over items by the workers."""
-
     def __init__(self, executor: Distributed, payload: Payload, on_result: OnResult | None):
         self._executor, self._payload, self._on_result = executor, payload, on_result
         self._calls = executor.client.get_executor(pure=False)
@@ -193,17 +175,14 @@ class _Map:
         """Numbers and items that workers have, by their futures."""
         self._results: dict[int, Any] = {}
         self._failed: tuple[int, BaseException] | None = None
-        """The first item, in their order, whose error is known, and its error."""
+        """The first item, in order, with a known error, and this error."""
         self._name = f"cortado-{uuid4().hex}"
         self._lost: deque[str] = deque()
-        """Addresses of workers that were lost with items, of which nothing was said yet."""
         self._most = 0
-        """How many items workers are given at a time."""
         self._counted, self._manned = -LOOK, time.monotonic()
-        """When the workers were counted last, and when there were any [s]."""
+        """Times of the last count of workers, and of the last count that found any [s]."""
 
     def results(self, items: Iterable[Item]) -> list[Any]:
-        """Return the results in the order of the items."""
         import dask
 
         with self._watched(), dask.config.set({"distributed.admin.large-graph-warning-threshold": 2**40}):
@@ -226,7 +205,6 @@ class _Map:
 
     @contextmanager
     def _watched(self) -> Iterator[None]:
-        """Note in the block workers that are lost with items of this map."""
 
         def hear(event: tuple[float, dict[str, Any]]) -> None:
             _, said = event
@@ -248,7 +226,7 @@ class _Map:
             warn(f"The worker {worker} was lost; what it was computing is computed again by another one.")
 
     def _fill(self, left: Iterator[tuple[int, Any]]) -> bool:
-        """Send as many items as workers need, none after an error; return True if there is anything to wait for."""
+        """Send items to workers, none after an error; return True if there is a result to wait for."""
         self._count_workers(LOOK)
         while not self._most and not self._sent:  # how much an item asks for may depend on how many workers there are
             time.sleep(WAIT)
@@ -264,8 +242,8 @@ class _Map:
         self._sent[self._calls.submit(call, payload, item, key=key)] = number, item
 
     def _count_workers(self, interval: float) -> None:
-        """Count workers, unless they were counted within the interval [s]; raises `ComputationError` where the
-        scheduler is lost, or where there was no worker for too long."""
+        """Count workers, at most once per interval [s]; raise `ComputationError` without a scheduler, or too long
+        without workers."""
         now = time.monotonic()
         if now - self._counted < interval:
             return
@@ -278,7 +256,7 @@ class _Map:
             raise self._executor.deserted(now - self._manned)
 
     def _take(self, future: Future[Any]) -> None:
-        """Take the result of a call that has ended; the whole function goes to a worker that does not have it."""
+        """Take the result of a call that has ended; if the worker lacks the function, send it."""
         number, item = self._sent.pop(future)
         try:
             answer = self._answer(future, number)
@@ -291,15 +269,15 @@ class _Map:
             self._on_result(number, self._results[number])
 
     def _answer(self, future: Future[Any], number: int) -> Answer | Lacking:
-        """Return the answer of a call that has ended; raises `ComputationError` where there is none."""
+        """Return the answer of a call that has ended; raise `ComputationError` if it has none."""
         try:
             answer = future.result()
         except CancelledError:
             raise self._executor.lost() from None
         except _distributed().KilledWorker as error:
             raise ComputationError(
-                f"Item {number} was given up, as {error.allowed_failures + 1} workers were lost one after the other "
-                "while they had it: they may have too little memory for it."
+                f"Item {number} was given up, as {error.allowed_failures + 1} workers were lost while they "
+                "computed it: they may have too little memory."
             ) from None
         except Exception as error:  # of distributed itself, such as a worker without Cortado
             raise ComputationError(f"Item {number} could not be computed by a worker: {in_words(error)}.") from error
@@ -307,7 +285,6 @@ class _Map:
         return answer
 
     def _fail(self, number: int, error: BaseException) -> None:
-        """Note an error; only items before it are still of interest."""
         if self._failed is None or number < self._failed[0]:
             self._failed = number, error
         for future in [future for future, (other, _) in self._sent.items() if other > self._failed[0]]:
@@ -316,7 +293,6 @@ class _Map:
 
 
 def _distributed() -> Any:
-    """Import and return Dask's distributed; raises `InputError` where it is not installed."""
     try:
         import distributed
     except ModuleNotFoundError:
@@ -327,7 +303,6 @@ def _distributed() -> Any:
 
 
 def _connected(module: Any, address: str) -> Any:
-    """Return a client of the scheduler at an address; raises `InputError` where there is none."""
     from distributed.comm import connect
 
     async def meet() -> None:
@@ -340,7 +315,7 @@ def _connected(module: Any, address: str) -> Any:
         try:
             thread.submit(asyncio.run, meet()).result()
         except (OSError, ValueError, TypeError) as error:
-            reason = f"nothing there answers as one within {REACHED:g} s" if isinstance(error, OSError) else error
+            reason = f"no scheduler answers there within {REACHED:g} s" if isinstance(error, OSError) else error
             raise InputError(
                 f"There is no scheduler at {address!r}, but an address such as tcp://10.0.0.1:8786 is needed: {reason}."
             ) from None
@@ -351,28 +326,25 @@ def _connected(module: Any, address: str) -> Any:
 
 LOOPBACK = "127.0.0.1"
 GONE = "3 s"
-"""Time after which another process replaces one that has ended, and was not started again."""
+"""Time after which another process replaces one that has ended."""
 PROCESSES_A_CORE = 4
-"""Greatest number of processes for each core; each has some 200 MB of its own."""
 LEAST_LIMIT = 64
-"""Limit on the number of processes where there are few cores."""
 IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
-"""Code that leaves Ctrl-C, which a terminal sends to all processes, to the one that started the workers."""
+"""Code with which workers ignore Ctrl-C, which a terminal sends to all processes."""
 
 
 class LocalWorkers(Distributed):
-    """An executor on worker processes of this machine, each with a nanny here that restarts it when killed."""
+    """An executor on worker processes of this machine, each with a nanny that restarts it when killed."""
 
     def __init__(self, client: Any, cluster: Any):
         super().__init__(client)
         self._cluster = cluster
 
     def replace_workers(self) -> None:
-        """Start workers for those whose nanny has ended, which the cluster drops after `GONE`."""
+        """Replace workers whose nanny has ended."""
         self._cluster.scale(len(self._cluster.worker_spec))
 
     def deserted(self, seconds: float) -> ComputationError:
-        """Return the error for a lack of workers over so many seconds."""
         return ComputationError(
             f"No worker process has started for {seconds:.0f} s; there may be too little memory for it, or the script "
             'does not begin under `if __name__ == "__main__":`.'
@@ -384,10 +356,10 @@ def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Di
     """Start worker processes on this machine with a scheduler in this process, which restarts lost ones, and end them
     with the block.
 
-    ``number``: of processes; by default one for each core, or for each GPU with a ``device`` of "cuda". The cores are
-    shared out among them. On GPUs each process sees one, as "cuda:0". A script that uses them must begin under
-    ``if __name__ == "__main__":``, as every process imports it. Raises `InputError` for more processes than there are
-    GPUs, or than four for each core, and 64.
+    ``number`` of processes: by default one for each core, or with the ``device`` "cuda" one for each GPU. Processes
+    share the cores; on GPUs each process sees one GPU, as "cuda:0". A script must begin under ``if __name__ ==
+    "__main__":``, as every process imports it. Raises `InputError` for more processes than there are GPUs, or than 64
+    and four for each core.
 
     Example: ``with cortado.executors.local_workers() as workers: ...``
     """
@@ -420,7 +392,6 @@ def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Di
 
 
 def _environments(number: int | None, device: str) -> list[dict[str, str]]:
-    """Return the environment variables of each process."""
     if number is not None:
         require_processes("number", number)
     if device == "cpu":
@@ -430,19 +401,19 @@ def _environments(number: int | None, device: str) -> list[dict[str, str]]:
         raise InputError(f'device is {shown(device)}, but must be "cpu", or "cuda" for all GPUs.')
     gpus = visible_gpus()
     if (number or 1) > len(gpus):
-        raise InputError(f"{number or 1} worker processes need a GPU each, but there are {len(gpus)}.")
+        raise InputError(f"{number or 1} worker processes need a GPU each, but there are {len(gpus)} GPUs.")
     return [{VISIBLE: gpu} for gpu in gpus[:number]]
 
 
 def require_processes(what: str, number: object) -> None:
-    """Raise `InputError`, in a sentence that begins with ``what``, for a senseless number of processes."""
+    """Raise `InputError`, in a sentence that begins with ``what``, unless a number of processes is possible."""
     require_whole(what, number, 1)
     cores = usable_cores()
     most = max(PROCESSES_A_CORE * cores, LEAST_LIMIT)
     if number > most:  # type: ignore[operator]
         raise InputError(
             f"{what} is {shown(number)}, but must be at most {most}, as this machine has {counted(cores, 'core')}: "
-            "more processes than cores compute nothing sooner."
+            "more processes than cores are no faster."
         )
 
 

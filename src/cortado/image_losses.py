@@ -16,9 +16,8 @@ from cortado.errors import InputError
 __all__ = ["ImageLoss", "Pyramid", "SquaredDifference", "psnr"]
 
 Image = NDArray[np.float64]
-"""A linear picture: array (rows, columns, 3) of red, green and blue."""
+"""A linear picture (rows, columns, 3) of red, green and blue."""
 SMALLEST = 2
-"""Greatest side of the coarsest level of a pyramid, in pixels."""
 
 
 class ImageLoss(Protocol):
@@ -61,18 +60,16 @@ class Pyramid:
     """An image loss: the weighted mean squared difference, summed over the levels of a Gaussian pyramid (Burt and
     Adelson 1983).
 
-    The first level is the image itself. Each further level is the previous one, blurred by a binomial and halved
+    The first level is the image. Each further level is the previous one, blurred by a binomial and halved
     (`reduction`). Coarse levels locate a shape before it overlaps its target; fine levels compare outlines.
-
-    ``weights``: a number for each level, by default 1, 2, 4 ... from fine to coarse.
 
     Example: ``loss = cortado.losses.Image(renderer, target, cortado.image_losses.Pyramid())``
     """
 
     levels: int | None = None
-    """Number of levels. If None, as many as weights; without weights, until no side is longer than 2 pixels."""
+    """Number of ``levels``. If None, as many as weights; without weights, until no side is longer than 2 pixels."""
     weights: tuple[float, ...] | None = None
-    """Weights (levels,) from fine to coarse; None: 1, 2, 4 ..., because blurring makes shapes fainter."""
+    """``weights`` (levels,) from fine to coarse; None: 1, 2, 4 ..., because blurring makes shapes fainter."""
 
     def __post_init__(self) -> None:
         if self.levels is not None:
@@ -109,7 +106,6 @@ class Pyramid:
         return bar
 
     def _levels(self, difference: Image) -> list[Image]:
-        """Return the pyramid of the difference, which equals the difference of the pyramids."""
         wanted = self.levels or (len(self.weights) if self.weights else None)
         levels = [difference]
         while len(levels) < wanted if wanted else max(levels[-1].shape[:2]) > SMALLEST:
@@ -148,8 +144,8 @@ def reduction(size: int) -> Any:
     """Return a sparse matrix (ceil(size / 2), size) that blurs a line of pixels and keeps every other one.
 
     For an odd size, Burt and Adelson's weights 1 4 6 4 1 are centred on every other pixel, from the first to the last.
-    For an even size these weights would treat the two ends differently, so weights 1 3 3 1 merge two pixels into one.
-    At an edge the weights inside the image are divided by their sum, so that a constant stays constant.
+    For an even size, weights 1 3 3 1 treat both ends alike. At an edge the weights inside the image are divided by
+    their sum, so that a constant stays constant.
     """
     from scipy.sparse import csr_array
 
@@ -172,7 +168,6 @@ def _along_columns(image: Image, matrix: Any) -> Image:
 
 
 def _difference(image: ArrayLike, target: ArrayLike) -> Image:
-    """Return image - target as a float64 array (rows, columns, 3)."""
     image, target = as_numbers("The image", image), as_numbers("The target", target)
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"The image has shape {image.shape}, but must be (rows, columns, 3).")

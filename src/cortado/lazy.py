@@ -1,7 +1,7 @@
 """Import names when they are first used, so that ``import cortado`` is quick.
 
 The core does not import the packages built on it: pictures, films, exports, notebook pages. A method such as
-`Trajectory.film` asks for a function by name, and the package with this function is imported only then.
+`Trajectory.film` imports a function of such a package by name (`on_top`).
 """
 
 import importlib
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
 
 def getter(package: str, homes: "Mapping[str, str] | None" = None) -> "Callable[[str], Any]":
-    """Return a ``__getattr__`` for a package that imports its modules and the names in ``homes`` when asked. ``homes``
-    maps a name to its module: one of the package, or of all Cortado if it begins with ``cortado.``."""
+    """Return a ``__getattr__`` for a package, which imports its modules and the names in ``homes``. ``homes`` maps a
+    name to its module: of the package, or of Cortado if it begins with ``cortado.``."""
 
     def found(name: str) -> "Any":
         if homes and name in homes:
@@ -45,7 +45,6 @@ FUNCTIONS = {
     "trajectory_page": "pictures.pages",
     "trajectory_picture": "pictures.run_pictures",
 }
-"""Modules of `cortado`, by the name of the function that each provides."""
 
 
 def on_top(name: str) -> "Any":

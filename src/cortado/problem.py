@@ -1,8 +1,4 @@
-"""Compute a simulation's loss from parameters, its gradient, and its derivative along a direction.
-
-`ProblemForwardPass` is a run with backward passes. A search stores the problem's fingerprint, so that nobody resumes
-the search with another problem.
-"""
+"""Compute a simulation's loss from parameters, its gradient, and its derivative along a direction."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -42,11 +38,9 @@ from cortado.sph.function_text import code_words
 __all__ = ["NAMES", "UNITS", "Problem"]
 
 SPARSE = 8
-"""Quantities are read during the run if the loss needs at least one state in so many. With a probe in every 8th state
-this saves 3 to 6 % of a loss and 1 to 9 % of its gradient (408 and 7,824 particles, float32). In every 16th state both
-ways cost the same to 2 % (`python -m benchmarks probed`)."""
+"""Quantities are read during the run if the loss needs at least one state in so many; else repeating their steps costs
+less."""
 KEPT = 2
-"""Number of batches of different sizes that a problem keeps for its next evaluations."""
 
 
 @dataclass(frozen=True)
@@ -64,29 +58,24 @@ class ProblemForwardPass(Staying):
 
     @property
     def rollout(self) -> Rollout:
-        """Rollout of this forward pass."""
         return self._residual.rollout
 
     @property
     def turn(self) -> Turn:
-        """Lock that a thread holds while it uses the rollout."""
         return self.rollout.turn
 
     @in_turn
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """Return the gradient by an estimator; ``observe`` is given the number and the adjoint of every state, from the
-        last to the first.
-
-        The result has the same bits if the problem was evaluated in between. Raises `InputError` for an estimator whose
-        settings may change, because the backward step would keep the old ones, or that may mix scenes of a batch.
-        """
+        """Return the gradient by an ``estimator``, with the same bits if the problem was evaluated in between.
+        ``observe`` is called with the number and the adjoint of every state, from the last to the first. Raises
+        `InputError` for an estimator whose settings may change, or that may mix scenes of a batch."""
         derivative = self._derivatives.of(estimator)
         return self._gradient(derivative, self._first_adjoint(derivative, observe))
 
     @in_turn
     def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
-        """Return the gradient by an estimator, and derivatives by name with respect to the first state's fields and its
-        ``time``."""
+        """Return the gradient by an ``estimator``, and derivatives with respect to the first state's fields and its
+        ``time``, by name."""
         derivative = self._derivatives.of(estimator)
         first = self._first_adjoint(derivative)
         initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
@@ -94,7 +83,6 @@ class ProblemForwardPass(Staying):
 
     @property
     def _lost(self) -> OfLost:
-        """NaN for each lost scene of a batch: its loss is NaN, so it has no derivatives."""
         return dict.fromkeys(self.rollout.lost, np.nan)
 
     def _first_adjoint(self, derivative: BackwardStep, observe: Observer | None = None) -> State:
@@ -115,26 +103,6 @@ class ProblemForwardPass(Staying):
             gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
         gradient = without_lost(self._lost, gradient)
         return {name: gradient[name] for name in values}
-
-
-def _fingerprint(simulation: Simulation, steps: int, loss: Any, states: Sequence[RestartState]) -> str:
-    """Return a text that identifies everything that a problem's values depend on; see `Problem.fingerprint`."""
-    energy = simulation.free_energy
-    parts = {
-        "scene": simulation.scene.computed_json().encode(),
-        "first positions": simulation.positions.tobytes(),
-        "target and loss": loss_fingerprint(loss).encode(),
-    }
-    checksums = [f"{name} {sha256(content).hexdigest()[:16]}" for name, content in parts.items()]
-    for state in states:
-        fields = b"".join(np.asarray(state[name]).tobytes() for name in sorted(state.fields))
-        clock = repr(state.clock) + (f" {state.clock.time_step!r}" if state.clock.time_step else "")
-        checksums.append(f"state {sha256(fields + clock.encode()).hexdigest()[:16]}")
-    code = "" if energy in FREE_ENERGIES.values() else f" {code_words(energy.functions)}"
-    energies = f"free energy {energy.name} {energy.curvature}{code}"
-    own = {"forces": simulation.forces, "solver": [simulation.own_solver] if simulation.own_solver else []}
-    told = [f"{what} {text}" for what, makers in own.items() if (text := parts_fingerprint(makers, simulation))]
-    return "; ".join([f"{steps} steps", simulation.precision.name, *checksums, energies, *told])
 
 
 @public
@@ -196,7 +164,6 @@ class Problem:
         self._batches: dict[int, Problem] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle or copy the problem as its constructor's arguments."""
         return Problem, (self.simulation, self.steps, self.loss, self.memory_budget, self._states or None)
 
     def __repr__(self) -> str:
@@ -205,34 +172,32 @@ class Problem:
 
     @property
     def turn(self) -> Turn:
-        """Lock that a thread holds while it uses the problem's simulation."""
         return self.simulation.turn
 
     @in_turn
     def value(self, parameters: Values) -> Any:
-        """Return the loss by a forward run: a float, or (batch,) for a batch, with NaN for a scene that is in
-        ``lost``."""
+        """Return the loss at ``parameters``: a float, or (batch,) for a batch, with NaN for a scene in ``lost``."""
         return self._losses.total(self._ends(self._checked(parameters), self._losses, keep=False), self._going)
 
     def end(self, parameters: Values) -> Any:
-        """Return the last state of the rollout with these parameters: a `Snapshot`, or a `SnapshotBatch` for a
-        batch."""
+        """Return the last state of the rollout at ``parameters``: a `Snapshot`, or a `SnapshotBatch` for a batch."""
         return self.states(parameters, [self.steps])[self.steps]
 
     @in_turn
     def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Any]:
-        """Return states of the rollout with these parameters, by their number of steps; 0 is the first state."""
+        """Return states of the rollout at ``parameters`` after the given numbers of ``steps``, by number; 0 is the
+        first state."""
         return self._ends(self._checked(parameters), check_step_numbers(steps, self.steps), keep=False)
 
     @in_turn
     def run(self, parameters: Values, record_every: int = 1) -> Any:
-        """Return the whole trajectory with these parameters, with a frame every ``record_every`` steps."""
+        """Return the trajectory at ``parameters``, with a frame every ``record_every`` steps."""
         self._space.begin(self._rollout, self._checked(parameters), states=self._states)
         return self.simulation.collect(self._rollout, record_every)
 
     def value_and_gradient(self, parameters: Values, gradient: GradientEstimator | None = None) -> tuple[Any, Arrays]:
-        """Return the loss and its derivatives: for each given parameter a float64 array of its shape, for a batch with
-        a first axis for the scenes."""
+        """Return the loss and its derivatives at ``parameters``: for each of them a float64 array of its shape, for a
+        batch with a first axis over the scenes."""
         found = self.estimate(parameters, gradient)
         return found.loss, found.gradient
 
@@ -241,8 +206,8 @@ class Problem:
         self, parameters: Values, gradient: AdjointEstimator | None = None
     ) -> tuple[Any, Arrays, Arrays]:
         """Return the loss, its derivatives as `value_and_gradient` does, and its derivatives with respect to the first
-        state. The third table has float64 arrays by field name, in the fields' shapes, and ``time``; for a batch with a
-        first axis for the scenes."""
+        state: by name ``time`` and float64 arrays in the fields' shapes, for a batch with a first axis over the
+        scenes."""
         forward_pass = self.forward_pass(parameters)
         return forward_pass.loss, *forward_pass.back_to_state(Exact() if gradient is None else gradient)
 
@@ -253,8 +218,8 @@ class Problem:
         """Return the loss, its derivatives, and the report of the estimator ``gradient`` (`gradients.Exact` by
         default).
 
-        Estimators with a backward pass call ``observe`` with the number and the adjoint of every state, from the last
-        to the first. `gradients.AdjointNorms` is such an observer.
+        Estimators with a backward pass call ``observe``, such as `gradients.AdjointNorms`, with the number and the
+        adjoint of every state, from the last to the first.
         """
         require_function("observe", observe, *OBSERVED)
         found = estimate(self, parameters, gradient, observe)
@@ -269,8 +234,8 @@ class Problem:
 
     @in_turn
     def forward_pass(self, parameters: Values) -> ProblemForwardPass:
-        """Run forward and return the run, for backward passes at any later time. The returned object keeps the stored
-        states in memory."""
+        """Run forward and return the run, for later backward passes. The returned object keeps the stored states in
+        memory."""
         values = self._checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
@@ -300,16 +265,17 @@ class Problem:
     def tangents(
         self, parameters: Values, directions: Values, observe: Observer, steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """Run in forward mode and return states by step, as `states` does. ``observe`` is called with the number of
-        every state and its tangent along ``directions`` (of any parameters); the next step overwrites this tangent."""
+        """Run in forward mode and return states after the given numbers of ``steps``. ``observe`` is called with the
+        number of every state and its tangent along ``directions`` (of any parameters), which the next step
+        overwrites."""
         return self.several_tangents(parameters, [(directions, observe)], steps)
 
     @in_turn
     def several_tangents(
         self, parameters: Values, each: Iterable[tuple[Values, Observer]], steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """Run once in forward mode along several directions, with an observer for each, and return states by step; see
-        `tangents`."""
+        """Run once in forward mode along several directions: ``each`` are pairs of directions and an observer, as in
+        `tangents`. Return states after the given numbers of ``steps``."""
         values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
         for directions, observe in each:
             require_arguments("observe", observe, OBSERVED)
@@ -322,8 +288,8 @@ class Problem:
 
     @in_turn
     def along(self, end: Any, quantities: Iterable[str], dot: Arrays, parameters: Values, directions: Values) -> Arrays:
-        """Return tangents of quantities of ``end``, a state of the last run, by name. ``dot`` is the state's tangent by
-        field; ``directions`` are those of the parameters."""
+        """Return tangents of ``quantities`` of ``end``, a state of the last run, by name. ``dot`` is the state's
+        tangent by field; ``directions`` are those of the parameters."""
         names = list(quantities)
         if not names:
             return {}
@@ -337,7 +303,7 @@ class Problem:
         return self._rollout.lost
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """Return how many points one call of `together` can take; see `Batchable.room`."""
+        """Return how many points one call of `together` can take with an ``estimator``; see `Batchable.room`."""
         if self.simulation.batch is not None or (estimator is not None and not checked_reverse(estimator).batches):
             return 1
         return self.simulation.room(self.steps, self.memory_budget if estimator else 0.0)
@@ -346,7 +312,7 @@ class Problem:
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
-        """Return estimates at several points in one launch; see `Batchable.together`."""
+        """Return estimates at several ``points`` in one launch; see `Batchable.together`."""
         require_points(points)
         if estimator is not None:
             checked_reverse(estimator)
@@ -361,7 +327,7 @@ class Problem:
         return [lost[b] if b in lost else found.member(b, shapes) for b in range(len(points))]
 
     def beginning_at(self, state: RestartState | Sequence[RestartState]) -> "Problem":
-        """Return a problem that begins at another state and shares this problem's arrays."""
+        """Return a problem that begins at another ``state`` and shares this problem's arrays."""
         found, judged = object.__new__(Problem), self.simulation.judged_states
         states = [one if one in judged else one.fixed() for one in one_for_each(state, self.simulation.batch)]
         found.__dict__ |= {**self.__dict__, "state": state, "_states": states, "_batches": {}}
@@ -379,10 +345,25 @@ class Problem:
 
     @property
     def fingerprint(self) -> str:
-        """Text that identifies the problem: steps, precision, scene, first positions, and free energy (name, curvature,
-        code). It also covers your own forces and solver, and the ``fingerprint`` of the loss or the code of a loss
-        function. Any other loss enters by its type alone."""
-        return _fingerprint(self.simulation, self.steps, self.loss, self._states)
+        """Text that identifies the problem: steps, precision, scene, first positions, free energy, user-defined forces
+        and solver, and the ``fingerprint`` of the loss or the code of a loss function. Any other loss enters by its
+        type alone."""
+        simulation, energy = self.simulation, self.simulation.free_energy
+        parts = {
+            "scene": simulation.scene.computed_json().encode(),
+            "first positions": simulation.positions.tobytes(),
+            "target and loss": loss_fingerprint(self.loss).encode(),
+        }
+        checksums = [f"{name} {sha256(content).hexdigest()[:16]}" for name, content in parts.items()]
+        for state in self._states:
+            fields = b"".join(np.asarray(state[name]).tobytes() for name in sorted(state.fields))
+            clock = repr(state.clock) + (f" {state.clock.time_step!r}" if state.clock.time_step else "")
+            checksums.append(f"state {sha256(fields + clock.encode()).hexdigest()[:16]}")
+        code = "" if energy in FREE_ENERGIES.values() else f" {code_words(energy.functions)}"
+        energies = f"free energy {energy.name} {energy.curvature}{code}"
+        own = {"forces": simulation.forces, "solver": [simulation.own_solver] if simulation.own_solver else []}
+        told = [f"{what} {text}" for what, makers in own.items() if (text := parts_fingerprint(makers, simulation))]
+        return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies, *told])
 
     def iterations(self) -> np.ndarray:
         """Return the pressure iterations (steps,) of the last evaluation, for a solver with one iteration loop."""
@@ -390,12 +371,11 @@ class Problem:
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
-        """Diagnostics (steps,) of the last evaluation, by name: ``converged``, and further ones that the solver
-        records."""
+        """Diagnostics (steps,) of the last evaluation, by name: ``converged``, and further ones of the solver."""
         return self._rollout.diagnostics
 
     def _checked(self, parameters: Values) -> Arrays:
-        """Return the parameters as arrays, after checking that they fit the given first state, if there is one."""
+        """Return the parameters as arrays, after a check against the given first state."""
         values = self._space.checked(parameters)
         self._space.check_restarts(self._states, values)
         self.simulation.judged_states.update(one for one in self._states if one.origin is not None)
@@ -423,8 +403,8 @@ class Problem:
         return ends
 
     def _reader(self, wanted: set[int]) -> QuantityReader | None:
-        """Return a reader that computes the quantities for the loss during the run. Return None if the loss needs so
-        few states that repeating their steps costs less."""
+        """Return a reader of the loss's quantities during the run; None if the loss needs so few that steps are
+        repeated."""
         each = {k: name for k, name in self._losses.quantities(self.simulation.evaluator).items() if k in wanted}
         each.pop(self.steps, None)  # no step is behind it
         if len(each) * SPARSE < self.steps or not each:
@@ -433,6 +413,5 @@ class Problem:
 
     @property
     def _going(self) -> list[int] | None:
-        """Numbers of the scenes of a batch that have not lost a particle; None for a single scene."""
         batch = self.simulation.batch
         return None if batch is None else [b for b in range(batch) if b not in self.lost]

@@ -58,8 +58,6 @@ from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy, stable_substeps
 from cortado.watching import Watch
 
 WORTH = {"cpu": 16_000, "cuda": 1_000_000}
-"""Number of particles in one launch, all scenes together, above which larger batches are no faster, by kind of
-device."""
 
 
 @public
@@ -67,7 +65,8 @@ device."""
 class Simulation(Stepping):
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
 
-    Only one thread at a time uses a simulation. It can be pickled and used after a fork; see `docs/processes.md`.
+    Only one thread at a time uses a simulation. A simulation can be pickled and used after a fork; see
+    `docs/processes.md`.
 
     Example::
 
@@ -90,8 +89,8 @@ class Simulation(Stepping):
     ):
         """Prepare ``scene``, a `Scene` or the path of its file. ``device``: "cpu" or "cuda:0", as in Warp.
         ``precision``: "float32" or "float64". ``free_energy`` replaces the scene's. ``batch``: number of copies in one
-        launch, each with its own parameters. ``forces``: your own forces, such as `cortado.forces.Body`, added to the
-        scene's. ``solver``: a function that makes your own solver, used instead of the scene's; see
+        launch, each with its parameters. ``forces``: user-defined forces, such as `cortado.forces.Body`, added to the
+        scene's. ``solver``: a function that makes a user-defined solver, which replaces the scene's; see
         `docs/own_parts.md`. ``lanes``: GPU threads per particle, by default the fastest number for one scene of this
         size; see `docs/batches.md`."""
         scene, self.batch = as_scene(scene), None if batch is None else whole_number("batch", batch, 1)
@@ -104,13 +103,12 @@ class Simulation(Stepping):
         self.scene = scene
         self._given = checked_makers(forces), None if solver is None else checked_solver(solver)
         self.forces = (*forces_named(scene), *self._given[0])
-        """Makers of the forces that are not part of Cortado: those of packages named in the scene, and those given."""
+        """Makers of the forces that are not part of Cortado: of packages named in the scene, and user-defined ones."""
         self._maker = self._given[1] or solver_named(scene.solver)
         self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
-        """The maker of the solver if it is not one of Cortado's; None otherwise."""
+        """Maker of a solver that is not one of Cortado's, or None."""
         self._called, self._lanes = called(scene.solver, self._given[1]), checked_lanes(lanes)
         self.known = known_of(self.forces, self._maker, scene)
-        """Parameters of the forces and of the solver."""
         self.device = device_named(device)
         self.precision = precision_named(precision)
         discrete = discretise(scene)
@@ -121,7 +119,7 @@ class Simulation(Stepping):
         require(parts, f"take {smaller}a larger spacing or a smaller container", self.device)
         check_distance(scene, discrete, self.precision)
         self.positions, self.velocities = discrete.fluid.positions, discrete.fluid.velocities
-        """First positions (n, d) [m] and first velocities (n, d) [m / s]."""
+        """First positions (n, d) [m] and first velocities (n, d) [m/s]."""
         self.mass_fractions = np.eye(len(scene.phase))[discrete.fluid.phase]
         """First mass fractions (n, phases) [-]."""
         self.particles = len(self.positions)
@@ -129,18 +127,17 @@ class Simulation(Stepping):
         self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
         self.smoothing = discrete.kernel
         self.walls, self.wall_solids = discrete.walls.positions, discrete.walls.solid
-        """Positions of wall particles (b, d) [m], and the number of each one's solid (b,) as in `wall_numbers`; -1 for
-        the container."""
+        """Positions of wall particles (b, d) [m], and the numbers of their solids (b,) as in `wall_numbers`; -1 for the
+        container."""
         self.lattice, self.masses = discrete.lattice, discrete.masses
-        """Constants of the lattice of particles at rest; masses of the fluid at the start, given and asked for [kg]."""
+        """Constants of the rest lattice; masses of the fluid at the start [kg], and those that the scene describes."""
         self.free_particles = discrete.fluid.emitted.start
-        """Number of particles outside nozzles at the start; these come first in the arrays."""
+        """Number of particles outside nozzles at the start, which come first in arrays."""
         own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
         self.solver: Solver = built(self._maker, SolverSetting(*own, self._called, self._lanes))
         self.initial = self.solver.new_state()
-        """The first state on the device."""
         self.judged_states: WeakSet[RestartState] = WeakSet()
-        """States that were checked once and cannot change, so that they are not checked again."""
+        """States that were checked once and cannot change."""
         first = SceneParameters(self, 0).first(self.parameters())
         self.initial.set(first if self.batch is None else {name: [a] * self.batch for name, a in first.items()})
         for array in (self.positions, self.velocities, self.mass_fractions, self.walls):
@@ -149,16 +146,13 @@ class Simulation(Stepping):
 
     @property
     def carried_by(self) -> str | None:
-        """Name of the solver for messages, if it adds fields to states so that no other solver can continue from them;
-        else None."""
+        """Name of a solver that adds fields to states, so that no other solver can continue from them; else None."""
         return self._called if getattr(self.solver, "carried_fields", ()) else None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle or copy the simulation as its constructor's arguments."""
         return _made_again, (self._made_of(self.precision.name, self.batch), self._points)
 
     def _made_of(self, precision: str, batch: int | None) -> tuple[Any, ...]:
-        """Return the constructor's arguments for a simulation of this scene in a precision and of a batch."""
         energy = self.free_energy if len(self.scene.phase) > 1 else None
         return self.scene, self.device.alias, precision, energy, batch, *self._given, self._lanes
 
@@ -168,18 +162,14 @@ class Simulation(Stepping):
         return f"Simulation({batch}{sizes}, {self.device.alias}, {self.precision.name})"
 
     def _repr_html_(self) -> str:
-        """Return the repr, and a picture of the first particles."""
-        page: str = on_top("simulation_page")(self)
-        return page
+        return on_top("simulation_page")(self)
 
     @property
     def _points(self) -> str:
-        """Checksum of the first positions."""
         return sha256(self.positions.tobytes()).hexdigest()
 
     @property
     def turn(self) -> Turn:
-        """Lock that a thread holds while it uses the simulation."""
         return self.solver.turn
 
     @in_turn
@@ -194,17 +184,17 @@ class Simulation(Stepping):
         time: float | None = None,
         observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
-        """Run from the scene's first state and return the frames: the first, every ``record_every`` steps one, and the
+        """Run from the scene's first state and return the frames: the first state, every ``record_every``-th and the
         last. A batch returns a `TrajectoryBatch`. ``time`` [s], instead of ``steps``, runs until the first step that
         ends at this time or later.
 
-        ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity and its schedule; any other
+        ``controls={"gravity": (d,) or (steps, d)}`` [m/s2] replaces the scene's gravity and its schedule; any other
         parameter of `Problem` can be given as well. ``state``, the ``last_state`` of an earlier trajectory (one for
         each scene of a batch), continues that run bit for bit. Parameters over time then have a value for each
         remaining step, and a rest density given to the earlier run must be given again. ``record=["density"]`` stores
         particle quantities with every frame: see `quantity`. ``sensors``, by name, are read in every step besides the
-        scene's: see `cortado.sensors`. ``observe`` is called with the number of each step, to show progress. Warns when
-        the pressure did not converge. When a particle is lost, a single run raises `DivergedError`; a batch warns and
+        scene's: see `cortado.sensors`. ``observe`` is called with the number of each step, to show progress. Warns if
+        the pressure did not converge. If a particle is lost, a single run raises `DivergedError`; a batch warns and
         continues without that scene.
         """
         own, number = self.__dict__, steps_of_run(self, steps, time, {} if controls is None else controls)
@@ -227,8 +217,8 @@ class Simulation(Stepping):
         sensors: Mapping[str, Sensor] | None = None,
         observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
-        """Run a rollout forward and return its frames. ``record_every``, ``record``, ``sensors``, ``observe``, warnings
-        and errors are as in `run`."""
+        """Run a ``rollout`` forward and return its frames. ``record_every``, ``record``, ``sensors``, ``observe``,
+        warnings and errors are as in `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         expected = expected_frames(rollout, record_every)
@@ -253,22 +243,20 @@ class Simulation(Stepping):
         return found
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
-        """Return those fields of a state that a trajectory records, which are the fields that steps change."""
+        """Return the fields of a ``state`` that steps change."""
         return state.numpy(self.dimension, self._changing)
 
     @property
     def _changing(self) -> list[str]:
-        """Names of the fields of a state that steps change."""
         return [field.name for field in self.initial.fields if not field.is_constant]
 
     def numbers_in_frame(self, components: int) -> int:
-        """Return the greatest number of floating-point numbers that `frame` records, for vectors with so many
-        components."""
+        """Return the greatest number of numbers in a `frame`, for vectors with so many ``components``."""
         sizes = self.particles, components, len(self.scene.phase)
         return sum(prod(field.shape(*sizes)) for field in self.initial.fields if not field.is_constant)
 
     def constants(self, rollout: Rollout) -> dict[str, np.ndarray]:
-        """Return the fields of a rollout's states that no step changes."""
+        """Return the fields of the states of a ``rollout`` that no step changes."""
         names = [field.name for field in rollout.initial.fields if field.is_constant]
         return rollout.initial.numpy(self.dimension, only=names)
 
@@ -293,7 +281,6 @@ class Simulation(Stepping):
         state: RestartState | Sequence[RestartState] | None,
         time: float | None,
     ) -> None:
-        """Set a rollout's first state and parameters, and its end time if one is given."""
         space, given = ParameterSpace(self, rollout.steps), {} if controls is None else controls
         values = space.checked(given)
         states = one_for_each(state, self.batch)
@@ -307,18 +294,20 @@ class Simulation(Stepping):
         of: RestartState | Sequence[RestartState] | Trajectory | None = None,
         controls: Mapping[str, Any] | None = None,
     ) -> np.ndarray:
-        """Return a quantity of the particles: "density" [kg / m3], "pressure" [Pa], "speed" [m / s], "vorticity" [1 /
-        s], "wall_force" [N]; see `docs/sensors.md`. Fields of the state work too, such as one of your own solver, and
+        """Return a quantity of the particles: "density" [kg/m3], "pressure" [Pa], "speed" [m/s], "vorticity" [1/s],
+        "wall_force" [N]; see `docs/sensors.md`. Fields of the state work too, such as one of a user-defined solver, and
         the load on a solid, such as "rotor.load".
 
         Args:
-            name: name of the quantity. of: a state of this simulation (of a batch, one for each scene), or a trajectory
-            to evaluate frame by frame; by default the scene's first state. controls: as in `run`, for the step that
-            begins at the state: the pressure is computed in this step. For a trajectory, give the controls of its run.
+            name: name of the quantity.
+            of: a state of this simulation (of a batch, one for each scene), or a trajectory, which is evaluated frame
+                by frame; by default the scene's first state.
+            controls: as in `run`, for the step that begins at the state, in which the pressure is computed. For a
+                trajectory, give the controls of its run.
 
         Returns:
-            float64 (n,) or (n, k) in the scene's order, for a trajectory (frames, n, ...); a field has its own shape, a
-            load (k,).
+            float64 (n,) or (n, k) in the scene's order, for a trajectory (frames, n, ...). A field has its shape, and
+            a load (k,).
 
         Raises:
             InputError: the name is unknown, or the state is not one of this simulation.
@@ -340,7 +329,7 @@ class Simulation(Stepping):
 
     @in_turn
     def evaluator(self) -> QuantityEvaluator:
-        """Return the object that computes quantities of states on the device. It is made once."""
+        """Return the object that computes quantities of states on the device, which is made once."""
         made: QuantityEvaluator | None = self.__dict__.get("_evaluator")
         if made is None:
             spacing, support = self.scene.discretisation.spacing, self.lattice.support
@@ -367,18 +356,15 @@ class Simulation(Stepping):
 
         Example: ``cortado.pictures.write_picture("last.png", simulation.picture(trajectory[-1]))``
         """
-        image: ShadedPicture = on_top("simulation_picture")(self, frame, settings)
-        return image
+        return on_top("simulation_picture")(self, frame, settings)
 
     def film(self, trajectory: Trajectory, path: str | Path, **settings: Any) -> Film:
         """Render a film of a ``trajectory`` on the simulation's device and write it to ``path``; for ``settings`` see
         `Trajectory.film`. If the quantity of ``colour``, such as the pressure, was not recorded, it is computed."""
-        film: Film = on_top("simulation_film")(self, trajectory, path, settings)
-        return film
+        return on_top("simulation_film")(self, trajectory, path, settings)
 
     @property
     def dimension(self) -> int:
-        """Number of space dimensions, 2 or 3."""
         return self.scene.dimension
 
     @unwarned()
@@ -388,7 +374,7 @@ class Simulation(Stepping):
 
     @unwarned()
     def in_precision(self, precision: str) -> "Simulation":
-        """Return a single simulation of this scene, on the same device, in a precision."""
+        """Return a single simulation of this scene, on the same device, in a ``precision``."""
         return Simulation(*self._made_of(precision, None))
 
     def replaced(self, *overrides: str) -> "Simulation":
@@ -397,7 +383,7 @@ class Simulation(Stepping):
         return Simulation(self.scene.replaced(*overrides), *others)
 
     def room(self, steps: int, checkpoints: float) -> int:
-        """Return how many runs of ``steps`` steps one launch should compute. They fit half of the free memory, with at
+        """Return how many runs of ``steps`` steps one launch should compute: they fit half of the free memory, with at
         most ``checkpoints`` bytes of stored states in total."""
         neighbours, real = first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
         own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
@@ -415,8 +401,8 @@ class Simulation(Stepping):
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
     ) -> int:
         """Return the number of explicit diffusion substeps per ``time_step`` [s] that is stable with a ``mobility``
-        [m2/s], an ``interface_width`` [m] and a ``rest_density`` (phases,) [kg/m3]; raises `InputError` if that is more
-        than `cortado.sph.free_energy.MOST_SUBSTEPS`."""
+        [m2/s], an ``interface_width`` [m] and a ``rest_density`` (phases,) [kg/m3]; raises `InputError` for more than
+        `cortado.sph.free_energy.MOST_SUBSTEPS`."""
         if len(self.scene.phase) == 1:
             return 0
         numbers = (float(time_step), float(mobility), float(interface_width), rest_density)
@@ -424,7 +410,6 @@ class Simulation(Stepping):
 
 
 def _controls_at(given: dict[str, Any], trajectory: Trajectory, frame: int) -> dict[str, Any]:
-    """Return the controls of the step that follows a frame, from the controls given to the whole run."""
     step = int(trajectory.steps[frame] - trajectory.steps[0])
     rows = {name: value for name, value in given.items() if name in OVER_TIME and np.ndim(value) == 2}
     return given | {name: value[min(step, len(value) - 1)] for name, value in rows.items()}
@@ -432,7 +417,6 @@ def _controls_at(given: dict[str, Any], trajectory: Trajectory, frame: int) -> d
 
 @unwarned()
 def _made_again(made_of: tuple[Any, ...], points: str) -> Simulation:
-    """Make a simulation from pickled arguments; raises `InputError` if the checksum of its first positions differs."""
     simulation = Simulation(*made_of)
     if simulation._points != points:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Observe a run while it runs: compute quantities of recorded frames and read sensors in every step."""
+"""Record quantities and read sensors during a run."""
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache, partial
@@ -7,42 +7,36 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.arrays import require_table
-from cortado.errors import InputError
+from cortado.arrays import require_names, require_table
+from cortado.errors import DivergedError, InputError
 from cortado.losses.loss import Snapshot, SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.rollout import Observer, Rollout
 from cortado.rollout.stepper import Steppable
 from cortado.runs.probes import SENSORS, sensors_of, warn_of_places
-from cortado.runs.quantity_values import Moment, QuantityEvaluator, Recorder
+from cortado.runs.quantity_values import Moment, QuantityEvaluator
 from cortado.runs.recording import StepReader, Waiting
 from cortado.runs.sensor import Readings, Sensor, SensorLog, value_of
 from cortado.scene.parameter_values import Arrays
+from cortado.scene.parameters import QUANTITIES, check_quantity
 
 
 class Watched(Steppable, Protocol):
-    """Protocol of the simulations that `Watch` can observe."""
-
     @property
-    def walls(self) -> NDArray:
-        """Positions (b, d) of wall particles [m]."""
+    def walls(self) -> NDArray: ...
 
-    def evaluator(self) -> QuantityEvaluator:
-        """Return the object that computes quantities with the arrays of the simulation."""
+    def evaluator(self) -> QuantityEvaluator: ...
 
-    def rollout(self, steps: int, controls: Mapping[str, Any] | None, state: Any) -> Rollout:
-        """Return a rollout that is ready to go forward."""
+    def rollout(self, steps: int, controls: Mapping[str, Any] | None, state: Any) -> Rollout: ...
 
-    def in_precision(self, precision: str) -> Any:
-        """Return a single simulation of this scene in a precision."""
+    def in_precision(self, precision: str) -> Any: ...
 
-    def batch_of(self, size: int) -> Any:
-        """Return a simulation of ``size`` copies of this scene in one launch."""
+    def batch_of(self, size: int) -> Any: ...
 
 
 class Watch:
-    """An observer of one rollout that computes quantities and reads sensors. Sensors that are sums over particles are
-    read on the device while the run continues. Other sensors use the arrays of a second solver of the scene."""
+    """An observer of one rollout, which records quantities and reads sensors. User-defined sensors and quantities use
+    the arrays of a second solver of the scene."""
 
     def __init__(
         self,
@@ -51,8 +45,7 @@ class Watch:
         record: Iterable[str] = (),
         sensors: Mapping[str, Sensor] | None = None,
     ):
-        """Prepare to record quantities, and to read ``sensors`` besides those of the scene. Raises `InputError` for
-        unknown quantities, and for a batch with user-defined sensors."""
+        """Raise `InputError` for unknown quantities, and for a batch with user-defined sensors."""
         if sensors is not None:
             require_table("sensors", sensors, "{'probe': cortado.sensors.PressureProbe([0.1, 0.1])}")
 
@@ -63,9 +56,11 @@ class Watch:
 
         known = sensors_of(simulation.scene) | dict(sensors or {})
         warn_of_places(simulation, known)
-        self._recorder = Recorder(rollout, record, evaluator, simulation.dimension)
+        names = require_names("record", record)
+        self.names = tuple(dict.fromkeys(check_quantity(name, "record") for name in names))
+        if self.names:
+            evaluator()
         self._logs = [SensorLog(known, simulation.dimension) for _ in range(simulation.batch or 1)]
-        """Sensor readings, one log for each scene."""
         self._rollout, self._simulation, self._evaluator = rollout, simulation, evaluator
         self._on_host = {name: one for name, one in known.items() if type(one) not in SENSORS.values()}
         if self._on_host and simulation.batch is not None:
@@ -73,13 +68,9 @@ class Watch:
             wanted = "sensors of a batch must be those of cortado.sensors: read one scene's"
             raise InputError(f"sensors has {type(own).__name__} as {name!r}, but {wanted}.")
         summed: Any = {name: one for name, one in known.items() if name not in self._on_host}
-        self._reader = StepReader(simulation.evaluator(), rollout, summed) if summed else None
-        """The reader of sensors on the device; None if there are no such sensors."""
+        self._reader = StepReader(simulation.evaluator(), rollout, summed, self._logs) if summed else None
         self._quantities = set[str](() if self._reader is None else self._reader.quantities)
-        """Names of the quantities that sensors read from a state."""
         self._colours = np.array([phase.colour for phase in simulation.scene.phase])
-        self.names = self._recorder.names
-        """Names of the recorded quantities."""
         self._waiting: Any = None
 
     def run(
@@ -88,12 +79,8 @@ class Watch:
         record: Observer,
         observe: Callable[[int], object] | None = None,
     ) -> State:
-        """Run the rollout forward and return its last state. Sensors read every state; ``record`` is called with the
-        frames.
-
-        Both read copies of states while a GPU computes the next steps; ``observe`` is called first, with each state's
-        number. Raises `DivergedError`. States computed before this error, or before an interrupt, are still read.
-        """
+        """Run the rollout forward and return its last state. ``record`` receives frames, and ``observe`` the number of
+        each state. States computed before a `DivergedError` or an interrupt are still read."""
 
         def look(step: int, state: State) -> None:
             if is_frame(step):
@@ -114,29 +101,36 @@ class Watch:
         return last
 
     def look(self) -> None:
-        """Process everything that waits: copied states, and sensor values read on the device."""
         if self._waiting is not None:
             self._waiting.look()
-        for row in () if self._reader is None else self._reader.rows():
-            self._logs[row.member].read(row.sensor, row.number, row.reading)
+        if self._reader is not None:
+            self._reader.look()
 
     def first(self) -> None:
-        """Make user-defined sensors read the first state, before the run."""
         self._step(0, self._rollout.initial)
 
     def frame(self, step: int, state: State) -> Arrays:
-        """Return the recorded quantities, by name, of the state after ``step`` steps."""
-        return self._recorder(step, state)
+        """Return recorded quantities of the state after ``step`` steps; NaN if the next step loses a particle."""
+        if not self.names:
+            return {}
+        found, real = dict[str, NDArray](), self._rollout.solver.discretisation.precision.numpy
+        moment = Moment.of(self._rollout, step, state, self._evaluator)
+        for name in self.names:
+            try:
+                found[name] = moment.value(name).astype(real)
+            except DivergedError:  # which the run itself raises
+                sizes = QUANTITIES[name].shape(len(state.positions), self._simulation.dimension)
+                found[name] = np.full(sizes, np.nan, dtype=real)
+        return found
 
     def _step(self, step: int, state: State) -> None:
-        """Make user-defined sensors read the state after ``step`` steps."""
         if self._on_host:
             at: Any = self._snapshot(step, state, self._evaluator)
             for name, sensor in self._on_host.items():
                 self._logs[0].read(name, step, partial(value_of, sensor, at))
 
     def end(self, state: State) -> None:
-        """Make the sensors read the last state of a finished run, with the arrays of the simulation."""
+        """Read the last state of a finished run, which no step follows."""
         if self._reader is None:
             return
         step = self._rollout.taken
@@ -156,14 +150,12 @@ class Watch:
         return SnapshotBatch(state, d, np.array([self._colours] * batch), moment)
 
     def known(self, readings: Mapping[str, Readings]) -> float:
-        """Return the last step for which an earlier process stored all readings; infinite without sensors."""
         return self._logs[0].known(readings)
 
     def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
-        """Load the sensor readings that an earlier process stored, up to the state after ``steps`` steps."""
+        """Take over ``readings`` of an earlier process, up to the state after ``steps`` steps."""
         self._logs[0].go_on(steps, readings)
 
     def readings(self, member: int = 0) -> dict[str, Readings]:
-        """Return the readings of the sensors of a scene, by their names."""
         clock, steps = self._rollout.clocks[member], np.arange(self._rollout.steps + 1)
         return self._logs[member].readings(clock.times(steps, float(self._rollout.time_steps[member])))

@@ -1,7 +1,5 @@
-"""The control tasks: carry a cup, pour a latte, pour from a jug, move a raft, shape a splash, stir a cup. Carrying and
-pouring exist in 2-D and in 3-D."""
+"""The control tasks. Carrying and pouring exist in 2-D and in 3-D."""
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 
 from cortado.environments.task import Actuator, Position, Task, Velocity
 from cortado.environments.terms import Distance, Miss, Missed, OneBox, Pose, Reward, Share, Spread
-from cortado.errors import CortadoWarning, InputError, shown
+from cortado.errors import InputError, shown, unwarned
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
@@ -20,7 +18,6 @@ WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.05, "colour": [
 COFFEE = {"name": "coffee", "rest_density": 1000.0, "viscosity": 0.05, "colour": [0.20, 0.09, 0.04]}
 MILK = {"name": "milk", "rest_density": 950.0, "viscosity": 0.05, "colour": [0.95, 0.92, 0.85]}
 LED = {"motion": "path", "velocity": [0.0, 0.0], "colour": [0.6, 0.6, 0.65]}
-"""Scene keys of a solid whose path is set by actions."""
 
 
 def box(lower: Sequence[float], upper: Sequence[float], **others: Any) -> dict[str, Any]:
@@ -29,8 +26,8 @@ def box(lower: Sequence[float], upper: Sequence[float], **others: Any) -> dict[s
 
 
 def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Actuator, Actuator]:
-    """Return the actuators of a solid that moves along x, at up to ``fastest`` [m/s], and turns about z, at up to
-    ``turning`` [rad/s]."""
+    """Return the actuators of a solid that moves along x, up to ``fastest`` [m/s], and turns about z, up to ``turning``
+    [rad/s]."""
     still, plane = (0.0,) * dimension, dimension == 2
     turn: Any = {"rest": (0.0,), "axes": (0,)} if plane else {"rest": still, "axes": (2,)}
     return (
@@ -40,40 +37,36 @@ def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Act
 
 
 class Vessels(Task):
-    """A base class of tasks with cups and jugs. In 3-D the vessels are round, with axes in the plane z = 0; in 2-D they
-    are cross-sections."""
+    """A base class of tasks with cups and jugs: in 2-D cross-sections, in 3-D round, with axes in the plane z = 0."""
 
     view: ClassVar[dict[str, Any]] = {}
-    """Settings of pictures; in 3-D the position of the camera and the point it looks at [m]."""
 
     def place(self, x: float, y: float) -> list[float]:
-        """Return a point of the plane z = 0 [m]."""
         return [x, y, 0.0][: self.dimension]
 
     def corners(self, lower: Sequence[float], upper: Sequence[float]) -> tuple[list[float], list[float]]:
-        """Return the corners of a box [m], given in the plane; in 3-D the box has a square base centred at z = 0."""
+        """Return the corners of a box [m], given in the plane; in 3-D with a square base centred at z = 0."""
         half = 0.5 * (upper[0] - lower[0])
         return [*lower, -half][: self.dimension], [*upper, half][: self.dimension]
 
     def filled(self, lower: Sequence[float], upper: Sequence[float], phase: str) -> dict[str, Any]:
-        """Return the scene table of fluid in a box of the plane [m]; in 3-D in a round vessel with this
-        cross-section."""
+        """Return the scene table of fluid with this cross-section [m]: a box, in 3-D a cylinder."""
         if self.dimension == 2:
             return box(lower, upper, phase=phase)
         size = {"radius": 0.5 * (upper[0] - lower[0]), "height": upper[1] - lower[1]}
         return {"shape": "cylinder", "base": self.place(0.5 * (lower[0] + upper[0]), lower[1]), **size, "phase": phase}
 
     def room(self, lower: Sequence[float], upper: Sequence[float]) -> dict[str, Any]:
-        """Return the scene table of a container; in 3-D there is no container, and spilt fluid falls without end."""
+        """Return the scene table of a container; none in 3-D, where spilt fluid falls without end."""
         return box(lower, upper) if self.dimension == 2 else {"shape": "none"}
 
 
 class Carry(Vessels):
     """The task of carrying a cup of water to a place, without spilling.
 
-    Actions: the cup's velocity along x and its angular velocity. Goal: the place of the cup's middle. The task and its
-    reward follow TransportWater of SoftGym (Lin et al. 2020). The reward is minus the cup's distance to its goal [m],
-    minus 10 times the share of water outside the cup. SoftGym counts particles; here they count smoothly
+    Actions: the cup's velocity along x and its angular velocity. Goal: the place of the cup's middle. The reward is
+    minus the cup's distance to its goal [m], minus 10 times the fraction of water outside the cup. Task and reward
+    follow TransportWater of SoftGym (Lin et al. 2020). SoftGym counts particles; here they count smoothly
     (`cortado.environments.terms.Share`), and the cup can lean.
     """
 
@@ -85,7 +78,6 @@ class Carry(Vessels):
     width, depth, height, wall = 0.15, 0.1, 0.175, 0.05
     """Inner width of the cup, depth of its water, inner height of the cup, and thickness of its walls [m]."""
     floor = -0.15
-    """Height of the floor that catches spilt water, below every corner of the cup [m]."""
     fastest, turning = 0.6, 1.0
     """Greatest velocity [m/s] and angular velocity [rad/s]."""
     actuators = led("cup", fastest, turning, 2)
@@ -130,9 +122,9 @@ class Latte(Task):
     """The task of pouring milk from a moving nozzle into coffee, so that it lands as if the nozzle followed a hidden
     path.
 
-    Actions: the positions along x to which the nozzle is sent. The task follows LatteArt of FluidLab (Xian et al.
-    2023); its reward differs by a factor and a constant. The reward is minus the mean squared distance between the
-    poured milk and its places with the hidden path at the same time, divided by the squared radius of the cup.
+    Actions: the positions along x to which the nozzle is sent. The reward is minus the mean squared distance between
+    the poured milk and its places with the hidden path, divided by the squared radius of the cup. The task follows
+    LatteArt of FluidLab (Xian et al. 2023); its reward differs by a factor and a constant.
     """
 
     name = "Latte"
@@ -144,8 +136,7 @@ class Latte(Task):
     height = depth + 0.005
     """Height of the nozzle above the floor [m]."""
     reach, lag, pouring = 0.6 * radius, 0.03, 25
-    """Greatest position of the nozzle [m], time constant of its motion [s], and number of environment steps during
-    which it pours."""
+    """Greatest position of the nozzle [m], time constant of its motion [s], and number of steps of pouring."""
     actuators = (Position("nozzle.path", (0.0, height), (0,), (reach,), lag=lag),)
 
     @property
@@ -160,7 +151,6 @@ class Latte(Task):
 
     @property
     def speed(self) -> float:
-        """Speed of the milk in the nozzle [m/s]."""
         return self.column / (self.pouring * self.repeats * self.coarse_step)
 
     def reward(self, simulation: Simulation) -> Reward:
@@ -181,8 +171,7 @@ def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]
     simulation = Simulation(task.scene, device, precision)
     (nozzle,), steps = task.actuators, task.horizon * task.substeps
     path = nozzle.over(task.horizon, task.substeps, task.time_step).parameter(hidden_actions(task))
-    with warnings.catch_warnings():  # of the milk, which is out before the end
-        warnings.simplefilter("ignore", CortadoWarning)
+    with unwarned():  # of the nozzle, which is empty before the end
         run = simulation.run(steps, {nozzle.parameter: path}, record_every=task.substeps)
     (emitter,) = simulation.scene.emitter
     sample, first = emitter.sample(task.spacing), simulation.free_particles
@@ -195,9 +184,9 @@ def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]
 class Pour(Vessels):
     """The task of turning and moving a jug until its syrup is in a glass.
 
-    Actions: the jug's velocity along x and its angular velocity, counterclockwise. The task and its reward, the share
-    of fluid in the glass, follow PourWater of SoftGym (Lin et al. 2020). SoftGym counts particles; here they count
-    smoothly (`cortado.environments.terms.Share`), and the jug stays at its height.
+    Actions: the jug's velocity along x and its angular velocity, counterclockwise. The reward is the fraction of fluid
+    in the glass. Task and reward follow PourWater of SoftGym (Lin et al. 2020). SoftGym counts particles; here they
+    count smoothly (`cortado.environments.terms.Share`), and the jug stays at its height.
     """
 
     name = "Pour"
@@ -230,16 +219,15 @@ class Pour(Vessels):
 
     @property
     def share(self) -> Share:
-        """The share of the syrup that is in the glass."""
         lower, upper = self.corners(self.lower, self.upper)
         return Share(OneBox(tuple(lower), tuple(upper)), 2.0 * self.coarse_spacing)
 
 
 class PourInSpace(Pour):
-    """The task of pouring exactly a given share of a round jug's syrup into a round glass.
+    """The task of pouring exactly a given fraction of a round jug's syrup into a round glass.
 
-    Actions are those of `Pour`. Goal: the share of the syrup to pour. The reward is minus the difference between the
-    share in the glass and the goal.
+    Actions are those of `Pour`. Goal: the fraction of the syrup to pour. The reward is minus the difference between the
+    fraction in the glass and the goal.
     """
 
     name = "PourInSpace"
@@ -268,7 +256,6 @@ class Raft(Task):
     free_solids: ClassVar[tuple[str, ...]] = ("raft",)
     goal_names: ClassVar[tuple[str, ...]] = ("x of the raft [m]",)
     length = 0.25
-    """Length of the raft [m]."""
     reach, lag = 0.05, 0.1
     """Greatest displacement of the paddle [m], and time constant of its motion [s]."""
     actuators = (Position("paddle.displacement", (0.0, 0.0), (0,), (reach,), lag=lag),)
@@ -295,12 +282,11 @@ class Splash(Task):
     """The task of shaking a box in which a dam breaks, so that its water gets the shape of the letter L.
 
     Actions: the acceleration of the box along x and y, which acts on its water as a change of gravity. Goal: the left
-    side of the letter's stem. The reward is the share of the water inside the letter, that is in its foot along the
-    floor or in its stem. Particles count smoothly (`cortado.environments.terms.Share`).
+    side of the letter's stem. The reward is the fraction of the water inside the letter, whose particles count smoothly
+    (`cortado.environments.terms.Share`).
     """
 
     half = 0.3
-    """Half of the width of the box [m]."""
     name = "Splash"
     horizon, repeats = 40, 5
     coarse_spacing, coarse_step = half / 12, 0.003
@@ -326,10 +312,10 @@ class Splash(Task):
 
 @dataclass(frozen=True)
 class Letter:
-    """A function from goals to the boxes of the letter's foot and stem, whose total area is that of the water."""
+    """A function from goals to the two boxes of the letter L, whose total area is that of the water."""
 
     half: float
-    """Side of the square that the water fills at the start [m]."""
+    """side of the square that the water fills at the start [m]"""
 
     def __call__(self, goal: NDArray) -> tuple[NDArray, NDArray]:
         lower, upper = np.zeros((len(goal), 2, 2)), np.zeros((len(goal), 2, 2))
@@ -342,9 +328,9 @@ class Letter:
 class Stir(Task):
     """The task of stirring a cup of coffee until milk from one corner is spread everywhere.
 
-    Actions: the positions to which the spoon, a disc in the plane, is sent. The task follows Mixing of FluidLab (Xian
-    et al. 2023); its reward differs by a factor. The reward is the mean distance |dx| + |dy| of pairs of milk
-    particles, divided by that of pairs of all particles at the start, minus 1.
+    Actions: the positions to which the spoon, a disc in the plane, is sent. The reward is the mean distance |dx| + |dy|
+    of pairs of milk particles, divided by that of pairs of all particles at the start, minus 1. The task follows Mixing
+    of FluidLab (Xian et al. 2023); its reward differs by a factor.
     """
 
     name = "Stir"
@@ -385,11 +371,11 @@ TASKS: dict[str, type[Task]] = {
 
 
 def task_of(task: str | Task, size: str | None) -> Task:
-    """Return the task of a name in a size ("small" if left out), or a user's `Task` itself; raises `InputError` for
-    unknown names and sizes, and for a size given together with a `Task`."""
+    """Return the task of a name and size ("small" by default), or a user's `Task`. Raise `InputError` for unknown names
+    and sizes, and for a size given together with a `Task`."""
     if isinstance(task, Task):
         if size is not None:
-            raise InputError(f"size is {shown(size)}, but must be left out, as the task is one of your own.")
+            raise InputError(f"size is {shown(size)}, but must be left out, as the task is a Task object.")
         return task
     if not isinstance(task, str) or task not in TASKS:
         raise InputError(f"task is {shown(task)}, but must be one of {', '.join(TASKS)}, or a Task.")

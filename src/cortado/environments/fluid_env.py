@@ -1,6 +1,5 @@
-"""Gymnasium environments: a single one, and a batch of one task in one launch. If Gymnasium is not installed, an error
-says so in a sentence. `Twin` is an episode as a differentiable function of its actions.
-"""
+"""Gymnasium environments: a single one, and a batch of one task in one launch. `Twin` is an episode as a differentiable
+function of its actions."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -25,12 +24,12 @@ from cortado.scene.parameter_values import Arrays
 
 
 class Twin:
-    """Minus the sum of rewards of one episode, as a loss of its actions (actions, a). Actions outside -1 to 1 are
+    """Minus the sum of rewards of one episode, as a function of its actions (actions, a). Actions outside -1 to 1 are
     clipped, as in the environment; their derivative is 0."""
 
     def __init__(self, scenes: Scenes, number: int = 0, actions: int | None = None, state: EnvState | None = None):
         """Copy the current episode of scene ``number``, from the episode's start or from a saved ``state``.
-        ``actions``: number of actions, by default all that remain of a whole episode."""
+        ``actions``: number of actions, by default all that remain."""
         task, m = scenes.task, scenes.task.substeps
         require_at_most("number", whole_number("number", number, 0), len(scenes) - 1)
         done, begun, restart = 0, [one.at_rest(1) for one in task.actuators], None
@@ -54,7 +53,7 @@ class Twin:
         """The loss as a function of the scene's parameters."""
         fixed: Any = FixedParameters(self.problem, self._start) if self._start else self.problem
         self.search = Transformed(fixed, self.coordinates)
-        """The loss as a function of actions, by the names of `named`; pass this to `cortado.optimise`."""
+        """The loss as a function of actions, by the names of `named`; pass it to `cortado.optimise`."""
         self.shape = count, sum(len(one.axes) for one in task.actuators)
         """Shape (actions, a) of the actions."""
 
@@ -64,7 +63,7 @@ class Twin:
         return {one.parameter: u for one, u in zip(self._actuators, parts, strict=True)}
 
     def value(self, actions: Any) -> float:
-        """Return the loss for these actions: minus the sum of rewards."""
+        """Return minus the sum of rewards for these actions."""
         return self.search.value(self.named(actions))
 
     def value_and_gradient(
@@ -99,7 +98,6 @@ class Twin:
         return lambda actions: loss(self._parameters(self._shaped(actions).clamp(-1.0, 1.0), contracted))
 
     def _shaped(self, actions: Any) -> Any:
-        """Return actions of another library unchanged; raises `InputError` for another shape."""
         shape = getattr(actions, "shape", None)
         if shape is None or tuple(shape) != self.shape:
             found = f"is {shown(actions)}" if shape is None else f"has shape {tuple(shape)}"
@@ -107,8 +105,7 @@ class Twin:
         return actions
 
     def _parameters(self, u: Any, contracted: Any) -> dict[str, Any]:
-        """Return the scene's parameters for actions of JAX or PyTorch; ``contracted`` is the library's product of
-        matrix and actions."""
+        """Return the scene's parameters for actions of JAX or PyTorch; ``contracted`` applies an affine map."""
         found, first = dict[str, Any](self._start), 0
         for one in self._actuators:
             last = first + len(one.axes)
@@ -127,15 +124,13 @@ except ModuleNotFoundError as error:
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
 WIDTH, HEIGHT = 320, 200
-"""Width and height of pictures [pixels]."""
 BEFORE = "before the first one"
-"""Words for the error of a step before any episode has begun."""
 Observation = NDArray[np.float32]
 Info = dict[str, Any]
 
 
 class FluidEnv(gymnasium.Env[Observation, NDArray]):
-    """A Gymnasium environment of one scene; `gymnasium.make("cortado/Carry-v0")` makes one. See
+    """A Gymnasium environment of one scene; ``gymnasium.make("cortado/Carry-v0")`` makes one. See
     `docs/environments.md`."""
 
     metadata = METADATA
@@ -187,7 +182,8 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         terminated, ``info["diverged"]`` is a sentence about it, and the observation is the previous one.
 
         Raises `InputError` for an action of a wrong shape or with numbers that are not finite, and if no episode is in
-        progress."""
+        progress.
+        """
         if self._over:
             raise InputError(f"step is called {self._over}, but must come after reset().")
         actions = checked_actions("action", action, self._shape)
@@ -200,7 +196,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return self._observation.copy(), float(rewards[0]), bool(lost), truncated, info
 
     def close(self) -> None:
-        """Close the environment: no further episode can begin."""
+        """Close the environment, which can then begin no episode."""
         self._closed, self._over = True, "after close()"
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -237,8 +233,8 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
 
 
 class FluidVectorEnv(VectorEnv):
-    """A Gymnasium vector environment: a batch of scenes. Each gives the same bits as a single environment with the same
-    seed."""
+    """A Gymnasium vector environment: a batch of scenes. Each scene gives the same bits as a single environment with
+    the same seed."""
 
     def __init__(
         self,
@@ -272,7 +268,7 @@ class FluidVectorEnv(VectorEnv):
         self._horizon = whole_number("max_episode_steps", most, 1)
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
         self._over = np.ones(num_envs, dtype=bool)
-        """Mask (num_envs,) of the environments whose episodes have ended."""
+        """Mask (num_envs,) of ended episodes."""
         self._observations = self.scenes.observed()
 
     @property
@@ -350,8 +346,7 @@ class FluidVectorEnv(VectorEnv):
         return self.scenes.save(self._over, self._observations, random)
 
     def restore(self, state: EnvState) -> Observation:
-        """Go back to a saved state of the same number of environments and return its observations; see
-        `FluidEnv.restore`."""
+        """Go back to a saved state of as many environments and return its observations; see `FluidEnv.restore`."""
         self._require_open("restore")
         self.scenes.restore(state)
         for generator, own in zip(self._generators, state.generators, strict=True):
@@ -368,19 +363,18 @@ class FluidVectorEnv(VectorEnv):
             raise InputError(f"{what} is called after close(), but must come before it.")
 
     def _begin(self, which: NDArray) -> dict[int, Start]:
-        """Begin new episodes in the environments that a mask (num_envs,) chooses, and return their starts."""
+        """Begin episodes in the environments of a mask (num_envs,), and return their starts."""
         starts = {b: self.scenes.drawn(self._generators[b]) for b in np.flatnonzero(which).tolist()}
         self.scenes.begin(starts)
         self._over = self._over & ~which
         return starts
 
     def _observe(self, which: NDArray) -> None:
-        """Observe the environments that a mask (num_envs,) chooses; others keep their last observation."""
+        """Observe the environments of a mask (num_envs,); others keep their last observation."""
         self._observations = np.where(which[:, None], self.scenes.observed(), self._observations)
 
 
 def spaces(scenes: Scenes) -> tuple[Any, Any]:
-    """Return the Gymnasium spaces of one environment's observations and actions."""
     seen = scenes.observed().shape[1]
     actions = sum(len(one.axes) for one in scenes.task.actuators)
     everything = gymnasium.spaces.Box(-np.inf, np.inf, (seen,), np.float32)
@@ -388,15 +382,13 @@ def spaces(scenes: Scenes) -> tuple[Any, Any]:
 
 
 def checked_render_mode(mode: str | None) -> str | None:
-    """Return a render mode; raises `InputError` unless it is None or "rgb_array"."""
     if mode not in (None, *METADATA["render_modes"]):
         raise InputError(f'render_mode is {shown(mode)}, but must be None or "rgb_array".')
     return mode
 
 
 def saved_option(options: Any, seed: Any, *others: str) -> EnvState | None:
-    """Return the state among the options of a reset, if any. Raises `InputError` if the options are no table or have
-    unknown names, and if other options or a seed come with a state."""
+    """Return the state among the options of a reset, or None; raise `InputError` for options that do not fit."""
     require_table("options", options or {}, "{'state': state}")
     found, known = options or {}, ("state", *others)
     for name in found:
@@ -404,12 +396,11 @@ def saved_option(options: Any, seed: Any, *others: str) -> EnvState | None:
             raise InputError(f"options has {shown(name)}, but must have {' or '.join(known)} alone.")
     if "state" in found and (seed is not None or len(found) > 1):
         other = "seed" if seed is not None else others[0]
-        raise InputError(f"{other} is given, but must be left out beside a state, which has all that is drawn.")
+        raise InputError(f"{other} is given, but must be left out with a state, which has its random numbers.")
     return found.get("state")
 
 
 def pictures(scenes: Scenes) -> list[NDArray[np.uint8]]:
-    """Render a picture (HEIGHT, WIDTH, 3) of each scene."""
     simulation, found = scenes.simulation, []
     fields = scenes.state.arrays.numpy(simulation.dimension)
     own = ("positions", "velocities", "mass_fractions")

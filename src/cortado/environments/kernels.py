@@ -1,4 +1,4 @@
-"""Kernels for observations and rewards with their derivatives, one thread per particle, for all scenes of a batch."""
+"""Kernels for observations and rewards, one thread per particle, for all scenes of a batch."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -14,9 +14,8 @@ FAR = wp.constant(1.0e30)
 
 @cache
 def environment_kernels(precision: Precision) -> Any:
-    """Return the kernels in one precision, by name. They store float64 values, which are summed later. ``per``:
-    particles of a scene; ``factor`` (scenes,) multiplies derivatives. ``period`` [m] and ``frequency`` [1/m] are 0
-    along axes that are not periodic."""
+    """Make the kernels, by name. They store float64 values, one per particle. ``per``: particles of a scene; ``factor``
+    (scenes,) multiplies derivatives. ``period`` [m] and ``frequency`` [1/m] are 0 along axes that are not periodic."""
     real, vector = precision.real, precision.vector
     module, boxes = kernel_module(f"environments_{precision.name}"), wp.array2d(dtype=vector)
     samples, names = wp.array(dtype=wp.float32, ndim=4), "r period frequency x v place"
@@ -49,8 +48,8 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.func
     @typed
     def outside(r, angle, period, frequency, b: int, lower: boxes, upper: boxes):
-        """Return the position of a particle's image in the frame of the boxes, and the vector from the nearest point of
-        any box to this image."""
+        """Return the particle's position in the frame of the boxes, and the vector to it from the nearest point of any
+        box."""
         place, found, least = vector(), vector(), real(FAR)
         for k in range(lower.shape[1]):
             middle = turned(real(0.5) * (lower[b, k] + upper[b, k]), angle)
@@ -68,8 +67,7 @@ def environment_kernels(precision: Precision) -> Any:
     def share(
         per: int, width: real, period: vector, frequency: vector, x, place, turn, lower: boxes, upper: boxes, value
     ):
-        """Store 1 / (1 + e^2 / w^2) for each particle, where e is its distance to the nearest box. Boxes may move with
-        a solid that turns in the plane."""
+        """Store 1 / (1 + e^2 / w^2), where e is the distance to the nearest box; boxes may move with a solid."""
         i = wp.tid()
         b = i // per
         _y, way = outside(x[i] - place[b], turn[b], period, frequency, b, lower, upper)
@@ -77,21 +75,21 @@ def environment_kernels(precision: Precision) -> Any:
         value[i] = wp.float64(real(1.0) / (real(1.0) + wp.dot(e, e)))
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def share_adjoint(
         per: int,
         width: real,
         period: vector,
         frequency: vector,
-        factor: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        place: wp.array(dtype=vector),
-        turn: wp.array(dtype=real),
+        factor,
+        x,
+        place,
+        turn,
         lower: boxes,
         upper: boxes,
-        # out
-        x_bar: wp.array(dtype=vector),
-        place_bar: wp.array(dtype=vector),
-        turn_bar: wp.array(dtype=real),
+        x_bar,
+        place_bar,
+        turn_bar,
     ):
         i = wp.tid()
         b = i // per
@@ -105,8 +103,7 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def apart(per: int, period: vector, frequency: vector, chosen, x, value: wp.array2d(dtype=wp.float64)):
-        """Store, for each chosen particle, the sum of distances |dx| + |dy| + |dz| to all chosen particles, between
-        nearest images."""
+        """Store the sum of distances |dx| + |dy| + |dz| to all chosen particles, between nearest images."""
         b, p = wp.tid()
         own, total = x[b * per + chosen[p]], wp.float64(0.0)
         for q in range(chosen.shape[0]):
@@ -132,7 +129,7 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def missed(per: int, step, target: wp.array2d(dtype=vector), weight: wp.array2d(dtype=real), x, value):
-        """Store each particle's weighted squared distance to its own target; targets change from step to step."""
+        """Store the weighted squared distance to the particle's target in this step."""
         i = wp.tid()
         k, p = step[i // per], i % per
         r = x[i] - target[k, p]

@@ -1,12 +1,8 @@
-"""Step many scenes of one task in one launch, each in its own episode, and save and restore their states.
+"""Step many scenes of one task in one launch, each in its episode, and save and restore their states.
 
-`Scenes` steps all scenes together, computes rewards and observations, and begins episodes. `EnvState` saves a state.
-
-On a CPU, a launch with few particles runs on one core as a captured graph. A larger launch is split over the cores
-without a graph, which pays only with many particles. Batches of medium size are split here into smaller batches.
+On a CPU, only launches with few particles are captured graphs; a batch of medium size is split into such launches.
 """
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -22,7 +18,7 @@ from cortado.device.launching import LEAST_PART, launch
 from cortado.device.threads import MOST_CORES, WARP, in_parallel, usable_cores
 from cortado.environments.kernels import environment_kernels
 from cortado.environments.task import Task, checked_scene, split
-from cortado.errors import CortadoWarning, DivergedError, InputError, MassWarning, shown
+from cortado.errors import DivergedError, InputError, MassWarning, shown, unwarned
 from cortado.losses.loss import SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState
@@ -37,37 +33,31 @@ from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
 JITTER = 0.02
-"""Standard deviation of the noise of first positions, in spacings."""
 LANES = 1
-"""Lanes per particle: the fastest number for large batches. It is the same for small ones, for equal bits in all."""
+"""Lanes per particle: the same for all batches, for equal bits."""
 SEEN = 32
-"""Number of observed particles by default."""
 MOST_PARTS = 16
-"""Greatest number of parts of a batch. If more were needed, launches are large enough to be split over cores."""
+"""Greatest number of parts of a batch; a batch that needs more is large enough for all cores without graphs."""
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """The start of an episode of one scene: positions and a goal."""
-
     positions: NDArray
-    """Positions (n, d) of the particles [m]."""
+    """(n, d) [m]"""
     goal: NDArray
-    """Goal (g,) of the episode."""
+    """(g,)"""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EnvState:
     """The saved state of an environment or batch; `save` returns it and `restore` accepts it.
 
-    It shares the environment's device arrays, which no step overwrites, so saving copies no array. Pickles and copies
-    have NumPy arrays instead.
+    The state shares the environment's device arrays, which no step overwrites. Pickles and copies have NumPy arrays.
     """
 
     kind: str
     """Number of scenes, task, size, precision and observed numbers in words; a restored state must have the same."""
     scene: Scene
-    """The scene that all environments of the batch simulate."""
     fields: Mapping[str, Any]
     """Fields of the fluid by name, (scenes n,) Warp arrays, or NumPy arrays of their numbers."""
     clocks: tuple[RestartState, ...]
@@ -79,16 +69,13 @@ class EnvState:
     driven: tuple[NDArray, ...]
     """For each actuator the driven components and the commands: (scenes, 2, a)."""
     lost: frozenset[int]
-    """Scenes that have diverged."""
     over: NDArray
-    """Mask (scenes,) of the episodes that have ended."""
+    """Mask (scenes,) of ended episodes."""
     observations: NDArray
-    """The last observation of each scene (scenes, k)."""
+    """Last observation of each scene (scenes, k)."""
     generators: tuple[Any, ...]
-    """States of the random generators from which the next episodes are drawn."""
 
     def __len__(self) -> int:
-        """Number of scenes."""
         return len(self.step_number)
 
     def __getitem__(self, numbers: int | Iterable[int]) -> "EnvState":
@@ -96,7 +83,7 @@ class EnvState:
         batch of eight scenes in the state of scene 0, with equal random generators."""
         chosen = list(numbers) if isinstance(numbers, Iterable) else [numbers]
         if not chosen or any(not isinstance(b, (int, np.integer)) or not 0 <= b < len(self) for b in chosen):
-            raise InputError(f"numbers are {shown(numbers)}, but must be from 0 to {len(self) - 1}, at least one.")
+            raise InputError(f"numbers are {shown(numbers)}, but must be one or more from 0 to {len(self) - 1}.")
         return replace(
             self,
             kind=self.kind.replace(_scenes_in_words(len(self)), _scenes_in_words(len(chosen)), 1),
@@ -138,8 +125,6 @@ def _picked(array: Any, chosen: list[int], scenes: int) -> Any:
 
 
 def parts_of(simulation: Simulation) -> int:
-    """Return the number of parts into which a batch is best split, so that each part has a graph. It is 1 if the whole
-    batch has a graph, on a GPU, and if too many parts would be needed."""
     scenes, cores = simulation.batch or 1, min(usable_cores(), MOST_CORES)
     together = (2 * LEAST_PART - 1) // simulation.particles
     if not simulation.device.is_cpu or cores == 1 or not together or scenes <= together:
@@ -151,15 +136,13 @@ def parts_of(simulation: Simulation) -> int:
 
 
 class SideBySide:
-    """A stepper that splits a batch into parts and takes ``steps`` steps of each; no bit of the results changes."""
+    """A stepper that splits a batch into parts and takes ``steps`` steps of each, without a change of any bit."""
 
     def __init__(self, simulation: Simulation, make: Callable[[int], Simulation], parts: int, steps: int):
-        """Split the batch of a simulation; ``make`` returns the same simulation for another number of scenes."""
         scenes = simulation.batch or 1
         self._ranges = list(pairwise(scenes * k // parts for k in range(parts + 1)))
         self._simulations = [simulation] if parts == 1 else [make(last - first) for first, last in self._ranges]
         self.steppers = [Stepper(one, steps) for one in self._simulations]
-        """One stepper for each part."""
 
     @property
     def lost(self) -> dict[int, DivergedError]:
@@ -168,12 +151,10 @@ class SideBySide:
         return {first + b: error for (first, _), one in each for b, error in one.rollout.lost.items()}
 
     def begin(self, rows: Arrays) -> None:
-        """Take steps from the first state, so that `follow` can continue; ``rows`` are all parameters over time."""
         for (first, last), one, simulation in zip(self._ranges, self.steppers, self._simulations, strict=True):
             one.advance(simulation.on_device(), {name: row[first:last] for name, row in rows.items()})
 
     def follow(self, state: DeviceState, rows: Arrays) -> DeviceState:
-        """Return the state after the steps; see `Stepper.follow`."""
         if len(self.steppers) == 1:
             return self.steppers[0].follow(state, rows)
         found: dict[int, DeviceState] = {}
@@ -190,7 +171,6 @@ class SideBySide:
 
 
 def _cut(arrays: State, first: int, last: int) -> State:
-    """Return some scenes of a batch as views."""
     assert arrays.batch is not None
     sizes = {name: len(arrays[name]) // arrays.batch for name in arrays.names}
     own = {name: arrays[name][first * size : last * size] for name, size in sizes.items()}
@@ -199,7 +179,6 @@ def _cut(arrays: State, first: int, last: int) -> State:
 
 @WARP
 def _together(like: State, parts: list[DeviceState]) -> DeviceState:
-    """Copy the states of all parts into one new state."""
     whole = {name: wp.empty_like(like[name]) for name in like.names}
     for name, array in whole.items():
         begin = 0
@@ -210,7 +189,7 @@ def _together(like: State, parts: list[DeviceState]) -> DeviceState:
 
 
 class Scenes:
-    """A batch of scenes of one task that are stepped together, each in its own episode."""
+    """A batch of scenes of one task that are stepped together, each in its episode."""
 
     def __init__(
         self,
@@ -221,11 +200,9 @@ class Scenes:
         seen: int,
         sensors: Mapping[str, Sensor] | None = None,
     ):
-        """Make ``scenes`` scenes; ``seen``: number of observed particles, at most all."""
         self._sensors = checked_sensors(sensors, {"particles", "goal", "progress", *task.free_solids, *task.driven})
         self.task = task
-        with warnings.catch_warnings():  # rewards are shares of the fluid that there is
-            warnings.simplefilter("ignore", MassWarning)
+        with unwarned(MassWarning):  # rewards are fractions of the fluid, whatever its mass
             make = partial(Simulation, checked_scene(task), device, precision, lanes=LANES)
             self.simulation = make(batch=scenes)
             parts = 1 if self._sensors else parts_of(self.simulation)  # sensors read the step of a whole
@@ -237,51 +214,41 @@ class Scenes:
         n, free = self.simulation.particles, self.simulation.free_particles or self.simulation.particles
         if not isinstance(seen, int) or not 0 <= seen <= n:
             raise InputError(
-                f"particles is {shown(seen)}, but must be a whole number from 0 to {n}, those of the scene."
+                f"particles is {shown(seen)}, but must be a whole number from 0 to {n}, all of the scene's particles."
             )
         self._seen = np.linspace(0, n - 1, seen).astype(int)
         self._jitters = (np.arange(n) < free)[:, None] * JITTER * task.spacing
         self.state: DeviceState = self._first
         self.step_number = np.zeros(scenes, dtype=int)
-        """Number of environment steps (scenes,) since each episode began."""
         self.goal = np.zeros((scenes, len(task.goals[0])))
-        """Goals of the episodes (scenes, g)."""
         self._now = [one.at_rest(scenes) for one in task.actuators]
         self.starts: list[Start] = [Start(self.simulation.positions, self.goal[b]) for b in range(scenes)]
-        """Start of each scene's episode."""
         self._lost: set[int] = set()
-        """Numbers of the scenes that have diverged; their states are meaningless."""
+        """Numbers of diverged scenes, whose states are meaningless."""
         self._given = task, scenes, device, precision, seen, sensors
         still = {name: np.repeat(row, task.substeps, axis=1) for name, row in self._driven.items()}
-        with warnings.catch_warnings():  # see `advance`
-            warnings.simplefilter("ignore", CortadoWarning)
+        with unwarned():  # see `advance`
             self._steps.begin(still)
 
     def __len__(self) -> int:
-        """Number of scenes."""
         return len(self.step_number)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle or copy the scenes as the constructor's arguments and a saved state."""
         return _made_again, (self._given, self.save())
 
     @cached_property
     def kind(self) -> str:
-        """Number of scenes, task, size, precision and observed numbers in words, which a saved state must share."""
         seen = counted(max(one.stop for one in self.layout.values()), "observed number")
         of = f"the task {self.task.name}, {self.task.size}, in {self.simulation.precision.name} with {seen}"
         return f"{_scenes_in_words(len(self))} of {of}"
 
     @cached_property
     def single(self) -> Simulation:
-        """A simulation of one scene, for twins."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MassWarning)
+        with unwarned(MassWarning):
             return Simulation(self.task.scene, self.simulation.device.alias, self.simulation.precision.name)
 
     def save(self, over: NDArray | None = None, observations: NDArray | None = None, generators: Any = ()) -> EnvState:
-        """Return the state of all scenes, with three additions of an environment: which episodes are ``over``, the last
-        ``observations``, and states of random ``generators``."""
+        """Return the state of all scenes; ``over``, ``observations`` and ``generators`` are those of an environment."""
         arrays, none = self.state.arrays, np.zeros(len(self))
         return EnvState(
             kind=self.kind,
@@ -298,9 +265,8 @@ class Scenes:
         )
 
     def require(self, saved: EnvState) -> None:
-        """Raise `InputError` for a state of another task, batch or scene."""
         if not isinstance(saved, EnvState):
-            raise InputError(f"state is {shown(saved)}, but must be one that the save of an environment returned.")
+            raise InputError(f"state is {shown(saved)}, but must be a state that an environment has saved.")
         own = self.simulation.scene
         if saved.kind != self.kind or (saved.scene is not own and saved.scene != own):
             other = saved.kind if saved.kind != self.kind else f"another scene than that of {self.kind}"
@@ -308,7 +274,6 @@ class Scenes:
 
     @WARP
     def taken(self, saved: EnvState) -> DeviceState:
-        """Return a copy of a saved state's fluid on the device; raises `InputError` for a state of other scenes."""
         self.require(saved)
         arrays = self._first.arrays.copy()
         for name in arrays.names:
@@ -317,20 +282,17 @@ class Scenes:
         return DeviceState(arrays, saved.clocks)
 
     def restore(self, saved: EnvState) -> None:
-        """Go back to a saved state of these scenes or of equal ones; raises `InputError` for other states."""
         self.state = self.taken(saved)
         self.step_number, self.starts, self._lost = saved.step_number.copy(), list(saved.starts), set(saved.lost)
         self.goal = np.stack([start.goal for start in saved.starts])
         self._now = [now.copy() for now in saved.driven]
 
     def drawn(self, generator: np.random.Generator) -> Start:
-        """Draw the start of an episode: first positions with noise, and a goal."""
         noise = generator.standard_normal(self.simulation.positions.shape)
         return Start(self.simulation.positions + self._jitters * noise, generator.uniform(*self.task.goals))
 
     @WARP
     def begin(self, starts: Mapping[int, Start]) -> None:
-        """Begin episodes in the scenes with these numbers."""
         if not starts:
             return
         arrays, first = self.state.arrays.copy(), self._first.arrays
@@ -351,7 +313,7 @@ class Scenes:
 
     def step(self, actions: NDArray) -> tuple[NDArray, dict[int, str]]:
         """Step all scenes with actions (scenes, a) from -1 to 1. Return the rewards (scenes,) and, by scene number, a
-        sentence on each diverged scene, which must begin a new episode before the next step."""
+        sentence on each diverged scene, which must begin a new episode."""
         self.advance(actions)
         rewards = self.reward.values(self.reward.at(self.state.arrays, self.goal, self.step_number))
         lost = {}
@@ -363,12 +325,10 @@ class Scenes:
         return rewards, lost
 
     def advance(self, actions: NDArray) -> None:
-        """Take the simulation's steps of one environment step."""
         task, rows = self.task, {}
         for k, (one, u) in enumerate(zip(task.actuators, split(task.actuators, actions), strict=True)):
             self._now[k], rows[one.parameter] = one.advance(self._now[k], u, task.substeps, task.time_step)
-        with warnings.catch_warnings():  # of a loose pressure, and of lost scenes, which are told of otherwise
-            warnings.simplefilter("ignore", CortadoWarning)
+        with unwarned():  # of a loose pressure, and of lost scenes, which `step` reports
             self.state = self._steps.follow(self.state, rows)
         self.step_number += 1
 
@@ -395,13 +355,11 @@ class Scenes:
 
     @cached_property
     def layout(self) -> dict[str, slice]:
-        """Slices of an observation by the name of its parts."""
         ends = np.cumsum([0, *(part[0].size for part in self.parts.values())]).tolist()
         return {name: slice(*ends[k : k + 2]) for k, name in enumerate(self.parts)}
 
     @WARP
     def _particles(self, state: State) -> NDArray[np.float32]:
-        """Return positions and velocities of the observed particles, (scenes, seen, 2, d)."""
         x, dimension = state.positions, self.simulation.dimension
         shape = len(self), len(self._seen), 2, dimension
         if not len(self._seen):
@@ -415,7 +373,6 @@ class Scenes:
         return seen.numpy()
 
     def _read(self, state: State) -> dict[str, NDArray]:
-        """Return the readings (scenes, k) of each sensor by name, with present driven parameters."""
         if not self._sensors:
             return {}
         if self._lost:  # so that all are numbers

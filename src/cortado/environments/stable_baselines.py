@@ -1,5 +1,4 @@
-"""`StableBaselinesVecEnv`, a `VecEnv` of Stable-Baselines3 whose scenes are stepped in one launch. If that library is
-not installed, an error says so in a sentence."""
+"""`StableBaselinesVecEnv`, a `VecEnv` of Stable-Baselines3 whose scenes are stepped in one launch."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -22,8 +21,7 @@ __all__ = ["StableBaselinesVecEnv"]
 
 
 class OneOfBatch:
-    """One environment of a batch, with the attributes and methods that `get_attr`, `set_attr` and `env_method` can
-    use."""
+    """One environment of a batch, with what `get_attr`, `set_attr` and `env_method` can use."""
 
     def __init__(self, envs: FluidVectorEnv, number: int):
         self._envs, self._number = envs, number
@@ -32,20 +30,16 @@ class OneOfBatch:
 
     @property
     def goal(self) -> NDArray[np.float64]:
-        """The goal (g,) of the present episode."""
         return self._envs.scenes.goal[self._number].copy()
 
     @property
     def step_number(self) -> int:
-        """Steps of the environment since the present episode began."""
         return int(self._envs.scenes.step_number[self._number])
 
     def twin(self, actions: int | None = None) -> Twin:
-        """Return a differentiable copy of the present episode; see `FluidEnv.twin`."""
         return self._envs.twin(self._number, actions)
 
     def save(self) -> EnvState:
-        """Return the state of the episode, for a single environment or to build batches from; see `FluidEnv.save`."""
         return self._envs.save()[self._number]
 
 
@@ -60,7 +54,7 @@ class StableBaselinesVecEnv(VecEnv):
         """Make ``num_envs`` environments of a task, such as "Carry"; ``settings`` are arguments of `FluidVectorEnv`,
         without ``autoreset_mode``."""
         if "autoreset_mode" in settings:
-            raise InputError("autoreset_mode is given, but must be left out, as Stable-Baselines3 has one way alone.")
+            raise InputError("autoreset_mode is given, but must be left out, as Stable-Baselines3 has only one mode.")
         self.envs = FluidVectorEnv(task, num_envs, **settings, autoreset_mode="SameStep")
         """The same batch as a vector environment of Gymnasium."""
         self._each = [OneOfBatch(self.envs, number) for number in range(num_envs)]
@@ -96,7 +90,7 @@ class StableBaselinesVecEnv(VecEnv):
         return seen, rewards.astype(np.float32), terminated | truncated, infos
 
     def close(self) -> None:
-        """Close the environments: no further episode can begin."""
+        """Close the environments, which can then begin no episode."""
         self.envs.close()
 
     def get_images(self) -> list[NDArray[np.uint8] | None]:
@@ -111,7 +105,7 @@ class StableBaselinesVecEnv(VecEnv):
         """Set a new attribute on each environment; raises `InputError` for attributes that belong to the whole
         batch."""
         if attr_name not in vars(self._each[0]) and hasattr(self._each[0], attr_name):
-            raise InputError(f"{attr_name} cannot be set, as the batch decides it; make another environment.")
+            raise InputError(f"{attr_name} cannot be set, as it belongs to the batch; make another environment.")
         for one in self._chosen(indices):
             setattr(one, attr_name, value)
 
@@ -122,7 +116,7 @@ class StableBaselinesVecEnv(VecEnv):
         return [getattr(one, method_name)(*arguments, **named) for one in self._chosen(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: int | Iterable[int] | None = None) -> list[bool]:
-        """Return False for each environment, because single environments of a batch have no wrappers."""
+        """Return False for each environment: environments of a batch have no wrappers."""
         return [False for _ in self._chosen(indices)]
 
     def _chosen(self, indices: int | Iterable[int] | None) -> list[OneOfBatch]:

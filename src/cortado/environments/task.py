@@ -1,9 +1,5 @@
-"""Base classes of control tasks: the scene, the actuators that actions drive, the reward of a step, and the goals.
-
-Cortado's tasks are in `cortado.environments.catalogue`. An `Actuator` converts actions, numbers between -1 and 1 that
-are constant during an environment step, to a parameter over time. The parameter is affine in the actions, so its
-derivative is a constant matrix.
-"""
+"""Base classes of control tasks. An `Actuator` converts actions, numbers from -1 to 1 that are constant during an
+environment step, to a parameter over time. The parameter is affine in the actions."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -39,7 +35,7 @@ class Actuator(ABC):
 
     @abstractmethod
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
-        """Return the driven components (..., a) after one simulation step, from their values ``q`` and the
+        """Return the driven components (..., a) after one simulation step, given their values ``q`` and the
         ``command``."""
 
     def at_rest(self, members: int) -> NDArray:
@@ -62,8 +58,8 @@ class Actuator(ABC):
         return found[..., 0] if self.is_number else found
 
     def over(self, actions: int, steps: int, time_step: float, begun: NDArray | None = None) -> Affine:
-        """Return the parameter as an affine function of actions (actions, a), each held for ``steps`` steps of the
-        simulation; ``begun``: driven components and commands (1, 2, a) at the start, by default those at rest."""
+        """Return the parameter as an affine function of actions (actions, a), each held for ``steps`` simulation steps.
+        ``begun``: components and commands (1, 2, a) at the start, by default those at rest."""
         a = len(self.axes)
         units = np.concatenate([np.zeros((1, actions, a)), np.eye(actions * a).reshape(-1, actions, a)])
         now, parts = np.repeat(self.at_rest(1) if begun is None else begun, len(units), axis=0), []
@@ -84,7 +80,7 @@ class Velocity(Actuator):
 
 @dataclass(frozen=True)
 class Position(Actuator):
-    """An actuator whose actions are places, or other values, approached with a lag: q' = (c - q) / lag."""
+    """An actuator whose actions are values of the parameter, approached with a lag: q' = (c - q) / lag."""
 
     lag: float = 0.1
     """Time constant of the approach [s]."""
@@ -100,14 +96,13 @@ class Task(ABC):
     size: str = "small"
     """"small", for a CPU, or "large", for a GPU, with `finer` times as many particles along each axis."""
     dimension: ClassVar[int] = 2
-    """2 in the plane, 3 in space."""
     finer: ClassVar[int] = 3
     """Factor by which the large size has a smaller spacing and a shorter time step."""
     name: ClassVar[str]
     horizon: ClassVar[int]
-    """Steps of the environment after which an episode is truncated."""
+    """Environment steps after which an episode is truncated."""
     repeats: ClassVar[int]
-    """Steps of the small simulation in one step of the environment."""
+    """Simulation steps of the small size in one environment step."""
     coarse_spacing: ClassVar[float]
     """Particle spacing of the small size [m]."""
     coarse_step: ClassVar[float]
@@ -115,9 +110,9 @@ class Task(ABC):
     lowest: ClassVar[float]
     """Smallest reward of a step; a diverged episode gets it for every missing step."""
     free_solids: ClassVar[tuple[str, ...]] = ()
-    """Names of the solids moved by the fluid; their motion is observed."""
+    """Names of solids moved by the fluid, whose motion is observed."""
     goal_names: ClassVar[tuple[str, ...]] = ()
-    """Descriptions of the numbers of a goal, with their units."""
+    """Descriptions of the numbers of a goal, with units."""
 
     def __post_init__(self) -> None:
         if self.size not in ("small", "large"):
@@ -128,22 +123,20 @@ class Task(ABC):
 
     @property
     def fineness(self) -> int:
-        """Factor by which the scene's spacing is smaller than in the small size."""
         return self.finer if self.size == "large" else 1
 
     @property
     def spacing(self) -> float:
-        """Particle spacing of the scene [m]."""
+        """Particle spacing [m]."""
         return self.coarse_spacing / self.fineness
 
     @property
     def time_step(self) -> float:
-        """The time step of the simulation [s]."""
+        """Time step of the simulation [s]."""
         return self.coarse_step / self.fineness
 
     @property
     def substeps(self) -> int:
-        """Steps of the simulation in one step of the environment."""
         return self.repeats * self.fineness
 
     @property
@@ -158,7 +151,6 @@ class Task(ABC):
 
     @property
     def driven(self) -> list[str]:
-        """Names of the parameters that actions drive."""
         return [one.parameter for one in self.actuators]
 
     @abstractmethod
@@ -171,7 +163,6 @@ class Task(ABC):
         return np.zeros(0), np.zeros(0)
 
     def scene_of(self, **tables: Any) -> Scene:
-        """Make a scene from tables and the settings that all sizes of the task share."""
         common: dict[str, Any] = {
             "name": self.name,
             "discretisation": {"spacing": self.spacing},
@@ -181,20 +172,19 @@ class Task(ABC):
 
 
 def checked_scene(task: Task) -> Scene:
-    """Return the scene of a task. Raises `InputError` unless its time step equals the task's, because actuators compute
-    velocities with the task's time step."""
+    """Return the scene of a task; raise `InputError` unless its time step is the task's."""
     scene = task.scene
     found, wanted = scene.solver.time_step, task.time_step
     if found == "auto" or not np.isclose(found, wanted, rtol=1e-6, atol=0.0):
         raise InputError(
-            f"the scene of the task {task.name} has solver.time_step = {shown(found)}, but must have the task's own, "
-            f"{wanted:g} s, by which actions move what they drive."
+            f"the scene of the task {task.name} has solver.time_step = {shown(found)}, but must have the "
+            f"time_step of the task, {wanted:g} s, with which its actuators compute."
         )
     return scene
 
 
 def checked_actions(what: str, given: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return actions clipped to -1 and 1; raises `InputError` for another shape and for values that are not finite."""
+    """Return actions clipped to -1 and 1; raise `InputError` for another shape and for values that are not finite."""
     array = as_numbers(what, given)
     if array.shape != shape:
         raise InputError(f"{what} has shape {array.shape}, but must be {shape}.")
@@ -204,5 +194,4 @@ def checked_actions(what: str, given: Any, shape: tuple[int, ...]) -> NDArray[np
 
 
 def split(actuators: Sequence[Actuator], actions: NDArray) -> list[NDArray]:
-    """Split actions (..., a) into one array for each actuator."""
     return np.split(actions, np.cumsum([len(one.axes) for one in actuators])[:-1], axis=-1)

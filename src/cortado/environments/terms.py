@@ -1,5 +1,4 @@
-"""Rewards and their derivatives: terms computed from a state, the reward of a step as a sum of terms, and the reward as
-a loss. Everything is computed for all scenes together, with sums over particles on the device."""
+"""Rewards and their derivatives for all scenes of a batch."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,25 +27,21 @@ class StepEnd:
     state: State
     """Fields of all particles, (scenes n,)."""
     goal: NDArray
-    """Goals (scenes, g) of the scenes."""
+    """Goals (scenes, g)."""
     step: NDArray
     """Number of the step in each scene's episode (scenes,), counted from 1."""
     domain: Domain = WITHOUT_PERIODS
-    """Periodic axes of the scene."""
 
     @property
     def scenes(self) -> int:
-        """Number of scenes."""
         return len(self.step)
 
     @property
     def per(self) -> int:
-        """Number of particles of a scene."""
         return len(self.state.positions) // self.scenes
 
     @property
     def period(self) -> dict[str, Any]:
-        """Period and frequency of the periodic axes, as arguments for kernels."""
         _, period, frequency = self.domain.vectors(precision_of(self.state).vector)
         return {"period": period, "frequency": frequency}
 
@@ -67,7 +62,7 @@ Boxes = Callable[[NDArray], tuple[NDArray, NDArray]]
 
 @dataclass(frozen=True)
 class OneBox:
-    """A function from goals to boxes that returns one fixed box for every goal."""
+    """A function that returns the same box for every goal."""
 
     lower: tuple[float, ...]
     """Lower corner [m]."""
@@ -85,13 +80,10 @@ class OverParticles:
     kernel: str
 
     def __init__(self, *given: Any):
-        """Store the arguments of the constructor, for copies and pickles."""
         self._given = given
         self._made: dict[Any, Any] = {}
-        """Reductions and device arrays, made once by `_kept`."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle or copy the term as its constructor's arguments."""
         return type(self), self._given
 
     def values(self, at: StepEnd) -> NDArray:
@@ -112,15 +104,13 @@ class OverParticles:
         launch(getattr(kernels, name), self._threads(at), x.device, **own, **arguments)
 
     def _threads(self, at: StepEnd) -> tuple[int, ...]:
-        """Return the shape of the kernel's launch: one thread for each particle by default."""
+        """Return the shape of the kernel's launch, by default one thread for each particle."""
         return (at.scenes * at.per,)
 
     def _over(self, at: StepEnd) -> float:
-        """Return the divisor of the sum over particles."""
         return 1.0
 
     def _arguments(self, at: StepEnd) -> dict[str, Any]:
-        """Return the arguments that the forward and the adjoint kernel share."""
         raise NotImplementedError
 
     def _kept(self, key: Any, at: StepEnd, make: Callable[[], Any]) -> Any:
@@ -132,14 +122,13 @@ class OverParticles:
 
 
 class Share(OverParticles):
-    """A reward term: the share of the fluid in boxes, counted smoothly. A particle at distance e from the nearest box
-    counts 1 / (1 + e^2 / w^2): 1 inside, 1/2 at distance w, with a gradient everywhere outside."""
+    """A reward term: the fraction of the fluid in boxes, counted smoothly. A particle at distance e from the nearest
+    box counts 1 / (1 + e^2 / w^2): 1 inside, 1/2 at distance w, with a gradient everywhere outside."""
 
     kernel = "share"
 
     def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
-        """Set the boxes and the width w [m]. With a ``solid``, boxes move and turn with this solid; in 3-D it may turn
-        about z only."""
+        """Set the boxes and the width w [m]. With a ``solid``, boxes move and turn with it, in 3-D about z only."""
         super().__init__(boxes, width, solid)
         self._boxes, self._width, self._solid = boxes, width, solid
 
@@ -169,7 +158,7 @@ class Share(OverParticles):
         return {**found, "place": fixed[0], "turn": fixed[1]}
 
     def _turn(self, at: StepEnd) -> wp.array:
-        """Return the angle (scenes,) of the solid about z. Raises `InputError` if it turns about another axis."""
+        """Return the angle (scenes,) of the solid about z; raise `InputError` if it turns about another axis."""
         turn = at.state[turn_name(self._solid or "")]
         if turn.dtype is precision_of(at.state).real:
             return turn
@@ -180,13 +169,13 @@ class Share(OverParticles):
 
 
 class Spread(OverParticles):
-    """A reward term: the mean distance ``|dx| + |dy|`` over all pairs of chosen particles, divided by ``everywhere``.
-    Along periodic axes the nearest images count."""
+    """A reward term: the mean distance ``|dx| + |dy|`` over all pairs of chosen particles, divided by ``everywhere``,
+    between nearest periodic images."""
 
     kernel = "apart"
 
     def __init__(self, chosen: NDArray, everywhere: float):
-        """Set the indices ``chosen`` (m,) of particles, and the length ``everywhere`` [m] that divides the mean."""
+        """Set the indices ``chosen`` (m,) of particles, and the length ``everywhere`` [m]."""
         super().__init__(chosen, everywhere)
         self._chosen, self._pairs = chosen, len(chosen) ** 2 * everywhere
 
@@ -203,11 +192,8 @@ class Spread(OverParticles):
 
 
 class Missed(OverParticles):
-    """A reward term: the weighted sum of squared distances of particles to targets that change from step to step.
-
-    Positions and targets are not wrapped along periodic axes: a particle one period away from its target counts as far
-    away.
-    """
+    """A reward term: the weighted sum of squared distances of particles to targets that change from step to step. A
+    particle one period away from its target counts as far away, also along periodic axes."""
 
     kernel = "missed"
 
@@ -225,8 +211,7 @@ class Missed(OverParticles):
 
 @dataclass(frozen=True)
 class Miss:
-    """A reward term: the difference ``|value - goal|`` between another term's value and the first number of the
-    goal."""
+    """A reward term: the difference ``|value - goal|`` between another term and the first number of the goal."""
 
     term: Term
 
@@ -257,7 +242,6 @@ class Pose:
 
     solid: str
     length: float
-    """Length l of the body [m]."""
 
     def values(self, at: StepEnd) -> NDArray:
         turned = sum(_numbers(at.state, name)[:, axis] for axis, name in self._axes)
@@ -271,8 +255,7 @@ class Pose:
 
     @property
     def _axes(self) -> list[tuple[int, str]]:
-        """Names of the fields with the displaced ends of the body's axes, each with the index of the component that is
-        cos angle - 1."""
+        """Fields with the displaced ends of the body's axes, each with the component that is cos angle - 1."""
         return [(axis, f"{self.solid}.{name}") for axis, name in enumerate(AXES[:2])]
 
 
@@ -283,10 +266,8 @@ class Reward:
     terms: tuple[tuple[float, Term], ...]
     constant: float = 0.0
     domain: Domain = WITHOUT_PERIODS
-    """Periodic axes of the scene."""
 
     def at(self, state: State, goal: NDArray, step: NDArray) -> StepEnd:
-        """Return the argument of the reward: the states of all scenes with their goals and step numbers."""
         return StepEnd(state, goal, step, self.domain)
 
     @WARP
@@ -312,9 +293,7 @@ class MinusReward:
 
     reward: Reward
     goal: NDArray
-    """Goals (scenes, g), or (1, g) for all scenes."""
     step: int
-    """Number of the step in the episode, counted from 1."""
 
     @property
     def fingerprint(self) -> str:
@@ -349,18 +328,15 @@ def _reals(at: StepEnd, values: NDArray) -> wp.array:
 
 
 def _vectors(at: StepEnd, values: NDArray) -> wp.array:
-    """Return numbers (..., d) as a Warp array of vectors with three components."""
     return to_device(values.reshape(-1, values.shape[-1]), precision_of(at.state), at.state.positions.device).reshape(
         values.shape[:-1]
     )
 
 
 def _numbers(state: State, name: str) -> NDArray:
-    """Return a field with one entry per scene as a float64 NumPy array."""
     return state[name].numpy().astype(np.float64)
 
 
 def _add(bar: State, name: str, values: NDArray) -> None:
-    """Add vectors (scenes, d) to a field with one entry per scene."""
     field = bar[name]
     add(wp.array(padded(values), dtype=field.dtype, device=field.device), field)

@@ -1,5 +1,4 @@
-"""Reading and writing of whole files, locks, encoding of films, and messages on terminals. Nothing here depends on
-fluids."""
+"""Files, locks, encoding of films, and messages on terminals, independent of fluids."""
 
 from typing import TYPE_CHECKING
 

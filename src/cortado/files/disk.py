@@ -1,7 +1,5 @@
-"""Files on the disk. User files must be regular files of limited size: reading a pipe may block, and a device may have
-no end. Written files appear whole or not at all; only one process at a time writes a folder. Errors of the disk become
-one sentence.
-"""
+"""Reading and writing of files. User files must be regular files of limited size, as a pipe may block and a device may
+have no end. Written files appear complete or not at all; only one process at a time writes a folder."""
 
 from __future__ import annotations
 
@@ -30,11 +28,10 @@ OTHERS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
-"""Tests for kinds of files that are not regular, with their names in a sentence."""
 
 
 def as_path(what: str, value: Any) -> str:
-    """Return a path as text; raises `InputError` for anything else, including numbers, which Python would take for open
+    """Return a path as text; raise `InputError` for anything else, such as numbers, which Python takes for open
     files."""
     if isinstance(value, (str, os.PathLike)):
         path = os.fspath(value)
@@ -44,10 +41,8 @@ def as_path(what: str, value: Any) -> str:
 
 
 def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
-    """Check that a file may be read, following links, and return its size and times.
-
-    Raises `OSError`, whose ``strerror`` says why in words, if it is no regular file, or has more bytes than ``most``.
-    """
+    """Return size and times of a file; raise `OSError`, with a reason in words, if it is not regular or has over
+    ``most`` bytes."""
     try:
         found = os.stat(path)
     except ValueError:  # a character that no name has
@@ -61,7 +56,6 @@ def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
 
 
 def content(path: str | os.PathLike[str], most: int) -> bytes:
-    """Return the bytes of a regular file; raises `OSError` as `regular_file` does."""
     regular_file(path, most)
     with open(path, "rb") as file:
         found = file.read(most + 1)
@@ -71,7 +65,6 @@ def content(path: str | os.PathLike[str], most: int) -> bytes:
 
 
 def reason(problem: BaseException) -> str:
-    """Return the reason why a file could not be read, on one line."""
     text = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
     return " ".join(text.split()).rstrip(".")
 
@@ -81,12 +74,11 @@ def _too_large(size: int, most: int) -> OSError:
 
 
 MOST_BYTES = 2**28
-"""Greatest size in bytes of a CSV table that is read."""
 
 
 def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV table, (lines,) by the names in its first line; an empty entry is NaN. Raises
-    `InputError` for a file that is no such table."""
+    """Return the columns of a CSV table, (lines,) by the names in its first line; an empty entry is NaN. Raise
+    `InputError` for any other file."""
     try:
         text = content(path, MOST_BYTES).decode("utf-8-sig")
         lines = [line for line in csv.reader(io.StringIO(text)) if any(entry.strip() for entry in line)]
@@ -109,7 +101,6 @@ def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def name_and_unit(head: str) -> tuple[str, str | None]:
-    """Split a column's head into name and unit; None without a unit in brackets."""
     name, bracket, unit = head.partition("[")
     return name.strip(), unit.rstrip().removesuffix("]").strip() if bracket else None
 
@@ -128,29 +119,24 @@ SCHEMA = _PACKAGE / "scene.schema.json"
 
 
 def examples_folder() -> Path:
-    """Return the folder of examples: in an installed package, or in the repository."""
     installed = _PACKAGE / "examples"
     return installed if installed.is_dir() else _PACKAGE.parents[1] / "examples"
 
 
 UNFINISHED = ".cortado-*.tmp"
-"""Pattern of the names under which files are written before they appear; a killed process leaves them behind."""
+"""Pattern of temporary names, under which a killed process leaves unfinished files."""
 _REFUSALS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-"""Errors of a disk that is full, has a quota or a limit, or is broken."""
 
 
 def unfinished(path: Path) -> Path:
-    """Return an unguessable temporary name beside `path`; open it with "x", which follows no links."""
+    """Return a temporary name beside `path` that nobody can guess; open it with "x", which follows no links."""
     return path.with_name(UNFINISHED.replace("*", secrets.token_hex(8)))
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a whole file under a temporary name and then rename it, so that no reader sees an incomplete file.
-
-    Raises:
-        ComputationError: the disk is full.
-        InputError: the file cannot be created, or the path is no regular file, such as a device.
-    """
+    """Write a file under a temporary name and rename it, so that no reader sees an incomplete file. Raise
+    `ComputationError` if the disk is full, and `InputError` for a path that cannot be created, or is a device or a
+    pipe."""
     temporary = unfinished(path)
     with sentences(path):
         if path.exists() and not path.is_file() and not path.is_dir():
@@ -166,8 +152,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def is_taken(path: Path) -> bool:
-    """Test if anything exists at a path, also a link that leads nowhere. Raises `InputError` if the test fails, for
-    example because the name is too long."""
+    """Test if anything exists at a path, also a broken link; raise `InputError` if the test fails."""
     with sentences(path):
         try:
             path.lstat()
@@ -177,14 +162,14 @@ def is_taken(path: Path) -> bool:
 
 
 def write_fully(file: Any, content: bytes) -> None:
-    """Write all bytes to an unbuffered file, which may accept only some bytes per call."""
+    """Write all bytes to an unbuffered file, which may accept only a part per call."""
     rest = memoryview(content)
     while rest:
         rest = rest[file.write(rest) :]
 
 
 def parsed_json(text: bytes) -> Any:
-    """Return the value of a JSON text; raises `ValueError`, also for nesting too deep."""
+    """Return the value of a JSON text; raise `ValueError`, also for nesting too deep."""
     try:
         return json.loads(text)
     except RecursionError:
@@ -193,12 +178,8 @@ def parsed_json(text: bytes) -> Any:
 
 @contextmanager
 def sentences(path: Path) -> Iterator[None]:
-    """Turn errors of the disk in the block into errors with a sentence about this file or folder.
-
-    Raises:
-        ComputationError: the disk is full or broken.
-        InputError: any other `OSError`, such as a folder that may not be written.
-    """
+    """Turn `OSError` in the block into a sentence about a file or folder: `ComputationError` for a full or broken disk,
+    else `InputError`."""
     try:
         yield
     except OSError as problem:
@@ -211,18 +192,16 @@ def sentences(path: Path) -> Iterator[None]:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder with its parents, if it is missing; raise as `sentences`."""
     with sentences(path):
         path.mkdir(parents=True, exist_ok=True)
 
 
 BEYOND = 2**30
-"""Offset of the byte that Windows locks: far behind the file's content, so that others can read the content."""
+"""Offset of the byte that Windows locks, far behind the content, which other processes can thus read."""
 
 
 def lock(file: int) -> None:
-    """Lock a file by its descriptor, until it is closed or its process dies; raises `BlockingIOError` if another
-    process holds the lock. `locked` reads the holder from the file, which the package filelock cannot tell."""
+    """Lock an open file until it is closed; raise `BlockingIOError` if another process holds the lock."""
     if sys.platform != "win32":
         import fcntl
 
@@ -239,21 +218,14 @@ def lock(file: int) -> None:
 
 
 LOCK = ".lock"
-"""Name of the locked file in a folder; it exists while a process writes the folder, or after it was killed."""
 _NOT_SUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Make a folder, and lock it against every other process until the block ends.
-
-    The operating system releases the lock of a process that dies. On file systems without locks, such as some network
-    drives, folders are not protected.
-
-    Raises:
-        InputError: another process holds the lock, or the folder cannot be written.
-        ComputationError: the disk is full.
-    """
+    """Make a folder, and lock it against other processes until the block ends or the process dies; raise `InputError`
+    if another process holds the lock. File systems without locks, such as some network drives, do not protect
+    folders."""
     path = folder / LOCK
     with sentences(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -267,7 +239,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _open_locked(path: Path) -> int:
-    """Open and lock a folder's lock file, write this process into it, and return its descriptor."""
+    """Open and lock a file, write the name of this process into it, and return its descriptor."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         try:
@@ -297,7 +269,7 @@ def _lock(file: int, folder: Path) -> None:
 
 
 def _is_at(path: Path, file: int) -> bool:
-    """Test if a path still names the open file, which another process may have removed as it ended."""
+    """Test if a path still names the open file, which another process may have removed."""
     try:
         return os.path.samestat(os.stat(path), os.fstat(file))
     except FileNotFoundError:

@@ -1,5 +1,4 @@
-"""Encoding of linear images: as 8-bit sRGB (IEC 61966-2-1), as videos that every browser plays (H.264 in an mp4), and
-as animated WebPs, which pages show without a player."""
+"""Encoding of linear images as 8-bit sRGB (IEC 61966-2-1), as videos (H.264 in mp4), and as animated WebPs."""
 
 from __future__ import annotations
 
@@ -22,12 +21,10 @@ from cortado.files.disk import sentences, unfinished, write_atomically
 from cortado.files.terminal import held
 
 ROWS = 32
-"""Number of rows of a picture converted at a time, few enough for the processor's cache."""
 MOST_LIGHT = 2.0
-"""Greatest value accepted in a user's picture: noise may exceed 1 a little; larger values are taken for bytes up to
-255."""
+"""Greatest value of a user's picture: noise may exceed 1 a little, while larger values must be bytes."""
 STEPS = 1 << 14
-"""Number of equal intervals of light from 0 to 1, each much shorter than the interval of any byte value."""
+"""Number of intervals of light from 0 to 1, each shorter than the interval of any byte value."""
 LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
 
 
@@ -42,12 +39,8 @@ def check_light(what: str, image: ArrayLike) -> None:
 
 
 def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArray[np.uint8]:
-    """Return sRGB bytes (rows, columns, 3) of a linear image, clipped to 0..1. ``each`` maps a function over parts, as
-    ``map`` of an executor does.
-
-    Raises:
-        InputError: another shape, or values that are not finite.
-    """
+    """Return sRGB bytes (rows, columns, 3) of a linear image, clipped to 0..1; ``each`` maps a function over parts.
+    Raise `InputError` for another shape and for values that are not finite."""
     light = image if isinstance(image, np.ndarray) and image.dtype == np.float32 else as_numbers("The image", image)
     if light.ndim != 3 or light.shape[2] != 3 or not light.size:
         raise InputError(f"The image has shape {light.shape}, but must be (rows, columns, 3).")
@@ -63,7 +56,7 @@ def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArr
 
 def _values(light: NDArray[Any]) -> NDArray[np.uint8]:
     if not np.isfinite(light).all():
-        raise InputError("The image has values that are not finite; look where it was computed.")
+        raise InputError("The image has values that are not finite; check how it was computed.")
     light = np.clip(light, light.dtype.type(0.0), light.dtype.type(1.0))
     bounds, values = _steps(light.dtype)
     steps = (light.dtype.type(STEPS) * light).astype(np.uint16)
@@ -74,8 +67,7 @@ def _values(light: NDArray[Any]) -> NDArray[np.uint8]:
 
 @cache
 def _steps(dtype: np.dtype[Any]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-    """Return the lower limit of light of each byte (256,), except byte 0, and the byte at the start of each interval
-    (STEPS + 1,)."""
+    """Return the least light of each byte after 0, (256,), and the byte at the start of each interval (STEPS + 1,)."""
     middles = (np.arange(1, 257) - 0.5) / 255.0
     exact = np.where(middles <= 0.04045, middles / 12.92, ((middles + 0.055) / 1.055) ** 2.4)
     rounded = exact.astype(dtype)
@@ -84,14 +76,13 @@ def _steps(dtype: np.dtype[Any]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
 
 
 def from_srgb(values: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return the linear light, 0 to 1, of sRGB bytes of any shape."""
     curved = values / 255.0
     return np.where(curved <= 0.04045, curved / 12.92, ((curved + 0.055) / 1.055) ** 2.4)
 
 
 def png(image: ArrayLike) -> bytes:
-    """Return the bytes of an 8-bit sRGB PNG file of a linear image (rows, columns, 3), clipped to 0..1; raises as
-    `to_srgb` and `check_light`."""
+    """Return an 8-bit sRGB PNG file of a linear image (rows, columns, 3), clipped to 0..1; raise errors of `to_srgb`
+    and `check_light`."""
     from PIL import Image
 
     pixels, content = to_srgb(image), BytesIO()
@@ -106,24 +97,19 @@ class ShadedPicture(np.ndarray):
 
     @classmethod
     def of(cls, image: ArrayLike) -> Self:
-        """Return a view of an image's numbers as a picture."""
         return np.asarray(image).view(cls)
 
     def _repr_png_(self) -> bytes | None:
-        """Return the picture as PNG bytes; None for a part of another shape, such as one row."""
+        """Return PNG bytes; None for a part of another shape, such as one row."""
         return png(self) if self.ndim == 3 and self.shape[2] == 3 else None
 
 
 VIDEO_QUALITY = "18"
-"""Constant rate factor of x264: 0 is lossless, 51 the worst; at 18 the eye sees no difference."""
 BITS = 1.2e6
-"""Greatest bit rate [1/s] for 1920 x 1080 pixels, averaged over seconds: 9.6 MB in the first minute."""
 THREADS = 8
-"""Number of encoder threads, each working on its own frame; fixed, because the file's bytes depend on it."""
+"""Number of encoder threads; the file's bytes depend on this number."""
 HELPERS = 4
-"""Number of threads that convert the parts of a frame."""
 TICKS = 90_000
-"""Number of units of frame time in a second."""
 
 
 class Video:
@@ -137,10 +123,9 @@ class Video:
         self._stream: Any = None
         self._shape: tuple[int, ...] | None = None
         self.frames = 0
-        """The number of frames so far."""
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """Add a frame shown from a time [s] on; an odd side is padded by repeating its last row or column."""
+        """Add a frame shown from a time [s] on; an odd last row or column is repeated."""
         from av import VideoFrame
 
         pixels = to_srgb(image, self._helpers.map)
@@ -161,7 +146,7 @@ class Video:
             self.frames += 1
 
     def copy(self, other: Any) -> None:
-        """Copy the frames of an open video written by this class, before others are added."""
+        """Copy the frames of an open video of this class, before others are added."""
         from av.bitstream import BitStreamFilterContext
 
         source = other.streams.video[0]
@@ -173,14 +158,12 @@ class Video:
         self.frames = source.frames
 
     def finish(self) -> None:
-        """Write the frames that are still in the encoder."""
         self._helpers.shutdown()
         if self._stream is not None:
             self._container.mux(self._stream.encode())
 
     def _stream_of(self, width: int, height: int) -> Any:
-        """Return the stream, created for the first frame. No frame depends on a later one, so new frames can follow
-        copied ones."""
+        """Return the stream; no frame depends on a later one, so that new frames can follow copies."""
         if self._stream is None:
             most = BITS * (width * height / (1920 * 1080)) ** 0.75
             options = {"crf": VIDEO_QUALITY, "bf": "0", "maxrate": f"{most:.0f}", "bufsize": f"{4.0 * most:.0f}"}
@@ -197,14 +180,16 @@ class Video:
 
 @contextmanager
 def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", count: int = 0) -> Iterator[Video]:
-    """Open a video for writing; it appears under its path when the block ends. After an interruption the file contains
-    the frames so far, and the next call with the same ``note`` and ``count`` begins with these.
+    """Open a video for writing; it appears under its path when the block ends.
+
+    After an interruption the file contains the frames so far, and the next call with equal ``note`` and ``count``
+    begins with these.
 
     Args:
         path: ends in .mp4.
-        frames_per_second: approximate rate; each frame has its own time.
+        frames_per_second: approximate rate; each frame has its time.
         note: text that identifies the content; it is stored in the file.
-        count: how many frames it will have.
+        count: number of frames that the video will have.
 
     Raises:
         InputError: PyAV is missing, there are no frames or frames of several sizes, or the file cannot be written.
@@ -239,8 +224,7 @@ def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", c
 
 
 def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second: float = 25.0) -> Path:
-    """Write a video of linear images (rows, columns, 3) of one size, taken one at a time, and return its path; errors
-    as of `writing`."""
+    """Write a video of linear images (rows, columns, 3) of one size, and return its path; raise errors of `writing`."""
     with writing(path, frames_per_second) as video:
         for k, frame in enumerate(frames):
             video.add(frame, k / frames_per_second)
@@ -248,7 +232,6 @@ def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second
 
 
 def _copy_interrupted(av: Any, video: Video, path: Path, note: str, count: int) -> None:
-    """Copy the frames of an existing video if it was interrupted and has an equal note."""
     if not note or not path.is_file():
         return
     try:
@@ -270,7 +253,6 @@ def _end(video: Video, container: Any, file: Any) -> None:
 
 
 def pyav() -> Any:
-    """Import and return PyAV; raises `InputError` where it is missing."""
     try:
         import av
     except ModuleNotFoundError as problem:
@@ -281,28 +263,23 @@ def pyav() -> Any:
 # ---- animations --------------------------------------------------------------------------------------------------
 
 ANIMATION_QUALITY = 80
-"""Quality of lossy WebP, from 0 to 100."""
 REST = 1.5
-"""Seconds for which the last frame is shown before the loop restarts."""
 
 
 class Animation:
-    """An animated WebP whose frames stay in memory until it is encoded."""
-
     def __init__(self) -> None:
         self._images: list[NDArray[np.uint8]] = []
         self._times: list[float] = []
         self.frames = 0
-        """The number of frames so far."""
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """Add a frame, a linear image (rows, columns, 3), shown from a time [s] on."""
+        """Add a linear image (rows, columns, 3) shown from a time [s] on."""
         self._images.append(to_srgb(image))
         self._times.append(time)
         self.frames += 1
 
     def encoded(self) -> bytes:
-        """Return the bytes of the WebP file, which loops for ever."""
+        """Return the WebP file, which loops for ever."""
         from PIL import Image
 
         first, *others = [Image.fromarray(pixels) for pixels in self._images]
@@ -315,8 +292,8 @@ class Animation:
 
 @contextmanager
 def moving_picture(path: Path, frames_per_second: float, note: str = "", count: int = 0) -> Iterator[Video | Animation]:
-    """Open a film for writing: an animated WebP for a path that ends in .webp, else a video as by `writing`. An
-    animation is written when the block ends; after an interruption it contains the frames so far."""
+    """Open a film for writing: an animated WebP for a path in .webp, else a video of `writing`. An animation is written
+    when the block ends, or after an interruption with the frames so far."""
     if path.suffix.lower() != ".webp":
         with writing(path, frames_per_second, note, count) as video:
             yield video

@@ -1,10 +1,8 @@
-"""Messages on stdout and stderr, whatever these are connected to; progress of long computations; and handling of
-signals.
+"""Messages on stdout and stderr, progress of long computations, and handling of signals.
 
-Ctrl-C and SIGTERM end a command with a sentence and the exit code that shells expect, at any moment.
-
-Outside `keeping` a signal ends the process at once: an exception could surface in, or get lost in, some library's
-import. Within `keeping` it raises a `KeyboardInterrupt`, so that files are closed.
+Ctrl-C and SIGTERM end a command with a sentence and the exit code that shells expect. Outside `keeping` a signal ends
+the process at once, because an exception could get lost in some library's import. Within `keeping` a signal raises a
+`KeyboardInterrupt`, so that files are closed.
 """
 
 from __future__ import annotations
@@ -19,33 +17,29 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from types import FrameType
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 from cortado.errors import ComputationError
 
 
 def printable(text: str) -> str:
-    """Return a text on one line, with control characters written as escapes, such as ``\\x1b``.
-
-    A byte of a file name that is not UTF-8, which Python keeps as a lone surrogate, becomes that byte's escape.
-    """
+    """Return a text on one line, with control characters and bytes that are not UTF-8 as escapes, such as ``\\x1b``."""
     return "".join(letter if letter.isprintable() else _escape(letter) for letter in text)
 
 
 def say(sentence: str, end: str = "\n") -> None:
-    """Print one line on stderr, such as an error or a warning; with another ``end``, only its beginning."""
     print(printable(sentence), end=end, file=sys.stderr, flush=True)
 
 
 def note(sentence: str, end: str = "\n") -> None:
-    """Print a line on the present work on stderr, unless `quietly`."""
+    """Print a line about the present work on stderr, unless `quietly`."""
     if not is_quiet():
         say(sentence, end)
 
 
 @contextmanager
 def timed_note(what: str) -> Iterator[None]:
-    """Print a line on stderr that says what the block does, and then its computing time, unless `quietly`."""
+    """Print on stderr what the block does, and then its computing time, unless `quietly`."""
     begun = time.monotonic()
     note(what, end="")
     try:
@@ -57,13 +51,12 @@ def timed_note(what: str) -> Iterator[None]:
 
 
 def is_quiet() -> bool:
-    """Test if only results, warnings and errors are wanted."""
     return _Quiet.depth > 0
 
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Suppress all output of the block, in all threads, except results, warnings and errors."""
+    """Suppress the output of the block, in all threads, except results, warnings and errors."""
     _Quiet.depth += 1
     try:
         yield
@@ -72,20 +65,17 @@ def quietly() -> Iterator[None]:
 
 
 class _Quiet:
-    """A counter of `quietly` blocks that are open."""
-
     depth = 0
 
 
 def tell(result: str) -> None:
-    """Print a result, of one line or several, on stdout."""
     with to_stdout():
         print("\n".join(map(printable, result.split("\n"))))
 
 
 @contextmanager
 def to_stdout() -> Iterator[None]:
-    """If a print in the block fails, raise `ComputationError`, or `BrokenPipeError` if the reader has gone."""
+    """Raise `ComputationError` if a print in the block fails, and `BrokenPipeError` if the reader has gone."""
     try:
         try:
             yield
@@ -100,8 +90,8 @@ def to_stdout() -> Iterator[None]:
 
 
 def steady_streams() -> None:
-    """Make stdout and stderr usable: closed streams discard their input, but a result written to a closed stdout fails;
-    characters unknown to the terminal are escaped; and a broken stderr is ignored."""
+    """Make stdout and stderr usable: closed streams discard their input, characters that the terminal lacks are
+    escaped, and errors of stderr are ignored. A result written to a closed stdout still fails."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             _point_nowhere(number, os.O_RDONLY if number == 1 else os.O_RDWR)
@@ -112,8 +102,6 @@ def steady_streams() -> None:
 
 
 class _Steady(io.TextIOWrapper):
-    """A text stream that ignores errors of the broken stream to which it writes."""
-
     def write(self, text: str) -> int:
         try:
             return super().write(text)
@@ -138,27 +126,22 @@ def _escape(letter: str) -> str:
 
 
 LINE_INTERVAL = 10.0
-"""Seconds between two lines of progress when the stream is no terminal."""
 
 
 def announce(result: str) -> None:
-    """Print a result on stdout before the command has ended, unless progress is hidden."""
     if not _hidden.get() and not is_quiet():
         tell(result)
 
 
-class Advance(Protocol):
-    """A function that reports `n` more steps as done, with latest values to show (loss=0.1)."""
-
-    def __call__(self, n: int = 1, **fields: Any) -> None: ...
-
+Advance = Callable[..., None]
+"""Reports ``n`` more steps as done, by default one, with values to show, such as ``loss=0.1``."""
 
 _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 
 
 @contextmanager
 def untracked() -> Iterator[None]:
-    """Hide the progress of this thread's computations in the block, because they are parts of a larger computation."""
+    """Hide the progress of the block's computations in this thread, which are parts of a larger computation."""
     token = _hidden.set(True)
     try:
         yield
@@ -170,14 +153,8 @@ def untracked() -> Iterator[None]:
 def track(
     total: int, description: str, *, stream: TextIO | None = None, interval: float | None = None
 ) -> Iterator[Advance]:
-    """Show the progress of `total` steps on a stream, stderr by default; without a terminal, by a line every `interval`
-    seconds, `LINE_INTERVAL` when none is given.
-
-    Use:
-        with track(120, "optimise") as advance:
-            for loss in ...:
-                advance(loss=loss)
-    """
+    """Show the progress of ``total`` steps, by default on stderr: as a bar on a terminal, else as a line every
+    ``interval`` seconds. Use: ``with track(120, "optimise") as advance: ...; advance(loss=loss)``."""
     stream = sys.stderr if stream is None else stream
     if _hidden.get() or is_quiet():
         yield lambda n=1, **fields: None
@@ -211,8 +188,8 @@ def _bar(total: int, description: str, stream: TextIO) -> Iterator[Advance]:
 
 
 class _Lines:
-    """A progress report of at most one line every `interval` seconds, and one for the last step. The time left is
-    estimated from steps after the first report: before it, kernels are compiled or earlier work is skipped."""
+    """Progress in lines. The time left is estimated from steps after the first report, as kernels are compiled
+    before."""
 
     def __init__(self, total: int, description: str, stream: TextIO, interval: float) -> None:
         self._total, self._description, self._stream, self._interval = total, description, stream, interval
@@ -239,7 +216,6 @@ class _Lines:
 
 
 def _text(fields: dict[str, Any]) -> str:
-    """Return fields as text: loss 0.1235, step 7."""
     words = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in fields.items()}
     return ", ".join(f"{name} {word}" for name, word in words.items())
 
@@ -249,16 +225,15 @@ AGAIN = 0.01
 """Delay [s] before an interruption is raised again, if Python dropped its exception, as in a finaliser."""
 
 _stderr = 2
-"""Descriptor of a copy of stderr, as stderr is silenced for a while when Warp starts."""
+"""Descriptor of a copy of stderr, which is silenced while Warp starts."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """The exception for a signal that interrupts a command; takes the signal's number and a text on what is kept."""
+    """The exception for a signal that interrupts a command; ``kept`` is a text about what remains."""
 
     def __init__(self, number: int, kept: str = ""):
         super().__init__(number, kept)
         self.code = 128 + number
-        """The exit code."""
         self.kept = kept
 
     def __str__(self) -> str:
@@ -266,7 +241,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def leave_at_once() -> None:
-    """Make signals end the process at once from now on; ignored signals stay ignored (nohup, background jobs)."""
+    """End the process at once on signals from now on; ignored signals stay ignored (nohup, background jobs)."""
     global _stderr
     with suppress(OSError):  # it may be closed
         _stderr = os.dup(2)
@@ -277,15 +252,14 @@ def leave_at_once() -> None:
 
 
 def finish() -> None:
-    """Ignore signals from now on, as the command has ended."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
 @contextmanager
 def keeping(kept: Callable[[], str]) -> Iterator[None]:
-    """Turn signals in the block into exceptions. ``kept`` returns the end of their message, which says what is kept and
-    where, or an empty text. In nested blocks the innermost non-empty text counts."""
+    """Turn signals in the block into exceptions. ``kept`` returns the end of their message, which tells what is kept
+    and where, or an empty text. In nested blocks the innermost non-empty text counts."""
     ours = [number for number in SIGNALS if signal.getsignal(number) is _leave]
     for number in ours:
         signal.signal(number, _raise)
@@ -301,8 +275,7 @@ def keeping(kept: Callable[[], str]) -> Iterator[None]:
 
 
 class Hold:
-    """A temporary delay of signals. Threads and processes started meanwhile never receive Ctrl-C, which a terminal
-    sends to all of them."""
+    """A temporary delay of signals. Threads and processes started meanwhile never receive the Ctrl-C of a terminal."""
 
     def __init__(self) -> None:
         self._late: list[int] = []
@@ -310,7 +283,6 @@ class Hold:
         self._handler: Any = None
 
     def begin(self) -> None:
-        """Delay signals from now on."""
         if hasattr(signal, "pthread_sigmask"):  # not on Windows
             self._mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         if signal.getsignal(signal.SIGTERM) in (_leave, _raise):  # a process that inherited a mask could not be ended
@@ -330,7 +302,7 @@ class Hold:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Delay signals in the block, so that files are written completely. Only the main thread receives signals."""
+    """Delay signals in the block, so that files are written completely."""
     late, before = list[int](), dict[int, Any]()
     if threading.current_thread() is threading.main_thread():
         heard = [number for number in SIGNALS if callable(signal.getsignal(number))]
@@ -345,7 +317,7 @@ def held() -> Iterator[None]:
 
 
 def _first_said(stop: BaseException | None) -> str:
-    """Return the end of an interruption's message, or that of an earlier interruption that was being handled."""
+    """Return the end of an interruption's message, or of an earlier interruption that was being handled."""
     if not isinstance(stop, Interrupted):
         return ""
     return stop.kept or _first_said(None if stop.__suppress_context__ else stop.__context__)

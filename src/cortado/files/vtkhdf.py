@@ -1,9 +1,8 @@
 """Frames of particles in one temporal VTKHDF file, which ParaView opens and a killed run leaves readable.
 
-A frame's bytes are written at the offsets of its datasets (`FileLayout`) without HDF5, as a full disk can crash HDF5.
-Then a single write of eight bytes stores the number of frames and their CRC-32; a SIGKILL comes before or after this
-write. HDF5's own checksums are not used: they need datasets in chunks, and a killed process leaves the index of the
-chunks half written.
+A frame's bytes are written at the offsets of its datasets (`FileLayout`) without HDF5, which may crash on a full disk.
+Then one write of eight bytes stores the number of frames and their CRC-32. HDF5's checksums are not used, as a killed
+process leaves the index of its chunks half written.
 """
 
 from __future__ import annotations
@@ -27,19 +26,13 @@ from cortado.files.vtkhdf_layout import FORMAT, WRITTEN, FileLayout, frame_check
 
 
 class TrajectoryWriter:
-    """Writes a trajectory's frames to one VTKHDF file; a context manager.
-
-    The file appears at `path` once its first frame, or the first `kept` frames, are written. It can be opened while it
-    grows, by ParaView too. Frames not yet written, or never written as the run ended early, contain no particles.
-
-    Raises:
-        InputError: an impossible size, or a path that cannot be written.
-        ComputationError: the disk has not enough room for all frames.
-    """
+    """Writes frames to one VTKHDF file; a context manager. The file appears at ``path`` when its first ``kept`` frames
+    are written, and can be opened while it grows. Missing frames contain no particles."""
 
     def __init__(self, path: str | Path, *, expected: int | None = None, kept: int = 1, **fields: Any) -> None:
-        """Create the file; ``fields`` are arguments of `FileLayout`. The disk must have room for all frames, or for
-        ``expected`` ones. A file of that name is replaced when the first ``kept`` frames are written."""
+        """Create the file; ``fields`` are arguments of `FileLayout`. The disk must have room for ``expected`` frames,
+        by default for all. Raise `InputError` for impossible sizes or paths, and `ComputationError` if the disk lacks
+        room."""
         self.path, self._layout = Path(path), FileLayout(**fields)
         self.frames_written, self.steps_written, self._kept = 0, 0, kept
         self._unfinished = unfinished(self.path)
@@ -64,24 +57,14 @@ class TrajectoryWriter:
         others: Mapping[str, ArrayLike] | None = None,
         **scalars: ArrayLike,
     ) -> None:
-        """Write one frame.
-
-        Args:
-            positions: (n, d) [m]
-            velocities: (n, d) [m/s]
-            step: number of steps taken so far; the number of this frame when left out.
-            time: time of this frame [s], if it differs from the announced one.
-            others: exactly those given at construction.
-            scalars: (n,) each, and vectors (n, d), exactly those named at construction.
-
-        Raises:
-            InputError: shapes or names other than announced, or more frames than announced.
-            ComputationError: the disk refused; the frames before this one stay readable.
-        """
+        """Write one frame: positions (n, d) [m], velocities (n, d) [m/s], and exactly the fields named at construction.
+        ``step`` is the number of steps so far, by default of frames; ``time`` [s] replaces the announced one. Raise
+        `InputError` for other shapes or names or for too many frames, and `ComputationError` if the disk is full;
+        earlier frames stay readable."""
         frame = self.frames_written
         frames = len(self._layout.times)
         if frame >= frames:
-            raise InputError(f"{self.path} was laid out for {frames} frames, and one more came.")
+            raise InputError(f"{self.path} has room for {frames} frames, but one more was given.")
         for what, found, wanted in (
             ("scalar fields", scalars, (*self._layout.scalars, *self._layout.vectors)),
             ("other fields", others or {}, self._layout.others),
@@ -116,19 +99,15 @@ class TrajectoryWriter:
         self.frames_written, self._frames_checksum = frame + 1, checksum
 
     def append_steps(self, **diagnostics: ArrayLike) -> None:
-        """Write the solver's diagnostics by name, of one step (scalars) or of k steps (arrays (k,)).
-
-        Raises:
-            InputError: names other than announced, or more steps than announced.
-            ComputationError: the disk refused.
-        """
+        """Write the diagnostics, by name, of one step (scalars) or of k steps (arrays (k,)); raise errors as `append`
+        does."""
         kinds = self._layout.diagnostics
         if set(diagnostics) != set(kinds):
             raise InputError(f"Expected the diagnostics {sorted(kinds)}, found {sorted(diagnostics)}.")
         records = _records(diagnostics, self._layout.records)
         first, last = self.steps_written, self.steps_written + len(records)
         if last > self._layout.steps:
-            raise InputError(f"{self.path} was laid out for {self._layout.steps} steps, and {last} came.")
+            raise InputError(f"{self.path} has room for {self._layout.steps} steps, but {last} were given.")
         checksum = zlib.crc32(records.tobytes(), self._steps_checksum)
         with self._refusal():
             for name, dtype in kinds.items():
@@ -137,7 +116,7 @@ class TrajectoryWriter:
         self.steps_written, self._steps_checksum = last, checksum
 
     def close(self) -> None:
-        """Finish the file; if it has no frame, or not all ``kept`` frames, remove it."""
+        """Finish the file; remove it if not all ``kept`` frames were written."""
         self._file.close()
         if self.frames_written < self._kept:
             self._unfinished.unlink(missing_ok=True)
@@ -157,7 +136,6 @@ class TrajectoryWriter:
         return array
 
     def _vectors(self, name: str, values: ArrayLike) -> NDArray[Any]:
-        """Return the values as (n, 3), with z = 0 in 2-D."""
         array = self._checked(name, values, self._layout.shape)
         return np.pad(array, ((0, 0), (0, 3 - array.shape[1])))
 
@@ -167,7 +145,6 @@ class TrajectoryWriter:
 
     @contextmanager
     def _refusal(self) -> Iterator[None]:
-        """Turn errors of the disk in the block into a `ComputationError` with a sentence."""
         try:
             yield
         except OSError as problem:
@@ -178,12 +155,12 @@ class TrajectoryWriter:
 
 
 def read(path: str | Path) -> dict[str, Any]:
-    """Read the completed frames and steps, even while the writer is running or after it was killed.
+    """Read the completed frames and steps, also while the writer is running or after it was killed.
 
     Returns:
         times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s], and every
-        scalar field (frames, n) under its own name. Tables by name: others (arrays of every frame), constants (arrays
-        for the whole run) and diagnostics (steps,). Also origin, a text, and marks, None or two numbers.
+        scalar field (frames, n) by name. Tables by name: others (arrays of every frame), constants (arrays of the run),
+        diagnostics (steps,). Also origin, a text, and marks, None or two numbers.
 
     Raises:
         InputError: the file is missing, damaged, or none of Cortado's trajectories.
@@ -197,18 +174,17 @@ def read(path: str | Path) -> dict[str, Any]:
             if "cortado" not in file:
                 raise InputError(f"{path} is an HDF5 file, but not a trajectory that Cortado wrote.")
             if file["cortado"].attrs.get("format") != FORMAT:
-                raise InputError(f"{path} was written by another version of Cortado, or is damaged; run it again.")
+                raise InputError(f"{path} was written by another version of Cortado, or is damaged; repeat the run.")
             arrays = _read_arrays(file, os.path.getsize(path))
     except (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError, OverflowError) as problem:
         reason = " ".join(str(problem).split())
         raise InputError(f"{path} cannot be read as a VTKHDF trajectory: {reason}.") from problem
     if arrays is None:
-        raise InputError(f"{path} is damaged: its checksums are not those of what it holds; restore or repeat it.")
+        raise InputError(f"{path} is damaged: its checksums do not fit its content; restore it, or repeat the run.")
     return arrays
 
 
 def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
-    """Return the arrays of an open file's completed frames and steps; None where a checksum is wrong."""
     vtk, own = file["VTKHDF"], file["cortado"]
     (frames, frames_checksum), (steps, steps_checksum) = own["progress"][:].tolist()
     dimension, particles = int(own.attrs["dimension"]), int(vtk["NumberOfPoints"][0])
@@ -245,7 +221,6 @@ def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
 
 
 def _records(columns: Mapping[str, ArrayLike], record: np.dtype[Any]) -> NDArray[Any]:
-    """Return structured records (steps,), made from one array for each field name."""
     arrays = {name: np.atleast_1d(column) for name, column in columns.items()}
     records = np.zeros(max((len(array) for array in arrays.values()), default=0), record)
     for name, array in arrays.items():
@@ -254,7 +229,6 @@ def _records(columns: Mapping[str, ArrayLike], record: np.dtype[Any]) -> NDArray
 
 
 def _require_room(layout: FileLayout, path: Path, expected: int | None) -> None:
-    """Raise `ComputationError` if the disk has no room for the expected frames."""
     free = shutil.disk_usage(path.absolute().parent).free
     frames = len(layout.times) if expected is None else min(expected, len(layout.times))
     if (needed := layout.size * frames / len(layout.times)) > free:

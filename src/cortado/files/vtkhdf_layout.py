@@ -1,13 +1,11 @@
-"""The layout of a trajectory file: room for every frame from the start, so that nothing changes its place or size.
+"""The layout of a trajectory file, with room for every frame from the start.
 
-Every dataset is contiguous, sparse on disk and at a fixed offset; `PointOffsets` maps a frame to its rows. The datasets
-that count points and cells have two parts: one with all particles, and an empty one. A frame not yet written refers to
-the empty part. Changing one number in `PartOffsets` makes the frame appear, so that readers such as ParaView never see
-sizes change.
+Every dataset is contiguous, sparse on disk and at a fixed offset; `PointOffsets` maps a frame to its rows. Datasets
+that count points and cells have two parts, one with all particles and an empty one. A missing frame refers to the empty
+part; one number in `PartOffsets` makes the frame appear, so that readers such as ParaView never see sizes change.
 
-HDF5 creates the file in memory, and plain writes copy it to disk. Files written by HDF5 itself would also be readable
-after a kill, but a full disk causes a segmentation fault: always while the file is created, and often later (HDF5 2.0).
-After a kill in HDF5's mode for one writer and many readers, VTK cannot open the file.
+HDF5 only creates the file in memory, and plain writes copy it to disk, because HDF5 crashes on a full disk (HDF5 2.0).
+Its mode for one writer and many readers is not used: after a kill, VTK cannot open the file.
 
 Format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/vtkhdf_specifications.html
 """
@@ -29,38 +27,30 @@ from cortado.files.disk import write_fully
 FORMAT = 3
 """Version of the group "cortado"; version 1 had no checksums, version 2 no states to continue from."""
 WRITTEN, MISSING = 0, 1
-"""The numbers of the part for a written frame and of the part for a missing frame."""
+"""Numbers of the part for a written frame and of the part for a missing frame."""
 _TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")
 _PAGE = 4096
 
 
 @dataclass(frozen=True)
 class FileLayout:
-    """The fields, types and sizes of a trajectory file, with room for every frame."""
-
     times: NDArray[np.float64]
-    """(frames,) [s] expected times of the frames, as far as known"""
+    """(frames,) expected times [s]"""
     particles: int
     dimension: int
-    """2 or 3; in 2-D the stored points have z = 0."""
+    """2 or 3; in 2-D the stored z is 0"""
     precision: str = "float32"
-    """Type of the stored positions, velocities and scalars, "float32" or "float64"."""
+    """"float32" or "float64": type of positions, velocities and scalars"""
     steps: int = 0
-    """Greatest number of steps whose diagnostics are stored."""
     scalars: Sequence[str] = ()
-    """Names of further scalar fields of every frame, such as "density" and "pressure", which ParaView shows."""
     vectors: Sequence[str] = ()
-    """Names of further vector fields, besides the velocity."""
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """Further arrays of every frame by name, with the types and shapes of the first."""
+    """further arrays of every frame by name, with the types and shapes of the first frame"""
     constants: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """Arrays of any shape that hold for the whole run, by name."""
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
-    """Types of the diagnostics of every step, by name."""
     origin: str = ""
-    """JSON text on the particles' origin; empty if unknown."""
     marks: tuple[float, ...] = ()
-    """Time [s] of the first due frame, and frames per second; empty if frames are chosen by steps."""
+    """time of the first frame [s] and frames per second [1/s]; empty if frames are chosen by steps"""
 
     def __post_init__(self) -> None:
         own: dict[str, Any] = {"times": np.array(self.times, dtype=np.float64, ndmin=1)}
@@ -78,12 +68,10 @@ class FileLayout:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return the numbers of particles n and of dimensions d."""
         return self.particles, self.dimension
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Return the type of positions, velocities and scalars."""
         return np.dtype(self.precision)
 
     @property
@@ -97,12 +85,10 @@ class FileLayout:
 
     @property
     def records(self) -> np.dtype[Any]:
-        """Structured type of the record of a step's diagnostics."""
         return np.dtype(sorted(self.diagnostics.items()))
 
     @property
     def seed(self) -> int:
-        """Checksum of a file without frames."""
         particles = self.shape[0]
         kinds = {name: (self.dtype, (particles, *row)) for name, row in self.rows.items()}
         kinds |= {name: (array.dtype, array.shape) for name, array in sorted(self.others.items())}
@@ -110,7 +96,6 @@ class FileLayout:
 
     @property
     def size(self) -> int:
-        """Approximate size in bytes of the full file."""
         numbers = sum(int(np.prod(row, dtype=int)) for row in self.rows.values())
         others, constants = (sum(a.nbytes for a in arrays.values()) for arrays in (self.others, self.constants))
         frame = (
@@ -182,28 +167,23 @@ def frames_seed(
     origin: str,
     marks: tuple[float, ...],
 ) -> int:
-    """Return the initial value of the frames' checksum. It depends on the frames' format, ``kinds`` (type and shape of
-    each field), and on all constants."""
+    """Return the checksum of no frames, which depends on ``kinds``, type and shape of each field, and on constants."""
     fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
     varying = [(name, dtype.str, sizes) for name, (dtype, sizes) in kinds.items()]
     return zlib.crc32(origin.encode(), zlib.crc32(repr((shape, varying, fixed, *marks)).encode()))
 
 
 def frame_checksum(checksum: int, time: Any, number: Any, rows: Iterable[bytes]) -> int:
-    """Return the CRC-32 of the frames so far and one more frame, given its time [s], its number of steps, and its
-    fields."""
     for content in (time.tobytes(), number.tobytes(), *rows):
         checksum = zlib.crc32(content, checksum)
     return checksum
 
 
 def steps_seed(records: np.dtype[Any]) -> int:
-    """Return the initial value of the steps' checksum, for records of this type."""
     return zlib.crc32(repr(records.descr).encode())
 
 
 def _reserve(group: Any, name: str, shape: tuple[int, ...], dtype: Any) -> int:
-    """Create a contiguous, unwritten dataset in the file, and return its byte offset."""
     from h5py import h5d, h5p, h5s, h5t
 
     options = h5p.create(h5p.DATASET_CREATE)
@@ -214,7 +194,7 @@ def _reserve(group: Any, name: str, shape: tuple[int, ...], dtype: Any) -> int:
 
 
 def _write_cells(group: Any, cells: int) -> None:
-    """Write one cell per point, shared by all frames (their offsets are zero), and no cells for the empty part."""
+    """Write one cell per point, shared by all frames, and no cells for the empty part."""
     group["NumberOfConnectivityIds"] = np.array([cells, 0])
     group["NumberOfCells"] = np.array([cells, 0])
     group["Connectivity"] = np.arange(cells)
@@ -236,34 +216,29 @@ class Pages(io.RawIOBase):
             write_fully(file, bytes(page[: self._end - number * _PAGE]))
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Move to a byte, and return its offset."""
         self._place = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._end}[whence]
         return self._place
 
     def tell(self) -> int:
-        """Return the byte at which the next operation begins."""
         return self._place
 
     def truncate(self, size: int | None = None) -> int:
-        """Set the size [byte], by default to the present place."""
         self._end = self._place if size is None else size
         return self._end
 
     def write(self, content: Any) -> int:
-        """Write all bytes of ``content``, and return their number."""
         for page, place, part in self._parts(content):
             page[place : place + len(part)] = part
         self._end = max(self._end, self._place)
         return len(content)
 
     def readinto(self, buffer: Any) -> int:
-        """Fill the buffer, with zeros where nothing was written, and return its length."""
         for page, place, part in self._parts(buffer):
             part[:] = page[place : place + len(part)]
         return len(buffer)
 
     def _parts(self, content: Any) -> Iterator[tuple[bytearray, int, memoryview]]:
-        """Yield for each page: the page, the offset in it, and the part of the content; advance the position."""
+        """Yield each page with an offset in it and the part of the content that belongs there; advance the position."""
         rest = memoryview(content)
         while rest:
             number, place = divmod(self._place, _PAGE)

@@ -1,6 +1,4 @@
-"""Sensors of free bodies: the force in a spring, with tangents and adjoints; and the position, rotation and velocities
-of a body.
-"""
+"""Sensors of free bodies: the force in a spring, and the motion of a body."""
 
 from functools import cache
 from typing import Any
@@ -27,7 +25,7 @@ from cortado.sph.springs import NUMBERS, PoseBars, Springs, numbers_of, springs_
 
 @cache
 def six_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Make two kernels: one copies a vector to the first components of a load, the other is its adjoint."""
+    """Make a kernel that copies a vector to the first components of a load, and its adjoint."""
     real, vector, module = precision.real, precision.vector, kernel_module(f"spring_load_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -44,7 +42,7 @@ def six_kernels(precision: Precision) -> tuple[Any, Any]:
 
 
 class SpringLoads:
-    """The quantity of a spring's force and length at the start of a step, stored in the first two numbers of a load."""
+    """The force and length of a spring at the start of a step, in the first two numbers of a load."""
 
     def __init__(self, springs: Springs, spring: Ends):
         layout, self._springs, self._spring = springs.layout, springs, spring
@@ -80,7 +78,7 @@ class SpringLoads:
 
 
 def spring_loads(solver: ParticleSolver) -> dict[str, QuantityFormula]:
-    """Make the formulas of the forces in a solver's springs, by their names."""
+    """Make the formulas of the forces in a solver's springs, by name."""
     return {load_name(spring.name): SpringLoads(springs, spring) for springs, spring in springs_in(solver)}
 
 

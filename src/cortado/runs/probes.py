@@ -1,5 +1,5 @@
-"""Sensors of pressure at a point, of flow through a plane, and of loads on walls and solids; the sensors of a scene;
-and warnings about sensors that fluid cannot reach."""
+"""Sensors of pressure, flow rate and loads; the sensors of a scene; and warnings about sensors that fluid cannot
+reach."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
@@ -143,13 +143,12 @@ class WallForce(LoadSensor):
         """Take corners ``lower``, ``upper`` (d,) of the region [m], unbounded if left out, and the point ``about`` (d,)
         of the torque [m], the origin if left out. ``on`` names a solid that carries and turns both. ``axes`` of force
         and torque are those of the "world", or of the "body", which turn with the solid."""
-        self.lower, self.upper, self.about = (
-            None if values is None else read(what, values)
-            for what, values, read in (("lower", lower, corner), ("upper", upper, corner), ("about", about, point))
-        )
+        self.lower = None if lower is None else corner("lower", lower)
+        self.upper = None if upper is None else corner("upper", upper)
+        self.about = None if about is None else point("about", about)
         given = [values for values in (self.lower, self.upper, self.about) if values is not None]
         if len({len(values) for values in given}) > 1:
-            raise InputError("lower, upper and about must have as many components as one another.")
+            raise InputError("lower, upper and about must have the same number of components.")
         if self.lower is not None and self.upper is not None and not (self.lower < self.upper).all():
             raise InputError(f"upper is {self.upper.tolist()}, but must be greater than lower, {self.lower.tolist()}.")
         self.on = named(on)
@@ -241,11 +240,9 @@ SENSORS: dict[str, Callable[..., Sensor]] = {
     "spring_force": SpringForce,
     "body_motion": BodyMotion,
 }
-"""Sensor classes by the ``kind`` in a scene file."""
 
 
 def sensors_of(scene: Scene) -> dict[str, Sensor]:
-    """Make the sensors of a scene, by name. Their up direction is opposite to gravity."""
     gravity = np.asarray(scene.forces.gravity, dtype=np.float64)
     upwards: dict[str, Any] = {"wave_gauge": {"up": -gravity}} if gravity.any() else {}
     return {
@@ -257,12 +254,12 @@ def sensors_of(scene: Scene) -> dict[str, Sensor]:
 MOST_CELLS = 200_000
 """Greatest number of cells, half a spacing wide, that are searched; larger containers are not checked."""
 DEEP = 0.01
-"""Depth in spacings: a point less deep in a wall or solid counts as on its surface."""
+"""Depth in a wall or solid, in spacings, up to which a point counts as on the surface."""
 
 
 def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_]:
-    """Return booleans (n,): True for points (n, d) [m] that no path connects with particles (m, d) [m]. Only solids at
-    rest block paths, which lead through cells half a spacing wide. The container has no periodic axes or emitters."""
+    """Return booleans (n,): True for points (n, d) [m] that solids at rest separate from all particles (m, d) [m];
+    False with periodic axes, with emitters or without a container."""
     from scipy.ndimage import label
 
     nowhere, ends = np.zeros(len(points), dtype=bool), scene.container.extent()
@@ -286,23 +283,19 @@ def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_
 
 
 MOST = 16
-"""Greatest number of points along an axis with which planes and columns are checked."""
 
 
 class Prepared(Cut, Protocol):
-    """The parts of a simulation that checks of sensors use."""
+    """A simulation, as the checks of sensors need it."""
 
     @property
-    def scene(self) -> Scene:
-        """Return the scene that is simulated."""
+    def scene(self) -> Scene: ...
 
     @property
-    def positions(self) -> Points:
-        """Return first positions (n, d) [m]."""
+    def positions(self) -> Points: ...
 
     @property
-    def walls(self) -> Points:
-        """Return wall particles (b, d) [m]."""
+    def walls(self) -> Points: ...
 
 
 def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
@@ -313,7 +306,6 @@ def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
 
 
 def _doubt(simulation: Prepared, sensor: Any) -> str | None:
-    """Return the reason why a sensor may never meet fluid; None if it can, and for user-defined sensors."""
     scene, spacing = simulation.scene, simulation.scene.discretisation.spacing
     if isinstance(sensor, WallForce):
         return _without_walls(simulation, sensor)
@@ -338,8 +330,7 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
 
 
 def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
-    """Return a warning if, without a container, a sensor's distance from fluid and solids exceeds its reach plus their
-    size."""
+    """Return a warning if a sensor is further from fluid and solids than its reach plus their size."""
     ends = _of_things(simulation)
     points = _looked_at(ends, sensor)
     gap = float(np.linalg.norm(points - np.clip(points, *ends), axis=1).min())
@@ -354,14 +345,12 @@ def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
 
 
 def _of_things(simulation: Prepared) -> tuple[Points, Points]:
-    """Return the box around the initial fluid and walls, lower and upper (d,) [m]."""
     points = np.concatenate([simulation.positions, simulation.walls])
     return points.min(axis=0), points.max(axis=0)
 
 
 def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
-    """Return a warning if a gauge's column does not begin at the container's bottom, or extends far beyond the
-    container."""
+    """Return a warning if a gauge's column does not begin at the container's bottom, or is too wide."""
     scene, ends = simulation.scene, simulation.scene.container.extent()
     assert ends is not None
     heights = corners(*ends) @ gauge.up
@@ -378,7 +367,6 @@ def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
 
 
 def _too_wide(scene: Scene, key: str, wide: float | None) -> str | None:
-    """Return a warning if a sensor's reach is larger than a container without periodic axes."""
     ends = scene.container.extent()
     if wide is None or ends is None or any(scene.periods[1]):
         return None
@@ -389,7 +377,7 @@ def _too_wide(scene: Scene, key: str, wide: float | None) -> str | None:
 
 
 def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
-    """Return points (n, d) [m] of a sensor within a box (2, d) [m]; the sensor works if fluid can reach any of them."""
+    """Return points (n, d) [m] of a sensor within a box (2, d) [m]; the sensor works if fluid can reach one of them."""
     place = sensor.position
     if isinstance(sensor, PressureProbe):
         return np.array([place])
@@ -405,7 +393,7 @@ def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
 
 
 def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
-    """Return for each of the points (n, d) [m] what keeps fluid away from it, or None."""
+    """Return what keeps fluid away from each of the points (n, d) [m], or None."""
     scene = simulation.scene
     d, deep = scene.dimension, DEEP * scene.discretisation.spacing
     region, ends = scene.container.region(d).opened(scene.container.periods(d)[1]), scene.container.extent()
@@ -427,14 +415,12 @@ def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
 
 
 def _in_metres(scene: Scene, place: Points) -> str:
-    """Return a hint on units if a place is far outside, as a place given in millimetres would be."""
     ends = scene.container.extent()
     far = ends is not None and np.abs(place).max() > 10.0 * np.abs(ends).max()
     return " (positions are in metres)" if far else ""
 
 
 def _without_walls(simulation: Prepared, sensor: WallForce) -> str | None:
-    """Return a warning if no particle in the region could push a wall."""
     walls, d = simulation.walls, simulation.scene.dimension
     lower = np.full(d, -np.inf) if sensor.lower is None else sensor.lower
     upper = np.full(d, np.inf) if sensor.upper is None else sensor.upper

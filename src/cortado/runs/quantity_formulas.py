@@ -1,21 +1,19 @@
-"""Formulas on the device for quantities of a step's sorted particles, with tangents and adjoints.
+"""Formulas of quantities on the device, with tangents and adjoints.
 
-Here n is the number density, and m a particle's mass divided by its volume V on the rest lattice. The vorticity is an
-SPH sum over fluid neighbours (Monaghan 1992):
+Here n is the number density, and m a particle's mass over its volume V on the rest lattice. The vorticity is an SPH sum
+over fluid neighbours (Monaghan 1992):
 
     c_i = V sum_j (v_i - v_j) x G_ij,   omega_i = c_i / (mu n_i).
 
-The factor mu = -(V / d) sum_j x_j . G_j is computed on the rest lattice. There a rigidly rotating fluid has a vorticity
-of twice its angular velocity. Walls do not contribute.
-
-Particle i exerts on all walls, or on those of one solid, the force
+With the factor mu = -(V / d) sum_j x_j . G_j on the rest lattice, a rigidly rotating fluid has a vorticity of twice its
+angular velocity. Particle i exerts on all walls, or on those of one solid, the force
 
     f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i + B_i),
 
-where A_i is the sum over wall particles along which its pressure acts (``wall_push`` of
-`cortado.solvers.particles.ParticleSolver`). The a are accelerations of the particle by wall forces such as viscosity.
-B_i is the contribution of mirror images (`cortado.solvers.projection.mean_stress`), if walls mirror. Walls gain the
-momentum that the fluid loses: a particle's mass is m_i s^d, with the spacing s.
+where A_i is the sum over wall particles along which its pressure acts (`ParticleSolver.wall_push`), a are accelerations
+of the particle by wall forces such as viscosity, B_i is the contribution of mirror images
+(`cortado.solvers.projection.mean_stress`), and m_i s^d is the particle's mass, with the spacing s. Walls gain the
+momentum that the fluid loses.
 """
 
 from collections.abc import Callable
@@ -41,7 +39,6 @@ from cortado.sph.density import WallAction
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 SIX = wp.types.vector(6, wp.float64)
-"""The type of a force and a torque on the device."""
 
 
 @dataclass(frozen=True)
@@ -49,31 +46,27 @@ class Bars:
     """Adjoints within a step, to which adjoints of quantities are added; see `cortado.solvers.solver.WithinBar`."""
 
     of: Adjoints
-    """Adjoints of sorted particles at the start of the step, and of parameters and solids."""
+    """Adjoints at the start of the step, of sorted particles, parameters and solids."""
     p: wp.array
-    """(n,) adjoint of the pressures that particles exert on walls."""
     stress: wp.array
-    """(n,) adjoint of the pressures that a gauge would read."""
+    """(n,) adjoint of the pressures of a gauge"""
     v_star: wp.array
-    """(n,) adjoint of the predicted velocities."""
 
 
 class QuantityFormula(Protocol):
-    """A formula of a quantity of the sorted particles of a step, with its derivatives: numbers or vectors (n,), or six
-    numbers for each scene. ``p`` (n,) are the pressures that particles exert on walls, if the step was taken."""
+    """The formula of a quantity of sorted particles, (n,), or of six numbers per scene; ``p`` (n,) are pressures on
+    walls."""
 
-    def value(self, step: StepContext, p: Any) -> wp.array:
-        """Return the quantity; the next call overwrites it."""
+    def value(self, step: StepContext, p: Any) -> wp.array: ...
 
     def tangent(self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any) -> wp.array:
-        """Return the tangent of the quantity, given the tangents of p and of the pressures that a gauge would read."""
+        """Return the tangent, given the tangents of p and of the pressures of a gauge."""
 
     def adjoint(self, step: StepContext, p: Any, own: wp.array, bar: Bars) -> None:
-        """Add the contribution of the quantity's adjoint ``own`` to the adjoints ``bar``."""
+        """Add to ``bar``, given the quantity's adjoint ``own``."""
 
 
 def turns(discretisation: Discretisation) -> Callable[..., Any]:
-    """Make the function of a pair's term (v_i - v_j) x G_ij in the circulation."""
     vector, neighbourhood = discretisation.precision.vector, neighbourhood_type(discretisation.precision)
     gradient = pair_functions(discretisation).gradient
 
@@ -85,7 +78,6 @@ def turns(discretisation: Discretisation) -> Callable[..., Any]:
 
 @cache
 def circulation_kernels(discretisation: Discretisation) -> Kernels:
-    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the sum c, the vorticity times mu n."""
     sums = (
         fluid_sum(discretisation)(turns(discretisation)),
         *(make(discretisation, turns) for make in (made_tangent, made_adjoint)),
@@ -97,8 +89,7 @@ def circulation_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def number_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
-    """Make the kernels of density, of speed, and of vorticity given the circulation c; ``factor`` is mu. At rest, where
-    the speed has a kink, its derivative is set to 0."""
+    """Make the kernels of density, of speed (at rest with derivative 0), and of vorticity given c; ``factor`` is mu."""
     real, vector = precision.real, precision.vector
     modules = [kernel_module(f"quantities_{kind}_{precision.name}") for kind in ("forward", "tangent", "derivative")]
 
@@ -119,27 +110,22 @@ def number_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
 
 @cache
 def wall_force_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the forces f of particles on walls, given the sums A, a and B as ``push``, ``rub`` and
-    ``by_images``."""
+    """Make the kernels of the forces f on walls, given the sums A, a and B as ``push``, ``rub`` and ``by_images``."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
 
     @TypesByName(real, {vector: "push rub by_images"})
     def wall_force(scale, power, cell, p_i, n_i, m_i, push_i, rub_i, by_images_i) -> vector:
         return (scale * p_i / wp.pow(n_i, power)) * push_i - (cell * m_i) * rub_i + cell * by_images_i
 
-    numbers, written, modules = (
-        ["scale", "power", "cell"],
-        ["push", "rub", "by_images"],
-        discretisation.modules("wall_force"),
-    )
-    make = pointwise_kernels
-    return make(discretisation.precision, modules, lambda _: wall_force, ["f"], numbers=numbers, written=written)
+    names: dict[str, Any] = {"numbers": ["scale", "power", "cell"], "written": ["push", "rub", "by_images"]}
+    modules = discretisation.modules("wall_force")
+    return pointwise_kernels(discretisation.precision, modules, lambda _: wall_force, ["f"], **names)
 
 
 @cache
 def load_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of each particle's contribution to force and torque on a solid with a ``middle``. Along periodic
-    axes the shorter arm counts; ``twist`` are the particle's `WallLoads.twists`."""
+    """Make the kernels of a particle's contribution to the load on a solid with a ``middle``; periodic arms are
+    shortest."""
     real, vector = precision.real, precision.vector
     module, derivative = (kernel_module(f"{name}_{precision.name}") for name in ("load", "load_derivative"))
     numbers = ["cell", "period"]
@@ -199,12 +185,9 @@ def load_kernels(precision: Precision) -> Kernels:
 
 
 class OfParticles:
-    """A quantity that is a function of each particle's own numbers, and of a sum over its neighbours, if there is
-    one."""
+    """A function of each particle's numbers, and of the circulation if its kernels ``total`` are given."""
 
     def __init__(self, solver: ParticleSolver, kernels: Kernels, kind: Any, total: Kernels | None = None, **given: Any):
-        """Take kernels that compute ``q`` of type ``kind``, and the kernels of the sum ``circulation``; ``given`` are
-        constants."""
         self._kernels, self._total, self._given = kernels, total, given
         self._q = solver.layout.arrays(q=kind, q_dot=kind)
         names = () if total is None else ("circulation", "circulation_dot", "circulation_bar")
@@ -232,7 +215,7 @@ class OfParticles:
 
 @dataclass(frozen=True)
 class Pressure:
-    """The quantity of pressures that a gauge would read."""
+    """The pressures of a gauge."""
 
     solver: ParticleSolver
 
@@ -247,8 +230,7 @@ class Pressure:
 
 
 class WallLoads:
-    """The forces of a solver's particles on walls [N], vectors (n,) on the device; the next call overwrites them.
-    ``solid`` is the number of a solid's wall particles, or `cortado.particles.wall_terms.ALL_WALLS`."""
+    """The forces of particles on the walls of a ``solid``, by number, or on `ALL_WALLS`: (n,) [N]."""
 
     def __init__(self, solver: ParticleSolver):
         self._solver, self._kernels, self.cell = solver, wall_force_kernels(solver.discretisation), solver.lattice.cell
@@ -264,13 +246,11 @@ class WallLoads:
         return [action for force in self._solver.forces if (action := getattr(force, name, None)) is not None]
 
     def forces(self, step: StepContext, p: wp.array, solid: int) -> wp.array:
-        """Return the forces f of particles on the walls of a solid."""
         found, known = self._vectors["f"], self._sums(step, p, solid)
         step.launch(self._kernels.forward, known, self._numbers, f=found)
         return found
 
     def tangent(self, step: StepContext, p: wp.array, p_dot: wp.array, along: Tangents, solid: int) -> wp.array:
-        """Return the tangent of the forces f of particles on the walls of a solid."""
         rub_dot = self._total("rub_dot", [action.tangent(step, along, solid) for action in self._rubs])
         dots = {"push_dot": self._push.tangent(step, along, solid), "rub_dot": rub_dot, "p_dot": p_dot}
         dots["by_images_dot"] = self._vectors["by_images_dot"]
@@ -281,7 +261,6 @@ class WallLoads:
         return found
 
     def adjoint(self, step: StepContext, p: wp.array, f_bar: wp.array, bar: Bars, solid: int) -> None:
-        """Add the contribution of the adjoint of the forces f to the particles' adjoints."""
         known, bars = self._sums(step, p, solid), {**self._bars, "p_bar": bar.p}
         step.launch(self._kernels.adjoint, known, bars, *bar.of.named, self._numbers, f_bar=f_bar)
         self._push.adjoint(step, bar.of, solid, self._bars["push_bar"], bar.v_star)
@@ -291,16 +270,13 @@ class WallLoads:
             action.adjoint(step, bar.of, solid, self._bars["rub_bar"], bar.v_star)
 
     def twists(self, step: StepContext, solid: int) -> wp.array:
-        """Return the sums of y x a over a solid's wall forces, which act at x_i - y; times m_i s^d they are torques on
-        the solid [N m]."""
+        """Return sums of y x a over wall forces, which act at x_i - y; times m_i s^d they are torques [N m]."""
         return self._total("twist", [action.total(step, solid) for action in self._twists])
 
     def twists_tangent(self, step: StepContext, along: Tangents, solid: int) -> wp.array:
-        """Return the tangent of `twists`."""
         return self._total("twist_dot", [action.tangent(step, along, solid) for action in self._twists])
 
     def twists_adjoint(self, step: StepContext, total_bar: wp.array, bar: Bars, solid: int) -> None:
-        """Add the contribution of the adjoint of `twists` to the particles' adjoints."""
         for action in self._twists:
             action.adjoint(step, bar.of, solid, total_bar, bar.v_star)
 
@@ -312,7 +288,6 @@ class WallLoads:
         return found
 
     def _total(self, name: str, arrays: list[wp.array]) -> wp.array:
-        """Return the sum of arrays; a single array is returned as it is."""
         if len(arrays) == 1:
             return arrays[0]
         total = self._vectors[name]
@@ -325,8 +300,6 @@ class WallLoads:
 
 @dataclass(frozen=True)
 class WallForces:
-    """The quantity of forces with which particles push all walls."""
-
     loads: WallLoads
 
     def value(self, step: StepContext, p: Any) -> wp.array:
@@ -340,9 +313,8 @@ class WallForces:
 
 
 class SolidLoads:
-    """The quantity of force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i. The vector r_i points from
-    the solid's middle at the end of the step, where its walls are, to particle i. For viscosity as a stress it points
-    to the surface beneath the particle."""
+    """The load on a solid, F = sum_i f_i and T = sum_i r_i x f_i, where r_i points from the solid's middle at the end
+    of the step to particle i, or for viscosity as a stress to the surface beneath particle i."""
 
     def __init__(self, loads: WallLoads, solver: ParticleSolver, solid: NamedSolid):
         vector, layout, number = solver.layout.precision.vector, solver.layout, solid.number
@@ -355,7 +327,7 @@ class SolidLoads:
 
     @cached_property
     def _each(self) -> dict[str, wp.array]:
-        """Allocate the arrays of particles' contributions on first use: most runs do not need them."""
+        """Allocate the particles' contributions on first use, as most runs have no loads."""
         return self._layout.arrays(load=SIX, load_dot=SIX)
 
     @cached_property
@@ -390,7 +362,6 @@ class SolidLoads:
 
 
 def formulas(solver: ParticleSolver, circulation_factor: float) -> dict[str, QuantityFormula]:
-    """Make the formulas of a solver's particles, and of the loads on its solids, by their names."""
     loads, precision = WallLoads(solver), solver.layout.precision
     (density, speed, vorticity), circulation = number_kernels(precision), circulation_kernels(solver.discretisation)
     return {

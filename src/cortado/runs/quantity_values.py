@@ -1,7 +1,4 @@
-"""Quantities of particles by name, with derivatives, computed from a state and the parameters of the step after it.
-
-The module computes them from formulas, and records them in the frames of a run.
-"""
+"""Quantities of particles by name, with derivatives, computed from a state and the parameters of the next step."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -12,17 +9,16 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.arrays import require_names
 from cortado.device.launching import CapturedGraph
 from cortado.device.threads import Turn, in_turn
-from cortado.errors import DivergedError, InputError
+from cortado.errors import InputError
 from cortado.particles.state import Fields, Parameters, State, padded
 from cortado.rollout.rollout import Rollout
 from cortado.runs.body_sensors import spring_loads
 from cortado.runs.particle_sums import in_the_scene
 from cortado.runs.quantity_formulas import SIX, Bars, QuantityFormula, formulas
 from cortado.scene.parameter_values import Arrays
-from cortado.scene.parameters import LOAD, QUANTITIES, check_quantity, is_load
+from cortado.scene.parameters import LOAD, check_quantity, is_load
 from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
@@ -34,24 +30,19 @@ from cortado.sph.parts import Adjoints, StepContext, sort
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A state, and the parameters of the step that begins at it. Quantities are computed on first use and cached."""
+    """A state, and the parameters of the step that begins at it. Quantities are computed on first use."""
 
     state: State
-    """The state on the device."""
     parameters: Mapping[str, NDArray]
-    """Parameters by name; of time-dependent ones the step's row. The first axis is over the scenes of a batch, or has
-    length 1."""
+    """Parameters of the step by name; the first axis is over the scenes of a batch, or has length 1."""
     substeps: int
-    """Explicit steps of diffusion within the step."""
     row: int
-    """The step of a run whose parameters these are, or the number of steps: after the last one."""
+    """Number of the step in its run; after the last step, the number of steps."""
     evaluator: Callable[[], "QuantityEvaluator"]
-    """Makes the object that computes quantities."""
     wanted: set[str] = field(default_factory=set)
-    """Quantities asked for so far, also at other moments of a run, which share this set: one step computes all that
-    need a step."""
+    """Quantities read so far, shared by the moments of a run, so that one step computes all that need a step."""
     counts: list[Counts] = field(default_factory=list)
-    """Iteration counts of the step's loops: one entry, once the run has taken the step."""
+    """Iteration counts of the step's loops; empty before the run has taken the step."""
     _values: Arrays = field(default_factory=dict)
 
     @classmethod
@@ -63,8 +54,7 @@ class Moment:
         evaluator: Callable[[], "QuantityEvaluator"],
         wanted: set[str] | None = None,
     ) -> "Moment":
-        """Take a state of a rollout's present evaluation, after ``step`` steps. For the parameters after the last step
-        see `row_of`."""
+        """Make the moment after ``step`` steps of a rollout; after the last step with the parameters of `row_of`."""
         parameters = row_of(rollout, rollout.parameters.written, step)
         size = rollout.step_sizes.of_step(min(step, max(rollout.steps - 1, 0)))
         if size is not None:
@@ -72,7 +62,7 @@ class Moment:
         return cls(state, parameters, rollout.substeps, step, evaluator, set() if wanted is None else wanted)
 
     def value(self, name: str) -> NDArray:
-        """Return a quantity of the state, float64, read-only, of a batch with a first axis for the scenes."""
+        """Return a quantity of the state: float64, read-only, in a batch with a first axis over the scenes."""
         if name not in self._values:
             self.wanted.add(name)
             names = filter(_needs_the_step, self.wanted) if _needs_the_step(name) else [name]
@@ -82,11 +72,9 @@ class Moment:
         return self._values[name]
 
     def know(self, values: Arrays) -> None:
-        """Store quantities (by name) that the run itself has computed."""
         self._values.update(values)
 
     def adjoint(self, bars: Mapping[str, NDArray]) -> tuple[Arrays, Arrays]:
-        """Convert adjoints of quantities to adjoints of the state's fields and of the step's parameters."""
         return self.evaluator().adjoint(bars, self)
 
     def tangents(self, names: list[str], dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]) -> Arrays:
@@ -95,57 +83,46 @@ class Moment:
 
 
 STRESS = "pressure"
-"""The quantity that is computed from the mean stress; no other quantity needs it."""
 OF_PRESSURE = {STRESS, "wall_force"}
-"""Quantities of particles that require solving the step after the state; others only need the state's neighbours."""
+"""Quantities of particles that need the pressure solve of the step; others only need neighbours."""
 
 
 class StepWithin(PressureAdjoint, Protocol):
-    """The adjoint of a particle solver's step, given adjoints of quantities within the step."""
-
     bar: Adjoints
 
 
 def _needs_the_step(name: str) -> bool:
-    """Test whether a quantity requires solving the step after the state, rather than only the state's neighbours."""
     return name in OF_PRESSURE or is_load(name)
 
 
 class QuantityEvaluator:
-    """Computes quantities of states, with tangents and adjoints, in the arrays of one solver; no run may use the solver
-    meanwhile. Arguments and results are in the scene's order; for a batch the first axis is over the scenes."""
+    """Computes quantities of states, with tangents and adjoints, in the arrays of a solver that no run uses meanwhile.
+    Arrays are in the scene's order, in a batch with a first axis over the scenes."""
 
     def __init__(self, solver: Solver, scene: Scene, circulation_factor: float):
-        """Take a solver; ``circulation_factor`` is that of `cortado.discretise.smoothing`. Raises `InputError` for a
-        solver without particles."""
+        """Raise `InputError` for a solver without particles."""
         if not isinstance(solver, ParticleSolver):
-            raise InputError("The solver of this scene does not say what lies around its particles: no quantities.")
+            raise InputError("The solver of this scene is no ParticleSolver, so that quantities cannot be computed.")
         self.solver, self.dimension = solver, scene.dimension
         self.lattice = solver.lattice
-        """Constants of the lattice of particles at rest."""
         self.solids: tuple[SolidTable, ...] = scene.solid
-        """The solids in their initial poses."""
         self.container: Container = scene.container
         self._formulas = {**formulas(solver, circulation_factor), **spring_loads(solver)}
         self._counts: Counts = ()
-        """Iteration counts of the step solved last."""
         self._graphs: dict[tuple[int, Counts], CapturedGraph] = {}
         """Captured adjoints of pressures, by the solver's generation and the step's iteration counts."""
         self._rounds: list[int] = []
-        """(members,) iteration counts of each scene."""
+        """(members,) iteration counts of each scene"""
 
     @property
     def turn(self) -> Turn:
-        """Return the lock that a thread holds while it uses the solver."""
         return self.solver.turn
 
     def within(self, names: Iterable[str]) -> dict[str, QuantityFormula]:
-        """Return by name the formulas of quantities that need a step, for use within steps taken by a run."""
         return {name: self._formulas[name] for name in self._checked(names)}
 
     @in_turn
     def values(self, names: Iterable[str], moment: Moment) -> Arrays:
-        """Compute quantities by name, float64."""
         wanted = self._checked(names)
         step, p = self._begin(wanted, moment, replay=False)
         return {name: self._shown(name, self._formulas[name].value(step, p)) for name in wanted}
@@ -154,8 +131,6 @@ class QuantityEvaluator:
     def tangents(
         self, names: Iterable[str], moment: Moment, dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]
     ) -> Arrays:
-        """Return tangents of quantities, given tangents ``dot`` of the state's fields and ``parameters_dot`` of the
-        step's parameters, which are as in `Moment`."""
         wanted, solver = self._checked(names), self.solver
         step, p = self._begin(wanted, moment, replay=True)
         state_dot, along = solver.new_state(), solver.new_parameters(1)
@@ -169,8 +144,7 @@ class QuantityEvaluator:
 
     @in_turn
     def adjoint(self, bars: Mapping[str, NDArray], moment: Moment) -> tuple[Arrays, Arrays]:
-        """Convert adjoints of quantities (by name) to adjoints of the state's fields and of the step's parameters.
-        Parameters are as in `Moment`, with an axis for the scenes."""
+        """Convert adjoints of quantities to adjoints of the state's fields and of the step's parameters."""
         wanted, solver = self._checked(bars), self.solver
         if wanted == [STRESS]:
             return self._from_stress(bars[STRESS], moment)
@@ -191,7 +165,7 @@ class QuantityEvaluator:
         return self._found(adjoint, state_bar)
 
     def _from_stress(self, stress_bar: NDArray, moment: Moment) -> tuple[Arrays, Arrays]:
-        """Return the result of `adjoint` for pressures that a gauge would read, using a captured graph."""
+        """Compute `adjoint` of pressures that a gauge would read, with a captured graph."""
         solver, (given, _, state_bar), adjoint = self.solver, self._of_stress, self._pressure_adjoint
         self._set(moment)
         if not moment.counts:
@@ -206,7 +180,6 @@ class QuantityEvaluator:
         return self._found(adjoint, state_bar)
 
     def _go_back(self, counts: Counts) -> None:
-        """Replay the step, and run its adjoint, starting from the adjoint of pressures."""
         solver, parameters, (given, own, state_bar) = self.solver, self._rollout.parameters, self._of_stress
         solver.reserve(counts)
         solver.replay(self._rollout.initial, parameters, counts)
@@ -215,19 +188,16 @@ class QuantityEvaluator:
 
     @cached_property
     def _of_stress(self) -> tuple[wp.array, WithinBar, State]:
-        """Allocate three adjoints: of pressures in the scene's order, within the step, and of the state."""
         solver, numbers = self.solver, self.solver.numbers
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
         return numbers(), WithinBar(fields, numbers(), numbers(), solver.vectors()), solver.new_state()
 
     def _found(self, adjoint: ParticleAdjoint | StepWithin, state_bar: State) -> tuple[Arrays, Arrays]:
-        """Return adjoints of the state and of the parameters in float64, by name."""
         parameters, state = adjoint.collect(), state_bar.numpy(self.dimension)
         found = {name: parameters[name].numpy().astype(np.float64) for name in parameters.names}
         return {name: array.astype(np.float64) for name, array in state.items()}, found
 
     def _checked(self, names: Iterable[str]) -> list[str]:
-        """Return names of quantities and of loads; raise `InputError` for any other."""
         wanted = list(names)
         for name in wanted:
             if not is_load(name):
@@ -240,8 +210,7 @@ class QuantityEvaluator:
     # ---- the step ------------------------------------------------------------------------------------------------
 
     def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[StepContext, wp.array | None]:
-        """Find the particles' neighbours and, if a pressure is wanted, take the step; with ``replay`` prepare
-        derivatives."""
+        """Find neighbours, and take the step if a quantity needs it; with ``replay`` prepare derivatives."""
         self._set(moment)
         solved = any(map(_needs_the_step, names))
         return self._solve(replay) if solved else (self._look_around(), None)
@@ -268,7 +237,7 @@ class QuantityEvaluator:
         rollout.forward(keep=False)
         found = solver.pressures()
         if found is None:
-            raise InputError("This scene is computed without a pressure of particles, so that there is none to see.")
+            raise InputError("This scene is computed without a pressure of particles, so that no pressure can be read.")
         pressures = wp.clone(found)  # as a replay overwrites what was found
         self._counts = rollout.log.seek(0)
         rounds = rollout.diagnostics[solver.loops[0].iterations_name][0]
@@ -283,7 +252,8 @@ class QuantityEvaluator:
     def _tangent(
         self, names: Iterable[str], state_dot: State, along: Parameters
     ) -> tuple[ParticleTangent | PressureTangent, wp.array | None, wp.array | None]:
-        """Return the tangents of the sorted particles and, if wanted, of their two pressures."""
+        """Return the tangents of sorted particles and, if the step was taken, of the pressures on walls and of a
+        gauge."""
         solver, parameters = self.solver, self._rollout.parameters
         if not any(map(_needs_the_step, names)):
             own = ParticleTangent(solver, along)
@@ -306,7 +276,6 @@ class QuantityEvaluator:
 
     @cached_property
     def _rollout(self) -> Rollout:
-        """Make a rollout of one step."""
         return Rollout(self.solver, 1)
 
     @cached_property
@@ -324,7 +293,6 @@ class QuantityEvaluator:
         return self.solver.search.order.numpy()[: self.solver.layout.all_particles]
 
     def _shown(self, name: str, values: wp.array) -> NDArray:
-        """Return a quantity in the scene's order, or the components of a load on a solid."""
         own = values.numpy().astype(np.float64)
         if is_load(name):
             return self._load(own)
@@ -333,8 +301,7 @@ class QuantityEvaluator:
         return self._by_scene(found[:, 2] if name == "vorticity" and self.dimension == 2 else found)
 
     def of_scene(self, name: str, values: NDArray) -> NDArray:
-        """Return, in the form of `values`, a quantity stored by a step in the scene's order, or the six numbers of a
-        load."""
+        """Return a quantity in the scene's order, or a load (6,), in the form of `values`."""
         found = values.astype(np.float64)
         found.flags.writeable = False
         return self._load(found) if is_load(name) else self._by_scene(found)
@@ -348,7 +315,7 @@ class QuantityEvaluator:
         return own if batch is None else own.reshape(batch, -1, *own.shape[1:])
 
     def _sorted(self, name: str, values: NDArray) -> wp.array:
-        """Return the adjoint of a quantity on the device, in the order of sorted particles that its formula uses."""
+        """Return the adjoint of a quantity on the device, in the order of sorted particles."""
         given, layout = np.asarray(values, dtype=np.float64), self.solver.layout
         if is_load(name):
             six = np.zeros((layout.members, 6))
@@ -363,9 +330,8 @@ class QuantityEvaluator:
 
 
 def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
-    """Return the values of parameters for all steps of a rollout, and one row of those over time, in arrays of their
-    own. After the last step, values stay constant, except that paths of solids are extrapolated, as solids would
-    otherwise stop."""
+    """Return one row of parameters over time, and other parameters unchanged. After the last step values stay constant,
+    but paths of solids are extrapolated, as solids would otherwise stop."""
     found = {}
     for name, value in values.items():
         shares = _shares_of_rows(rollout, name, row, value) or {}
@@ -375,7 +341,7 @@ def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
 
 
 def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArray) -> None:
-    """Add the adjoint of one row of a parameter to that of all rows, ``total``: the transpose of `row_of`."""
+    """Add the adjoint of one row of a parameter to the adjoint ``total`` of all rows: the transpose of `row_of`."""
     shares = _shares_of_rows(rollout, name, row, total)
     if shares is None:
         total += bar
@@ -385,7 +351,7 @@ def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArr
 
 
 def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> dict[int, float] | None:
-    """Return the rows, with factors, whose weighted sum is a given row; None for time-independent parameters."""
+    """Return factors by number of row, whose weighted sum is the wanted row; None for a time-independent parameter."""
     known = rollout.solver.layout.known
     if name not in known.over_time:
         return None
@@ -393,34 +359,3 @@ def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> d
     if row < rows:
         return {row: 1.0}
     return {rows - 1: 2.0, rows - 2: -1.0} if known[name].grows and rows > 1 else {rows - 1: 1.0}
-
-
-class Recorder:
-    """Computes quantities of a rollout's states. It has its own solver for the same scene, as the arrays of the
-    rollout's solver are in use."""
-
-    def __init__(
-        self, rollout: Rollout, names: Iterable[str], evaluator: Callable[[], QuantityEvaluator], dimension: int
-    ):
-        """Take ``names`` of quantities; ``evaluator`` creates their evaluator and is called only if there are names.
-        Raises `InputError` for an unknown name."""
-        self.names = tuple(dict.fromkeys(check_quantity(name, "record") for name in require_names("record", names)))
-        self._rollout, self._evaluator = rollout, evaluator() if self.names else None
-        self._dimension = dimension
-
-    def __call__(self, step: int, state: State) -> Arrays:
-        """Return by name the quantities of the state after ``step`` steps, in the precision of the run."""
-        made = self._evaluator
-        if made is None:
-            return {}
-        real = self._rollout.solver.discretisation.precision.numpy
-        moment = Moment.of(self._rollout, step, state, lambda: made)
-        return {name: self._value(name, moment).astype(real) for name in self.names}
-
-    def _value(self, name: str, moment: Moment) -> NDArray:
-        """Return a quantity; NaN if the next step loses a particle: the run itself raises that error."""
-        try:
-            return moment.value(name)
-        except DivergedError:
-            positions = moment.state.positions
-            return np.full(QUANTITIES[name].shape(len(positions), self._dimension), np.nan)

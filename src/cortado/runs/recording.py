@@ -1,13 +1,10 @@
-"""Choose the states of a run that become frames (by steps or by time), and read quantities and sensors during the run.
-
-Sensors' sums over particles are computed on the device. Whole states are copied to the host and stored in tables.
-"""
+"""Choose the frames of a run, and read states, quantities and sensors during the run."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import inf
-from typing import Any, Protocol, overload
+from typing import Any, ClassVar, overload
 
 import numpy as np
 import warp as wp
@@ -22,7 +19,7 @@ from cortado.rollout.step_bounds import expected_frames
 from cortado.runs.frames import Marks, solid_motions
 from cortado.runs.particle_sums import Summed
 from cortado.runs.quantity_values import QuantityEvaluator
-from cortado.runs.sensor import Readings
+from cortado.runs.sensor import Readings, SensorLog
 from cortado.runs.step_sums import SIX, ChunkSums, StepQuantities
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameter_values import Arrays
@@ -31,51 +28,25 @@ from cortado.scene.restart import Clock
 from cortado.scene.scene import Scene
 
 
-class FrameChoice(Protocol):
-    """A rule that chooses the states of a run that become frames, besides the first and the last state."""
+@dataclass(frozen=True)
+class EverySteps:
+    """Frames at every ``steps``-th state, besides the first and the last state."""
+
+    steps: int
+    rate: ClassVar[None] = None
 
     @property
     def settings(self) -> dict[str, Any]:
         """Return the settings that must be unchanged when a run is resumed."""
-
-    @property
-    def rate(self) -> float | None:
-        """Return the number of frames per simulated second [1/s]; None if frames are chosen by steps."""
-
-    def is_due(self, step: int, before: float, now: float) -> bool:
-        """Test whether the state after ``step`` steps is a frame, given the times [s] since the start of the previous
-        state and of this state."""
-
-    def announced(self, rollout: Rollout) -> NDArray[Any]:
-        """Return times (frames,) [s] for the greatest possible number of frames: exact if known before the run, else
-        estimates."""
-
-    def expected(self, rollout: Rollout) -> int:
-        """Return the expected number of frames."""
-
-    def count(self, steps: int, time: float | None) -> int | None:
-        """Return the number of frames of ``steps`` equal steps over a ``time`` [s]; None if it depends on an unknown
-        time."""
-
-
-@dataclass(frozen=True)
-class EverySteps:
-    """A `FrameChoice` of one frame for every ``record_every`` steps."""
-
-    steps: int
-
-    @property
-    def settings(self) -> dict[str, Any]:
         return {"record_every": self.steps}
 
-    @property
-    def rate(self) -> None:
-        """Return None, as steps are chosen."""
-
     def is_due(self, step: int, before: float, now: float) -> bool:
+        """Test if the state after ``step`` steps is a frame, at time ``now`` after a state at ``before`` [s since the
+        start]."""
         return step % self.steps == 0
 
     def announced(self, rollout: Rollout) -> NDArray[Any]:
+        """Return times (frames,) [s] of the greatest possible number of frames, exact or estimated."""
         recorded = np.array([*range(0, rollout.steps, self.steps), rollout.steps])
         clock = Clock(rollout.clocks[0].steps, rollout.clocks[0].time)  # as steps of one length go on from the first
         return clock.times(recorded, float(rollout.time_steps[0]))
@@ -84,23 +55,20 @@ class EverySteps:
         return expected_frames(rollout, self.steps)
 
     def count(self, steps: int, time: float | None) -> int:
+        """Return the number of frames of ``steps`` equal steps over ``time`` [s]; None if the time must be known."""
         return 1 + -(-steps // self.steps)
 
 
 @dataclass(frozen=True)
 class FramesPerSecond:
-    """A `FrameChoice` of ``rate`` frames per simulated second; each frame is the first state at or after its due time.
-
-    Raises:
-        InputError: a rate that is not a number greater than 0.
-    """
+    """Frames at the first state at or after each due time, besides the first and the last state; ``rate`` [1/s]. Raise
+    `InputError` unless the rate is positive and finite."""
 
     rate: float
-    """[1/s]"""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.rate < inf:
-            raise InputError(f"--fps is {self.rate:g}, but must be a number of frames in a second greater than 0.")
+            raise InputError(f"--fps is {self.rate:g}, but must be a number of frames per second greater than 0.")
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -125,15 +93,17 @@ class FramesPerSecond:
         return 1 + min(steps, due if due > before else due + 1)
 
 
+FrameChoice = EverySteps | FramesPerSecond
+
+
 @dataclass(frozen=True, eq=False)
 class TrajectoryBatch(Sequence[Trajectory]):
     """The trajectories of a batch of runs: ``batch[b]`` is the `Trajectory` of scene b, with the bits of its single
-    run; if the scene lost a particle, it contains the frames before."""
+    run. If scene b lost a particle, its trajectory ends before."""
 
     trajectories: tuple[Trajectory, ...]
-    """One for each scene."""
     fields: Mapping[str, NDArray[Any]]
-    """(frames, batch, ...) every field that steps change, by name; NaN after the last frame of a lost scene."""
+    """(frames, batch, ...) every field that steps change, by name; NaN after the last frame of a lost scene"""
     lost: Mapping[int, DivergedError]
     """Errors of the scenes that lost a particle, by the number of the scene."""
 
@@ -144,7 +114,6 @@ class TrajectoryBatch(Sequence[Trajectory]):
         return f"TrajectoryBatch({counted(len(self), 'scene')}{lost}, {sizes})"
 
     def __len__(self) -> int:
-        """Return the number of scenes."""
         return len(self.trajectories)
 
     @overload
@@ -181,9 +150,8 @@ def recorded(
     quantities: Arrays,
     readings: Callable[[int], Mapping[str, Readings]],
 ) -> Trajectory | TrajectoryBatch:
-    """Make the trajectory of a scene from ``fields`` (frames, ...), of a batch (frames, batch, ...), recorded after
-    ``steps`` (frames,) steps. ``constants`` are fields that no step changes, ``quantities`` (frames, ...) those of the
-    same frames, ``readings`` those of sensors by scene number."""
+    """Make the trajectory of a rollout from ``fields`` and ``quantities`` (frames, ...), in a batch (frames, batch,
+    ...), after ``steps`` (frames,) steps. ``readings`` returns the readings of a scene's sensors."""
 
     def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
         own = {name: array[kept][at] for name, array in fields.items()}
@@ -218,24 +186,11 @@ def recorded(
 
 
 MOST = 2**28
-"""Size [bytes] of waiting copies above which they are read before the next steps begin."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """A sensor's reading of one state."""
-
-    sensor: str
-    number: int
-    """Number of the state."""
-    member: int
-    """Number of the scene in a batch, else 0."""
-    reading: Callable[[], NDArray[Any]]
-    """Computes the reading (k,) of the sensor."""
+"""Size [bytes] of waiting copies above which they are read at once."""
 
 
 class _Poses(dict[str, NDArray[Any]]):
-    """A `cortado.runs.sensor.Reading` of a state that contains only the poses of solids."""
+    """A state for sensors that contains only the poses of solids."""
 
     def __init__(self, scene: QuantityEvaluator, fields: Mapping[str, NDArray[Any]]):
         super().__init__(fields)
@@ -244,22 +199,16 @@ class _Poses(dict[str, NDArray[Any]]):
 
 
 def kept_by_steps(scene: QuantityEvaluator, rollout: Rollout, names: tuple[str, ...]) -> StepQuantities:
-    """Return the `StepQuantities` of these names for a rollout, created once and reused."""
     kept: dict[tuple[str, ...], Any] = rollout.beside
     if names not in kept:
         kept[names] = StepQuantities(scene.within(names), scene.solver, rollout.longest_chunk)
-    found: StepQuantities = kept[names]
-    return found
+    return kept[names]
 
 
 class QuantityReader:
-    """A `cortado.rollout.checkpoints.ChunkReader` of quantities computed within the step after a state; it uses the
-    run's own steps."""
-
     def __init__(self, scene: QuantityEvaluator, rollout: Rollout, wanted: Mapping[int, str]):
-        """Prepare to read quantities: ``wanted`` gives their names and the numbers of the states."""
+        """``wanted`` are names of quantities by the number of the state."""
         self.found: dict[int, Arrays] = {}
-        """Quantities by name, by the numbers of states."""
         self.beside = kept_by_steps(scene, rollout, tuple(sorted(set(wanted.values()))))
         self._scene, self._wanted = scene, wanted
 
@@ -270,40 +219,37 @@ class QuantityReader:
 
 
 class StepReader:
-    """A `cortado.rollout.checkpoints.ChunkReader` of sensors. Sums are copied to the host, where `rows` converts them
-    to readings while a GPU takes the next steps."""
+    """A `ChunkReader` of sensors: it sums over particles on the device; `look` writes readings into ``logs``, one per
+    scene."""
 
-    def __init__(self, scene: QuantityEvaluator, rollout: Rollout, sensors: Mapping[str, Summed]):
-        """Prepare to read ``sensors`` (by name) in the run of a rollout; ``scene`` has the rollout's solver."""
-        self.sensors, self._scene, self._rollout = dict(sensors), scene, rollout
+    def __init__(
+        self, scene: QuantityEvaluator, rollout: Rollout, sensors: Mapping[str, Summed], logs: Sequence[SensorLog]
+    ):
+        self.sensors, self._scene, self._rollout, self._logs = dict(sensors), scene, rollout, logs
         length, layout, first = rollout.longest_chunk, rollout.solver.layout, rollout.initial
         summed = {name: one.summed(scene) for name, one in sensors.items()}
-        made = (ChunkSums(one, scene, scene.solver, length) for one in summed.values())
-        self._sums = dict(zip(summed, made, strict=True))
+        self._sums = {name: ChunkSums(one, scene, scene.solver, length) for name, one in summed.items()}
         self._needs_the_step = {name for name, one in summed.items() if one.quantity is not None}
         self.quantities = tuple(sorted({one.quantity for one in summed.values() if one.quantity is not None}))
-        """Names of the quantities that are read."""
         self._beside = kept_by_steps(scene, rollout, self.quantities) if self.quantities else None
         moved = any(table.moves for table in scene.solids)
         self._poses = [f for f in first.fields if f.axis is Axis.SCALAR and not f.is_constant] if moved else []
         options = {"device": "cpu", "pinned": first.positions.device.is_cuda}
         self._found = {name: wp.empty(length * layout.members, dtype=SIX, **options) for name in summed}
-        """Sums on the host, state by state."""
-        sizes = {f.name: (first[f.name].dtype, layout.members) for f in self._poses}
-        self._first = {name: wp.empty(size, dtype=kind, **options) for name, (kind, size) in sizes.items()}
-        self._later = {name: wp.empty(length * size, dtype=kind, **options) for name, (kind, size) in sizes.items()}
-        """Poses of solids on the host: in the first state of a chunk, and in its later states."""
+        self._first, self._later = (
+            {f.name: wp.empty(states * layout.members, dtype=first[f.name].dtype, **options) for f in self._poses}
+            for states in (1, length)
+        )
         self._is_ready = wp.Event(first.positions.device) if first.positions.device.is_cuda else None
         self._step = self._count = 0
-        """The number of the last chunk's first state, and how many of the chunk's states are not yet read."""
-        self._rows = list[Row]()
+        """First state of the last chunk, and number of its states that `look` must still read."""
 
     @property
     def beside(self) -> Beside | None:
         return self._beside
 
     def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
-        self._look()
+        self.look()
         self._step, self._count = step, end - step
         rows, kept = self._count * (first.batch or 1), {} if self._beside is None else self._beside.kept
         for name, sums in self._sums.items():
@@ -314,14 +260,8 @@ class StepReader:
         if self._is_ready is not None:
             first.positions.device.stream.record_event(self._is_ready)
 
-    def rows(self) -> list[Row]:
-        """Return the readings of all states since the last call, state by state."""
-        self._look()
-        found, self._rows = self._rows, []
-        return found
-
-    def _look(self) -> None:
-        """Convert the sums of the last chunk to rows."""
+    def look(self) -> None:
+        """Write the readings of the last chunk into the logs."""
         if self._is_ready is not None and self._count:
             wp.synchronize_event(self._is_ready)
         count, self._count = self._count, 0
@@ -334,14 +274,13 @@ class StepReader:
                 for name, sensor in self.sensors.items():
                     is_lost = number == lost.get(member) and name in self._needs_the_step
                     found = np.full(6, np.nan) if is_lost else sums[name][k, member]
-                    self._rows.append(Row(name, number, member, partial(sensor.reading, at, found)))
+                    self._logs[member].read(name, number, partial(sensor.reading, at, found))
 
     @property
     def _members(self) -> int:
         return self._rollout.solver.layout.members
 
     def _poses_of(self, k: int, member: int) -> dict[str, NDArray[Any]]:
-        """Return fields (1, ...) of solids in state k of the last chunk."""
         found = {}
         for pose in self._poses:
             array, row = (self._first, 0) if k == 0 else (self._later, k - 1)
@@ -351,12 +290,10 @@ class StepReader:
 
 
 class Waiting:
-    """A queue of state copies in pinned host memory. An observer of a forward run fills it. The run calls `look`, which
-    empties it, while a GPU takes the next steps."""
+    """A queue of copies of states in pinned host memory, which an observer fills and `look` empties."""
 
     def __init__(self, look: Callable[[int, State], None], first: State, copies: list[State]):
-        """Take the function ``look`` to call with a state's number and its copy, which is overwritten later. ``first``
-        is a state of the run; ``copies`` of earlier runs are reused."""
+        """``look`` receives the number and the copy of each state; ``first`` is a state; ``copies`` are reused."""
         self._look, self._device = look, first.positions.device
         names = [field.name for field in first.fields if field.is_constant]
         self._constant = {name: copies[0][name] if copies else _empty(first[name]) for name in names}
@@ -367,7 +304,7 @@ class Waiting:
         self._most = max(MOST // sum(array.capacity for array in first.arrays()), 1)
 
     def keep(self, number: int, state: State) -> None:
-        """Copy a state; on a GPU the copy is queued after all launched kernels, without waiting for them."""
+        """Copy a state; on a GPU without waiting for launched kernels."""
         if len(self._numbers) == len(self._copies):
             own = {n: self._constant[n] if n in self._constant else _empty(state[n]) for n in state.names}
             self._copies.append(State(state.fields, own, state.batch))
@@ -382,7 +319,6 @@ class Waiting:
             self.look()
 
     def look(self) -> None:
-        """Call the function for all copies; kernels launched on a GPU after the copies keep running."""
         if self._is_ready is not None and self._numbers:
             wp.synchronize_event(self._is_ready)
         numbers, self._numbers = self._numbers, []
@@ -391,14 +327,12 @@ class Waiting:
 
 
 class Table:
-    """Arrays by name, with one row for each record. Many rows are allocated at a time: allocating each row separately
-    costs more than copying it."""
+    """Arrays by name with one row per record. Memory grows by doubling."""
 
     def __init__(self, expected: int):
         self._rows, self._count, self._arrays = expected, 0, dict[str, NDArray]()
 
     def add(self, record: Mapping[str, NDArray]) -> None:
-        """Copy a record to the next row."""
         if self._count == self._rows:
             self._rows *= 2
             self._arrays = {name: np.concatenate([own, np.empty_like(own)]) for name, own in self._arrays.items()}
@@ -409,11 +343,9 @@ class Table:
         self._count += 1
 
     def arrays(self) -> dict[str, NDArray]:
-        """Return the arrays (records, ...) by name, without unused memory for more than one further record."""
         own = {name: array[: self._count] for name, array in self._arrays.items()}
         return own if self._count >= self._rows - 1 else {name: array.copy() for name, array in own.items()}
 
 
 def _empty(array: wp.array) -> wp.array:
-    """Allocate a host array that a GPU can write to while the host continues."""
     return wp.empty(array.shape, dtype=array.dtype, device="cpu", pinned=array.device.is_cuda)

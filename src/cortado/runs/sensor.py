@@ -1,9 +1,8 @@
-"""The interface of sensors, and their readings in every step of a run: as arrays, as a file, and compared with measured
-data."""
+"""The interface of sensors; readings over a run, as arrays and as a file; and comparison with measured data."""
 
 import csv
 import io
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -21,31 +20,25 @@ from cortado.scene.solids import SolidTable
 
 
 class Cut(Protocol):
-    """The discretisation of a scene, as sensors need it."""
-
     @property
-    def dimension(self) -> int:
-        """Return the number of dimensions, 2 or 3."""
+    def dimension(self) -> int: ...
 
     @property
     def lattice(self) -> Lattice:
-        """Return the constants of the rest lattice, such as the particles' volume and the periodic axes."""
+        """Return the constants of the rest lattice, such as a particle's volume and the periodic axes."""
 
 
 class SensedScene(Cut, Protocol):
-    """A discretised scene with its solids and container; sensors use it before a run."""
-
     @property
     def solids(self) -> tuple[SolidTable, ...]:
-        """Return the solids of the scene in their initial poses."""
+        """Return the solids in their initial poses."""
 
     @property
-    def container(self) -> Container:
-        """Return the container of the scene."""
+    def container(self) -> Container: ...
 
 
 class Reading(SensedScene, Protocol):
-    """A state from which sensors read fields and quantities: a `cortado.losses.Snapshot`."""
+    """A state from which sensors read: a `cortado.losses.Snapshot`."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return a field of the state or a quantity of its particles, float64."""
@@ -65,11 +58,10 @@ class Sensor(Protocol):
 
 
 TIME = "time [s]"
-"""The first column of a table of readings."""
 
 
 def point(what: str, values: Any) -> NDArray[Any]:
-    """Check that a place or direction (d,) is finite; raise `InputError` if not."""
+    """Return a finite place or direction (d,); raise `InputError` for anything else."""
     array = corner(what, values)
     if not np.isfinite(array).all():
         raise InputError(f"{what} is {array.tolist()}, but must be finite.")
@@ -77,7 +69,7 @@ def point(what: str, values: Any) -> NDArray[Any]:
 
 
 def corner(what: str, values: Any) -> NDArray[Any]:
-    """Check a corner (d,) of a region, whose unbounded sides are infinite; raise `InputError` if it is wrong."""
+    """Return the corner (d,) of a region, whose unbounded sides are infinite; raise `InputError` for anything else."""
     array = read_only(what, values)
     if array.shape not in ((2,), (3,)):
         raise InputError(f"{what} has shape {array.shape}, but must have 2 or 3 components.")
@@ -87,7 +79,7 @@ def corner(what: str, values: Any) -> NDArray[Any]:
 
 
 def direction(what: str, values: Any) -> NDArray[Any]:
-    """Check a direction (d,) and scale it to length 1; raise `InputError` if it is wrong."""
+    """Return a direction (d,) scaled to length 1; raise `InputError` for anything else."""
     array = point(what, values)
     if not array.any():
         raise InputError(f"{what} is {array.tolist()}, but must not be 0.")
@@ -95,7 +87,7 @@ def direction(what: str, values: Any) -> NDArray[Any]:
 
 
 def positive(what: str, value: Any) -> float:
-    """Check that a number is finite and above 0; raise `InputError` if not."""
+    """Return a finite number above 0; raise `InputError` for anything else."""
     number = as_one_number(what, value)
     if not 0.0 < number < np.inf:
         raise InputError(f"{what} is {number:g}, but must be greater than 0 and finite.")
@@ -103,7 +95,6 @@ def positive(what: str, value: Any) -> float:
 
 
 def checked_sensor(sensor: Any) -> Sensor:
-    """Return the user's object if it is a sensor; else raise `InputError`."""
     require_methods("sensor", sensor, ("columns", "value", "adjoint"), "a sensor, such as one of cortado.sensors")
     return sensor
 
@@ -117,13 +108,13 @@ def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict
     for name in given:
         if not isinstance(name, str) or name in taken:
             raise InputError(
-                f"sensors has the name {shown(name)}, but must have texts other than {', '.join(sorted(taken))}."
+                f"sensors has the name {shown(name)}, but names must be texts other than {', '.join(sorted(taken))}."
             )
     return {name: checked_sensor(sensor) for name, sensor in given.items()}
 
 
 def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
-    """Return the reading (k,) of a sensor; raise `InputError` unless it has one number for each of its columns."""
+    """Return the reading (k,) of a sensor; raise `InputError` unless it has one number for each column."""
     what, columns = f"value of the sensor {type(sensor).__name__}", len(sensor.columns(at.dimension))
     found = as_numbers(what, sensor.value(at))
     if found.shape != (columns,):
@@ -132,7 +123,7 @@ def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
 
 
 def in_dimension(what: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Check that a place has one component for each dimension of the scene; raise `InputError` if not."""
+    """Return a place with one component for each dimension of the scene; raise `InputError` for any other."""
     if len(values) != dimension:
         raise InputError(f"{what} has {len(values)} components, but must have {dimension}, as the scene has.")
     return values
@@ -147,7 +138,7 @@ class Readings:
     values: NDArray[Any]
     """(readings, k)"""
     units: Mapping[str, str]
-    """Units of the sensor's numbers by name, in column order."""
+    """units of the sensor's numbers by name, in column order"""
 
     def __repr__(self) -> str:
         return f"Readings({len(self.times)} of {', '.join(self.units)})"
@@ -160,23 +151,16 @@ class Readings:
 
 
 class SensorLog:
-    """A log of the readings of several sensors, state by state."""
-
     def __init__(self, sensors: Mapping[str, Sensor], dimension: int):
-        """Take ``sensors`` by the names that tell them apart; raise `InputError` for an object that is no sensor."""
-        if not isinstance(sensors, Mapping):
-            raise InputError(f"sensors is {shown(sensors)}, but must be a table of sensors by name.")
         for name, sensor in sensors.items():
             if isinstance(sensor, type) or not all(hasattr(sensor, part) for part in ("columns", "value", "adjoint")):
                 raise InputError(f"sensors has {shown(sensor)} as {name!r}, but must have a sensor of cortado.sensors.")
         self.sensors = dict(sensors)
         self._units = {name: dict(sensor.columns(dimension)) for name, sensor in self.sensors.items()}
         self._rows: dict[str, list[NDArray[Any]]] = {name: [] for name in self.sensors}
-        """Readings (k,) of each sensor, state by state."""
 
     def read(self, name: str, number: int, reading: Callable[[], NDArray[Any]]) -> None:
-        """Store the reading (k,) of a sensor for state ``number``, unless it is known. It is NaN if the next step loses
-        a particle; the run itself raises that error."""
+        """Store a reading (k,) of state ``number``, unless it is known; NaN if the next step loses a particle."""
         if number == len(self._rows[name]):
             try:
                 self._rows[name].append(reading())
@@ -184,18 +168,16 @@ class SensorLog:
                 self._rows[name].append(np.full(len(self._units[name]), np.nan))
 
     def known(self, readings: Mapping[str, Readings]) -> float:
-        """Return the last step for which all of these sensors have readings; infinite without sensors."""
+        """Return the last step for which all sensors have ``readings``; infinite without sensors."""
         if any(name not in readings or readings[name].units != self._units[name] for name in self.sensors):
             return -1
         return min((len(readings[name].times) - 1 for name in self.sensors), default=inf)
 
     def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
-        """Take over an earlier log's readings, from the first state up to ``steps`` steps."""
         self._rows = {name: list(readings[name].values[: steps + 1]) for name in self.sensors}
 
     def readings(self, times: NDArray[Any]) -> dict[str, Readings]:
-        """Return the readings of all states that every sensor has read; ``times`` [s] begin with those of these
-        states."""
+        """Return the readings of all states that every sensor has read, given their ``times`` [s]."""
         count = min(map(len, self._rows.values()), default=0)
         found = {}
         for name, units in self._units.items():
@@ -205,12 +187,13 @@ class SensorLog:
 
 
 def as_csv(readings: Mapping[str, Readings]) -> str:
-    """Return a CSV table with a column for time and one for each number of each sensor, with units in the heads."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     heads = [f"{name}.{column} [{unit}]" for name, own in readings.items() for column, unit in own.units.items()]
     writer.writerow([TIME, *heads])
-    writer.writerows(_rows(list(readings.values())))
+    each = list(readings.values())
+    for k, time in enumerate(each[0].times):
+        writer.writerow([repr(float(number)) for number in (time, *(value for own in each for value in own.values[k]))])
     return text.getvalue()
 
 
@@ -231,18 +214,11 @@ def from_csv(path: Path) -> dict[str, Readings]:
     }
 
 
-def _rows(readings: list[Readings]) -> Iterable[list[str]]:
-    for k, time in enumerate(readings[0].times):
-        yield [repr(float(number)) for number in (time, *(value for own in readings for value in own.values[k]))]
-
-
 Summary = dict[str, dict[str, dict[str, float]]]
-"""``last``, ``mean`` and ``greatest``, by sensor and by the number's name."""
 
 
 def summary(readings: Mapping[str, Readings]) -> Summary:
-    """Return for each number of each sensor the last reading, the mean over time, and the reading with the greatest
-    absolute value, with its sign."""
+    """Return for each number the last reading, the mean over time, and the reading with the greatest absolute value."""
     return {name: {column: _of(own, column) for column in own.units} for name, own in readings.items()}
 
 
@@ -257,19 +233,17 @@ def _of(read: Readings, column: str) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredColumn:
-    """Measured values for one number of a sensor, at times within the run, and the simulated values at these times."""
+    """Measured values for one number of a sensor, and simulated values at the same times."""
 
     name: str
-    """Name of the number, such as "gauge.height" of the sensor "gauge"."""
+    """"gauge.height" for the number height of the sensor gauge"""
     unit: str
     times: NDArray[Any]
-    """(k,) [s], times within the run."""
     values: NDArray[Any]
     """(k,)"""
     simulated: NDArray[Any]
-    """(k,) readings of the sensor at these times, linearly interpolated between steps."""
+    """(k,) readings of the sensor, linearly interpolated between steps"""
     left_out: int
-    """Number of measured points before the start or after the end of the run."""
 
     @property
     def errors(self) -> dict[str, float]:
@@ -285,15 +259,9 @@ class MeasuredColumn:
 
 
 def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[MeasuredColumn]:
-    """Read a table of measured data, and pair each column with the readings of a run's sensor.
-
-    The table has a column "time" [s] and columns such as "gauge.height", named as in sensors.csv. Units in brackets may
-    be left out, and entries may be empty.
-
-    Raises:
-        InputError: the file is no such table, a column belongs to no sensor or has another unit, or no point is within
-        the run.
-    """
+    """Read a table of measured data, and pair each column with the readings of a sensor. The table has a column "time"
+    [s] and columns such as "gauge.height", named as in sensors.csv. Units in brackets may be left out, and entries may
+    be empty. Raise `InputError` for another table or unit, an unknown sensor, and if no point is within the run."""
     columns = read_columns(path)
     named = {name_and_unit(head): values for head, values in columns.items()}
     times = named.get(("time", "s"), named.get(("time", None)))
@@ -319,16 +287,15 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
         left_out = int(np.count_nonzero(there & ~within))
         found.append(MeasuredColumn(name, own.units[column], times[within], values[within], simulated, left_out))
     if not found:
-        raise InputError(f"{path} has times alone, but must have some of {', '.join(known)}.")
+        raise InputError(f"{path} has only times, but must have some of {', '.join(known)}.")
     return found
 
 
 def measured_columns(
     path: Path, units: Mapping[str, str], own: str = "", sensors: Collection[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """Return the columns of a table, (lines,) by name. As in sensors.csv, the ``own`` sensor's name may precede a
-    column's name, and its unit may follow in brackets. Columns of other ``sensors`` are left out. Raises `InputError`
-    for a column in another unit, or twice."""
+    """Return the columns of a table, (lines,) by name, without those of other ``sensors`` than ``own``. Names may begin
+    with ``own`` and end with a unit. Raise `InputError` for a column in another unit, or twice."""
     found: dict[str, NDArray[Any]] = {}
     for head, values in read_columns(path).items():
         name, unit = name_and_unit(head)

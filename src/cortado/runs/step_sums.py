@@ -1,6 +1,5 @@
-"""The values that sensors read on the device during a run. Captured steps store quantities of each step. Sums over
-particles (`cortado.runs.particle_sums`) are launched after a chunk of steps, for all its states, in float64 and fixed
-order."""
+"""Values that sensors read on the device during a run. Steps store quantities; after a chunk of steps, the sums of
+`cortado.runs.particle_sums` are launched for all its states, in float64 and in fixed order."""
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
@@ -30,7 +29,7 @@ from cortado.sph.parts import unsort
 
 @wp.struct
 class _Around:
-    """A sensor's place and projection padded to three dimensions; see `Domain.ways` and `Weights`."""
+    """A sensor's place and projection in three dimensions; see `Domain.ways` and `Weights`."""
 
     place: wp.vec3d
     lower: wp.vec3d
@@ -47,7 +46,7 @@ class _Around:
 
 @wp.struct
 class _Region:
-    """A region padded to three dimensions; see `Domain.within`."""
+    """A region in three dimensions; see `Domain.within`."""
 
     start: wp.vec3d
     lengths: wp.vec3d
@@ -58,7 +57,7 @@ class _Region:
 
 @wp.struct
 class _Ride:
-    """A point that a solid carries, and the solid's R_0^T; see `cortado.runs.particle_sums`."""
+    """A point that a solid carries, and the solid's R_0^T."""
 
     arm: wp.vec3d
     own: wp.mat33d
@@ -67,8 +66,8 @@ class _Ride:
 
 @cache
 def _rides(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make kernels that compute the place to which a solid carries a point, and the matrix that turns vectors back to
-    the solid's initial axes. Each thread computes one row."""
+    """Make kernels of the place to which a solid carries a point, and of the matrix back to the solid's initial
+    axes."""
     angle, of = rotations(precision, dimension).angle, rotations(FLOAT64, dimension)
     module = kernel_module(f"sensors_on_solids_{precision.name}_{dimension}")
     wide = wp.float64 if dimension == 2 else wp.vec3d
@@ -101,14 +100,12 @@ def _rides(precision: Precision, dimension: int) -> SimpleNamespace:
 
 @cache
 def _kernels(precision: Precision) -> SimpleNamespace:
-    """Make kernels that compute partial sums over a scene's particles with a fixed stride in one state, and the sum of
-    the partial sums."""
+    """Make kernels of partial sums over the particles of each state with a fixed stride, and of their total."""
     real, vector = precision.real, precision.vector
-    module = kernel_module(f"particle_sums_{precision.name}")
+    module, numbers = kernel_module(f"particle_sums_{precision.name}"), wp.array(dtype=real)
 
     @wp.func(module=module)
     def of_state(first: wp.array(dtype=vector), later: wp.array(dtype=vector), i: int, before: int) -> vector:
-        """Return entry i of the states of a chunk; the chunk's first state is in a separate array."""
         if i < before:
             return first[i]
         return later[i - before]
@@ -132,7 +129,6 @@ def _kernels(precision: Precision) -> SimpleNamespace:
     def from_a_solid(
         row: int, y: wp.vec3d, places: wp.array(dtype=wp.vec3d), views: wp.array(dtype=wp.mat33d)
     ) -> wp.vec3d:
-        """Return the vector from a row's place to a point, in the axes of the solid that carried the place."""
         return views[row] * (y - places[row])
 
     @wp.func(module=module)
@@ -161,18 +157,7 @@ def _kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def weighted(
-        particles: int,
-        before: int,
-        stride: int,
-        a: _Around,
-        x_first,
-        x,
-        v_first,
-        v,
-        q: wp.array(dtype=real),
-        places,
-        views,
-        partial,
+        particles: int, before: int, stride: int, a: _Around, x_first, x, v_first, v, q: numbers, places, views, partial
     ):
         state, total = wp.tid() // stride, SIX()
         row = state * particles
@@ -222,19 +207,17 @@ def _kernels(precision: Precision) -> SimpleNamespace:
 
 
 class StepQuantities:
-    """Quantities of particles and loads on solids that each step of a chunk computes for its initial state. They are
-    stored until the next chunk."""
+    """Quantities and loads that each step of a chunk computes for its initial state."""
 
     def __init__(self, formulas: Mapping[str, QuantityFormula], solver: ParticleSolver, length: int):
-        """Allocate arrays for ``formulas`` (by quantity name) in chunks of ``length`` steps."""
         self._formulas, self._solver, self._length, self.kept = formulas, solver, length, dict[str, wp.array]()
 
     def launch(self, step: int, parameters: Parameters) -> None:
-        """Launch the kernels for the step that the solver has just taken; ``step`` counts from 0 within the chunk."""
+        """Launch the formulas for the last step of the solver, number ``step`` of the chunk."""
         solver, context = self._solver, self._solver.context(parameters)
         pressures = solver.pressures()
         if pressures is None:
-            raise InputError("This scene is computed without a pressure of particles, so that there is none to see.")
+            raise InputError("This scene is computed without a pressure of particles, so that no pressure can be read.")
         for name, formula in self._formulas.items():
             found = formula.value(context, pressures)
             if name not in self.kept:
@@ -246,19 +229,19 @@ class StepQuantities:
                 unsort(context, found, own)
 
     def of_step(self, name: str, step: int) -> wp.array:
-        """Return a load, or a quantity in the scene's order, of step number ``step`` (from 0) of the chunk."""
+        """Return a load, or a quantity in the scene's order, of step number ``step`` of the chunk."""
         size = len(self.kept[name]) // self._length
         return self.kept[name][step * size : (step + 1) * size]
 
 
 class CarriedRows:
-    """The places to which a solid has carried a sensor, in each state of a chunk of a run."""
+    """The places to which a solid has carried a sensor, in each state of a chunk."""
 
     def __init__(self, ride: Ride, point: NDArray[Any], scene: SensedScene, solver: ParticleSolver, rows: int):
-        """Allocate arrays for ``rows`` states; ``point`` (d,) is the sensor's initial place in the ``scene`` [m]."""
+        """Allocate arrays for ``rows`` states; ``point`` (d,) is the sensor's initial place [m]."""
         table, layout = ride.table(scene), solver.layout
         self._device, self._members, self._ride = solver.device, layout.members, _Ride()
-        self._ride.arm = wp.vec3d(*_wide(point - table.middle()))
+        self._ride.arm = wp.vec3d(*in_space(point - table.middle()))
         self._ride.own = wp.mat33d(*square(table.turn(scene.dimension)).T.ravel())
         self._ride.turns = int(ride.turns)
         kernels, is_free = _rides(layout.precision, scene.dimension), table.motion == "free"
@@ -275,7 +258,6 @@ class CarriedRows:
         self.views = wp.empty(rows, dtype=wp.mat33d, device=solver.device)
 
     def recorded(self, rows: int, first: State, later: StateSeries) -> list[Callable[[], None]]:
-        """Return functions that compute the places in ``rows`` states; the first state is in separate arrays."""
         members, behind = self._members, rows - self._members
         copies = [partial(wp.copy, own, first[name], count=members) for name, own in self._fields.items()]
         if behind:
@@ -286,10 +268,9 @@ class CarriedRows:
 
 
 class ChunkSums:
-    """The sums of one sensor over the particles of each state of a chunk of a run."""
+    """The sums of one sensor over the particles of each state of a chunk."""
 
     def __init__(self, summed: ParticleSum, scene: SensedScene, solver: ParticleSolver, length: int):
-        """Prepare the sum ``summed`` over a scene's particles, for chunks of up to ``length`` steps."""
         layout, self._summed, domain = solver.layout, summed, scene.lattice.domain
         self._scenes, self._particles, self._device = layout.members, layout.particles, solver.device
         self._stride, self._kernels = isqrt(layout.particles - 1) + 1, _kernels(layout.precision)
@@ -297,7 +278,7 @@ class ChunkSums:
         self._partial = wp.empty(rows * self._stride, dtype=SIX, device=solver.device)
         self._total = wp.zeros(rows, dtype=SIX, device=solver.device)
         self._launches: dict[tuple[int, int], list[Callable[[], None]]] = {}
-        """Cached launches by number of steps and address of the first state, which are the same in most chunks."""
+        """Launches by number of steps and address of the first state, which are the same in most chunks."""
         self._setting: Any = None
         point: NDArray[Any] | None = None
         if isinstance(summed, WeightedSum):
@@ -308,8 +289,7 @@ class ChunkSums:
         self._carried = None if ride is None or point is None else CarriedRows(ride, point, scene, solver, rows)
 
     def launch(self, count: int, first: State, later: StateSeries, kept: Mapping[str, wp.array]) -> wp.array:
-        """Launch the sums over the initial states of ``count`` steps (``first`` and ``later``), with the ``kept``
-        quantities. Return the sums (at least count * scenes,); the next launch overwrites them."""
+        """Launch the sums over the initial states of ``count`` steps, and return them (at least count * scenes,)."""
         if isinstance(self._summed, LoadSum):
             return kept[self._summed.quantity]
         if isinstance(self._summed, NoSum):
@@ -329,7 +309,7 @@ class ChunkSums:
         later: StateSeries,
         kept: Mapping[str, wp.array],
     ) -> list[Callable[[], None]]:
-        """Return functions that launch the sums; their arguments are packed only once."""
+        """Return launches of the sums, whose arguments are packed only once."""
         rows = count * self._scenes
         sizes = {"particles": self._particles, "before": self._scenes * self._particles, "stride": self._stride}
         fields = {"x_first": first.positions, "x": later.whole("positions"), "a": self._setting}
@@ -350,39 +330,30 @@ class ChunkSums:
 
 
 def _around(summed: WeightedSum, domain: Domain, device: Any) -> Any:
-    """Return a sensor's place and projection as a struct for kernels."""
     around, found = summed.around, _Around()
     d, shifts = len(around.place), around.shifts()
     widest = around.reach + float(np.linalg.norm(shifts, axis=1).max())
     steps, inverse, images = domain.images(widest, around.across)
     offsets = (images[:, None] + shifts).reshape(-1, shifts.shape[1])
-    found.place, found.seen = wp.vec3d(*_wide(around.place)), wp.mat33d(*_square(around.across(np.eye(d)).T))
+    found.place, found.seen = wp.vec3d(*in_space(around.place)), wp.mat33d(*_square(around.across(np.eye(d)).T))
     found.lower, found.lengths, _ = domain.vectors(wp.vec3d)
     found.turns, found.steps = wp.mat33d(*_square(inverse.T)), wp.mat33d(*_square(steps.T))
     found.reach, found.share = around.reach, 1.0 / len(shifts)
     found.widest = float(np.linalg.norm(offsets, axis=1).max()) + around.reach
-    found.along = wp.vec3d(*_wide(np.zeros(d) if summed.along is None else summed.along))
+    found.along = wp.vec3d(*in_space(np.zeros(d) if summed.along is None else summed.along))
     found.offsets = wp.array(in_space(offsets), dtype=wp.vec3d, device=device)
     return found
 
 
 def _region(summed: RegionSum, domain: Domain) -> Any:
-    """Return a region as a struct for kernels; in 2-D it is unbounded along the third axis."""
+    """Return a region as a struct, unbounded along the third axis in 2-D."""
     found, (start, lower, upper) = _Region(), domain.ends(summed.lower, summed.upper)
-    found.start, found.about = wp.vec3d(*_wide(start)), wp.vec3d(*_wide(summed.about))
-    found.lower, found.upper = wp.vec3d(*_wide(lower, -np.inf)), wp.vec3d(*_wide(upper, np.inf))
+    found.start, found.about = wp.vec3d(*in_space(start)), wp.vec3d(*in_space(summed.about))
+    beyond = [np.inf] * (3 - len(lower))
+    found.lower, found.upper = wp.vec3d(*lower, *(-end for end in beyond)), wp.vec3d(*upper, *beyond)
     found.lengths = domain.vectors(wp.vec3d)[1]
     return found
 
 
-def _wide(values: NDArray[Any], rest: float = 0.0) -> NDArray[Any]:
-    found = np.full(3, rest)
-    found[: len(values)] = values
-    return found
-
-
 def _square(matrix: NDArray[Any]) -> NDArray[Any]:
-    """Return a matrix padded with zeros to (3, 3), row by row."""
-    found = np.zeros((3, 3))
-    found[: matrix.shape[0], : matrix.shape[1]] = matrix
-    return found.ravel()
+    return np.pad(matrix, [(0, 3 - size) for size in matrix.shape]).ravel()

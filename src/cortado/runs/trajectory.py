@@ -36,7 +36,7 @@ from cortado.scene.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One recorded state of a run, ``trajectory[k]``; n particles in d dimensions."""
+    """One recorded state of a run, ``trajectory[k]``, of n particles in d dimensions."""
 
     positions: NDArray[Any]
     """(n, d) [m]"""
@@ -49,19 +49,14 @@ class Frame:
     quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """(n,) or (n, k) recorded quantities by name, such as ``density``"""
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """further fields of the state by name, such as fields of parts; see `Trajectory`"""
+    """further fields of the state by name; see `Trajectory`"""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Return a recorded quantity of the particles, the speed, or a field of the state, by name.
-
-        Raises:
-            InputError: it was not recorded, or there is no such quantity.
-        """
+        """Return a recorded quantity, the speed or a field of the state; raise `InputError` for any other name."""
         return chosen(self.quantities, name, fields_of(self))
 
     def moved(self, duration: float) -> Frame:
-        """Return the frame extrapolated by ``duration`` [s], which may be negative, with constant velocities of
-        particles."""
+        """Return the frame extrapolated by ``duration`` [s], which may be negative, with constant velocities."""
         if duration == 0.0:
             return self
         return replace(self, positions=self.positions + duration * self.velocities, time=self.time + duration)
@@ -71,13 +66,12 @@ class Frame:
 
 
 def fields_of(of: Frame | Trajectory) -> dict[str, NDArray[Any]]:
-    """Return by name every field that steps change, of a frame or of a trajectory."""
     fractions = {} if of.mass_fractions is None else {"mass_fractions": of.mass_fractions}
     return {"positions": of.positions, "velocities": of.velocities, **fractions, **of.others}
 
 
 def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return a recorded quantity, the speed, or one of ``fields``, by name; raise `InputError` for any other name."""
+    """Return a recorded quantity, the speed or one of ``fields``; raise `InputError` for any other name."""
     check_quantity(name, others=tuple(fields))
     if name in fields:
         return fields[name]
@@ -91,13 +85,12 @@ def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[st
 
 
 SUFFIXES = (".vtkhdf", ".hdf")
-"""File suffixes that ParaView accepts for a trajectory."""
 
 
 @public
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """The recorded frames of a run, and the solver's notes on every step.
+    """The recorded frames of a run, and the solver's diagnostics of every step.
 
     ``trajectory[k]`` is the `Frame` k; a negative k counts from the end. ``trajectory[2:5]`` and ``trajectory[::10]``
     are trajectories of only these frames. ``len``, ``for`` and ``reversed`` work on the frames.
@@ -142,11 +135,11 @@ class Trajectory:
     solids: SolidMotions = field(default_factory=SolidMotions)
     """motions of the moving solids, by name"""
     begun: int | None = None
-    """[-] number of steps before the first entry of ``diagnostics``; if left out, that of the first frame"""
+    """number of steps before the first entry of ``diagnostics``, by default before the first frame [-]"""
     marks: Marks | None = None
     """times at which frames of a run with ``--fps`` are due; None if frames are chosen by steps"""
     scene: Scene | None = field(default=None, repr=False)
-    """scene of the run; None if the trajectory was read from a file, which does not contain the scene"""
+    """scene of the run; None if the trajectory was read from a file"""
 
     def __post_init__(self) -> None:
         if self.begun is None and len(self.steps):
@@ -167,7 +160,6 @@ class Trajectory:
         return f"Trajectory({counted(len(self), 'frame')} of {counted(self.particles, 'particle')}{times})"
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.times)
 
     @overload
@@ -177,38 +169,30 @@ class Trajectory:
     def __getitem__(self, k: slice) -> Trajectory: ...
 
     def __getitem__(self, k: int | slice) -> Frame | Trajectory:
-        """Return a frame, or a trajectory of some frames, which keeps the solver's notes on the whole run.
-
-        Raises:
-            IndexError: there is no such frame.
-            InputError: k is neither a whole number nor a slice.
-        """
+        """Return a frame, or a trajectory of some frames with the diagnostics of the whole run. Raise `IndexError` if
+        there is no such frame, and `InputError` unless k is a whole number or a slice."""
         if isinstance(k, slice):
             return self._chosen(k)
         try:
             place = index(k)
         except TypeError:
-            raise InputError(f"a frame is asked for by {shown(k)}, but must be by a whole number or a slice.") from None
+            raise InputError(f"The number of a frame is {shown(k)}, but must be a whole number or a slice.") from None
         if place not in range(-len(self), len(self)):
-            raise IndexError(f"frame {place} is asked for, but there are {len(self)} frames.")
+            raise IndexError(f"There is no frame {place}, as the trajectory has {len(self)} frames.")
         fractions = None if self.mass_fractions is None else self.mass_fractions[place]
         own, others = ({n: a[place] for n, a in each.items()} for each in (self.quantities, self.others))
         return Frame(self.positions[place], self.velocities[place], fractions, float(self.times[place]), own, others)
 
     def quantity(self, name: str) -> NDArray[Any]:
         """Return by ``name`` a recorded quantity of the particles or the speed, (frames, n) or (frames, n, k), or a
-        field (frames, ...) of the states. `Simulation.quantity` computes others.
-
-        Raises:
-            InputError: it was not recorded, or there is no such quantity.
-        """
+        field (frames, ...) of the states; raise `InputError` for any other name. `Simulation.quantity` computes
+        others."""
         return chosen(self.quantities, name, fields_of(self))
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
 
     def _chosen(self, frames: slice) -> Trajectory:
-        """Return the trajectory of some frames."""
         names = ("times", "steps", "positions", "velocities", "mass_fractions")
         arrays = {name: getattr(self, name) for name in names}
         kept: dict[str, Any] = {name: None if array is None else array[frames] for name, array in arrays.items()}
@@ -220,58 +204,45 @@ class Trajectory:
 
     @property
     def due(self) -> NDArray[Any]:
-        """Return the times (frames,) [s] at which pictures and films show the frames. In a run with ``--fps`` a frame
-        is extrapolated to its due time; else this is the frame's own time."""
+        """Return the times (frames,) [s] at which films show the frames: due times with ``--fps``, else ``times``."""
         return self.times if self.marks is None else self.marks.due(self.times)
 
     @property
     def dimension(self) -> int:
-        """Return the number of dimensions, 2 or 3."""
         return self.positions.shape[2]
 
     @property
     def particles(self) -> int:
-        """Return the number of particles."""
         return self.positions.shape[1]
 
     @property
     def iterations(self) -> NDArray[Any]:
-        """Return the pressure iterations (steps,) [-] of each step, for a solver with one pressure loop.
-
-        Raises:
-            InputError: the solver does not record iterations.
-        """
+        """Return the pressure iterations (steps,) [-] of each step; raise `InputError` if the solver does not record
+        them."""
         return noted(self.diagnostics, "iterations")
 
     @property
     def density_errors(self) -> NDArray[Any]:
-        """Return the average (rho - rho_0) / rho_0 (steps,) [-] at the end of each step.
-
-        Raises:
-            InputError: the solver does not record density errors.
-        """
+        """Return the average (rho - rho_0) / rho_0 (steps,) [-] of each step; raise `InputError` if it is not
+        recorded."""
         return noted(self.diagnostics, "density_errors")
 
     @property
     def converged(self) -> NDArray[Any]:
-        """Return booleans (steps,), true where the solver reached its tolerance."""
+        """Return booleans (steps,): True where the solver reached its tolerance."""
         return self.diagnostics["converged"]
 
     @property
     def not_converged(self) -> int:
-        """Return the number of steps at which the solver did not reach its tolerance."""
+        """Return the number of steps in which the solver did not reach its tolerance."""
         return int(np.count_nonzero(~self.converged))
 
     @property
     def last_state(self) -> RestartState:
-        """Return a copy of the state of the last frame. `Simulation.run` continues from it bit for bit as without a
-        stop.
-
-        Raises:
-            InputError: there is no frame.
-        """
+        """Return a copy of the last state, from which `Simulation.run` continues with the same bits as without a stop.
+        Raise `InputError` if there is no frame."""
         if not len(self):
-            raise InputError("The trajectory has no frame, but must have one to go on from.")
+            raise InputError("The trajectory has no frame, but must have one to continue from.")
         last = {**{name: array[-1] for name, array in fields_of(self).items()}, **self.constants}
         own = {name: array.copy() for name, array in last.items()}
         taken = self.diagnostics.get("time_steps", np.zeros(0))[: int(self.steps[-1]) - (self.begun or 0)]
@@ -279,26 +250,20 @@ class Trajectory:
         return RestartState(own, Clock(int(self.steps[-1]), float(self.times[-1]), size), self.origin)
 
     def save(self, path: str | Path) -> None:
-        """Write a VTKHDF file, which ParaView opens; a file of that name is replaced.
-
-        Raises:
-            InputError: no frames, a name that does not end in one of `SUFFIXES`, or a path that cannot be written.
-            ComputationError: the disk is full.
-        """
+        """Write a VTKHDF file, which ParaView opens; a file at this ``path`` is replaced. Raise `InputError` without
+        frames, for a name that does not end in .vtkhdf or .hdf, or if the path cannot be written, and
+        `ComputationError` if the disk is full."""
         if Path(as_path("path", path)).suffix.lower() not in SUFFIXES:
             wanted = f"must be a VTKHDF file, whose name ends in {' or '.join(SUFFIXES)}"
             raise InputError(f"path is {str(path)!r}, but {wanted}.")
-        frames = fields_of(self)
-        first = {name: array[0] if len(array) else array for name, array in frames.items()}
-        steps = len(self.converged)
-        own = {name: array[:1] for name, array in self.quantities.items()}
-        known = self.constants, steps, self.diagnostics, self.origin, own, self.marks
+        first = {name: array[0] if len(array) else array for name, array in fields_of(self).items()}
+        known = self.constants, len(self.converged), self.diagnostics, self.origin, self.quantities, self.marks
         with frame_writer(path, self.times, first, *known) as writer:
             writer.append_steps(**self.diagnostics)
             self.write_frames(writer)
 
     def write_frames(self, writer: vtkhdf.TrajectoryWriter) -> None:
-        """Write all frames with a ``writer`` whose file has room for them."""
+        """Write all frames with the ``writer`` of a file that has room for them."""
         for k, step in enumerate(self.steps):
             recorded = {name: array[k] for name, array in self.quantities.items()}
             frame = {name: array[k] for name, array in fields_of(self).items()}
@@ -310,28 +275,22 @@ class Trajectory:
 
         ``to``: "usd", one file with time samples; "ply", "obj", "glb" or "vtp", files for each frame, the last with
         ``run.pvd`` for ParaView. ``scene``: the scene or its file's path; needed for a trajectory from a file. The
-        folder must be empty or missing. In 2-D no surface is exported, and z is 0.
+        ``folder`` must be empty or missing. In 2-D no surface is exported, and z is 0.
 
-        Raises:
-            InputError: another format, a folder with files, no scene or another one, a library that is missing, or a
-                ``picture.colour`` of the scene that was not recorded.
-            ComputationError: the disk is full.
+        Raise `InputError` for another format, a folder with files, no scene or another one, a missing library, or a
+        ``picture.colour`` of the scene that was not recorded, and `ComputationError` if the disk is full.
         """
         of = self.scene if scene is None else scene
         if of is None:
             raise InputError(
                 "scene is missing, but must be given, as a trajectory from a file does not hold its scene."
             )
-        path: Path = on_top("export")(self, folder, to, of)
-        return path
+        return on_top("export")(self, folder, to, of)
 
     def to_xarray(self) -> Any:
-        """Return an ``xarray.Dataset`` with units and the dimensions time, particle, space and solid. It contains
-        position, velocity, recorded quantities, motions of solids and, with several phases, mass_fraction.
-
-        Raises:
-            InputError: xarray is missing.
-        """
+        """Return an ``xarray.Dataset`` with units and the dimensions time, particle, space and solid: position,
+        velocity, recorded quantities, motions of solids and, with several phases, mass_fraction. Raise `InputError` if
+        xarray is missing."""
         return on_top("labelled")(self)
 
     def picture(
@@ -343,8 +302,7 @@ class Trajectory:
 
         Example: ``cortado.pictures.write_picture("last.png", trajectory.picture(width=640, height=360))``
         """
-        image: ShadedPicture = on_top("trajectory_picture")(self, k, scene, device, settings)
-        return image
+        return on_top("trajectory_picture")(self, k, scene, device, settings)
 
     def film(
         self, path: str | Path, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
@@ -363,22 +321,16 @@ class Trajectory:
             SceneError: settings that do not fit.
             InputError: a package is missing, or the quantity of ``colour`` was not recorded and cannot be computed.
         """
-        film: Film = on_top("trajectory_film")(self, path, scene, device, settings)
-        return film
+        return on_top("trajectory_film")(self, path, scene, device, settings)
 
     def _repr_html_(self) -> str:
-        """Show in a notebook an animation of the run, with y up, and its first, middle and last frame, coloured by
-        speed."""
-        page: str = on_top("trajectory_page")(self)
-        return page
+        """Show an animation of the run in a notebook, with its first, middle and last frame."""
+        return on_top("trajectory_page")(self)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read the file at ``path`` that `save` or `TrajectoryWriter` wrote; its writer may be running or killed.
-
-        Raises:
-            InputError: the file is missing, damaged, or none of Cortado's trajectories.
-        """
+        """Read the file at ``path`` that `save` or `TrajectoryWriter` wrote; its writer may be running or killed. Raise
+        `InputError` if the file is missing, damaged, or none of Cortado's trajectories."""
         arrays = vtkhdf.read(as_path("path", path))
         names = ("times", "steps", "positions", "velocities", "diagnostics", "others", "constants")
         phases = sum(name.startswith(FRACTION) for name in arrays)
@@ -386,7 +338,7 @@ class Trajectory:
         try:
             origin = Origin.from_json(arrays["origin"]) if arrays["origin"] else None
         except (ValueError, TypeError, AttributeError) as problem:
-            raise InputError(f"{path} is damaged: of which particles it is cannot be read: {problem}.") from problem
+            raise InputError(f"{path} is damaged: the scene of its particles cannot be read: {problem}.") from problem
         recorded = {name: arrays[name] for name in QUANTITIES if name in arrays}
         for name, array in recorded.items():
             _, *row = QUANTITIES[name].shape(1, arrays["positions"].shape[2])

@@ -1,14 +1,14 @@
 """The height of the fluid's surface at a place: the level up to which the fluid fills a column above a floor.
 
-Solids occupy part of the column. The column is a grid of levels; the points x_c of a level have weights w_c that add up
-to 1. Of the point x_c a solid occupies the fraction
+The column is a grid of levels; the points x_c of a level have weights w_c that add up to 1. Solids occupy of point x_c
+the fraction
 
     s_c = min(max(1/2 - phi(x_c) / step, 0), 1)
 
-with the signed distance phi from the solid. A flat solid thus occupies exactly its own height, wherever it lies between
-levels. Fractions of several solids add up, to at most 1. Level k has the room 1 - sum_c w_c s_c, and the fluid fills
-level after level. A solid that leaves no room above fluid, such as a boat or a ceiling, is a step in the height. So
-that slightly compressed fluid does not appear on a deck, the step is a slope over the next `FILM` of depth.
+with the signed distance phi, so that a flat solid occupies exactly its height. Fractions of several solids add up, to
+at most 1. Level k has the room 1 - sum_c w_c s_c, and the fluid fills level after level. A solid that leaves no room
+above fluid, such as a boat or a ceiling, is a step in the height; a slope over the next `FILM` of depth replaces the
+step, so that slightly compressed fluid does not appear on a deck.
 """
 
 from dataclasses import dataclass, replace
@@ -39,29 +39,26 @@ from cortado.runs.particle_sums import (
     square,
     together,
 )
-from cortado.runs.sensor import Cut, Reading, SensedScene, direction, in_dimension, point, positive
+from cortado.runs.sensor import Reading, SensedScene, direction, in_dimension, point, positive
 from cortado.scene.motions import Pose, position_name, scale_name
 from cortado.scene.shape_tables import Container, NoContainer
 from cortado.scene.solids import SolidTable
 
 FINE = 0.5
-"""Greatest distance between the points of a column, in spacings."""
 ACROSS_REACH = 20.0
 """Least number of points from the axis of a column to its side."""
 LEAST = 1e-3
-"""Room of a level, as a fraction, below which the level counts as full of solid."""
+"""Fraction of a level that must be free of solids, else the level counts as full."""
 MOST = 4_000_000
-"""Greatest number of points: for higher solids the points are further apart."""
 NARROW = 0.01
-"""Least fraction of a column's cross-section that must lie within the container."""
+"""Least fraction of a column's cross-section that must be within the container."""
 FILM = 1.0
-"""Depth in spacings of the film above a solid with fluid below, from which on the height is exactly the film's
-surface."""
+"""Depth in spacings of the film of fluid above a solid with fluid below."""
 
 
 @dataclass(frozen=True)
 class Standing:
-    """A solid at its pose near a gauge: a point r in the solid's frame is at ``middle + scale turn r``."""
+    """A solid near a gauge: a point r in the solid's frame is at ``middle + scale turn r``."""
 
     own: Solid
     middle: NDArray[Any]
@@ -70,7 +67,6 @@ class Standing:
     """(d, d)"""
     scale: float
     pose: Pose | None
-    """Pose of a moving solid; None for a solid at rest."""
 
     @classmethod
     def of(cls, table: SolidTable, d: int, at: Reading | None = None) -> "Standing":
@@ -81,13 +77,11 @@ class Standing:
         return cls(table.own_solid(), pose.position, pose.rotation[:d, :d], pose.scale, pose)
 
     def local(self, points: NDArray[Any], domain: Domain) -> NDArray[Any]:
-        """Return points (n, d) [m] in the solid's frame, using each point's periodic image nearest to the solid's
-        middle."""
+        """Return points (n, d) [m] in the solid's frame, each as its periodic image nearest to the solid's middle."""
         return np.asarray(domain.shortest(points - self.middle) @ self.turn / self.scale)
 
     def reach(self, up: NDArray[Any], foot: NDArray[Any]) -> tuple[float, float]:
-        """Return the solid's greatest height above ``foot`` (d,) along ``up`` (d,), and its radius about its middle
-        [m]; infinite if unbounded."""
+        """Return the height above ``foot`` (d,) along ``up`` (d,) and the radius [m]; infinite if unbounded."""
         ends = self.scale * corners(*self.own.extent())
         high = float(((self.middle - foot) @ up) + (ends @ self.turn.T @ up).max())
         return high, float(np.linalg.norm(ends, axis=1).max()) if self.own.is_bounded else np.inf
@@ -95,30 +89,21 @@ class Standing:
 
 @dataclass(frozen=True)
 class Axis:
-    """The axis of a gauge: a line upwards from the gauge's floor."""
+    """A line upwards from a gauge's floor."""
 
     foot: tuple[float, ...]
     """(d,) point where the axis meets the floor [m]"""
     up: tuple[float, ...]
     """(d,) unit vector"""
     reach: float
-    """Reach of the gauge's weights [m]."""
     step: float
-    """Distance from point to point [m]."""
+    """distance between points [m]"""
     film: float
-    """`FILM` [m]"""
     beside: tuple[tuple[float, ...], ...]
-    """(d - 1, d) unit vectors perpendicular to the axis"""
-
-    @classmethod
-    def of(cls, at: Cut, position: NDArray[Any], floor: float, up: NDArray[Any], reach: float) -> "Axis":
-        """Make the axis of a gauge at ``position``, from ``floor`` upwards."""
-        in_dimension("position", position, at.dimension)
-        spacing = at.lattice.cell ** (1.0 / at.dimension)
-        return _axis_of(spacing, tuple(position.tolist()), floor, tuple(up.tolist()), reach)
+    """(d - 1, d) unit vectors perpendicular to ``up``"""
 
     def places(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the column's points (c, d) on the floor relative to the foot [m], and their weights (c,)."""
+        """Return the points (c, d) on the floor relative to the foot [m], and their weights (c,)."""
         d, count = len(self.foot), int(np.ceil(self.reach / self.step))
         along = np.asarray(self.step * np.arange(-count, count + 1), dtype=np.float64)
         places = grid([along] * (d - 1))
@@ -126,7 +111,6 @@ class Axis:
         return places[weights > 0.0] @ np.array(self.beside), weights[weights > 0.0] / weights.sum()
 
     def carried(self, carrier: Carrier, turns: bool) -> "Axis":
-        """Return the axis with its foot carried by a solid, and turned with the solid if it ``turns``."""
         foot = tuple(carrier.place(np.array(self.foot)).tolist())
         if not turns:
             return replace(self, foot=foot)
@@ -136,7 +120,6 @@ class Axis:
 
 @lru_cache(maxsize=64)
 def _axis_of(spacing: float, position: tuple[float, ...], floor: float, up: tuple[float, ...], reach: float) -> Axis:
-    """Return the axis of a gauge; results are cached, as every step calls this."""
     foot = np.array(position) + (floor - np.dot(position, up)) * np.array(up)
     beside = tuple(map(tuple, np.linalg.svd(np.array([up]))[2][1:].tolist()))
     return Axis(tuple(foot.tolist()), up, reach, min(FINE * spacing, reach / ACROSS_REACH), FILM * spacing, beside)
@@ -150,16 +133,14 @@ class Column:
     points: NDArray[Any]
     """(levels, c, d) [m]"""
     weights: NDArray[Any]
-    """(c,) weights, normalised over the points within the container"""
+    """(c,) weights, which add up to 1 within the container"""
     outside: NDArray[Any]
-    """(c,) fraction of each point's cell that is behind the sides of the container"""
+    """(c,) fraction of each point's cell outside the container"""
     solids: list[tuple[Standing, NDArray[Any]]]
-    """Solids in the column, each with the distances (levels, c) of the points from it [m], if some are less than a
-    step."""
+    """solids in the column, with the distances (levels, c) of the points from each [m]"""
 
     @classmethod
     def of(cls, axis: Axis, solids: list[Standing], domain: Domain, container: Container) -> "Column | None":
-        """Make a column that contains solids; None if no solid is in the column."""
         foot, up = np.array(axis.foot), np.array(axis.up)
         tops, sizes = np.array([one.reach(up, foot) for one in solids]).T
         ways = domain.shortest(foot - np.array([one.middle for one in solids], dtype=np.float64))
@@ -186,18 +167,17 @@ class Column:
 
     @cached_property
     def _taken(self) -> NDArray[Any]:
-        """Return the fraction (levels, c) of each point that solids and the container occupy; 1 or more means all."""
+        """Return the fraction (levels, c) of each point that is not free; above 1 if solids overlap."""
         return self.outside + sum(np.clip(0.5 - far / self.axis.step, 0.0, 1.0) for _, far in self.solids)
 
     @cached_property
     def room(self) -> NDArray[Any]:
-        """Return the fraction (levels,) of each level that is free of solids."""
+        """Return the fraction (levels,) of each level that is free."""
         return np.asarray((1.0 - np.minimum(self._taken, 1.0)) @ self.weights)
 
     @cached_property
     def _ends(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the heights between which the level is a linear function of depth, and the depths of fluid that fill
-        the room below them [m]."""
+        """Return heights, in levels, between which the height is linear in the depth, and the depths below them [m]."""
         filled = self.axis.step * np.concatenate([[0.0], np.cumsum(self.room)])
         kept, blocked = np.ones(len(filled), dtype=bool), np.append(self.room < LEAST, False)
         kept[: int(np.argmin(blocked))] = False  # what stands on the floor
@@ -207,9 +187,8 @@ class Column:
         return ends, filled[ends]
 
     def level(self, depth: float) -> tuple[float, NDArray[Any], float]:
-        """Return the height above the column's floor of fluid that would have ``depth`` [m] without solids. Also return
-        the fraction (levels,) of each level's solids that adds to the height, and the height's derivative with respect
-        to ``depth``."""
+        """Return the height [m] of fluid that would have ``depth`` [m] without solids, the fraction (levels,) of each
+        level's solids that adds to the height, and the height's derivative with respect to ``depth``."""
         (ends, filled), step, levels = self._ends, self.axis.step, np.arange(len(self.room))
         low = max(int(np.searchsorted(filled, depth, side="right")) - 1, 0)
         if low == len(ends) - 1:  # above all solids
@@ -220,7 +199,7 @@ class Column:
         return step * (ends[low] + part * (ends[low + 1] - ends[low])), below, float(slope)
 
     def pushes(self, depth: float, bar: float, domain: Domain) -> "list[Push]":
-        """Convert the derivative with respect to the height at a depth [m] to derivatives with respect to motions of
+        """Convert the derivative with respect to the height at a depth [m] to those with respect to motions of
         solids."""
         _, below, slope = self.level(depth)
         shares, found = bar * slope * below, list[Push]()
@@ -237,19 +216,16 @@ class Column:
 
 @dataclass(frozen=True, eq=False)
 class Push:
-    """The derivative of a gauge's height with respect to the motion of a solid in its column."""
-
     solid: Standing
     shift: NDArray[Any]
     """(d,) with respect to a shift of the solid"""
     twist: NDArray[Any]
     """(3,) with respect to a small rotation about the solid's middle"""
     grown: float
-    """With respect to the solid's scale."""
+    """with respect to the scale"""
 
     @property
     def bars(self) -> dict[str, NDArray[Any]]:
-        """Return derivatives with respect to fields of the state; a solid at rest has no fields."""
         pose = self.solid.pose
         if pose is None:
             return {}
@@ -257,18 +233,17 @@ class Push:
         return found if pose.is_free else found | {scale_name(pose.name): np.array([self.grown])}
 
 
-def column_of(axis: Axis, at: Reading) -> Column | None:
-    """Return the gauge's column with the solids in it in a state; None if no solid is in the column."""
+def column_of(axis: Axis, at: Reading, container: Container) -> Column | None:
     tables, domain = at.solids, at.lattice.domain
     if any(table.moves for table in tables):
-        return Column.of(axis, [Standing.of(table, at.dimension, at) for table in tables], domain, at.container)
-    return _at_rest(axis, tables, domain, at.container)
+        return Column.of(axis, [Standing.of(table, at.dimension, at) for table in tables], domain, container)
+    return _at_rest(axis, tables, domain, container)
 
 
 @lru_cache(maxsize=64)
 def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
-    """Return the fraction (c,) of the cell around each point of a column that is within the container. None if all
-    cells are inside, or if the container's sides are not parallel to the column."""
+    """Return the fraction (c,) of the cell around each point that is in the container; None if all cells are inside, or
+    if container sides are not parallel to the column."""
     up, foot = np.array(axis.up), np.array(axis.foot)
     region, periods = container.region(len(up)), container.periods(len(up))[1]
     along = np.abs(up) > 1.0 - 1e-12
@@ -284,21 +259,13 @@ def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
 
 @lru_cache(maxsize=64)
 def _at_rest(axis: Axis, tables: tuple[SolidTable, ...], domain: Domain, container: Container) -> Column | None:
-    """Return the column with the solids at rest, computed once and cached; None if no such solid is in the column."""
     if not tables:
         return None
     return Column.of(axis, [Standing.of(table, len(axis.foot)) for table in tables], domain, container)
 
 
-def _on_a_solid(axis: Axis, at: Reading) -> Column | None:
-    """Return the column of a gauge that rides on a solid, with the solids in it in a state; None if no solid is in the
-    column."""
-    solids = [Standing.of(table, at.dimension, at) for table in at.solids]
-    return Column.of(axis, solids, at.lattice.domain, NoContainer())
-
-
 FINER = 4.0
-"""Factor for the number of a particle's parts along an axis if solids are in the gauge's column."""
+"""Factor for the number of a particle's parts along an axis if solids are in the column."""
 
 
 @fixed
@@ -342,8 +309,7 @@ class WaveGauge(Summed):
         return {"height": "m"}
 
     def summed(self, at: SensedScene) -> WeightedSum:
-        """Return the weighted sum over horizontal distances of particles. Particles have more parts if the container
-        cuts the column, or if solids can enter it."""
+        """Return the sum over horizontal distances, with more parts if the column is cut or may contain solids."""
         axis, across, ride = self._axis(at), at.dimension - 1, ride_of(self.on, self.axes == "body", at)
         if ride is not None:
             parts = parts_of(axis.reach / FINER, at, self._across, across)
@@ -357,10 +323,10 @@ class WaveGauge(Summed):
         axis = self._axis(at)
         depth, ride = self._scale(axis, at) * float(found[0]), ride_of(self.on, self.axes == "body", at)
         if ride is None:
-            column, floor = column_of(axis, at), self.floor
+            column, floor = column_of(axis, at, at.container), self.floor
         else:
             axis = axis.carried(ride.carrier(at), ride.turns)
-            column = _on_a_solid(axis, at)
+            column = column_of(axis, at, NoContainer())
             floor = self.floor if ride.turns else float(np.dot(axis.foot, axis.up))
         return np.array([floor + (depth if column is None else column.level(depth)[0])])
 
@@ -368,11 +334,11 @@ class WaveGauge(Summed):
         axis, summed = self._axis(at), self.summed(at)
         around, scale, ride = summed.seen(at), self._scale(axis, at), summed.ride
         if ride is None:
-            column = column_of(axis, at)
+            column = column_of(axis, at, at.container)
         else:
             carrier, begun = ride.carrier(at), np.array(axis.foot)
             axis = axis.carried(carrier, ride.turns)
-            column = _on_a_solid(axis, at)
+            column = column_of(axis, at, NoContainer())
         depth, slope, pushes = float(scale * around.weights.sum()), 1.0, list[Push]()
         if column is not None:
             slope, pushes = column.level(depth)[2], column.pushes(depth, bar[0], at.lattice.domain)
@@ -387,7 +353,9 @@ class WaveGauge(Summed):
         return together(*bars, {"positions": pulled})
 
     def _axis(self, at: SensedScene) -> Axis:
-        return Axis.of(at, self.position, self.floor, self.up, reach_of(self.radius, at))
+        in_dimension("position", self.position, at.dimension)
+        spacing, reach = at.lattice.cell ** (1.0 / at.dimension), reach_of(self.radius, at)
+        return _axis_of(spacing, tuple(self.position.tolist()), self.floor, tuple(self.up.tolist()), reach)
 
     def _scale(self, axis: Axis, at: SensedScene) -> float:
         """Return the volume of a particle over the column's cross-section [m]."""
