@@ -311,7 +311,7 @@ def test_a_force_of_a_users_own_is_not_trusted_with_a_batch(monkeypatch):
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_one_scene_is_certified_and_optimised(precision):
     problem = Problem(Simulation(scenes.plane(), precision=precision, batch=2), 2, CentreOfMass([0.1, 0.1]))
-    with pytest.raises(InputError, match="What is certified is a batch, but must be one scene"):
+    with pytest.raises(InputError, match="problem is of a batch, but must be of one scene"):
         cortado.certify(problem, {"gravity": [0.0, -9.0]})
     with pytest.raises(InputError, match=r"The problem's loss has shape \(2,\), but must be one number"):
         cortado.optimise(problem, {"gravity": [0.0, -9.0]}, "adam", learning_rate=0.1, iterations=1)

@@ -276,7 +276,7 @@ def test_runs_that_fail_are_left_out_and_said(file, cortado_command, quick):
     assert [train[f"0000{k}/position"][0, 0, 0] for k in range(2)] == [0.0, 4.0]
     quick.others |= dict.fromkeys([0, 3, 4], InputError("no fluid fits."))
     code, _, err = cortado_command("dataset", file, "--runs", 5, "--out", "none")
-    assert code == 1 and "No run of those for train could be computed. The first: no fluid fits." in err
+    assert code == 1 and "None of the runs for train could be computed. The first: no fluid fits." in err
 
 
 def test_what_was_killed_goes_on(file, cortado_command, quick):
@@ -316,7 +316,10 @@ def varied(key, lower, upper, more=("dataset.logarithmic=[]",)):
         (("--runs", 2), "--runs is 2, but must be from 3 to 100,000: one to train and one to validate"),
         (("--set", "dataset.write_every=4"), "dataset.write_every is 4, but must be a divisor of steps, which is 6"),
         (varied("solver.time_step", 0.001, 0.002), "vary has solver.time_step, which must be the same"),
-        (varied("picture.film_speed", 0.1, 0.2), "vary has picture.film_speed, which changes nothing that is computed"),
+        (
+            varied("picture.film_speed", 0.1, 0.2),
+            "vary has picture.film_speed, which has no effect on what is computed",
+        ),
         (("--set", "problem.steps=3"), "problem.steps is given, but must be left out"),
         (varied("phase.oil.viscosity", 0.1, 0.2), "oil"),
         (varied("phase.0.viscosity", 0.2, 0.1, ()), "dataset.vary.'phase.0.viscosity' is [0.2, 0.1], but must"),

@@ -270,7 +270,7 @@ def test_in_a_batch_the_others_go_on():
     ("settings", "sentence"),
     [
         ({"size": "huge"}, 'size is \'huge\', but must be "small" or "large"'),
-        ({"particles": 1000}, "particles is 1000, but must be a whole number from 0 to 96"),
+        ({"particles": 1000}, "particles is 1000, but must be from 0 to 96, the scene's particles"),
         ({"particles": 2.5}, "particles is 2.5"),
         ({"render_mode": "human"}, "render_mode is 'human'"),
         ({"num_envs": 0}, "num_envs"),

@@ -86,7 +86,7 @@ def test_a_trajectory_makes_films_and_pictures(tmp_path):
     loaded = cortado.Trajectory.load(tmp_path / "run.vtkhdf")
     again = loaded.picture(0, scene=simulation.scene, lines=64)
     np.testing.assert_allclose(again, picture, atol=1e-4)  # the surface adds up in an order of its own
-    with pytest.raises(InputError, match=r"does not know its scene.*scene=scene"):
+    with pytest.raises(InputError, match=r"from a file, which has no scene.*scene=scene"):
         loaded.picture()
 
 

@@ -201,7 +201,7 @@ def test_rings_of_hinges_and_rubbed_bodies_on_them_are_a_sentence():
         {"name": f"{one}{two}", "solid": one, "to": two, "position": [0.5, 0.6]} for one, two in [*ring, ("raft", "a")]
     ]
     for some in (hinges[:3], [hinges[0], hinges[3]]):
-        with pytest.raises(SceneError, match=r"but must be a solid to which hinges do not join this one already"):
+        with pytest.raises(SceneError, match=r"but must be a solid that other hinges do not join to this one already"):
             plane(RAFT, *others, hinge=[{**one, "name": str(k)} for k, one in enumerate(some)])
     with pytest.raises(
         SceneError, match=r"solid\[1\]\.slip is 'no', but must be \"free\", as the body is on the hinge"

@@ -353,10 +353,13 @@ def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, proble
         (lambda: layer.rollout(simulation, state, steps=5, record_every=2), "record_every is 2, but must divide the 5"),
         (lambda: layer.step(simulation, state, gradient=gentle), "estimator is .*, but must be an AdjointEstimator"),
         (lambda: layer.step(simulation, state, gradient=Changing()), "estimator has an unhashable type: 'Changing'"),
-        (lambda: layer.value(problem, gentle)({}, state), "gradient is a RandomizedSmoothing, but must go back"),
+        (
+            lambda: layer.value(problem, gentle)({}, state),
+            "gradient is a RandomizedSmoothing, but must be an AdjointEstimator",
+        ),
         (lambda: layer.measure(simulation, "colour"), "quantity is 'colour', but must be one of density"),
         (lambda: layer.measure(Simulation(plane(), batch=2), "density"), "simulation is a batch of 2, but must be"),
-        (lambda: layer.picture(simulation, state["positions"]), "renderer is .*, but must be one such as"),
+        (lambda: layer.picture(simulation, state["positions"]), "renderer is .*, but must be a renderer, such as"),
     ]:
         assert_refused(words, use)
 
@@ -398,7 +401,7 @@ def test_float64_needs_a_jax_that_has_it(jax, layer, problem):
         assert end["positions"].dtype == end["time"].dtype == "float32"
         assert jax.grad(lambda m: layer.value(matched(single))({"viscosity": m}))(3.0) != 0.0
         for use in (lambda: layer.state(problem.simulation), lambda: layer.value(problem)({"viscosity": 3.0})):
-            with pytest.raises(InputError, match=r"float64, but must be float32 where .*\(\"jax_enable_x64\", True\)"):
+            with pytest.raises(InputError, match=r"float64, but must be float32, as .*\(\"jax_enable_x64\", True\)"):
                 use()
     finally:
         jax.config.update("jax_enable_x64", True)

@@ -106,7 +106,7 @@ def test_what_is_far_away_is_left_out_and_what_is_no_number_is_a_sentence():
     alone = surface_of(positions)
     found = surface_of(np.concatenate([positions, [[1e7, 0.0, 0.0], [0.0, -1e9, 0.0]]]))
     np.testing.assert_allclose(found.points, alone.points, atol=1e-6)
-    with pytest.raises(ComputationError, match="2 particles cannot be drawn, whose positions are not finite"):
+    with pytest.raises(ComputationError, match="2 particles cannot be drawn, as their positions are not finite"):
         surface_of(np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]]))
 
 

@@ -582,7 +582,7 @@ def test_parameters_that_a_search_comes_to_are_no_mistake_of_the_user(tmp_path):
     found = optimise(Walled(0.75), {"x": 1.0}, Adam(learning_rate=0.1), 3)
     assert found.parameters["x"] == pytest.approx(0.75, abs=2e-3) and found.refused == 1
     assert found.message.endswith("It refused 1 step, as runs diverged or parameters were out of their range.")
-    with pytest.raises(ComputationError, match=r"In evaluation 1 the search came to .* x is 0.7499") as caught:
+    with pytest.raises(ComputationError, match=r"In evaluation 1 the search tried .* x is 0.7499") as caught:
         optimise(Walled(0.75), {"x": 0.75}, Adam(learning_rate=0.1), 10, checkpoint=tmp_path)
     assert str(tmp_path) in str(caught.value)
     with pytest.raises(InputError, match="x is 1, but"):
@@ -793,7 +793,10 @@ def test_wrong_settings_are_refused(make):
         ({"optimiser": "gradient_descent"}, "^'gradient_descent' needs 'learning_rate'; its settings are"),
         ({"optimiser": "lbfgs", "learning_rate": 0.1}, "^'learning_rate' is no setting of 'lbfgs', whose settings"),
         ({"optimiser": "adam", "learning_rate": -1.0}, "^learning_rate must be a positive, finite number"),
-        ({"learning_rate": 0.1}, "^optimise was given 'learning_rate', but takes settings only of an optimiser that"),
+        (
+            {"learning_rate": 0.1},
+            "^optimise was given 'learning_rate', but takes settings only with the name of an optimiser",
+        ),
         ({"optimiser": Adam({"y": 0.1})}, "learning_rate is given for 'y', but the optimised parameters are 'x'"),
         ({"optimiser": LBFGS(scale={})}, "scale is given for none"),
         ({"iterations": 0}, "number of iterations"),

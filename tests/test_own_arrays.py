@@ -315,7 +315,7 @@ def test_mass_fractions_that_are_not_there_are_said():
         return mass_fractions[2] * v
 
     for made, words in (
-        (splash(), "takes mass_fractions, but must take them in scenes of several phases alone"),
+        (splash(), "takes mass_fractions, but only scenes of several phases have them"),
         (two_layers(), r"mass_fractions\[2\], but must have an index from -2 to 1 there, as there are 2 phases"),
     ):
         with pytest.raises(InputError, match=words):

@@ -173,7 +173,7 @@ def field(entry, first, *axis):
         (of_fields(field(Entry.NUMBER, "initial_velocities")), TypeError, "which is not a number of each particle"),
         (of_fields(field(Entry.VECTOR, "viscosity", Axis.SCALAR)), TypeError, "which is not a vector of the scene"),
         (lambda setting: object(), InputError, r"object, which .*Made.* made, has no shares, but must have"),
-        (Duck, InputError, "the force Duck has the methods settle of a part, but is none"),
+        (Duck, InputError, "the force Duck has the methods settle of a part, but is no Part"),
         (type("Idle", (MemoryForce,), {"end": Part.end}), InputError, "Idle has fields, but no method `end` that"),
     ],
 )

@@ -200,7 +200,7 @@ def helping_itself(r: wp.float64):
 
 """
 NO_FORCES = {
-    "calls itself": ("def f(x, v): return f(x, v)", "Body function f calls itself, which Warp cannot"),
+    "calls itself": ("def f(x, v): return f(x, v)", "Body function f calls itself, but must not"),
     "calls what calls itself": (
         "def f(x, v): return helping_itself(x[0]) * v",
         "helping_itself that Body function f calls calls itself",
@@ -211,10 +211,10 @@ NO_FORCES = {
     "order": ("def f(v, x, k): return -k * v", "f has the arguments v, x, k, but must have x, v first, and"),
     "one": ("def f(x): return x", "Body function f has x without a value, but must have"),
     "many": ("def f(x, v, *rest): return v", r"Body function f has the argument \*rest, but must have"),
-    "time": ("def f(x, v, t=0.0, k=1.0): return -k * t * v", "f is given a value of t, but must be given none"),
+    "time": ("def f(x, v, t=0.0, k=1.0): return -k * t * v", "f is given a value of t, but the run gives it"),
     "no return": ("def f(x, v, k): wp.length(x)", "f may end without return, but must return a vector"),
     "some return": ("def f(x, v, k):\n if x[0] < 0.1: return k * v", "Body function f may end without return"),
-    "unknown": ("def f(x, v, k): return k * undefined(v)", "f has the name .*, which stands for nothing"),
+    "unknown": ("def f(x, v, k): return k * undefined(v)", "f has the name .*, which is not defined"),
     "list": ("def f(x, v, k): return k * AWAY", "AWAY, which is a list outside of it, but must take a number"),
     "named part": ("def f(x, v, k):\n a = k * x\n a.y = 0.0\n return a", "changes a.y alone, which Warp cannot differ"),
     "added part": ("def f(x, v, k):\n a = k * x\n a.y += k\n return a", "changes a.y alone, which Warp cannot differ"),
@@ -271,11 +271,11 @@ def test_what_is_no_force_is_a_sentence(name, tmp_path, capfd):
         (lambda: Body(three, k=1.0), "Body function three is given no value of c, but must have"),
         (lambda: Body(three, c=[1.0, 0.0, 0.0]), "Body function three is given no value of k, but must have"),
         (lambda: Pair(time_second, k=1.0), "time_second has the arguments .*, but must have x_ij, v_ij first"),
-        (lambda: Body(drag, k=1.0, x=2.0), "drag is given a value of x, but must be given none"),
+        (lambda: Body(drag, k=1.0, x=2.0), "drag is given a value of x, but the run gives it"),
         (lambda: Pair(drag, k=1.0, c=2.0), r"is given a value of c, but .* among .*\(x, v, t, k\)"),
         (lambda: Body(drag, k="fast"), "parameter drag.k is 'fast', but must be"),
         (lambda: Body(drag, k=[[1.0]]), r"Body function drag has the array k without indices"),
-        (lambda: Body(drag, "a b", k=1.0), "Body has the name 'a b', but must have a word"),
+        (lambda: Body(drag, "a b", k=1.0), "Body has the name 'a b', but must have a name"),
         (lambda: problem(Body(drag, k=math.nan)), "parameter drag.k has a value that is not finite"),
         (lambda: problem(Body(drag, k=[1.0, 2.0])), r"parameter drag.k has shape \(2,\), but must be \(3,\)"),
         (lambda: OverTime([0.0, 0.0], [1.0, 2.0]), "OverTime times are .*, but each must be greater than the one"),

@@ -87,7 +87,7 @@ def simulation():
 @pytest.mark.parametrize("given", [None, [1.0], 3, "gravity"])
 def test_parameters_are_a_table(simulation, given):
     problem = Problem(simulation, 3, losses.FinalPositions(simulation.positions))
-    with pytest.raises(InputError, match=r"parameters are .*, but must be given by name, as \{'gravity': value\}"):
+    with pytest.raises(InputError, match=r"parameters are .*, but must be a table by name, such as \{'gravity'"):
         problem.value(given)
 
 

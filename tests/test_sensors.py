@@ -249,7 +249,7 @@ def series_of(sensor, values=(1.0, 2.0), time_step=0.0021, parameters=None, **op
 
 
 MISTAKES = [
-    (lambda: read_by(sensors=[PROBE]), "sensors is .* but must be given by name"),
+    (lambda: read_by(sensors=[PROBE]), "sensors is .* but must be a table by name"),
     (lambda: read_by(sensors={"o": Odd(3.0)}), r"sensor Odd has shape \(\), but must be \(1,\)"),
     (lambda: read_by(sensors={"o": Odd([3.0, 4.0])}), r"Odd has shape \(2,\), but must be"),
     (lambda: read_by(sensors={"o": Odd("deep")}), "sensor Odd is 'deep', but must be"),
@@ -260,7 +260,7 @@ MISTAKES = [
     (lambda: Series(PROBE, [0.0, 1.0], ["a", "b"], 0.1), "values is made of text"),
     (lambda: Series(PROBE, [0.0, 1.0], [[1.0], [1.0, 2.0]], 0.1), "values is .* but must be a number or an array"),
     (lambda: Series(PROBE, [0.0, 1.0], [np.inf, 0.0], 0.1), "values must be finite"),
-    (lambda: Series(PROBE, [0.0, 1.0], [np.nan, np.nan], 0.1), "values must be finite, .* not for all of them"),
+    (lambda: Series(PROBE, [0.0, 1.0], [np.nan, np.nan], 0.1), "values must be finite, .* but not all NaN"),
     (lambda: Series(PROBE, [0.0, 1.0], [1.0, 0.0], 0.1, scale=[1.0, 2.0]), r"scale has shape \(2,\), but must be"),
     (lambda: Series(PressureProbe, [0.0, 1.0], [1.0, 0.0], 0.1), "sensor is .* but must be a sensor, such as"),
     (lambda: series_of(PROBE, [[1.0, 2.0], [3.0, 4.0]]), "values has 2 columns, but must have 1"),

@@ -134,7 +134,7 @@ def test_a_film_of_trajectories(runs, tmp_path):
     "call, words",
     [
         (lambda a, b: cortado.film_side_by_side([], "x.mp4"), "There are 0 runs"),
-        (lambda a, b: cortado.film_side_by_side([a] * 10, "x.mp4"), "There are 10 runs, but from 1 to 9"),
+        (lambda a, b: cortado.film_side_by_side([a] * 10, "x.mp4"), "There are 10 runs, but 1 to 9"),
         (lambda a, b: cortado.film_side_by_side([a, 5], "x.mp4"), "runs has 5, but must have trajectories"),
         (lambda a, b: cortado.film_side_by_side(a, "x.mp4"), "runs is Trajectory"),
         (lambda a, b: cortado.film_side_by_side(5, "x.mp4"), "runs is 5, but must be several trajectories"),

@@ -237,7 +237,7 @@ def test_a_solver_that_does_not_fit_is_a_sentence(solver, options, said):
 
 def test_a_solver_that_does_not_count_its_steps_is_a_sentence():
     simulation = Simulation(plane(), solver=Makes(Uncounted))
-    with pytest.raises(InputError, match=r"solver Uncounted has not counted its steps, but must: .* self\.end_step"):
+    with pytest.raises(InputError, match=r"solver Uncounted does not count its steps: .* self\.end_step"):
         simulation.run(3)
 
 

@@ -419,7 +419,7 @@ def test_a_problem_with_a_state_is_copied_batched_and_told_from_others():
     assert problem.tangent(point, {"nozzle.flow_rate": 1.0}) == pytest.approx(
         float(gradient["nozzle.flow_rate"]), rel=1e-10
     )
-    with pytest.raises(InputError, match="must begin as its scene does to be certified"):
+    with pytest.raises(InputError, match="must begin as its scene does, as certificates vary"):
         certify(problem, point)
     path = {"nozzle.path": np.array(state["nozzle.outlet"]) + np.zeros((6, 2))}
     bars = problem.value_and_gradient(path)[1]

@@ -80,7 +80,7 @@ COUNT = ",".join(map(str, range(400)))
 @pytest.mark.parametrize(
     "options, zipped, words",
     [
-        ([], ["a=1,2", "b=3"], "--zip gives 2 of a, 1 of b, but must give as many values of each"),
+        ([], ["a=1,2", "b=3"], "--zip gives 2 of a, 1 of b, but must give the same number of values for each"),
         (["a=1,2"], ["a=1,2"], "--zip gives a, which --set gives too"),
         ([], ["a=1", "a=2"], "--zip gives a twice"),
         ([], ["a"], "--zip is 'a', but must have the form"),

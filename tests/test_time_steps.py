@@ -321,8 +321,8 @@ def test_what_cannot_be_is_said_in_a_sentence(tmp_path):
         (lambda: cortado.Problem(simulation, 90, series), "loss is a Series of steps of 0.001 s"),
         (lambda: cortado.certify(simulation, ["viscosity"], steps=3), "seconds for a certificate"),
         (lambda: Simulation(jet(solver=CHOSEN)).run(3, path), f"nozzle.path has a row for each .* must be {one_place}"),
-        (lambda: simulation.run(), "steps is left out, but must be given where no time"),
-        (lambda: simulation.run(3, time=1.0), "time is given, but must be left out, as steps says"),
+        (lambda: simulation.run(), "steps is left out, but must be given, as no time"),
+        (lambda: simulation.run(3, time=1.0), "time is given, but must be left out, as steps is given"),
         (lambda: simulation.run(time=-1.0), "time is -1, but must be a number of seconds greater than 0"),
         (lambda: simulation.run(time=1.0, controls={"gravity": np.zeros((9, 2))}), r"but must be \(2,\)"),
         (lambda: Simulation(drop(CHOSEN), batch=2).run(time=1.0), "time is given, but must be left out"),
@@ -333,7 +333,7 @@ def test_what_cannot_be_is_said_in_a_sentence(tmp_path):
         ({"solver": {"time_step": "fast"}}, 'time_step is .fast., but must be a finite number, .* or "auto"'),
         ({"solver": {"time_step": 0.001, "courant": 0.2}}, "courant is 0.2, but must be left out"),
         ({"solver": {**CHOSEN, "courant": 1.5}}, "courant is 1.5, but must be"),
-        ({"solver": CHOSEN, "forces": still}, "step is missing, but must be given, as nothing else bounds"),
+        ({"solver": CHOSEN, "forces": still}, "step is missing, but must be given, as .* nothing else limits"),
     ]:
         with pytest.raises(SceneError, match=what):
             plane(**tables)

@@ -185,7 +185,7 @@ BAD_STATES = {
 }
 BAD_PARAMETERS = {
     **layered.BAD_PARAMETERS,
-    "a tensor": (lambda: torch.ones(3), "parameters is tensor.*, but must be given by name"),
+    "a tensor": (lambda: torch.ones(3), "parameters is tensor.*, but must be a table by name"),
     "another shape": (lambda: {"gravity": torch.zeros(3).double()}, r"parameter gravity has shape \(3,\), but must"),
     "float32": (lambda: {"viscosity": torch.tensor(3.0)}, "parameter viscosity is torch.float32, but must be torch"),
     "another device": (lambda: {"viscosity": torch.zeros((), device="meta").double()}, "viscosity is on meta"),
@@ -220,7 +220,7 @@ def test_other_bad_uses_are_refused_in_a_sentence(layer, simulation, problem):
         (lambda: layer.rollout(simulation, state, steps=5, record_every=2), "record_every is 2, but must divide the 5"),
         (lambda: layer.value(simulation), "problem is Simulation.*, but must be a cortado.Problem"),
         (lambda: layer.measure(simulation, "colour"), "quantity is 'colour', but must be one of density"),
-        (lambda: layer.picture(simulation, state["positions"]), "renderer is .*, but must be one such as"),
+        (lambda: layer.picture(simulation, state["positions"]), "renderer is .*, but must be a renderer, such as"),
         (lambda: layer.Steps(problem), "simulation is .*, but must be a cortado.Simulation"),
         (lambda: layer.Steps(simulation, trained={"viscosity": "thick"}), "parameter viscosity is 'thick', but must"),
         (lambda: second(layer, problem, viscosity), "first ones only: leave out create_graph=True"),

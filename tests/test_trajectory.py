@@ -288,9 +288,9 @@ def test_writer_refuses_what_was_not_announced(tmp_path):
             with pytest.raises(InputError, match=words):
                 writer.append(positions, rows, **more)
         writer.append(rows, rows, others=outlet)
-        with pytest.raises(InputError, match="1 frames, and one more"):
+        with pytest.raises(InputError, match="1 frames, but one more was given"):
             writer.append(rows, rows)
-        with pytest.raises(InputError, match="1 steps, and 2 came"):
+        with pytest.raises(InputError, match="1 steps, but 2 were given"):
             writer.append_steps(iterations=[5, 5])
         with pytest.raises(InputError, match=r"the diagnostics \['iterations'\], found \['density_errors'\]"):
             writer.append_steps(density_errors=[0.1])

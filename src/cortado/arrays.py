@@ -140,7 +140,7 @@ def require_methods(what: str, value: object, names: tuple[str, ...], wanted: st
 
 def require_table(what: str, value: object, example: str) -> None:
     if not isinstance(value, Mapping):
-        raise InputError(f"{what} is {shown(value)}, but must be given by name, as {example}.")
+        raise InputError(f"{what} is {shown(value)}, but must be a table by name, such as {example}.")
 
 
 def check_steps(steps: int, least: int = 1) -> int:

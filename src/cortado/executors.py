@@ -74,7 +74,7 @@ class InProcess(Executor):
 def _check_call(function: Any, items: Any, on_result: Any) -> None:
     require_arguments("function", function, ("an item",))
     if not isinstance(items, Iterable):
-        raise InputError(f"items is {shown(items)}, but must be a list of them.")
+        raise InputError(f"items is {shown(items)}, but must be a list of items.")
     require_function("on_result", on_result, "the number of an item", "its result")
 
 
@@ -306,7 +306,7 @@ def _connected(module: Any, address: str) -> Any:
     from distributed.comm import connect
 
     async def meet() -> None:
-        """Raises `OSError` unless something of Dask's answers. A client that fails would go on trying for a while."""
+        """Raise `OSError` without an answer at once, as a client would try for longer."""
         comm = await connect(address, timeout=REACHED)
         await comm.close()
 

@@ -61,15 +61,16 @@ class Pyramid:
     Adelson 1983).
 
     The first level is the image. Each further level is the previous one, blurred by a binomial and halved
-    (`reduction`). Coarse levels locate a shape before it overlaps its target; fine levels compare outlines.
+    (`reduction`). Coarse levels locate a shape before it overlaps its target; fine levels compare outlines. ``levels``
+    is their number, and ``weights`` has a number for each, by default 1, 2, 4 ... from fine to coarse.
 
     Example: ``loss = cortado.losses.Image(renderer, target, cortado.image_losses.Pyramid())``
     """
 
     levels: int | None = None
-    """Number of ``levels``. If None, as many as weights; without weights, until no side is longer than 2 pixels."""
+    """If None, as many as weights; without weights, until no side is longer than 2 pixels."""
     weights: tuple[float, ...] | None = None
-    """``weights`` (levels,) from fine to coarse; None: 1, 2, 4 ..., because blurring makes shapes fainter."""
+    """(levels,) from fine to coarse, as blurring makes shapes fainter"""
 
     def __post_init__(self) -> None:
         if self.levels is not None:

@@ -206,7 +206,7 @@ def certify(
         raise InputError(f"perturbation is {shown(perturbation)}, but must be greater than 0 and less than 1.")
     problem = _problem(problem, steps)
     if problem.simulation.batch is not None:
-        raise InputError("What is certified is a batch, but must be one scene: they all have the same derivatives.")
+        raise InputError("problem is of a batch, but must be of one scene, as all scenes have the same derivatives.")
     problem.simulation.scene.solver.fixed_time_step("a certificate, whose differences would not hold chosen ones")
     double = in_float64(problem)
     chosen = checked_parameters(double, parameters)
@@ -275,7 +275,7 @@ def _problem(subject: Any, steps: int | None) -> Problem:
         return subject
     if steps is None:
         found = type(subject).__name__
-        raise InputError(f"steps is left out, but must be given where what is certified is no Problem but a {found}.")
+        raise InputError(f"steps is left out, but must be given to certify what is no Problem but a {found}.")
     simulation = subject if isinstance(subject, Simulation) else Simulation(subject, precision="float64")
     return Problem(simulation, steps, FinalPositions(simulation.positions))
 

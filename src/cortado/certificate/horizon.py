@@ -27,8 +27,8 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
     simulation = problem.simulation
     if problem.state is not None:
         raise InputError(
-            "problem begins at a state, but must begin as its scene does to be certified, as first positions and "
-            "velocities are moved, too."
+            "problem begins at a state, but must begin as its scene does, as certificates vary first positions and "
+            "velocities, too."
         )
     values = ParameterSpace(simulation, problem.steps).defaults()
     for view, other in simulation.known.views.items():

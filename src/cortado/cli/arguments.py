@@ -132,7 +132,7 @@ class Where:
 
     def __post_init__(self) -> None:
         if self.scheduler is not None and self.workers is not None:
-            raise InputError("--scheduler and --workers are both given, but only one of them can be meant.")
+            raise InputError("--scheduler and --workers are both given, but exclude each other: leave one out.")
         if self.workers is not None:
             from cortado.executors import require_processes
 
@@ -180,7 +180,7 @@ def require_at_least(least: int, value: int, option: str) -> None:
 def require_one_of_both(resume: bool, overwrite: bool) -> None:
     """Raise `InputError` if both --resume and --overwrite are given."""
     if resume and overwrite:
-        raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
+        raise InputError("--resume and --overwrite are both given, but exclude each other: leave one out.")
 
 
 def steps_or_time(steps: int | None, time: float | None) -> int | None:

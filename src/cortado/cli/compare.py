@@ -250,7 +250,7 @@ class Resolved:
         ended."""
         result = folder.read_result()
         if result is None or result["failures"] or "energy" not in result or not folder.trajectory.exists():
-            raise InputError(f"{folder.path} is no run that has ended well, but all of them must be.")
+            raise InputError(f"{folder.path} is no run that has ended well, but each RUN must be one.")
         trajectory = Trajectory.load(folder.trajectory)
         last, self.path, self.scene = trajectory[-1:], folder.path, read_json(folder.scene)
         self.precision = read_json(folder.environment).get("settings", {}).get("precision", "")
@@ -277,7 +277,7 @@ class Resolved:
         table, name = key.split(".")
         value = self.scene[table][name]
         if not isinstance(value, float | int):
-            raise InputError(f"{self.path} chooses its {name}, but must have one that is fixed.")
+            raise InputError(f"{self.path} chooses its {name}, but must have a fixed one.")
         return float(value)
 
 
@@ -292,7 +292,7 @@ def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_jso
     sizes = [run.size(key) for run in runs]
     for coarse, fine in pairwise(runs):
         if coarse.size(key) == fine.size(key):
-            raise InputError(f"{coarse.path} and {fine.path} have one {key}, but all of them must differ.")
+            raise InputError(f"{coarse.path} and {fine.path} have the same {key}, but each run must have another.")
         if abs(coarse.end - fine.end) > SAME_TIME * abs(fine.end):
             raise InputError(
                 f"{coarse.path} ends at {coarse.end:g} s and {fine.path} at {fine.end:g} s, but all runs must end at "

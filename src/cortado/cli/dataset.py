@@ -88,7 +88,7 @@ def make_dataset(
         folder = DatasetFolder(member.out)
         before, known = folder.size, folder.metadata.get("failed", {})
         if runs < before:
-            raise InputError(f"--runs is {runs}, but must be at least {before}: {out} has as many, and keeps them.")
+            raise InputError(f"--runs is {runs}, but must be at least {before}: {out} contains as many already.")
         left = [number for number in range(runs) if number not in folder.runs and number not in folder.failures]
 
         def kept() -> str:
@@ -140,7 +140,7 @@ def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int)
     for purpose, numbers in split.items():
         if numbers and not there[purpose]:
             first = folder.failures[numbers[0]]
-            raise ComputationError(f"No run of those for {purpose} could be computed. The first: {first}")
+            raise ComputationError(f"None of the runs for {purpose} could be computed. The first: {first}")
     folder.assemble(there)
     with unwarned():
         content = metadata(member.scene(there["train"][0]), member.table, there, folder, runs)
@@ -184,7 +184,7 @@ def _asked(member: Member) -> dict[str, Any]:
         for k, key in enumerate(table.vary):
             others = [*ends[0][:k], *ends[0][k + 1 :]]
             if ends[0][k] != ends[1][k] and _are_one(member, [*others, ends[0][k]], [*others, ends[1][k]]):
-                raise InputError(f"vary has {key}, which changes nothing that is computed.")
+                raise InputError(f"vary has {key}, which has no effect on what is computed.")
     for key in table.vary:
         if key in ("solver.time_step", "dimension", "discretisation.spacing") or key.startswith("container."):
             raise InputError(f"vary has {key}, which must be the same in all runs of a data set.")
@@ -228,7 +228,7 @@ def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
         if other := differences(there, json.loads(json.dumps(asked)), "missing"):
             own = {key.removeprefix("scene."): pair for key, pair in other.items()}
             unlike = "; ".join(f"{key} is {shown(now)}, but must be {shown(old)}" for key, (old, now) in own.items())
-            raise InputError(f"{file}: {unlike}, as in the data set that {out} holds; choose another --out.")
+            raise InputError(f"{file}: {unlike}, as in the data set in {out}; choose another --out.")
         return
     with sentences(out):
         others = [one.name for one in out.iterdir() if one.name != LOCK]

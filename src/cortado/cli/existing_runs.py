@@ -66,7 +66,7 @@ class OwnQuantity:
         except Exception as problem:
             raise InputError(f"--quantity {where} cannot be read: {_told(problem)}.") from problem
         if not callable(function):
-            raise InputError(f"{file} has no function {name}, but must, as --quantity names it.")
+            raise InputError(f"{file} has no function {name}, which --quantity names.")
         self.where, self.name, self._function = where, name, function
 
     def __call__(self, trajectory: Trajectory) -> float:
@@ -107,7 +107,9 @@ def scene_of_run(folder: RunFolder, overrides: list[str]) -> Scene:
     """Read the scene of an existing run, with overridden keys of [picture]."""
     for override in overrides:
         if not override.startswith("picture."):
-            raise InputError(f"--set is {override}, but must begin with picture., as the run is there already.")
+            raise InputError(
+                f"--set is {override}, but must begin with picture., as the run has been computed already."
+            )
     folder.require_files()
     return folder.read_scene(overrides)
 

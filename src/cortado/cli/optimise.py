@@ -284,8 +284,8 @@ def fit_task(
         folder.write_result(**fit_for_machines(fitted, profiles))
     if not fitted.converged:
         raise ComputationError(
-            f"The fit has not converged in {task.fit.iterations} trial points: give fit.iterations more, or a start "
-            f"nearer to what you expect. The results are in {folder.path}."
+            f"The fit has not converged in {task.fit.iterations} trial points: increase fit.iterations, or start "
+            f"nearer to the expected values. The results are in {folder.path}."
         )
     doubted = " They are in doubt, as said above." if fitted.in_doubt else ""
     return f"The results are in {folder.path}; open report.html.{doubted}"

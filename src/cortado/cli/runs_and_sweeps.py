@@ -183,7 +183,7 @@ def export(
     for word in words:
         if word.partition("=")[0].strip() not in ("picture.colour", "picture.surface"):
             raise InputError(
-                f"--set is {word}, but must replace picture.colour or picture.surface: others act in pictures."
+                f"--set is {word}, but must replace picture.colour or picture.surface: other keys only affect pictures."
             )
     from cortado.cli.existing_runs import export_run
 

@@ -111,7 +111,7 @@ def examples(
         to: Folder to copy to, created if missing; the current folder if left out.
     """
     if to is not None and not copy:
-        raise InputError("--to is given, but must be left out, as --copy says of nothing that it is copied.")
+        raise InputError("--to is given, but must be left out, as --copy is not given.")
     return partial(list_examples, as_text(copy), to or Path())
 
 
@@ -343,7 +343,7 @@ def new_scene(path: Path, template: str, dimension: int | None) -> str:
     if template not in templates():
         raise InputError(f"--template is {shown(template)}, but must be one of {', '.join(templates())}.")
     if dimension is not None and template != DAM:
-        raise InputError(f"--dimension is given, but must be left out, as only {DAM} is there in 2-D and in 3-D.")
+        raise InputError(f"--dimension is given, but must be left out, as only {DAM} exists in 2-D and in 3-D.")
     if dimension not in (None, 2, 3):
         raise InputError(f"--dimension is {dimension}, but must be 2 or 3.")
     if path.name in ("", ".."):

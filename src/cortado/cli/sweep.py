@@ -71,7 +71,7 @@ def combinations(options: Sequence[str], zipped: Sequence[str] = ()) -> list[Com
     lengths = {len(values) for values in together.values()}
     if len(lengths) > 1:
         told = ", ".join(f"{len(values)} of {key}" for key, values in together.items())
-        raise InputError(f"--zip gives {told}, but must give as many values of each, as they go together.")
+        raise InputError(f"--zip gives {told}, but must give the same number of values for each key.")
     rows = [tuple(zip(together, row, strict=True)) for row in zip(*together.values(), strict=True)]
     number = prod(map(len, keys.values())) * max(len(rows), 1)
     if number > MOST_COMBINATIONS:

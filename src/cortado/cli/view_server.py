@@ -136,7 +136,7 @@ class GuardedServer:
         if not self._guarded:
             self.close()
             found = f"viser {viser.__version__} cannot be guarded by a token"
-            raise InputError(f"{found}, so that any page could drive it: pip install viser=={KNOWN}.")
+            raise InputError(f"{found}, so that any web page could control the view: pip install viser=={KNOWN}.")
         self.viser.gui.configure_theme(show_share_button=False)
 
     @property

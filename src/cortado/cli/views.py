@@ -75,7 +75,7 @@ class Window:
 
             from cortado.cli.view_server import GuardedServer
         except ModuleNotFoundError:
-            raise InputError("viser is not installed, which shows it: pip install viser.") from None
+            raise InputError("viser, which shows the view, is not installed: pip install viser.") from None
         self.scene = scene
         self._guarded = GuardedServer(port, f"Cortado: {scene.name}")
         self.server: Any = self._guarded.viser
@@ -440,7 +440,7 @@ def opened(path: Path, overrides: list[str], device: str, precision: str | None,
         return LiveView(Simulation(load_scene(path, overrides), device, precision or "float32"), port)
     for option, value in (("set", overrides), ("precision", precision)):
         if value:
-            raise InputError(f"--{option} is given, but must be left out, as the run is there already.")
+            raise InputError(f"--{option} is given, but must be left out, as the run has been computed already.")
     folder = RunFolder.open(path)
     if not folder.trajectory.exists():
         raise InputError(f"{path} has no trajectory, but must be the folder of `cortado run`, or a scene file.")

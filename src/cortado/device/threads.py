@@ -271,8 +271,8 @@ def call(payload: Payload, item: bytes) -> Answer | Lacking:
 def _function(payload: Payload) -> Callable[[Any], Any]:
     if payload.versions != versions():
         raise InputError(
-            f"A worker has {versions()}, but must have {payload.versions}, as the process that asks it has: else bits "
-            "would differ."
+            f"A worker has {versions()}, but must have {payload.versions}, as the calling process has, for results "
+            "with equal bits."
         )
     if payload.digest not in _functions:
         assert payload.content is not None

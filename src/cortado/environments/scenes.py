@@ -213,9 +213,7 @@ class Scenes:
         self._first = self.simulation.on_device()
         n, free = self.simulation.particles, self.simulation.free_particles or self.simulation.particles
         if not isinstance(seen, int) or not 0 <= seen <= n:
-            raise InputError(
-                f"particles is {shown(seen)}, but must be a whole number from 0 to {n}, all of the scene's particles."
-            )
+            raise InputError(f"particles is {shown(seen)}, but must be from 0 to {n}, the scene's particles.")
         self._seen = np.linspace(0, n - 1, seen).astype(int)
         self._jitters = (np.arange(n) < free)[:, None] * JITTER * task.spacing
         self.state: DeviceState = self._first

@@ -78,7 +78,7 @@ class Ensemble:
                 "samples it runs in batches of its own."
             )
         if not parameters:
-            raise InputError(f"parameters is empty, but must name what {type(self).__name__} is to vary.")
+            raise InputError(f"parameters is empty, but must name the parameters that {type(self).__name__} varies.")
         values = {name: as_numbers(f"parameter {name}", value) for name, value in parameters.items()}
         widths = {name: self._spread(name) for name in values}
         for name, value in values.items():

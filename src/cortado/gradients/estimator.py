@@ -50,9 +50,7 @@ class Estimate:
             InputError: the estimate is no average, or the confidence is not between 0 and 1.
         """
         if self.standard_error is None or self.degrees_of_freedom is None:
-            raise InputError(
-                "The estimate has no standard error, as it is no average over samples: it has no interval."
-            )
+            raise InputError("The estimate has no confidence interval, as it is no average over samples.")
         if not 0.0 < as_one_number("confidence", confidence) < 1.0:
             raise InputError(f"confidence is {confidence}, but must be between 0 and 1.")
         from scipy.stats import t as student

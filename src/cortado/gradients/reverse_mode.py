@@ -311,7 +311,7 @@ class AdjointViscosity(AdjointEstimator):
     def derivative(self, rollout: Rollout) -> BackwardStep:
         """Return the backward step for order 1; raises `InputError` for order 2, which takes two passes."""
         if self.order != 1:
-            raise InputError(f"order is {self.order}, but must be 1 where a gradient goes on to the state before.")
+            raise InputError(f"order is {self.order}, but must be 1 for derivatives with respect to an earlier state.")
         step = EXACT.derivative(rollout)
         return _ViscousStep(step, rollout, self) if self.coefficient > 0.0 else step
 

@@ -361,7 +361,7 @@ class Series(Frames):
         if series.ndim != 2 or len(series) != len(moments):
             raise InputError(f"values has shape {series.shape}, but must have {len(moments)} rows, one for each time.")
         if np.isinf(series).any() or np.isnan(series).all():
-            raise InputError("values must be finite, or NaN for those that do not count, but not for all of them.")
+            raise InputError("values must be finite, or NaN for values to ignore, but not all NaN.")
         columns, sizes = series.shape[1], as_numbers("scale", scale)
         if sizes.shape not in ((), (columns,)):
             raise InputError(
@@ -375,7 +375,7 @@ class Series(Frames):
         first, last = int(np.ceil(moments[0] / step - 1e-9)), int(np.floor(moments[-1] / step + 1e-9))
         steps = [k for k in range(max(first, 0), last + 1) if k % stride == 0]
         if not steps:
-            raise InputError(f"times go from {moments[0]:g} to {moments[-1]:g} s, between which there is no step.")
+            raise InputError(f"times go from {moments[0]:g} to {moments[-1]:g} s, between which no step ends.")
         rows = np.stack([np.interp(np.array(steps) * step, moments, column) for column in series.T], axis=1)
         weight = 1.0 / len(steps)
         self.time_step = step
@@ -386,4 +386,4 @@ class Series(Frames):
         other = time_steps[np.abs(time_steps - self.time_step) > 1e-6 * time_steps]  # rounded to float32
         if len(other):
             found = f"time_step of the series is {self.time_step:g} s"
-            raise InputError(f"{found}, but must be that of the run, {other[0]:g} s, which cannot be varied beside it.")
+            raise InputError(f"{found}, but must be that of the run, {other[0]:g} s: a series has a fixed time step.")

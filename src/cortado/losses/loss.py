@@ -103,7 +103,7 @@ def _read_only(values: np.ndarray) -> np.ndarray:
 def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
     """Return the state and parameters from which quantities are computed; raise `InputError` if unknown."""
     if end.moment is None:
-        raise InputError("a quantity is asked for of a state whose simulation is not known, but must be of a run's.")
+        raise InputError("The state has no simulation, with which quantities are computed: take a state of a run.")
     return end.moment
 
 

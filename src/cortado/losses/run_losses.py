@@ -129,7 +129,7 @@ class CheckedBatchedLoss(CheckedLoss):
 def as_loss(loss: Any) -> Loss:
     """Wrap a loss, or a function of Warp arrays, with checks of results; raise `InputError` for anything else."""
     if isinstance(loss, type):
-        raise InputError(f"loss is the class {loss.__name__}, but must be an object that is made of it.")
+        raise InputError(f"loss is the class {loss.__name__}, but must be an object of this class.")
     derivative = next((name for name in ("adjoint", "value_and_adjoint") if hasattr(loss, name)), None)
     if derivative is not None and hasattr(loss, "value"):
         for name in ("value", derivative):

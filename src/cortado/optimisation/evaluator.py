@@ -320,7 +320,7 @@ class Evaluator:
             if not self.history:
                 raise
             raise ComputationError(
-                f"In evaluation {len(self.history)} the search came to parameters that cannot be: {error} Try a "
+                f"In evaluation {len(self.history)} the search tried impossible parameters: {error} Try a "
                 f"smaller learning rate, or bounds on the parameters. The {len(self.history)} evaluations before "
                 f"{self.log.fate}."
             ) from error

@@ -49,14 +49,14 @@ class Function:
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
         """Return the function's result; raise `InputError` if a gradient estimator is given."""
         if gradient is not None:
-            raise InputError("gradient is given, but must be left out where a function makes its own.")
+            raise InputError("gradient is given, but must be left out, as a function returns its gradient.")
         return self.function(parameters)
 
 
 def as_differentiable(problem: Any) -> Optimisable:
     """Return a problem unchanged, or wrap a function in a problem; raise `InputError` for anything else."""
     if isinstance(problem, type):
-        raise InputError(f"What is optimised is the class {problem.__name__}, but must be an object made of it.")
+        raise InputError(f"What is optimised is the class {problem.__name__}, but must be an object of this class.")
     if hasattr(problem, "value_and_gradient"):
         return problem
     if callable(problem):
@@ -135,7 +135,7 @@ def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
 def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayout) -> tuple[Vector, Vector]:
     """Return lower and upper bounds (size,); raise `InputError` for bounds that do not match the parameters."""
     if not isinstance(bounds, Mapping):
-        raise InputError(f"bounds is {shown(bounds)}, but must be by name, as {{'gravity': (lower, upper)}}.")
+        raise InputError(f"bounds is {shown(bounds)}, but must be a table, such as {{'gravity': (lower, upper)}}.")
     unknown = sorted(set(bounds) - set(layout.names), key=str)
     if unknown:
         raise InputError(

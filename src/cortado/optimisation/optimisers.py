@@ -356,8 +356,8 @@ def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
         )
     if settings:
         raise InputError(
-            f"optimise was given {quoted(settings)}, but takes settings only of an optimiser that is given by its "
-            "name: an object has its own."
+            f"optimise was given {quoted(settings)}, but takes settings only with the name of an optimiser, as an "
+            "object has its own."
         )
     return optimiser
 

@@ -357,7 +357,7 @@ def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> 
     if (often > 1).any():
         k, tracer = once[:, int(np.argmax(often > 1))]
         found = f"{often.max()} lines for tracer {tracers[tracer]:g} at {times[k] - table.start:g} s"
-        raise InputError(f"{path} has {found}, but must have one: number the tracers each for itself.")
+        raise InputError(f"{path} has {found}, but must have one: give each tracer its own number.")
     places = np.full((len(times), len(tracers), len(axes)), np.nan)
     places[when, who] = np.stack([data[axis] for axis in axes], axis=1)
     begin = int(np.argmin(np.abs(times)))

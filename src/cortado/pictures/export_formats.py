@@ -327,7 +327,7 @@ def export(
     with sentences(into):
         into.mkdir(parents=True, exist_ok=True)
         if any(into.iterdir()):
-            raise InputError(f"{into} is not empty; choose another folder, in which no other files get in between.")
+            raise InputError(f"{into} is not empty; choose a new or an empty folder.")
     whole = run.whole if to == "usd" else run.series
     with track(len(trajectory if whole is None else whole.times), "export") as advance:
         path = FORMATS[to](run, into, advance)

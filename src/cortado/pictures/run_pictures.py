@@ -134,7 +134,9 @@ def simulation_picture(simulation: Simulation, frame: Frame, settings: Mapping[s
         raise InputError(f"frame is {shown(frame)}, but must be one frame of a trajectory, such as trajectory[-1].")
     units = _units_of_fields(simulation)
     if (shown_as(simulation.scene, settings, units).picture or Picture()).colour == "age":
-        raise InputError('One frame does not tell how old its fluid is: take trajectory.picture(k, colour="age").')
+        raise InputError(
+            'The age of fluid cannot be computed from one frame: take trajectory.picture(k, colour="age").'
+        )
     run = shown_run(_alone(frame), simulation.scene, settings, units)
     return ShadedPicture.of(run_page(run, simulation.device).image(0))
 
@@ -177,7 +179,7 @@ def device_of(name: str) -> Any:
 def _scene_of(trajectory: Trajectory, given: Scene | str | Path | None) -> Scene:
     found = trajectory.scene if given is None else as_scene(given)
     if found is None:
-        raise InputError("The trajectory does not know its scene, as it was loaded: give it, as scene=scene.")
+        raise InputError("The trajectory is from a file, which has no scene: give it, as scene=scene.")
     return found
 
 

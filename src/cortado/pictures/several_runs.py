@@ -71,7 +71,7 @@ def film_side_by_side(
         raise InputError(f"scenes has {len(scenes)} scenes, but must have one for each of {len(each)} runs.")
     known = [run.scene for run in each] if scenes is None else [as_scene(one) for one in scenes]
     if None in known:
-        raise InputError("A trajectory does not know its scene, as it was loaded: give all scenes, as scenes=[...].")
+        raise InputError("A trajectory from a file has no scene: give all scenes, as scenes=[...].")
     there = [scene for scene in known if scene is not None]
     pictured = shown_alike(there, each, settings)
     numbers = [f"run {k}" for k in range(1, len(each) + 1)]
@@ -103,9 +103,9 @@ def shown_alike(
     """Return the runs' scenes, all with the first scene's table [picture], after `shown_as` has replaced keys. Raise
     `InputError` if runs cannot be shown together, or if a package is missing."""
     if not 0 < len(scenes) <= MOST_PICTURES:
-        raise InputError(f"There are {len(scenes)} runs, but from 1 to {MOST_PICTURES} can be side by side.")
+        raise InputError(f"There are {len(scenes)} runs, but 1 to {MOST_PICTURES} can be side by side.")
     if len({scene.dimension for scene in scenes}) > 1:
-        raise InputError("Some runs are in 2-D and some in 3-D, but all that are side by side must be in one of them.")
+        raise InputError("Some runs are in 2-D and some in 3-D, but all must have the same dimension.")
     for scene, run in zip(scenes, trajectories, strict=True):
         if not len(run):
             raise InputError(f"The run of {scene.name} has no frames, but must have one to be shown.")

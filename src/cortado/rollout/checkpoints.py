@@ -87,7 +87,7 @@ class Progress:
         if self.state is None:
             return initial, 0, False
         if keep:
-            raise InputError("keep is True, but must be False in a run that goes on from the middle.")
+            raise InputError("keep is True, but must be False in a run that continues from a later step.")
         return self.state, self.step, sizes.go_on(self.step, self.state, self.diagnostics.get("time_steps"))
 
     def whole(self, found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

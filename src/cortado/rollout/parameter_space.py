@@ -63,7 +63,7 @@ class ParameterSpace:
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Return values as float64 arrays; raise `InputError`. Values of a "direction" may be negative."""
         if not isinstance(values, Mapping):
-            raise InputError(f"{what}s are {shown(values)}, but must be given by name, as {{'gravity': value}}.")
+            raise InputError(f"{what}s are {shown(values)}, but must be a table by name, such as {{'gravity': value}}.")
         for view, name in self._known.views.items():
             if view in values and name in values:
                 raise InputError(f"{what} {name} is given, but must be left out, as {view} is given in its place.")
@@ -167,7 +167,7 @@ class ParameterSpace:
         if len(substeps) > 1:
             raise InputError(
                 f"The scenes of the batch take {' and '.join(map(str, sorted(substeps)))} explicit steps of diffusion "
-                f"in a time step, but must all take as many: make {', '.join(DIFFUSION)} differ less."
+                f"in a time step, but must all take the same number: make {', '.join(DIFFUSION)} differ less."
             )
         several = len(simulation.scene.phase) > 1
         rollout.substeps = max(*substeps, 1) if "mobility" in varied and several else max(substeps)
@@ -384,9 +384,9 @@ def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, v
     """Return the number of steps of a run, given directly or by a time [s]; with adaptive steps an upper bound. Raise
     `InputError` unless exactly one of both is given and valid."""
     if steps is None and time is None:
-        raise InputError("steps is left out, but must be given where no time says how long the run is.")
+        raise InputError("steps is left out, but must be given, as no time is given.")
     if steps is not None and time is not None:
-        raise InputError("time is given, but must be left out, as steps says how long the run is.")
+        raise InputError("time is given, but must be left out, as steps is given, too.")
     if time is None:
         assert steps is not None
         return check_steps(steps)
@@ -399,8 +399,8 @@ def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, v
         return counted_steps(time, time / shortest * (1.0 - SAME)) if 0.0 < shortest < np.inf else 1
     if simulation.batch is not None:
         raise InputError(
-            "time is given, but must be left out of a batch that chooses its time steps, whose scenes do not reach it "
-            "together: give steps."
+            "time is given, but must be left out of a batch with chosen time steps, as its scenes reach a time in "
+            "different steps: give steps."
         )
     # with 0 steps, because rows for steps have no meaning with an unknown number of steps
     own = SceneParameters(simulation, 0).upright(ParameterSpace(simulation, 0).checked(values))

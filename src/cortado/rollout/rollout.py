@@ -243,9 +243,7 @@ class Rollout(Staying):
         self._chunks[key]()
         if is_new and (self.solver.step_number.numpy() != last).any():  # then no lost particle would be noticed
             name = type(self.solver).__name__
-            raise InputError(
-                f"solver {name} has not counted its steps, but must: its step is to end with self.end_step."
-            )
+            raise InputError(f"solver {name} does not count its steps: its method step must end with self.end_step.")
         return self._chunk[:length]
 
     def _length(self, left: int) -> int:
@@ -292,7 +290,7 @@ class Rollout(Staying):
         `forward` has run to the end with this first state and these parameters, and with ``keep``.
         """
         if derivative.rollout is not self:
-            raise InputError("The derivative was made for another rollout, but must be one of this rollout's own.")
+            raise InputError("The derivative was made for another rollout, but must be made for this one.")
         if beyond := [step for step in bars if step not in range(self.steps + 1)]:
             raise InputError(f"bars has the state {beyond[0]}, but must have states from 0 to {self.steps}.")
         self._require("backward", self._kept)

@@ -38,8 +38,8 @@ def greatest_step(scene: SceneTables, values: Arrays) -> float:
     found = min(chosen_limits(scene, values).values())
     if not np.isfinite(found):
         raise InputError(
-            "solver.greatest_time_step is missing, but must be given, as nothing else bounds the time step with these "
-            "parameters where the fluid rests."
+            "solver.greatest_time_step is missing, but must be given, as with these parameters nothing else limits "
+            "the time step of fluid at rest."
         )
     return found
 
@@ -55,7 +55,7 @@ def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0
     if (shortest := min(float(bounds.min()), strongest["gravity"], strongest["depth"])) < least:
         raise InputError(
             f"The time step is chosen as {shortest:.3g} s at most, but must be at least {least:g} s in this precision: "
-            "make solver.greatest_time_step, or what else bounds it, larger."
+            "increase solver.greatest_time_step, or whatever else limits the time step."
         )
     return bounds
 

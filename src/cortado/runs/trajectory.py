@@ -283,7 +283,7 @@ class Trajectory:
         of = self.scene if scene is None else scene
         if of is None:
             raise InputError(
-                "scene is missing, but must be given, as a trajectory from a file does not hold its scene."
+                "scene is missing, but must be given, as a trajectory from a file does not contain its scene."
             )
         return on_top("export")(self, folder, to, of)
 

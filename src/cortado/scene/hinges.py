@@ -82,7 +82,7 @@ class HingeTable(Table):
             check_over_time(path, self, f"{name}s", name)
         if self.damping is None and (self.speed is not None or self.speeds is not None):
             key = "speed" if self.speed is not None else "speeds"
-            raise field_error((*path, key), Words("given"), "left out, as the hinge has no damping to bring it about")
+            raise field_error((*path, key), Words("given"), "left out, as the hinge has no damping")
         return super().in_dimension(dimension, path)
 
     def _read(self, path: FieldPath) -> Self:
@@ -189,7 +189,7 @@ def _check_joint(hinge: HingeTable, solids: Sequence[SolidTable], joined: dict[s
             wanted = f'"free", as the body is on the hinge {hinge.name!r} to another solid'
             raise field_error(("solid", number, "slip"), solid.slip, wanted)
     if hinge.to in joined[hinge.solid]:
-        raise field_error((*path, "to"), hinge.to, "a solid to which hinges do not join this one already")
+        raise field_error((*path, "to"), hinge.to, "a solid that other hinges do not join to this one already")
     whole = joined[hinge.solid] | joined[hinge.to]
     joined |= dict.fromkeys(whole, whole)
 

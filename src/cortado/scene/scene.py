@@ -338,7 +338,7 @@ def put_in(data: dict[str, Any], overrides: Sequence[str], file: str, unread: Se
         raise InputError(f"overrides is {shown(overrides)}, but must be a list of texts such as 'solver.kind=pcisph'.")
     for idle in overrides_of(overrides, unread):
         key, table = idle.partition("=")[0].strip(), _table_of(idle)
-        raise SceneError(file, key, Words("given"), f"left out, as the table [{table}] is not looked at here")
+        raise SceneError(file, key, Words("given"), f"left out, as the table [{table}] is not used here")
     for override in overrides:
         if not isinstance(override, str):
             sentence = "is no override, which is a text such as 'solver.time_step=0.002'."

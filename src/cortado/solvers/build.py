@@ -196,7 +196,7 @@ def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
         found = f"build of {setting.called} returned {shown(solver)}, which has no {lacking[0]}"
         raise InputError(f"{found}, but must have one: see cortado.solvers.solver.Solver.")
     if setting.forces and not hasattr(solver, "forces"):
-        raise InputError(f"forces is given, but must be left out, as {setting.called} takes no others.")
+        raise InputError(f"forces is given, but must be left out, as {setting.called} takes no user-defined forces.")
     return solver
 
 
@@ -347,8 +347,8 @@ def _check_force(force: Force, maker: Any) -> None:
         found = [method for method in PART_METHODS if hasattr(force, method)]
         if found:
             raise InputError(
-                f"the force {name} has the methods {', '.join(found)} of a part, but is none: let its class be a "
-                "cortado.sph.parts.Part too."
+                f"the force {name} has the methods {', '.join(found)} of a part, but is no Part: derive its class "
+                "from cortado.sph.parts.Part."
             )
     elif type(force).end is Part.end and not all(field.is_constant for field in force.fields):
         raise InputError(f"the force {name} has fields, but no method `end` that writes them after a step.")

@@ -244,7 +244,8 @@ def drained_of(scene: Scene, discrete: DiscreteScene, precision: Precision) -> D
             pulls[drain.name] = Pull(ends, sphere, sphere * (shell / spacing) ** d / d)
     if (furthest := np.abs(fluid.places).max() / spacing) > precision.furthest:
         raise InputError(
-            f"The drains would put particles aside as far as {furthest:.3g} spacings of {spacing:g} m from the origin, "
+            f"The drains would store drained particles as far as {furthest:.3g} spacings of {spacing:g} m from the "
+            "origin, "
             f"but must stay within {precision.furthest:g} in {precision.name}: take another precision."
         )
     return Drained(mouths, pulls, fluid.places, nozzles_of(scene, discrete), discrete.periods)

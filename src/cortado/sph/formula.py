@@ -116,7 +116,7 @@ class Formula:
         if FRACTIONS not in self.fields:
             return self
         if phases == 1:
-            raise InputError(f"{what} takes {FRACTIONS}, but must take them in scenes of several phases alone.")
+            raise InputError(f"{what} takes {FRACTIONS}, but only scenes of several phases have them.")
         for node in ast.walk(ast.parse(self.text)):
             is_read = isinstance(node, ast.Subscript) and ast.unparse(node.value) == FRACTIONS
             if is_read and ast.literal_eval(node.slice) not in range(-phases, phases):
@@ -210,7 +210,7 @@ def _arguments(
     signature, known = inspect.signature(function, follow_wrapped=False).parameters, (*first.names, "t")
     for argument in signature.values():
         if argument.kind is not argument.POSITIONAL_OR_KEYWORD:
-            raise InputError(f"{what} has the argument {argument}, but must have arguments by position alone.")
+            raise InputError(f"{what} has the argument {argument}, but must have positional arguments alone.")
     if any(name in known and known.index(name) != place for place, name in enumerate(signature)):
         found = f"{what} has the arguments {', '.join(signature)}"
         raise InputError(f"{found}, but must have {', '.join(known[:2])} first, and then {known[2]} if it takes time.")
@@ -221,7 +221,7 @@ def _arguments(
     values = {n: given.get(n, a.default) for n, a in signature.items() if n in given or a.default is not a.empty}
     for name in known:
         if name in values:
-            raise InputError(f"{what} is given a value of {name}, but must be given none, as the run has its own.")
+            raise InputError(f"{what} is given a value of {name}, but the run gives it.")
     taken = tuple(name for name in signature if name not in values)
     inputs = tuple(name for name in taken if name not in first.fields or name in taken[:2])
     if lacking := [name for k, name in enumerate(inputs[2:]) if k > 0 or name not in TIME]:

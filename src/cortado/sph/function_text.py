@@ -78,7 +78,7 @@ def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDe
         for argument in found.args.args:
             argument.annotation = None
         if any(isinstance(one, ast.Call) and ast.unparse(one.func) == found.name for one in ast.walk(found)):
-            raise InputError(f"{what} calls itself, which Warp cannot, but must have its result without that.")
+            raise InputError(f"{what} calls itself, but must not, as Warp has no recursion.")
         if found.name == function.__code__.co_name and _same(_compiled(found, function.__code__), function.__code__):
             return found
     raise InputError(
@@ -244,7 +244,7 @@ def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
         if not isinstance(node, ast.Name) or node.id in own:
             continue
         if node.id not in scope and not hasattr(builtins, node.id):
-            raise InputError(f"{what} has the name {node.id}, which stands for nothing, but must name what is there.")
+            raise InputError(f"{what} has the name {node.id}, which is not defined.")
         if isinstance(scope.get(node.id), (list, tuple, dict, str, np.ndarray)):
             found = f"{what} has the name {node.id}, which is a {type(scope[node.id]).__name__} outside of it"
             raise InputError(f"{found}, but must take a number or a vector: make it a parameter of the function.")

@@ -96,7 +96,9 @@ class OwnFunction(ABC):
         self._formula, values = formula(self.kind, self._function, self._source, parameters)
         self.name = self._formula.name if name is None else name
         if not isinstance(self.name, str) or not self.name.isidentifier():
-            raise InputError(f"{self.kind} has the name {shown(name)}, but must have a word, as names of Python are.")
+            raise InputError(
+                f"{self.kind} has the name {shown(name)}, but must have a name as Python's variables have."
+            )
         self._values = {argument: self._value(argument, value) for argument, value in values.items()}
         own = tuple(self._parameter(argument, value) for argument, value in self._values.items())
         self.parameters = ((TIME,) if len(self._formula.inputs) == 3 else ()) + own
@@ -213,7 +215,7 @@ def _made_again(
     found = made(function, name, **values)
     if found.fingerprint != fingerprint:
         said = f"what the {made.kind} function {name} names or calls has changed since the force was made"
-        raise InputError(f"{said}, but must be the same where it goes to another process: make the force anew.")
+        raise InputError(f"{said}, but must be the same to be used in another process: make the force anew.")
     return found
 
 

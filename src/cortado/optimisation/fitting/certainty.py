@@ -228,13 +228,13 @@ def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
         raise ComputationError("The derivatives are not finite: try fewer steps, or float64.")
     if not size.all():
         lost = [label for label, s in zip(labels, size, strict=True) if not s]
-        raise ComputationError(f"What was measured does not depend on {', '.join(lost)}: leave it out of the fit.")
+        raise ComputationError(f"The measurements do not depend on {', '.join(lost)}: leave it out of the fit.")
     eigenvalues, axes = np.linalg.eigh(N / np.outer(size, size))
     if eigenvalues[0] < 1e-10:
         mixed = [label for label, a in zip(labels, axes[:, 0], strict=True) if abs(a) > 0.1]
         raise ComputationError(
-            f"What was measured does not tell {' and '.join(mixed)} apart at all: leave one of them out of the fit, or "
-            "measure something else besides."
+            f"The measurements do not distinguish {' and '.join(mixed)}: leave one of them out of the fit, or measure "
+            "something else, too."
         )
     return np.asarray((axes / eigenvalues) @ axes.T / np.outer(size, size))
 

@@ -47,7 +47,7 @@ class Experiment:
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
         if not observations:
-            raise InputError("observations is empty, but must have what was measured.")
+            raise InputError("observations is empty, but must have at least one measurement.")
         for name, one in observations.items():
             if not hasattr(one, "measured"):
                 raise InputError(f"observations {name} is {shown(one)}, but must be one such as a measured.Video.")

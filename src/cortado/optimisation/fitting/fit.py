@@ -206,7 +206,8 @@ class Fit:
             raise InputError(f"u has shape {point.shape}, but must be {self.u.shape}, one for each fitted number.")
         if self.problem is None:
             raise InputError(
-                "The fit was pickled, but must have its experiments to say how likely other parameters are."
+                "The fit was pickled without its experiments, which are needed to compute how likely other "
+                "parameters are."
             )
         lower, upper = self.coordinates.bounds
         root = np.linalg.cholesky(self.hessian)

@@ -150,7 +150,7 @@ def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np
     if values.ndim != 2 or len(values) != len(moments):
         raise InputError(f"measured has shape {values.shape}, but must have {len(moments)} rows, one for each time.")
     if np.isinf(values).any() or np.isnan(values).all():
-        raise InputError("measured must be finite, or NaN for what does not count, but not for all of it.")
+        raise InputError("measured must be finite, or NaN for numbers to ignore, but not all NaN.")
     if noise is not None and not 0.0 < as_one_number("noise", noise) < np.inf:
         raise InputError(f"noise is {shown(noise)}, but must be greater than 0.")
     return moments, values, None if noise is None else float(noise)

@@ -175,9 +175,7 @@ class Value(OfSimulation):
             check_state(own, self.states.shapes)
         if own and not isinstance(self._estimator, AdjointEstimator):
             kind = type(self._estimator).__name__
-            raise InputError(
-                f"gradient is a {kind}, but must go back through a run where a state is given: an AdjointEstimator."
-            )
+            raise InputError(f"gradient is a {kind}, but must be an AdjointEstimator, as a state is given.")
         self._parameters.check(given, with_state=bool(own) or self._problem.state is not None)
 
     def outputs(self) -> dict[str, tuple[int, ...]]:
@@ -313,7 +311,7 @@ class Picture(Layer):
     def __init__(self, renderer: Renderer):
         super().__init__()
         if not isinstance(renderer, Renderer):
-            raise InputError(f"renderer is {shown(renderer)}, but must be one such as simulation.renderer() gives.")
+            raise InputError(f"renderer is {shown(renderer)}, but must be a renderer, such as simulation.renderer().")
         self._renderer = renderer
         self.real, self.device = renderer.precision.numpy, renderer.device
         self.kept_bytes = sum(int(np.prod(shape)) for shape in renderer.inputs.values()) * renderer.precision.bytes

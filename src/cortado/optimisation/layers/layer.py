@@ -78,7 +78,7 @@ class Layer(ABC):
         """Raise `InputError` if `many` is unavailable."""
         if self.unmapped:
             raise InputError(
-                f"{self.unmapped} cannot be mapped over a further axis: map over one axis, of what has none."
+                f"{self.unmapped} cannot be mapped over a further axis: use one jax.vmap or torch.vmap alone."
             )
 
     def many(self, size: int) -> "Layer":

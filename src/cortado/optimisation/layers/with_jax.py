@@ -230,7 +230,7 @@ class JaxBridge(Bridge):
         real = np.dtype(layer.real)
         if real == np.float64 and not jax.config.jax_enable_x64:
             raise InputError(
-                "precision of the simulation is float64, but must be float32 where JAX computes in that: call "
+                "precision of the simulation is float64, but must be float32, as JAX computes in float32: call "
                 'jax.config.update("jax_enable_x64", True) before anything else, or make the simulation in float32.'
             )
         if not isinstance(value, jax.Array):

@@ -62,7 +62,7 @@ class Particles:
         finite = np.isfinite(places)
         if not finite.all():
             astray = len(places) - int(finite.all(axis=1).sum())
-            raise ComputationError(f"{counted(astray, 'particle')} cannot be drawn, whose positions are not finite.")
+            raise ComputationError(f"{counted(astray, 'particle')} cannot be drawn, as their positions are not finite.")
         looks = np.empty((len(places), 5), dtype=np.float32)
         looks[:, :3], looks[:, 3:] = colours, media
         return cls(
