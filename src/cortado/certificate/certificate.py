@@ -63,8 +63,7 @@ class Certificate:
     """Time step of the run [s]."""
     loss: float
     loss_changes: dict[str, float]
-    """Change of the loss by a meaningful perturbation of each parameter, estimated as adjoint times perturbation,
-    without a run."""
+    """Change of the loss by a meaningful perturbation of each parameter, the adjoint times the perturbation."""
     consistency: Consistency
     """Check of the derivatives with respect to all parameters together."""
     wrong: tuple[str, ...]
@@ -76,11 +75,10 @@ class Certificate:
     horizons: tuple[Horizon, ...]
     """Horizon of every requested parameter; empty if the adjoint is wrong."""
     alignment: Alignment | None
-    """Alignment of each estimator's gradient with the smoothed gradient, for all requested parameters together; None
+    """Comparison of each estimator's gradient with the smoothed gradient, for all requested parameters together; None
     without a smoothed gradient."""
     beside: Consistency | None = None
-    """Check with slightly moved particles, if the loss has a corner at the first state so that differences are not
-    conclusive; else None."""
+    """Check with slightly moved particles if the loss has a corner at the first state; otherwise None."""
     beyond: tuple[str, ...] = ()
     """Sentences on open questions, because a copy of the run lost a particle."""
 
@@ -117,8 +115,8 @@ class Certificate:
         return "\n".join(lines)
 
     def _changes(self) -> Iterator[tuple[str, str, str]]:
-        """Yield for each parameter its name, its change of the loss and the verdict. The change is marked as
-        extrapolated unless the horizon reaches the last step."""
+        """Yield each parameter with its change of the loss, marked as extrapolated unless the horizon reaches the last
+        step, and the verdict."""
         tried = {one.parameter for one in self.horizons if one.lasts}
         for name, share in self.loss_changes.items():
             verdict = "WRONG" if name in self.wrong else "right" if share else "no effect on this loss"
@@ -151,7 +149,6 @@ class Certificate:
 
     @property
     def _spread(self) -> str:
-        """Phrase with the spread for the advised estimator; empty if this estimator has no spread."""
         if self.alignment is None or "(spread)" not in self.estimator:
             return ""
         return f" with spread = { {name: float(f'{value:.3g}') for name, value in self.alignment.spread.items()} }"
@@ -224,7 +221,7 @@ def certify(
 
 
 def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int) -> Certificate:
-    """Return the certificate of a problem in float64; raises `DivergedError` if its run diverges."""
+    """Return the certificate of a problem in float64; raise `DivergedError` if its run diverges."""
     random = np.random.default_rng(seed)
     history, values = LossHistory(problem), everything(problem, chosen)
     norms = AdjointNorms(problem.simulation.solver, problem.steps)
@@ -283,8 +280,8 @@ def _problem(subject: Any, steps: int | None) -> Problem:
 def _consistency(
     history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays
 ) -> tuple[Consistency, tuple[str, ...]]:
-    """Check all parameters together; if this fails, check each alone. Return the check and the names of the parameters
-    that fail alone."""
+    """Check all parameters together, and each alone if this fails; return the check and the parameters that fail
+    alone."""
     together = check_consistency(history, values, gradient, balanced(gradient, along))
     if together.right:
         return together, tuple(along) if history.rough_miss(values, along) > ROUGHLY else ()
@@ -296,11 +293,10 @@ def _beside(
     problem: Problem, values: Arrays, along: Arrays, random: np.random.Generator
 ) -> tuple[Consistency | None, int]:
     """Check all parameters at slightly, randomly moved first positions and velocities. Return the check and its number
-    of steps, all before the moved run loses a particle; the check is None if there are no such steps.
+    of steps; the check is None if the moved run loses a particle in the first step.
 
-    Fluid at rest is at a corner of every |v| and min(v, 0), where the adjoint is a derivative to one side. Errors of
-    many corners may cancel in the one-sided slopes of the loss, so these slopes bound nothing. Moved fluid has the same
-    terms but no corners.
+    Fluid at rest is at a corner of every |v| and min(v, 0), where the adjoint is a derivative to one side. Moved fluid
+    has the same terms but no corners.
     """
     known = problem.simulation.known
     states = {n: v for n, v in values.items() if known[n].role is Role.STATE and known[n].range is Range.ANY}
@@ -318,12 +314,10 @@ def _beside(
 
 
 WIDTH = 110
-"""Greatest number of characters of a table's line."""
 
 
 def beyond_words(horizon: Horizon) -> str | None:
-    """Return a sentence about the step after which a horizon has no result; None if it has results up to the last
-    step."""
+    """Return a sentence about the step after which a horizon has no result; None for a result up to the last step."""
     if horizon.reached == horizon.sample_steps[-1]:
         return None
     moved = f"a run that the perturbation of {horizon.parameter} moves"

@@ -1,6 +1,5 @@
-"""Check the adjoint: compare the loss's derivative along a direction by reverse mode, forward mode and differences, in
-float64, for growing numbers of steps.
-"""
+"""Compare the loss's derivative along a direction by reverse mode, forward mode and differences, in float64, for
+growing numbers of steps."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -34,8 +33,8 @@ from cortado.simulation import Simulation
 
 
 def up_to(problem: Problem, steps: int) -> Problem | None:
-    """Return a problem shortened to ``steps`` steps, with its loss at the new end, or the loss's frames up to there;
-    None if no step or frame is left."""
+    """Return a problem shortened to ``steps`` steps, with its loss at the new end or its frames up to there; None if no
+    step or frame is left."""
     loss: Any = problem.loss
     if isinstance(loss, Frames):
         kept = {step: one for step, one in loss.losses.items() if step <= steps}
@@ -44,7 +43,7 @@ def up_to(problem: Problem, steps: int) -> Problem | None:
 
 
 def first_rows(problem: Problem, values: Arrays, steps: int) -> Arrays:
-    """Return parameters of a problem; those over time are cut to the rows of the first ``steps`` steps."""
+    """Cut parameters over time to the rows of the first ``steps`` steps."""
     known = problem.simulation.known
     over_time = {name for name, value in values.items() if name in known.over_time and value.ndim > known[name].rank}
     return {name: value[:steps] if name in over_time else value for name, value in values.items()}
@@ -55,12 +54,8 @@ ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong, SensorMatch)
 
 
 def in_float64(problem: Problem) -> Problem:
-    """Return a float64 problem unchanged; otherwise return a problem with the same scene, device, steps and loss in
-    float64.
-
-    Cortado's losses are then computed from float64 states. Any other loss may work in float32 alone, so it gets states
-    rounded to float32: see `Rounded`.
-    """
+    """Return a problem with the same scene, device, steps and loss in float64. A loss that is not Cortado's gets states
+    rounded to float32 (`Rounded`), because it may work in float32 alone."""
     single = problem.simulation
     if single.precision == FLOAT64:
         return problem
@@ -82,10 +77,9 @@ def _loss_in_float64(loss: Any, single: Simulation) -> Any:
 
 
 class Rounded:
-    """A wrapper of a loss that may work in float32 alone: it rounds float64 states to float32."""
+    """A wrapper of a loss that rounds float64 states to float32."""
 
     def __init__(self, loss: Any, single: Simulation):
-        """Wrap a loss made for the float32 simulation ``single``."""
         self._loss, self._single = as_loss(loss), single
 
     def value(self, end: Snapshot) -> float:
@@ -109,34 +103,17 @@ class Rounded:
 
 
 SAMPLE_STEPS = 25
-"""Greatest number of sample steps for a loss of the last state."""
 ROUGH = (1e-1, 1e-2, 1e-3)
 """Steps h of central differences of a loss in float32, in units of the direction."""
 FLOAT32_ROUND_OFF = 1e-6
 """Relative round-off of a loss in float32."""
 ABOVE_ROUND_OFF = 30.0
-"""Least ratio of a difference of float32 losses to their round-off; smaller differences are ignored."""
-
-
-@dataclass(frozen=True)
-class Tangent:
-    """Derivatives along one direction, by forward mode."""
-
-    losses: np.ndarray
-    """Losses (sample_steps,)."""
-    slopes: np.ndarray
-    """Derivatives (sample_steps,) of the loss."""
-    strain: np.ndarray
-    """Differences (sample_steps,) between the position tangents of a particle and of its nearest neighbour [m], root
-    mean square over particles."""
+"""Least ratio of a difference of float32 losses to their round-off."""
 
 
 class LossHistory:
-    """A problem whose loss is also computed at earlier steps, the sample steps, as if the run ended there.
-
-    A loss of several frames (`Frames`) is sampled at its frames; its value there is the sum over frames up to the
-    sample step.
-    """
+    """A problem whose loss is also computed at earlier steps, the sample steps, as if the run ended there. A loss of
+    several frames (`Frames`) is sampled at its frames, as the sum over frames up to the sample step."""
 
     def __init__(self, problem: Problem):
         loss, steps = problem.loss, problem.steps
@@ -145,20 +122,14 @@ class LossHistory:
         spread = range(steps + 1) if every else np.linspace(0, steps, SAMPLE_STEPS + 1).round().astype(int)
         self.problem = problem
         self.sample_steps = np.array(sorted(frames) if frames else list(spread)[min(1, steps) :])
-        """(sample_steps,) numbers of steps after which the loss is computed; the last is the problem's own."""
+        """(sample_steps,) numbers of steps after which the loss is computed; the last is the problem's."""
         by_step = {int(m): frames[m] if frames else loss for m in self.sample_steps}
         self._losses = {m: one if isinstance(one, Rounded) else as_loss(one) for m, one in by_step.items()}
         self._total = np.cumsum if frames else np.asarray
 
-    def difference(self, parameters: Arrays, along: Arrays, h: float) -> np.ndarray:
-        """Return central differences (sample_steps,) of step h along a direction of all or some parameters; NaN after a
-        run diverges."""
-        return self.sides(parameters, along, h, np.zeros(len(self.sample_steps)))[0]
-
     def sides(self, parameters: Arrays, along: Arrays, h: float, losses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return central differences (sample_steps,), and how far the two one-sided differences are apart; ``losses``
-        (sample_steps,) are the unperturbed losses. For float32 losses the second result is 0, because it would be
-        round-off."""
+        """Return central differences (sample_steps,) of step h along a direction, NaN after a run diverges, and the
+        distances of the two one-sided differences, 0 for float32 losses. ``losses`` are the unperturbed losses."""
         differences, sums = [], []
         for loss, before, after in self._beside(parameters, along, h):
             rounded = isinstance(loss, Rounded)
@@ -171,11 +142,8 @@ class LossHistory:
 
     def rough_miss(self, parameters: Arrays, along: Arrays) -> float:
         """Return the relative difference between the adjoints of `Rounded` losses and finite differences of their
-        values.
-
-        It is the smallest over steps h of the median over sample steps; 0 if no loss is `Rounded`, or if round-off is
-        as large as the differences.
-        """
+        values: the smallest over steps h of the median over sample steps. The result is 0 if no loss is `Rounded`, or
+        if round-off is as large as the differences."""
         if not any(isinstance(loss, Rounded) for loss in self._losses.values()):
             return 0.0
         found = np.full((len(ROUGH), len(self.sample_steps)), np.inf)
@@ -212,8 +180,9 @@ class LossHistory:
         shorter = Problem(problem.simulation, last, self._losses[last], problem.memory_budget)
         return shorter.states(first_rows(problem, parameters, last), steps)
 
-    def tangent(self, parameters: Arrays, along: Arrays) -> Tangent:
-        """Return derivatives along a direction of all or some of the parameters."""
+    def tangent(self, parameters: Arrays, along: Arrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return losses and their derivatives along a direction (sample_steps,), and the difference (sample_steps,) [m]
+        between the position tangents of a particle and of its nearest neighbour, root mean square over particles."""
         dots: dict[int, Arrays] = {}
         dimension = self.problem.simulation.dimension
 
@@ -230,14 +199,12 @@ class LossHistory:
             slopes.append(float(slope(bar, {**along, **dots[step], **more})))
             strain.append(_strain(ends[step].positions, dots[step]["positions"]))
         losses = self._total([loss.value(ends[step]) for step, loss in self._losses.items()])
-        return Tangent(losses, self._total(slopes), np.array(strain))
+        return losses, self._total(slopes), np.array(strain)
 
 
 def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
     """Return the change of a loss between two states: the mean of its two adjoints times the difference of the states.
-
-    The result is exact to second order and avoids the round-off of the loss's values.
-    """
+    The change is exact to second order and avoids the round-off of the loss's values."""
     ends = (before, after)
     old, new = (end.state.numpy(end.dimension) for end in ends)
     distance = {name: new[name] - old[name] for name in new} | {"colours": after.colours - before.colours}
@@ -255,27 +222,25 @@ def _strain(positions: np.ndarray, dot: np.ndarray) -> float:
 
 
 STEPS = tuple(10.0**-k for k in range(3, 9))
-"""Steps h of the central differences, in units of the direction. Smaller ones are tried until the differences stop
-converging and agree with forward mode."""
+"""Steps h of the central differences, in units of the direction, tried until differences stop converging and agree with
+forward mode."""
 MODE_TOLERANCE = 1e-8
-"""Greatest accepted relative difference between reverse and forward mode in float64; both are exact to round-off."""
+"""Greatest accepted relative difference between reverse and forward mode in float64."""
 PLATEAU = 1e-3
-"""Central differences with two successive steps h count as converged up to this relative difference."""
+"""Relative difference up to which central differences with two successive steps h count as converged."""
 CORNER = 1e-4
-"""The loss has a corner if its slopes to the two sides differ by at least this relative amount."""
+"""Least relative difference of the slopes to the two sides of a corner of the loss."""
 SLACK = 10.0
 """Greatest accepted distance of forward mode from a central difference, divided by the least distance of two successive
 differences."""
 RESOLUTION = 1e-6
-"""Relative difference between forward mode and finite differences that is always accepted."""
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
-"""Golden ratio minus 1; the fractional parts of its multiples are all different."""
 FAINT = 1e-4
-"""`balanced` ignores parameters whose effect on the loss is less than this part of the strongest parameter's effect."""
+"""Part of the strongest parameter's effect on the loss below which `balanced` ignores a parameter."""
 ROUND_OFF = 1e-13
-"""Derivatives along the direction smaller than this part of the loss are treated as 0."""
+"""Part of the loss below which derivatives along the direction count as 0."""
 DIFFERENCE_ROUND_OFF = 1e-15
-"""Estimated round-off of a central difference of step h, relative to the loss divided by h."""
+"""Round-off of a central difference of step h, relative to the loss divided by h."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -309,11 +274,8 @@ class Consistency(ShortRepr):
 
     @property
     def gaps(self) -> np.ndarray:
-        """Relative differences (tried - 1, sample_steps) between central differences with successive h, with round-off
-        added.
-
-        The value at a sample step is the greatest up to that step.
-        """
+        """Relative differences (tried - 1, sample_steps) between central differences with successive h, each the
+        greatest up to its sample step, with round-off added."""
         round_off = DIFFERENCE_ROUND_OFF * np.abs(self.losses).max() / self.steps[1:, None]
         return self._worst(np.abs(np.diff(self.differences, axis=0)) + round_off)
 
@@ -326,8 +288,7 @@ class Consistency(ShortRepr):
     @property
     def corner(self) -> np.ndarray:
         """Least relative distances over h (sample_steps,) between the two one-sided differences, each the greatest up
-        to its sample step. For small h they vanish, except at a corner of the loss, where the two sides have different
-        limits."""
+        to its sample step. For small h they vanish, except at a corner of the loss."""
         return np.asarray(self._worst(self.sides).min(axis=0, initial=np.inf))
 
     @property
@@ -339,8 +300,7 @@ class Consistency(ShortRepr):
 
     @property
     def converged(self) -> np.ndarray:
-        """Mask (sample_steps,) of the steps up to which differences with two successive h agree. Beyond them, chaos or
-        round-off hides the limit."""
+        """Mask (sample_steps,) of the steps up to which differences with two successive h agree."""
         return np.asarray(self.gaps.min(axis=0, initial=np.inf) < PLATEAU)
 
     @property
@@ -350,8 +310,8 @@ class Consistency(ShortRepr):
 
     @property
     def miss(self) -> float | None:
-        """Relative distance of forward mode from the nearest difference at the last converged step; None without such a
-        step."""
+        """Relative distance of forward mode from the nearest difference at the last converged step; None without
+        convergence."""
         return float(self.misses[:, self.converged].min(axis=0)[-1]) if self.converged.any() else None
 
     @property
@@ -359,8 +319,7 @@ class Consistency(ShortRepr):
         """True if forward mode is near a central difference at every sample step at which differences converge.
 
         Near means within `SLACK` times the least distance of two successive differences or, at a corner of the loss,
-        within the distance between its sides. One near difference is enough: close to a corner, differences agree but
-        are wrong until h is smaller than the distance to the corner.
+        within the distance between its sides.
         """
         allowed = np.maximum(SLACK * self.gaps.min(axis=0, initial=np.inf), RESOLUTION)
         near = self.misses.min(axis=0, initial=np.inf) <= np.maximum(allowed, self.corner)
@@ -372,7 +331,6 @@ class Consistency(ShortRepr):
         return self.disagreement < MODE_TOLERANCE and self.differences_agree
 
     def _worst(self, distances: np.ndarray) -> np.ndarray:
-        """Return the greatest distance up to each sample step, divided by the greatest derivative up to that step."""
         size = np.maximum.accumulate(np.abs(self.differences[len(self.differences) - len(distances) :]), axis=1)
         worst = np.maximum.accumulate(distances, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -380,12 +338,9 @@ class Consistency(ShortRepr):
 
 
 def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
-    """Scale directions so that each parameter's direction changes the loss about as much as the weakest one, at most
-    twice as much.
-
-    Then a parameter with a much larger effect cannot hide an error in another one's adjoint. No two effects are equal,
-    so two wrong signs cannot cancel.
-    """
+    """Scale directions so that each parameter changes the loss by 1 to 2 times the weakest parameter's change. A
+    parameter with a much larger effect then cannot hide an error in another adjoint; two wrong signs cannot cancel,
+    because no two effects are equal."""
     changes = {name: abs(float((gradient[name] * along).sum())) for name, along in directions.items()}
     finite = [change for change in changes.values() if np.isfinite(change)]
     strongest = max(finite, default=0.0)
@@ -400,8 +355,7 @@ def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
 
 def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays) -> Consistency:
     """Compare reverse mode's ``gradient`` along a direction with forward mode and central differences."""
-    tangent = history.tangent(values, along)
-    losses, tangents = tangent.losses, tangent.slopes
+    losses, tangents, _ = history.tangent(values, along)
     products = np.concatenate([(gradient[name] * along[name]).ravel() for name in along])
     found: list[tuple[np.ndarray, np.ndarray]] = []
 

@@ -23,7 +23,7 @@ PERTURBATION = 0.05
 
 
 def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
-    """Return the values of parameters, from a table of values or from names, whose values are then the scene's."""
+    """Return the values of parameters, from a table of values or from names of the scene's parameters."""
     simulation = problem.simulation
     if problem.state is not None:
         raise InputError(
@@ -54,12 +54,8 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
 
 
 def everything(problem: Problem, chosen: Arrays) -> Arrays:
-    """Return the values of all parameters that have an effect and can be both increased and decreased.
-
-    Values are the chosen ones, or otherwise those of the scene and its schedule; parameters over time have a row for
-    each step. A viscosity of 0 is left out, because it cannot be decreased, and so is the mobility of a single phase,
-    which has no effect.
-    """
+    """Return the values of all parameters that have an effect and can be both increased and decreased, with a row for
+    each step if they are over time. Values are the chosen ones, or those of the scene and its schedule."""
     values = {**ParameterSpace(problem.simulation, problem.steps).defaults(), **chosen}
     found = {}
     for name, value in values.items():
@@ -81,11 +77,8 @@ def _moves_both_ways(parameter: Parameter, value: np.ndarray) -> bool:
 
 
 def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION) -> Arrays:
-    """Return the size of a meaningful perturbation of every number of these parameters, in their shapes and units.
-
-    It is the fraction ``perturbation`` of the parameter's value, for positions of the spacing, and for velocities of
-    the speed of a fall.
-    """
+    """Return the size of a meaningful perturbation of these parameters, in their shapes and units: the fraction
+    ``perturbation`` of the value, for positions of the spacing, for velocities of the speed of a fall."""
     known = problem.simulation.known
     return {
         name: np.broadcast_to(perturbation * known[name].change(problem.simulation, value), value.shape)
@@ -94,8 +87,7 @@ def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION)
 
 
 def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return a random direction of the given size for every parameter; for a single number the direction is
-    positive."""
+    """Return a random direction of the given size for every parameter; a single number increases."""
     return {
         name: sizes[name] * (random.standard_normal(value.shape) if value.ndim else 1.0)
         for name, value in values.items()
@@ -103,11 +95,8 @@ def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Ar
 
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return random directions that are smooth in space and constant in time, so that they move the fluid as a whole.
-    For a path that begins at 0 they grow in time.
-
-    Independent random numbers for each particle would only move neighbouring particles against each other.
-    """
+    """Return random directions that are smooth in space and constant in time, or growing in time for a path that begins
+    at 0. Independent random numbers for each particle would only move neighbours against each other."""
     x = problem.simulation.positions - problem.simulation.positions.mean(axis=0)
     x = x / (np.abs(x).max() or 1.0)
     found = directions(values, sizes, random)
@@ -126,12 +115,9 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
 
 
 def growth(norms: np.ndarray, time_step: float) -> float:
-    """Return the growth rate of an adjoint from the last state to the first, in e-folds, by a line fitted to the
-    logarithm of its norm.
-
-    The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the duration T of the run. In free flight v^ grows linearly, and this
-    norm grows little.
-    """
+    """Return the growth of an adjoint from the last state to the first, in e-folds, by a line fitted to the logarithm
+    of its norm. The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the duration T of the run, because v^ grows linearly in
+    free flight."""
     steps = len(norms) - 1
     total = np.hypot(norms[:, 0], norms[:, 1] / max(steps * time_step, 1e-300))[::-1]
     there = np.flatnonzero(total > 0.0)
@@ -143,16 +129,14 @@ def growth(norms: np.ndarray, time_step: float) -> float:
 
 
 WITHIN = 0.25
-"""Greatest relative difference between the exact derivative and the finite difference at which the derivative counts as
-useful."""
+"""Greatest relative difference between a useful exact derivative and the finite difference."""
 LINEAR = 0.3
 """Relative displacement of neighbours up to which their forces depend on it almost linearly [spacings]."""
 
 
 @dataclass(frozen=True, repr=False)
 class Horizon(ShortRepr):
-    """The loss's derivative along a meaningful perturbation of one parameter, exact and by a finite difference, at
-    several numbers of steps."""
+    """The loss's derivative along a meaningful perturbation of one parameter, exact and by a finite difference."""
 
     parameter: str
     sample_steps: np.ndarray
@@ -160,10 +144,9 @@ class Horizon(ShortRepr):
     exact: np.ndarray
     """Derivatives (sample_steps,) by forward mode."""
     difference: np.ndarray
-    """Central differences (sample_steps,) over the whole perturbation; NaN after the first of their two runs
-    diverges."""
+    """Central differences (sample_steps,) over the full perturbation; NaN after one of their two runs diverges."""
     strain: np.ndarray
-    """Change of the distance of nearest neighbours by the perturbation, to first order (sample_steps,) [spacings]."""
+    """(sample_steps,) change of the distance of nearest neighbours by the perturbation, to first order [spacings]"""
 
     @property
     def meaningful(self) -> np.ndarray:
@@ -172,15 +155,15 @@ class Horizon(ShortRepr):
 
     @property
     def measured(self) -> int:
-        """Last sample step such that the exact derivative is useful there and at the sample step before; 0 if there is
-        none."""
+        """Last sample step such that the exact derivative is useful there and at the sample step before; 0 without
+        one."""
         good = self.meaningful
         there = np.flatnonzero(good & np.append(good[:1], good[:-1]))
         return int(self.sample_steps[there[-1]]) if there.size else 0
 
     @property
     def reached(self) -> int:
-        """Last sample step with a finite difference; 0 if there is none."""
+        """Last sample step with a finite difference; 0 without one."""
         there = np.flatnonzero(~np.isnan(self.difference))
         return int(self.sample_steps[there[-1]]) if there.size else 0
 
@@ -191,30 +174,26 @@ class Horizon(ShortRepr):
 
     @property
     def predicted(self) -> int | None:
-        """First sample step at which the perturbation separates neighbours by more than `LINEAR`; None if there is
-        none."""
+        """First sample step at which the perturbation separates neighbours by more than `LINEAR`; None without one."""
         beyond = np.flatnonzero(self.strain > LINEAR)
         return int(self.sample_steps[beyond[0]]) if beyond.size else None
 
 
 def horizon(history: LossHistory, values: Arrays, name: str, perturbation: np.ndarray) -> Horizon:
-    """Return the horizon of one parameter for a given perturbation of the parameter."""
     along, spacing = {name: perturbation}, history.problem.simulation.scene.discretisation.spacing
-    tangent = history.tangent(values, along)
-    difference = history.difference(values, along, 1.0)
-    return Horizon(name, history.sample_steps, tangent.slopes, difference, tangent.strain / spacing)
+    _, slopes, strain = history.tangent(values, along)
+    difference, _ = history.sides(values, along, 1.0, np.zeros(len(history.sample_steps)))
+    return Horizon(name, history.sample_steps, slopes, difference, strain / spacing)
 
 
 MOST_NUMBERS = 12
-"""Greatest number of components for which a smoothed gradient is computed; each component costs two runs per sample."""
+"""Greatest number of components for a smoothed gradient; each component costs two runs per sample."""
 SAMPLES = 2
 LEAST_COSINE = 0.5
-"""An estimator is recommended only if its gradient's cosine with the smoothed gradient is at least this."""
+"""Least cosine with the smoothed gradient of a recommended estimator."""
 GOOD_COSINE = 0.95
-"""If all estimators with one run have a smaller cosine than this, ensemble averages are tried too. They cost about ten
-times as much."""
+"""Cosine below which ensemble averages are tried too, at ten times the cost."""
 ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity())
-"""Estimators that need one run, tried first."""
 AVERAGES: dict[str, Callable[[dict[str, float]], GradientEstimator]] = {
     "EnsembleMean(spread)": lambda spread: EnsembleMean(spread, seed=1, estimator=AdjointViscosity()),
     "Guided(spread)": lambda spread: Guided(spread, seed=1),
@@ -225,14 +204,13 @@ gradient."""
 
 @dataclass(frozen=True)
 class Judged:
-    """An estimator's gradient compared with the smoothed gradient, each component scaled by its meaningful
-    perturbation."""
+    """An estimator's gradient compared with the smoothed gradient, both scaled by the meaningful perturbation."""
 
     estimator: str
     """Estimator as written in Python, after ``gradients.``."""
     cosine: float
     size: float
-    """Norm of the gradient divided by the norm of the smoothed gradient."""
+    """Norm of the gradient divided by that of the smoothed gradient."""
 
     @property
     def merit(self) -> float:
@@ -242,12 +220,9 @@ class Judged:
 
 @dataclass(frozen=True)
 class Alignment:
-    """The cosines and sizes of the gradients of several estimators, compared with the smoothed one."""
-
     noise: float
     """Relative standard error of the smoothed gradient."""
     estimators: tuple[Judged, ...]
-    """Results of the estimators; `Exact` comes first."""
     spread: Mapping[str, float] = field(default_factory=dict)
     """Spreads by parameter of the smoothed gradient and of averages."""
 
@@ -259,11 +234,8 @@ class Alignment:
 
 
 def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Alignment | None:
-    """Compare estimators' gradients with the smoothed gradient, for all these parameters together.
-
-    Return None if there are too many components for a smoothed gradient, if its runs fail, or if the loss does not
-    depend on the parameters.
-    """
+    """Compare estimators' gradients with the smoothed gradient, for all parameters together. Return None if there are
+    too many components for a smoothed gradient, if its runs fail, or if the loss does not depend on the parameters."""
     if sum(value.size for value in values.values()) > MOST_NUMBERS:
         return None
     spread = {name: float(size.mean()) for name, size in sizes.items()}

@@ -1,5 +1,4 @@
-"""Estimators that average over an ensemble of parameters and first states: differences of the loss, gradients, or
-both."""
+"""Estimators that average over an ensemble of parameters and first states."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,9 +27,7 @@ from cortado.rollout.rollout import Observer
 from cortado.scene.parameter_values import Arrays, Values
 
 MOST_SAMPLES = 100_000
-"""Greatest number of samples of an ensemble."""
 _RUN = 1000.0
-"""Bytes stored per run in addition to its numbers."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +40,10 @@ class Ensemble:
     """
 
     spread: float | Mapping[str, float] = 0.5
-    """Width of the ensemble in each parameter, in the parameter's units: one number for all, or a table by name. It is
+    """Width of the ensemble in each parameter, in the parameter's units: one number, or a table by name. The width is
     sqrt((N + 2) / N) times a component's standard deviation."""
     samples: int = 8
-    """Number of samples, at most 100,000. The results of all samples are kept in memory until they are averaged."""
+    """Number of samples, at most 100,000; memory holds all results until they are averaged."""
     position_noise: float = 0.01
     """Standard deviation of the perturbations of first positions [spacings]; 0 for none."""
     seed: int = 0
@@ -70,8 +67,8 @@ class Ensemble:
         keep_own(self, "spread")
 
     def around(self, problem: Differentiable, parameters: Values, draw: int = 0) -> "Sampler":
-        """Return the ensemble around these parameters of a problem; a different ``draw`` has independent samples.
-        Raises `InputError` for a batch, without parameters, and for spreads smaller than round-off."""
+        """Return the ensemble around the parameters of a problem; each ``draw`` has independent samples. Raise
+        `InputError` for a batch, without parameters, and for spreads smaller than round-off."""
         if problem.simulation.batch is not None:
             raise InputError(
                 f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene, whose "
@@ -89,14 +86,12 @@ class Ensemble:
         return Sampler(values, spreads, start, position_noise, np.random.default_rng([self.seed, draw]))
 
     def evaluated(self, problem: Differentiable, points: Iterable[Point], observe: Observer | None) -> list[Estimate]:
-        """Return estimates at points, in order. With ``observe`` they are computed in this process, because it needs
-        the states."""
+        """Return estimates at points, in order; ``observe`` needs the states and keeps the runs in this process."""
         executor = self.executor if observe is None else InProcess()
         return evaluated(problem, points, executor, observe)
 
     def require_memory(self, runs: int, numbers: int) -> None:
-        """Raise `InputError` unless memory is sufficient for the results of ``runs`` runs with ``numbers`` numbers
-        each."""
+        """Raise `InputError` unless memory suffices for the results of ``runs`` runs with ``numbers`` numbers each."""
         require({f"{runs:,} runs of {self.samples:,} samples": runs * (_RUN + 8.0 * numbers)}, "take fewer samples")
 
     def _spread(self, name: str) -> float:
@@ -107,20 +102,17 @@ class Ensemble:
 
 @dataclass(frozen=True)
 class Sampler:
-    """An ensemble around the parameters of a problem, from which samples are drawn."""
-
     values: Arrays
     spreads: np.ndarray
-    """Spread of every component of the values, as one vector (numbers,)."""
+    """(numbers,) spread of every component of the values"""
     start: np.ndarray
-    """First positions (n, d) of the simulation [m]."""
+    """(n, d) first positions [m]"""
     position_noise: float
     """Standard deviation of the perturbations of first positions [m]."""
     random: np.random.Generator
 
     def rotation(self) -> np.ndarray:
-        """Return a random orthonormal basis (numbers, numbers), uniform over all rotations, with the vectors as
-        rows."""
+        """Return a random orthonormal basis (numbers, numbers), uniform over all rotations, as rows."""
         q, r = np.linalg.qr(self.random.standard_normal((len(self.spreads), len(self.spreads))))
         return (q * np.sign(np.diag(r))).T
 
@@ -143,7 +135,7 @@ class Sampler:
         return Sample(values, estimator)
 
     def named(self, numbers: np.ndarray) -> Arrays:
-        """Split one vector of numbers (numbers,) into arrays by the parameters' names."""
+        """Split a vector (numbers,) into arrays by the parameters' names."""
         return _moved({name: np.zeros_like(value) for name, value in self.values.items()}, numbers)
 
 
@@ -156,7 +148,7 @@ def _check_resolved(name: str, value: np.ndarray, spread: float, precision: Prec
 
 
 def _moved(values: Arrays, change: np.ndarray) -> Arrays:
-    """Return values by name plus a change, which is one vector (numbers,) for all values."""
+    """Return values by name plus a change, a vector (numbers,) for all values."""
     ends = np.cumsum([value.size for value in values.values()])
     parts = np.split(change, ends[:-1])
     return {name: value + part.reshape(value.shape) for (name, value), part in zip(values.items(), parts, strict=True)}
@@ -168,16 +160,12 @@ ADVICE = "take a smaller spread, or a logarithm (cortado.optimisation.transforms
 
 
 class LeftOutWarning(CortadoWarning):
-    """A warning that an average uses fewer runs than asked for."""
+    """A warning that an average uses fewer runs than the ensemble has."""
 
 
 def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
-    """Return a mask (members,) of the ensemble members to average, given the runs of one member after the other.
-    Members with a diverged run are left out; the rest stays symmetric about the parameters.
-
-    ``what``: word for the members, in the plural. Warns of members left out. If they are more than a quarter of all,
-    raises the error of the first run that diverged.
-    """
+    """Return a mask (members,) of the members to average, without members with a failed run; ``what`` names the members
+    in the plural. Warn of members left out, or raise the first run's error if they are more than a quarter of all."""
     errors = [getattr(one, "diverged", None) for one in runs]  # an estimator of one's own may return anything
     lost = np.array([error is not None for error in errors], dtype=bool).reshape(members, -1)
     kept = np.array([not any(member) for member in lost], dtype=bool)
@@ -197,13 +185,13 @@ def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
 
 SMOOTHING, SURROGATE = AdjointViscosity(order=2), AdjointViscosity()
 MOST_NUMBERS = 64
-"""Greatest number of components along which differences are taken; each component costs two runs per sample."""
+"""Greatest number of components for differences; each component costs two runs per sample."""
 
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(Ensemble):
-    """A gradient estimator: central differences averaged over an ensemble of parameters and first states. It is the
-    reference for long runs.
+    """A gradient estimator: central differences averaged over an ensemble of parameters and first states; the reference
+    for long runs.
 
     Formula: for parameters u of N numbers, each in units of its spread h,
 
@@ -213,11 +201,11 @@ class RandomizedSmoothing(Ensemble):
     same perturbed first positions. g is the gradient of the loss averaged over the ball of an `Ensemble`, of radius h
     sqrt(N) (randomised smoothing with antithetic, orthogonal directions).
 
-    Bias: features of the loss narrower than the spread are averaged out, as intended. Noise: the ``standard_error`` of
-    the `Estimate`. Cost: 2 N forward runs per sample, so N should be a few dozen at most.
+    Bias: the average removes features of the loss narrower than the spread, as intended. Noise: the ``standard_error``
+    of the `Estimate`. Cost: 2 N forward runs per sample, so N should be a few dozen at most.
 
-    Runs that diverge: their differences are left out, up to a quarter of all. The sum over a sample's remaining
-    differences is scaled by N divided by their number. This adds no bias if all directions diverge equally often.
+    Runs that diverge: their differences are left out, up to a quarter of all, and the sum over a sample's other
+    differences is scaled up. The scaling adds no bias if all directions diverge equally often.
 
     ``position_noise``: how far first positions are moved, in spacings; ``seed`` of the random numbers; ``executor``:
     where the members run.
@@ -280,9 +268,8 @@ class EnsembleMean(Ensemble):
     """
 
     samples: int = 4
-    """Number of samples, which is even because samples are drawn in antithetic pairs."""
+    """Number of samples, even because samples come in antithetic pairs."""
     estimator: GradientEstimator = SMOOTHING
-    """The estimator whose gradients are averaged."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -311,8 +298,8 @@ class EnsembleMean(Ensemble):
         return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1, mean, len(samples) - len(checked))
 
     def combined(self, gradients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the average (numbers,) of gradients (samples, numbers), and its standard error from the means of
-        antithetic pairs. The two samples of a pair are adjacent rows."""
+        """Return the average (numbers,) of gradients (samples, numbers) and its standard error; antithetic pairs are
+        adjacent rows."""
         return mean_and_error((gradients[::2] + gradients[1::2]) / 2.0)
 
 
@@ -332,7 +319,7 @@ def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def joined(gradient: Arrays, names: Iterable[str]) -> np.ndarray:
-    """Return the gradient with respect to these parameters as one vector."""
+    """Return the gradient as one vector."""
     return np.concatenate([gradient[name].ravel() for name in names])
 
 
@@ -372,7 +359,6 @@ class Guided(Ensemble):
     differences: int = 2
     """Number of samples of each difference."""
     surrogate: GradientEstimator = SURROGATE
-    """The estimator whose gradients give the directions."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -414,8 +400,8 @@ class Guided(Ensemble):
         return Estimate(surrogate.loss, gradient, error, freedom, surrogate.mean_loss, left_out)
 
     def _parts(self, ensemble: Sampler, gradient: Arrays, error: Arrays) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return directions (numbers,) of length 1, in units of the spreads, and their standard errors. A direction is
-        the gradient on one part of one parameter, and 0 elsewhere. Parts with zero gradient are left out."""
+        """Return directions (numbers,) of length 1, in units of the spreads, and their standard errors; each is the
+        gradient on one part of a parameter. Parts with zero gradient are left out."""
         places = np.concatenate([_places(value, self.parts) for value in ensemble.values.values()])
         firsts = np.cumsum([0, *(value.size for value in ensemble.values.values())])
         places += self.parts * np.repeat(np.arange(len(firsts) - 1), np.diff(firsts))
@@ -436,8 +422,7 @@ class Guided(Ensemble):
 
 
 def _places(value: np.ndarray, parts: int) -> np.ndarray:
-    """Return, for each number of a parameter (size,), the number of the part to which its row belongs; 0 for a vector
-    or a number."""
+    """Return for each number of a parameter (size,) the part to which its row belongs; 0 for a vector or a number."""
     rows = len(value) if value.ndim > 1 else 1
     return np.repeat(np.arange(rows) * parts // rows, value.size // rows)
 

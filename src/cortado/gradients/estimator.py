@@ -25,26 +25,23 @@ class Estimate:
     loss: Any
     """Loss: a float, or an array (batch,) for a batch."""
     gradient: Arrays
-    """Gradient by parameter name, float64 in the parameter's shape; for a batch with a first axis for the scenes."""
     standard_error: Arrays | None = None
-    """Standard error of every component of the gradient; None if the gradient is no average over samples."""
+    """Standard error of each component of the gradient; None if the gradient is no average over samples."""
     degrees_of_freedom: float | None = None
-    """Degrees of freedom of the standard error: the number of independent samples minus one; `Guided` combines two
-    errors."""
+    """Number of independent samples minus one; `Guided` combines two errors."""
     mean_loss: float | None = None
-    """Mean of the loss over the ensemble over which the gradient is averaged."""
+    """Mean of the loss over the ensemble of the gradient."""
     left_out: int = 0
-    """Number of an ensemble's runs left out of the average, because they or their partners diverged or are out of
-    range."""
+    """Number of an ensemble's runs that the average leaves out, because they or their partners failed."""
     diverged: Exception | None = None
-    """The `DivergedError` or `OutOfRangeError` of a point of `cortado.evaluate` that has no result; loss and gradient
-    are then NaN."""
+    """The `DivergedError` or `OutOfRangeError` of a point of `cortado.evaluate` without a result; loss and gradient are
+    then NaN."""
 
     def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
         """Return the lower and the upper end, by parameter, of an interval for each component of the gradient.
 
-        With this probability the interval contains the estimator's mean over infinitely many samples. It uses Student's
-        t-distribution, because there are few samples. It does not include the estimator's bias.
+        With the probability ``confidence`` the interval contains the estimator's mean over infinitely many samples, by
+        Student's t-distribution. The interval does not include the estimator's bias.
 
         Raises:
             InputError: the estimate is no average, or the confidence is not between 0 and 1.
@@ -61,7 +58,7 @@ class Estimate:
         return lower, {name: value + reach * errors[name] for name, value in self.gradient.items()}
 
     def member(self, number: int, shapes: Mapping[str, tuple[int, ...]]) -> "Estimate":
-        """Return the estimate of one scene of a batch, with gradients of these shapes."""
+        """Return the estimate of one scene of a batch, with gradients of the given shapes."""
         gradient = {name: bar[number].reshape(shapes[name]) for name, bar in self.gradient.items()}
         return replace(self, loss=float(self.loss[number]), gradient=gradient)
 
@@ -73,7 +70,7 @@ class Estimate:
 
 
 class ForwardPass(Protocol):
-    """Protocol of a forward run with its loss, from which backward passes can start until the problem is run again."""
+    """Protocol of a forward run with its loss; backward passes can start until the problem is run again."""
 
     @property
     def loss(self) -> float:
@@ -81,7 +78,7 @@ class ForwardPass(Protocol):
 
     def back(self, estimator: "AdjointEstimator", observe: Observer | None = None) -> Arrays:
         """Return the gradient by an estimator; ``observe`` is called with the number and the adjoint of every state,
-        from the last to the first."""
+        last to first."""
 
 
 class Differentiable(Protocol):
@@ -90,7 +87,7 @@ class Differentiable(Protocol):
     simulation: Any
 
     def value(self, parameters: Values) -> float:
-        """Return the loss for these parameters by a forward run."""
+        """Return the loss for given parameters."""
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
         """Run forward and return the run, from which backward passes can start."""
@@ -106,27 +103,27 @@ class Batchable(Protocol):
     def together(
         self, points: Sequence[Values], estimator: "AdjointEstimator | None" = None
     ) -> list[Estimate | DivergedError]:
-        """Return estimates at points with equal parameter names and shapes, computed in one launch, bit for bit as one
-        by one. Without an estimator they have the loss alone. A point with a lost particle returns its error
-        instead."""
+        """Return estimates at points with equal parameter names and shapes, computed in one launch with the bits of
+        separate runs. Without an estimator estimates have the loss alone; a point with a lost particle returns its
+        error."""
 
 
 class GradientEstimator(Protocol):
     """Protocol of an object that computes a gradient, exact or approximate."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the loss and its gradient; ``observe``, if given, is called with the adjoint of each state."""
+        """Return the loss and its gradient; ``observe`` is called with the adjoint of each state."""
 
 
 def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
-    """Return the estimator; raises `InputError` for anything else, such as the class of an estimator."""
+    """Return the estimator; raise `InputError` for anything else, such as the class of an estimator."""
     if isinstance(estimator, type) or not hasattr(estimator, "estimate"):
         raise InputError(f"estimator is {shown(estimator)}, but must be an object such as cortado.gradients.Exact().")
     return estimator
 
 
 def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
-    """Return the estimator; raises `InputError` unless it makes a backward pass through a run."""
+    """Return the estimator; raise `InputError` unless it is an `AdjointEstimator`."""
     if not isinstance(estimator, AdjointEstimator):
         wanted = "an AdjointEstimator such as cortado.gradients.Exact()"
         raise InputError(f"estimator is {shown(estimator)}, but must be {wanted}.")
@@ -134,8 +131,8 @@ def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
 
 
 def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -> Estimate:
-    """Return an estimator's result in float64; raises `InputError` unless there is a gradient of every given parameter
-    in its shape, for a batch with a first axis for the scenes."""
+    """Return an estimator's result in float64; raise `InputError` unless it has a gradient of every parameter in its
+    shape, for a batch with a first axis for the scenes."""
     if not isinstance(found, Estimate):
         raise InputError(f"the estimator returned a {type(found).__name__}, but must return a gradients.Estimate.")
     loss = as_one_number("the estimate's loss", found.loss) if batch is None else as_numbers("losses", found.loss)
@@ -156,8 +153,7 @@ class AdjointEstimator(ABC):
 
     @property
     def batches(self) -> bool:
-        """True if the estimator never mixes scenes of a batch. Your own class overrides this property to allow
-        batches."""
+        """True if the estimator never mixes scenes of a batch; override this property to allow batches."""
         return False
 
     @abstractmethod
@@ -175,11 +171,11 @@ class AdjointEstimator(ABC):
 
 
 class Filtered:
-    """A backward step that calls another estimator's backward step and then filters the adjoint."""
+    """A backward step of another estimator whose adjoint is then filtered."""
 
     only_launches: ClassVar[bool] = False
-    """True if `filter` only launches kernels, and always the same ones. Only then may a backward step be captured as a
-    CUDA graph, because a graph does not repeat work in Python or NumPy."""
+    """True if `filter` always launches the same kernels and nothing else; only then may a CUDA graph capture the
+    backward step."""
 
     def __init__(self, base: BackwardStep):
         self._base, self.rollout, self.solver = base, base.rollout, base.solver
@@ -196,27 +192,27 @@ class Filtered:
         return self._base.parameters()
 
     def filter(self, bar: State) -> None:
-        """Change the adjoint of the state that begins the step which the solver replayed last."""
+        """Change the adjoint of the state from which the last replayed step starts."""
         raise NotImplementedError
 
 
 NO_RUN: tuple[type[Exception], ...] = (DivergedError, OutOfRangeError)
-"""Errors that mean that a point has no result; with many points they do not stop the others."""
+"""Errors that mean that a point has no result; other points are still evaluated."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """A set of parameter values, and the estimator of the gradient there."""
+    """Parameter values, and the estimator of the gradient there."""
 
     values: Values
     estimator: GradientEstimator | None = None
-    """Estimator of the gradient; None for the loss alone."""
+    """None for the loss alone."""
     loss_if_diverged: float = np.nan
     errors: tuple[type[Exception], ...] = ()
-    """Error types after which the point gets a substitute loss."""
+    """Errors after which the point has a substitute loss."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """Return the loss of a problem at the point, and its gradient; without an estimator the gradient is empty."""
+        """Return the loss at the point and its gradient, which is empty without an estimator."""
         try:
             found = self.found(problem, observe)
             return found if self.estimator is None else checked_estimate(found, self.values, problem.simulation.batch)
@@ -224,24 +220,23 @@ class Point:
             return self.without_a_run(error, self.loss_if_diverged)
 
     def found(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """Return the estimator's result at the point, unchecked."""
         if self.estimator is None:
             return Estimate(problem.value(self.values), {})
         return self.estimator.estimate(problem, self.values, observe)
 
     def without_a_run(self, why: Exception, loss: float = np.nan) -> Estimate:
-        """Return the estimate for a point whose run failed: its gradient is NaN."""
+        """Return the estimate of a point whose run failed, with a gradient of NaN."""
         names = self.values if self.estimator is not None else ()
         return Estimate(loss, {name: np.full(np.shape(self.values[name]), np.nan) for name in names}, diverged=why)
 
 
 @dataclass(frozen=True)
 class Sample(Point):
-    """A random point of an ensemble; the run there may fail."""
+    """A random point of an ensemble."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """Return the estimate at the sample without checks, because perturbed first positions need no gradient. Its
-        `InputError` says that the user did not choose this point."""
+        """Return the unchecked estimate, because perturbed first positions need no gradient; an `InputError` says that
+        the point is a sample."""
         try:
             return self.found(problem, observe)
         except NO_RUN as error:
@@ -251,13 +246,12 @@ class Sample(Point):
 
 
 Group = tuple[Point, ...]
-"""A tuple of points that are evaluated together."""
+"""Points that are evaluated together."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A problem as a function of groups of points; worker processes keep it. Errors have the same sentences as when
-    points are evaluated one by one."""
+    """A problem as a function of groups of points; errors have the same sentences as for single points."""
 
     problem: Differentiable
     observe: Observer | None = None
@@ -310,12 +304,12 @@ def evaluated(
 
 
 def without_runs(errors: Sequence[Exception], of: str) -> str:
-    """Return a phrase with the number and the cause of failed runs: "2 of 4 points diverged"."""
+    """Return a phrase with the number and the cause of failed runs, such as "2 of 4 points diverged"."""
     diverged = sum(isinstance(error, DivergedError) for error in errors)
     why = ["diverged"] * bool(diverged) + ["cannot be run"] * (diverged < len(errors))
     return f"{len(errors)} of {of} {' or '.join(why)}"
 
 
 def _kind(point: Point) -> tuple[Any, ...]:
-    """Return a key of a point; points with equal keys can be evaluated in one launch."""
+    """Return a key, which is equal for points that one launch can evaluate."""
     return point.estimator, {name: np.shape(value) for name, value in point.values.items()}

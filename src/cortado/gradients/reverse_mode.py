@@ -1,6 +1,4 @@
-"""Estimators with one backward pass: exact, by Warp's tape, or with an eddy viscosity and a limit on the adjoint
-between steps. Also an observer of adjoint norms.
-"""
+"""Estimators with one backward pass, and an observer of adjoint norms."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -22,15 +20,14 @@ from cortado.scene.parameter_values import Arrays
 from cortado.solvers.solver import Counts, Solver
 
 STRONGEST = 0.6
-"""Greatest strength s of the viscosity; with it, waves two spacings long are damped without a change of sign."""
+"""Greatest strength s of the viscosity, which damps waves two spacings long without a change of sign."""
 
 
 @cache
 def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
-    """Return the kernels of `AdjointViscosity`, by name; its docstring has the formulas. Launch ``crowd`` and
-    ``strength``, then ``sort``, which brings adjoints from the scene's order to the sorted one, then ``viscosity``.
-    Dividing by S makes it as strong at surfaces and in drops as inside the fluid; W(h / 2) weakens it between distant
-    particles."""
+    """Make the kernels of `AdjointViscosity`, whose docstring has the formulas. Launch ``crowd`` and ``strength``,
+    ``sort``, which brings adjoints from the scene's order to the sorted one, and ``viscosity``. Division by S makes the
+    viscosity as strong at surfaces and in drops as inside the fluid; W(h / 2) weakens it between distant particles."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, per_size = pair.weight, pair.per_size
@@ -58,7 +55,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def crowd(s, x, most):
-        """Store max(S_i, W(h / 2)), where S_i is the sum of weights over neighbours."""
+        """Store max(S_i, W(h / 2))."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x, s) - real(s.filling[i]) * s.self_weight
         if lane() > 0:
@@ -68,7 +65,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def strength(s, coefficient: real, time_step, x, v, most, strengths):
-        """Store the viscosity's strength s_i for sorted particles, from sorted arguments."""
+        """Store s_i of sorted particles."""
         i = s.first + wp.tid() // LANES
         total = strain(i, x, v, most, s)
         if lane() > 0:
@@ -85,7 +82,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def viscosity(s, order: wp.array(dtype=wp.int32), x, most, strengths, a_sorted, b_sorted, a, b):
-        """Apply the viscosity to two adjoint fields and store the results in the scene's order."""
+        """Apply the viscosity to two adjoint fields; results are in the scene's order."""
         i = s.first + wp.tid() // LANES
         a_total, b_total = exchange(i, x, most, strengths, a_sorted, b_sorted, s)
         if lane() > 0:
@@ -121,8 +118,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
 
 
 class EddyViscosity:
-    """A filter that blends adjoints of positions and velocities with averages over neighbours, more strongly where the
-    forward flow's strain rate is larger."""
+    """A filter that blends adjoints of positions and velocities with averages over neighbours."""
 
     def __init__(self, solver: Solver, coefficient: float):
         self._solver, self._coefficient = solver, coefficient
@@ -133,7 +129,7 @@ class EddyViscosity:
         self._sorted = {"a_sorted": a, "b_sorted": b}
 
     def __call__(self, bar: State, parameters: Parameters) -> None:
-        """Filter the adjoint of the state that begins the step replayed last, and set ``strengths`` for its sorted
+        """Filter the adjoint of the state from which the last replayed step starts, and set ``strengths`` of sorted
         particles."""
         context, kernels = self._solver.context(parameters), self._kernels
         fields = {"a": bar.positions, "b": bar.velocities, **self._sorted}
@@ -145,8 +141,7 @@ class EddyViscosity:
 
 
 class AdjointNorms:
-    """An observer of a backward pass that computes the norms of adjoints; they stay on the device until `numpy` is
-    called."""
+    """An observer of a backward pass that computes the norms of adjoints on the device."""
 
     def __init__(self, solver: Solver, steps: int):
         self._launch, self._layout = solver.launch, solver.layout
@@ -237,7 +232,7 @@ class _TapeStep:
             wp.copy(total, own.grad)
 
     def _forget(self, tape: Any) -> None:
-        """Set every adjoint to 0 except those of the parameters, which are summed over the steps."""
+        """Set all adjoints to 0 except those of the parameters, which are summed over steps."""
         kept = {own.ptr for own in self._own.arrays()}
         for array, gradient in tape.gradients.items():
             if isinstance(array, wp.array) and array.ptr not in kept:
@@ -309,7 +304,7 @@ class AdjointViscosity(AdjointEstimator):
     batches = True
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
-        """Return the backward step for order 1; raises `InputError` for order 2, which takes two passes."""
+        """Return the backward step for order 1; raise `InputError` for order 2, which takes two passes."""
         if self.order != 1:
             raise InputError(f"order is {self.order}, but must be 1 for derivatives with respect to an earlier state.")
         step = EXACT.derivative(rollout)
@@ -338,8 +333,6 @@ class _ViscousStep(Filtered):
         self._sum, self._sum_of_strengths = layout.sum_of(wp.vec2d), layout.sum_of(layout.precision.real)
 
     def filter(self, bar: State) -> None:
-        """Filter the adjoint, then limit each particle's vector to a multiple of the root mean square over all
-        particles. Without strain nothing changes."""
         self._viscosity(bar, self._parameters)
         launch, kernels = self.solver.launch, adjoint_filter_kernels(self.solver.discretisation)
         squares, fields = self._squares, {"a": bar.positions, "b": bar.velocities}

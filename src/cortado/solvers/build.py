@@ -1,7 +1,5 @@
-"""Makers of forces and solvers. `Simulation` takes makers as ``forces`` and ``solver``; a scene names them by kind, and
-each maker may define parameters. Every solver is made from the scene's neighbour search, forces, phases, nozzle, and
-region of particles.
-"""
+"""Makers of forces and solvers, which `Simulation` takes as ``forces`` and ``solver`` and which a scene names by
+kind."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +30,7 @@ from cortado.scene.parameters import PARAMETERS, Parameter, Source
 from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import NoContainer
 from cortado.scene.solids import SolidTable
-from cortado.scene.solvers import OWN, PackageSolver, SolverTable
+from cortado.scene.solvers import PackageSolver, SolverTable
 from cortado.scene.springs import ends_of, spring_parameters
 from cortado.solvers.contacts import Contacts, Touching
 from cortado.solvers.obstacles import (
@@ -64,13 +62,13 @@ from cortado.sph.stress_forces import LAWS
 class ForceMaker(Protocol):
     """A maker that makes a force for each solver of a simulation and lists the force's parameters.
 
-    The maker is pickled with the simulation. An optional ``fingerprint``, a text, identifies it, so that a search is
-    not resumed with another force; by default its type and its attributes do. An optional method ``check(values,
-    simulation)`` raises `InputError` for parameter values, by name, with which no run is possible.
+    The maker is pickled with the simulation. An optional text ``fingerprint`` identifies the maker when a search
+    resumes; by default the maker's type and attributes do. An optional method ``check(values, simulation)`` raises
+    `InputError` for parameter values, by name, with which no run is possible.
     """
 
     parameters: Sequence[Parameter]
-    """Parameters of the force, with unique names: kernels have ``drag.k`` as their argument ``drag_k``. If kernels read
+    """Parameters of the force, with unique names; kernels read ``drag.k`` as their argument ``drag_k``. If kernels read
     ``time``, `known.TIME` must be among the parameters."""
 
     def force(self, setting: Setting) -> Force | None:
@@ -78,8 +76,7 @@ class ForceMaker(Protocol):
 
 
 def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
-    """Return the value that a user gives as ``forces`` if it consists of makers of forces; otherwise raise
-    `InputError`."""
+    """Return ``forces`` as a tuple; raise `InputError` if an entry is not a maker of forces."""
     if not isinstance(forces, (list, tuple)):
         wanted = "a list of forces, such as [cortado.forces.Body(function, k=2.0)]"
         raise InputError(f"forces is {shown(forces)}, but must be {wanted}.")
@@ -87,21 +84,20 @@ def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
         if isinstance(maker, type) or not callable(getattr(maker, "force", None)):
             wanted = "but each must be an object with a method force(setting), such as cortado.forces.Body(f, k=2.0)"
             raise InputError(f"forces has {shown(maker)} at place {k}, {wanted}.")
-        checked_parameters("force", maker, getattr(maker, "parameters", None))
+        check_parameters("force", maker, getattr(maker, "parameters", None))
     return tuple(forces)
 
 
-def checked_parameters(what: str, maker: Any, parameters: Any) -> Sequence[Parameter]:
-    """Return the parameters of a maker of ``what``; raise `InputError` if they are not a list of parameters."""
+def check_parameters(what: str, maker: Any, parameters: Any) -> None:
+    """Raise `InputError` if the parameters of a maker of ``what`` are not a list of `Parameter`."""
     if not isinstance(parameters, (list, tuple)) or not all(isinstance(p, Parameter) for p in parameters):
         wanted = "a list of cortado.scene.parameters.Parameter, which may be empty"
         raise InputError(f"the {what} {shown(maker)} has parameters {shown(parameters)}, but must have {wanted}.")
-    return parameters
 
 
 def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
-    """Return the parameters of a simulation with these forces, this solver's maker and the scene's solids and springs;
-    raise `InputError` if two have one name or replace the same force."""
+    """Return all parameters of a simulation; raise `InputError` if two parameters have one name or two forces replace
+    the same force."""
     taken: dict[str, ForceMaker] = {}
     for maker in forces:
         if (place := getattr(maker, "replaces", None)) is not None and taken.setdefault(place, maker) is not maker:
@@ -117,14 +113,14 @@ def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
 
 
 def check_own(known: Known, source: Source) -> None:
-    """Raise `InputError` if a force or a solver gives a parameter a value whose shape does not fit the scene."""
+    """Raise `InputError` if the shape of a parameter's value does not fit the scene."""
     for parameter in known.own:
         shapes = parameter.shapes(0, len(source.scene.phase), source.positions.shape)
         checked_value(parameter.name, parameter.value(source), shapes, known=known)
 
 
 def fingerprint(makers: Sequence[Any], source: Source) -> str:
-    """Return a hash of the forces or solvers of these makers, with their parameters' values; empty without any."""
+    """Return a hash of makers and their parameters' values; return an empty text without makers."""
     words = []
     for maker in makers:
         parameters = getattr(maker, "parameters", ())
@@ -135,8 +131,7 @@ def fingerprint(makers: Sequence[Any], source: Source) -> str:
 
 @dataclass(frozen=True)
 class SolverSetting:
-    """The arguments from which a solver is made; `cortado.solvers.build.particle_system` makes the particles from
-    them."""
+    """The arguments from which a solver is made; `particle_system` makes the particles from them."""
 
     scene: Scene
     discrete: DiscreteScene
@@ -145,21 +140,18 @@ class SolverSetting:
     device: Any
     batch: int | None
     forces: Sequence[ForceMaker]
-    """Makers of the forces besides those that the scene names."""
+    """Makers of the forces that the scene does not name."""
     known: Known
-    """The parameters of the simulation, including those of these forces and of the solver."""
     called: str
-    """The name of the solver in messages."""
     lanes: int | None = None
-    """Number of GPU threads that share a particle; None chooses a number that suits the scene
-    (`cortado.device.precision`)."""
+    """Number of GPU threads for each particle; with None, `cortado.device.precision` chooses the number."""
 
 
 class SolverMaker(Protocol):
-    """Makes the solver of a simulation, and of every simulation derived from it in another precision or size.
+    """A maker of the solver of a simulation, and of every simulation derived from it in another precision or size.
 
-    The maker is pickled with the simulation. Like makers of forces it may have ``parameters``, which kernels read by
-    name, and a ``fingerprint``. ``batches = True`` declares that its solver runs in batches.
+    The maker is pickled with the simulation. Its optional ``parameters`` are read by kernels by name, and an optional
+    text ``fingerprint`` identifies the maker. ``batches = True`` declares that its solver runs in batches.
     """
 
     def build(self, setting: SolverSetting) -> Solver:
@@ -167,25 +159,23 @@ class SolverMaker(Protocol):
 
 
 def checked_solver(solver: Any) -> SolverMaker:
-    """Return the value that a user gives as ``solver`` if it is a maker of solvers; otherwise raise `InputError`."""
+    """Return ``solver`` if it is a maker of solvers; otherwise raise `InputError`."""
     if isinstance(solver, type) or not callable(getattr(solver, "build", None)):
         wanted = "an object with a method build(setting), which returns a solver: see docs/own_parts.md"
         raise InputError(f"solver is {shown(solver)}, but must be {wanted}.")
-    checked_parameters("solver", solver, getattr(solver, "parameters", ()))
+    check_parameters("solver", solver, getattr(solver, "parameters", ()))
     return solver
 
 
 def called(table: SolverTable, given: SolverMaker | None) -> str:
-    """Return the name of a solver in messages, from the scene's table or from the maker that is given in its place."""
     return f'solver.kind "{table.kind}"' if given is None else f"the solver {type(given).__name__}"
 
 
 NEEDED = ("new_parameters", "new_log", "set_substeps", "reset", "make_room", "step")
-"""Methods that a solver must have to take steps."""
 
 
 def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
-    """Let a maker build its solver; raise `InputError` if the solver does not fit the simulation."""
+    """Build a solver; raise `InputError` if the solver does not fit the simulation."""
     if setting.batch is not None and not getattr(maker, "batches", False):
         raise InputError(f"batch is {setting.batch}, but must be left out, as {setting.called} has no batches.")
     solver = maker.build(setting)
@@ -200,20 +190,16 @@ def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
     return solver
 
 
-MODULES = {kind: f"cortado.solvers.{kind}.solver" for kind in OWN}
-"""Modules of Cortado's own solvers by kind; each has a function ``maker`` that takes the table [solver] of a scene."""
-
-
 def solver_named(table: SolverTable) -> SolverMaker:
-    """Return the maker of the solver that the table of a scene names."""
+    """Return the maker of the solver for a scene's table [solver]."""
     if isinstance(table, PackageSolver):
         return checked_solver(table.make())
-    made: SolverMaker = import_module(MODULES[table.kind]).maker(table)
+    made: SolverMaker = import_module(f"cortado.solvers.{table.kind}.solver").maker(table)
     return made
 
 
 def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
-    """Return makers of the forces that a scene names by kind: laws of viscosity and forces of installed packages."""
+    """Return makers of a scene's laws of viscosity and of its forces from installed packages."""
     laws = [
         Rheology(LAWS[phase.rheology.kind], None, **phase.rheology.numbers(phase.viscosity))
         for phase in scene.phase
@@ -223,8 +209,7 @@ def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
 
 
 def known_in(scene: Scene) -> Known:
-    """Return the parameters of a scene, including those of parts from packages and of moving solids; raise `InputError`
-    if two have one name."""
+    """Return the parameters of a scene; raise `InputError` if two parameters have one name."""
     own = scene.force or any(phase.rheology for phase in scene.phase) or isinstance(scene.solver, PackageSolver)
     if not (own or scene.emitter or scene.drain or moving(scene.solid)):
         return REGISTRY
@@ -232,20 +217,18 @@ def known_in(scene: Scene) -> Known:
 
 
 FORCE_ATTRIBUTES = ("shares", "accelerate", "tangent", "adjoint")
-"""Attributes that every `Force` must have."""
 PART_METHODS = ("begin", "sort", "settle", "target", "end", "new_tangent", "new_adjoint")
 """Methods that a `Part` has and a plain `Force` lacks."""
 
 
 def first_capacity(support: float, dimension: int) -> int:
-    """Return the first capacity of lists of neighbours: 1.5 times the number on the lattice, for a support in
-    spacings."""
+    """Return the first capacity of neighbour lists, 1.5 times the number on the lattice; ``support`` is in spacings."""
     filled = np.pi * support**2 if dimension == 2 else 4.0 / 3.0 * np.pi * support**3
     return int(1.5 * filled) + 6
 
 
 def particle_system(setting: SolverSetting) -> ParticleSystem:
-    """Discretise the scene of a setting into particles on a device, with the forces of the scene and of the setting."""
+    """Discretise the scene of a setting into particles on a device, with all forces."""
     scene, discrete, precision, device = setting.scene, setting.discrete, setting.precision, setting.device
     layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, setting.batch, setting.known)
     lanes, moves = lanes_for(layout.particles, device, setting.lanes), bool(moving(scene.solid))
@@ -291,7 +274,6 @@ def _search(
     mirrored: bool,
     faces: FlatFaces,
 ) -> NeighbourSearch:
-    """Make the search for neighbours of particles within the support radius, and a little beyond."""
     support = discrete.lattice.support
     grid = Grid.around(
         discrete.near.lower,
@@ -322,36 +304,34 @@ def _forces(
     setting = Setting(scene, discretisation, discrete.lattice, discrete.wall_layers, layout)
     replaced = {getattr(maker, "replaces", None) for maker in makers}
     modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene) and p.force not in replaced]
-    made = [(maker, maker.force(setting)) for maker in (*map(import_module, modules), *makers)]
-    forces = [force for _, force in made if force is not None]
-    for maker, force in made:
-        if force is not None:
-            _check_force(force, maker)
-    for force in forces:
-        if layout.batch is not None and not getattr(force, "batches", False):
-            raise InputError(
-                f"batch is {layout.batch}, but must be left out, as the force {type(force).__name__} has no "
-                "`batches = True`, which says that its kernels read the parameters of a particle's own scene."
-            )
+    forces: list[Force] = []
+    for maker in (*map(import_module, modules), *makers):
+        if (force := maker.force(setting)) is not None:
+            _check_force(force, maker, layout.batch)
+            forces.append(force)
     return sorted(forces, key=lambda one: bool(getattr(one, "is_last", False)))
 
 
-def _check_force(force: Force, maker: Any) -> None:
-    """Raise `InputError` if a maker's result lacks an attribute of a `Force`, if it is a part that would not write its
-    fields, or if it has methods of a part without being a `Part`: no step would call them."""
+def _check_force(force: Force, maker: Any, batch: int | None) -> None:
+    """Raise `InputError` if a force lacks an attribute, has methods of a `Part` that no step would call, or lacks
+    batches."""
     name = type(force).__name__
     if missing := [one for one in FORCE_ATTRIBUTES if not hasattr(force, one)]:
         made = f"the force {name}, which {shown(maker)} made, has no {missing[0]}"
         raise InputError(f"{made}, but must have {', '.join(FORCE_ATTRIBUTES)}.")
     if not isinstance(force, Part):
-        found = [method for method in PART_METHODS if hasattr(force, method)]
-        if found:
+        if found := [method for method in PART_METHODS if hasattr(force, method)]:
             raise InputError(
                 f"the force {name} has the methods {', '.join(found)} of a part, but is no Part: derive its class "
                 "from cortado.sph.parts.Part."
             )
     elif type(force).end is Part.end and not all(field.is_constant for field in force.fields):
         raise InputError(f"the force {name} has fields, but no method `end` that writes them after a step.")
+    if batch is not None and not getattr(force, "batches", False):
+        raise InputError(
+            f"batch is {batch}, but must be left out, as the force {name} has no `batches = True`, which says that its "
+            "kernels read the parameters of a particle's own scene."
+        )
 
 
 def _parts(
@@ -362,7 +342,7 @@ def _parts(
     search: NeighbourSearch,
     layout: Layout,
 ) -> list[PartMaker]:
-    """Make the parts of a solver that are not forces, in the order in which their `end` is called."""
+    """Make the parts that are not forces, in the order in which a step calls their `end`."""
     found: list[PartMaker | None] = [_phases(scene, discretisation, free_energy), *nozzles_of(scene, discrete)]
     found.append(_free_solids(scene, discrete, search, layout))
     if tables := moving(scene.solid):  # this also writes the walls of free bodies
@@ -372,7 +352,7 @@ def _parts(
 
 
 def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch, layout: Layout) -> FreeSolids | None:
-    """Make the part that moves free bodies with the fluid; None for a scene without free bodies."""
+    """Make the part that moves free bodies with the fluid; return None without free bodies."""
     cell = scene.discretisation.spacing**scene.dimension
     tables = []
     for number, table in enumerate(moving(scene.solid)):
@@ -391,8 +371,7 @@ def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch,
 
 
 def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:
-    """List for each free body the solids that it may touch: container and solids at rest, and each other moving
-    solid."""
+    """List for each free body the solids that it may touch: all solids at rest, and each other moving solid."""
     moved, spacing, walls = moving(scene.solid), scene.discretisation.spacing, discrete.walls
     bodies = [number for number, table in enumerate(moved) if table.motion == "free"]
     sides = scene.container.solids(scene.dimension, discrete.lattice.support)
@@ -414,7 +393,6 @@ def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:
 
 
 def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:
-    """Make the part for the phases of a mixture, with their diffusion into one another where there are several."""
     mixture, count = scene.mixture, len(scene.phase)
     if count == 1:
         return Phases(1, None, 0.0)
@@ -423,8 +401,7 @@ def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnerg
 
 
 def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
-    """Describe the region open to particles: container and solids. Without pressure walls do not stop particles and are
-    left out."""
+    """Describe the region open to particles; without pressure, walls do not stop particles and are left out."""
     holds = scene.container if scene.forces.pressure else NoContainer()
     region = holds.region(scene.dimension).opened(discrete.periods)
     spacing = scene.discretisation.spacing
@@ -435,7 +412,6 @@ def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
 
 
 def _named_solids(scene: Scene) -> dict[str, NamedSolid]:
-    """Return the solids of a scene by name, each with the number of its wall particles and its middle."""
     numbers = wall_numbers(scene.solid)
     return {table.name: NamedSolid(numbers[table.name], padded(table.middle()[None])[0]) for table in scene.solid}
 

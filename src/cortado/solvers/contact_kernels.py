@@ -1,76 +1,60 @@
-"""Bodies that touch the container, solids and each other: a smooth penalty with restitution and friction.
+"""Contacts of free bodies with the container, solids and each other: a smooth penalty with restitution and friction.
 
 At the predicted pose, points of a body's surface are inside the other solid by depths d_j > 0 along the normals n_j of
-the faces above them. With the weights w_j = d_j^3 / sum d_j^3 the contact has the depth D = sum_j w_j d_j, which is
-near the greatest depth for any number of points. The body gets the momentum
+the faces above them. The weights w_j = d_j^3 / sum d_j^3 give the contact the depth D = sum_j w_j d_j, near the
+greatest depth for any number of points. The body gets the momentum
 
     P = (q / dt) m D sum_j w_j n_j,   1 / m = 1 / M + r^2 / I,
 
 and the other solid -P. Here r is the arm of P and I the least moment of inertia; if the other solid is free, 1 / m also
-has the same terms of that body. So each contact oscillates with the angular frequency sqrt(q) / dt. Two free bodies
-have points in each other, and both contacts have the weight one half.
+has the same terms of that body. Each contact oscillates with the angular frequency sqrt(q) / dt. Two free bodies have
+points in each other, and both contacts have the weight one half.
 
 *Restitution*: beta - 1 times the growth of D in the step is added to D. beta(e), with which a body rebounds at e times
 its speed, is fitted to steps of a body that hits a wall: within 0.004 for e from 0.03 to 0.95; for e = 1 it rebounds at
 0.98.
 
 *Friction* (Coulomb's): the momentum that would stop all slip is Q = sum_j w_j (m_j u_j + M g dt). Point j slips with
-the velocity u_j and m_j is its effective mass. The term with gravity along the face is only there if the other solid is
-not free. The body gets
+the velocity u_j and m_j is its effective mass. The term M g dt, gravity along the face, is zero if the other solid is
+free. The body gets
 
     -Q / (1 + t^8)^(1/8),   t = sum_j w_j |m_j u_j + M g dt| / (mu (q / dt) m D):
 
-which stops the slip if Q is small, and is mu times the push if Q is large. So a body at rest on a slope creeps with up
-to t^8 / 8 times M g dt / m_j.
+which stops the slip if Q is small, and is mu times the push if Q is large. A body at rest on a slope creeps with up to
+t^8 / 8 times M g dt / m_j.
 
-All is smooth except that derivatives jump when a contact begins or the face above a point changes. At mu = 0 the
-derivative with respect to mu is one-sided.
+Derivatives jump when a contact begins or the face above a point changes; at mu = 0 the derivative with respect to mu is
+one-sided.
 """
 
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from types import SimpleNamespace
 
 import warp as wp
 
 from cortado.device.launching import bundle
-from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.sph.moving_solids import free_module, hold_type
 
 STIFFNESS = 0.04
-"""The stiffness q of contacts [-]."""
+"""Stiffness q of contacts [-]."""
 FAR = 1e6
-"""[m] the greatest distance at which faces are searched."""
+"""Greatest distance at which faces are searched [m]."""
 SHARES = ("pushes", "drags", "scales")
-"""Names of a point's terms: d^3 n and its moments about the middles of both solids, as columns; the same for d^3 times
-the momentum that stops the point; d^3 and d^4, both also with d before the step; and the length of that momentum."""
+"""Terms of a surface point. ``pushes`` has the columns d^3 n and its moments about the middles of both solids.
+``drags`` has the same columns for d^3 times the momentum that stops the point. ``scales`` has d^3, d^4, both with d
+before the step, and the length of that momentum."""
 OWN = ("before", "turned_before", "after", "turned")
 POSES = ("before", "turns_before", "after", "turns")
 NUMBERS = ("time_step", "density", "other_density")
 
 
-@dataclass(frozen=True)
-class ContactKernels:
-    """Kernels of contact between a body and a solid; the first two have a thread for each surface point in each
-    scene."""
-
-    look: Any
-    """Finds the face behind which a point is deepest, starting from the deepest found so far. It writes the normal in
-    the other solid's frame, the distance of the face's plane from that solid's middle at a scale of 1, and the shift to
-    the nearest periodic image."""
-    push: Kernels
-    """Compute `SHARES` from both poses, the scale of the other solid, the lift of `lift_kernels` and `NUMBERS`. The
-    adjoint kernel writes adjoints of these inputs, point by point."""
-    give: Kernels
-    """Turn the sums of shares into momenta of both solids, with a thread for each scene; a solid that is not free gets
-    none."""
-
-
 @cache
-def contact_kernels(precision: Precision) -> ContactKernels:
-    """Make the kernels of contacts between bodies and solids in a precision."""
+def contact_kernels(precision: Precision) -> SimpleNamespace:
+    """Make the kernels of contact: ``look`` and ``push`` have a thread for each surface point in each scene, ``give``
+    has one for each scene. ``push`` computes `SHARES` from poses, scale, lift (`lift_kernels`) and `NUMBERS`, and
+    ``give`` turns their sums into momenta of both solids, 0 for a solid that is not free."""
     real, vector, matrix, pair = precision.real, precision.vector, precision.matrix, precision.pair
     modules, stiffness = [free_module(precision, "contacts")] * 3, wp.constant(real(STIFFNESS))
 
@@ -80,7 +64,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
 
     @wp.func
     def along(way: real, length: real) -> real:
-        """Shorten a separation along one axis [m] to that of the nearest periodic image."""
+        """Return a separation along one axis [m] as that of the nearest periodic image."""
         found = way
         if length > real(0.0):
             found = way - length * wp.round(way / length)
@@ -136,10 +120,9 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         other_scales,
         of: bundle(face=vector, plane=real, shift=vector, depth=real),
     ):
-        """Find the face. The mesh is about ``origin`` of a solid at rest, and about ``inner`` in the frame of one that
-        moves; ``period`` is 0 along an axis without one. ``axes`` is 1 along the axes of space. In the plane it
-        is 0 along z, where a GPU's fused products would leave the normal some 1e-18, and fluid would leave the
-        plane."""
+        """Find the face behind which a point is deepest. The mesh is centred on ``origin`` for a solid at rest, and on
+        ``inner`` in the frame of a moving solid. ``axes`` is 1 along the scene's axes; its 0 along z in the plane
+        removes the 1e-18 that a GPU's fused products leave in the normal."""
         j = wp.tid()
         b = j // particles
         way = after[b] + turns[b] * own[j] - other_after[b] - origin
@@ -264,4 +247,4 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         numbers=["is_free", "volumes", "greatest"],
         written=[f"{name}_sum" for name in SHARES],
     )
-    return ContactKernels(look, pushes, gives)
+    return SimpleNamespace(look=look, push=pushes, give=gives)

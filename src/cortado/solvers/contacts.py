@@ -1,4 +1,4 @@
-"""The contacts of free bodies with the container, solids and each other in a step: see `contact_kernels`."""
+"""Contacts of free bodies with the container, solids and each other in a step; see `contact_kernels`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,19 +29,17 @@ class Touching:
     body: int
     """Number of the body among the free bodies."""
     against: int
-    """Number of the other solid among the solids that move; -1 for solids at rest."""
+    """Number of the other solid among the moving solids; -1 for solids at rest."""
     other: int
-    """Number of the other solid among the free bodies; -1 for a solid that is not free."""
+    """Number of the other solid among the free bodies; -1 if it is not free."""
     obstacles: Sequence[Obstacle]
     points: NDArray[np.float64]
     """(n, d) points of the body's surface in the body's frame [m]"""
     slides: Sequence[float] = ()
-    """(d,) velocity with which the other solid's surface slides, in this solid's frame [m/s]; 0 without sliding"""
+    """(d,) velocity of the other solid's sliding surface, in the solid's frame [m/s]"""
 
 
 class Contact:
-    """One contact between a body and other solids, with its arrays on the device, in the steps of a solver."""
-
     def __init__(self, touching: Touching, spacing: float, layout: Layout):
         self.touching, precision, device = touching, layout.precision, layout.device
         self.meshes = [obstacle_mesh(one, spacing, device) for one in touching.obstacles]
@@ -57,22 +55,21 @@ class Contact:
         self.own = wp.array(np.tile(points, (layout.members, 1)), dtype=vector, device=device)
         self.all = layout.members * self.count
         self.found = self.arrays({"face": vector, "plane": real, "shift": vector, "depth": real})
-        """The faces above points of the body, as the kernel ``look`` writes them."""
+        """The faces above points of the body, written by the kernel ``look``."""
 
     def arrays(self, kinds: Mapping[str, Any]) -> Arrays:
-        """Make arrays (members points,) of zeros by name, with the types in ``kinds``."""
         return {name: wp.zeros(self.all, dtype=kind, device=self.layout.device) for name, kind in kinds.items()}
 
     def poses(self, each: Sequence[Named]) -> Named:
         """Return pose, scale and tangents of the other solid by the names of kernel arguments, given those of all
-        moving solids, ``each``."""
+        moving solids."""
         against = self.touching.against
         other = resting_pose(self.layout) if against < 0 else each[against]
         return {f"other_{name}": array for name, array in other.items()}
 
 
 class Totals:
-    """Arrays of values of a body's points, such as ``push_dot``, and their sums of each scene, ``push_sum_dot``."""
+    """Arrays of values of a body's points, and their sums over each scene."""
 
     def __init__(self, contact: Contact, kinds: Mapping[str, Any], suffix: str = "", end: str = "_sum"):
         layout = contact.layout
@@ -83,20 +80,18 @@ class Totals:
         }
 
     def sums(self) -> Arrays:
-        """Add up the values of each scene, to arrays (members,) by name."""
+        """Sum the values over each scene, to arrays (members,) by name."""
         pairs = zip(self._totals.items(), self.each.values(), strict=True)
         return {name: total(array) for (name, total), array in pairs}
 
 
 def share_kinds(layout: Layout) -> dict[str, Any]:
-    """Return the types of `SHARES` by name."""
     matrix = layout.precision.matrix
     return dict(zip(SHARES, (matrix, matrix, layout.precision.six), strict=True))
 
 
 class Contacts:
-    """The contacts of the free bodies of one solver with solids, the container and each other; each step looks for them
-    once poses are known."""
+    """The contacts of a solver's free bodies; each step looks for contacts once poses are known."""
 
     def __init__(
         self,
@@ -106,7 +101,7 @@ class Contacts:
         periods: NDArray[np.float64],
         layout: Layout,
     ):
-        """Prepare contacts of a solver's bodies; ``periods`` (d,) [m] are 0 along axes without one."""
+        """Prepare contacts; ``periods`` (d,) [m] are 0 along axes without one."""
         self.part, self.layout, self.kernels = part, layout, contact_kernels(layout.precision)
         self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
         self._poses = [contact.poses(part.made_of.walls.each) for contact in self.contacts]
@@ -120,20 +115,18 @@ class Contacts:
             for label, value in unsaid.items()
             for suffix in ("", "_dot", "_bar")
         }
-        """Default values for bodies without such keys; they are not parameters, and their tangents and adjoints are
-        never read."""
+        """Default friction and restitution of bodies without these keys; nothing reads their tangents and adjoints."""
         self.lifts = lift_kernels(layout.precision)
         self.lift = {"lift": wp.zeros(layout.members, dtype=layout.precision.vector, device=layout.device)}
 
     def bodies(self, number: int) -> tuple[FreeBody, FreeBody]:
-        """Return the body of a contact and the other free body. If the other solid is not free, return the first body
-        twice."""
+        """Return the body of a contact and the other free body; return the first body twice if the other solid is not
+        free."""
         touching, bodies = self.contacts[number].touching, self.part.bodies
         own = bodies[touching.body]
         return own, own if touching.other < 0 else bodies[touching.other]
 
     def known(self, step: StepContext, number: int) -> tuple[Named, ...]:
-        """Return the arrays and constants of a contact by the names of kernel arguments."""
         contact, (own, other), pair = self.contacts[number], self.bodies(number), self.layout.precision.pair
         constants: dict[str, Any] = {
             "particles": contact.count,
@@ -149,7 +142,7 @@ class Contacts:
         return *known, self._poses[number], own.constants, self.lift
 
     def numbers(self, parameters: Parameters, number: int, suffix: str = "") -> Arrays:
-        """Return the parameters of both solids, or tangents or adjoints of these, by the names of kernel arguments."""
+        """Return the parameters of both solids, or their tangents or adjoints, by the names of kernel arguments."""
         found = {f"time_step{suffix}": parameters["time_step"]}
         for way, body in zip(("", "other_"), self.bodies(number), strict=True):
             name, weight = body.table.name, body.table.weight
@@ -160,12 +153,12 @@ class Contacts:
         return found
 
     def given(self, number: int, each: Sequence[FreeBody | Changes]) -> Arrays:
-        """Return the momenta that both solids get, or tangents or adjoints of these."""
+        """Return the momenta of both solids, or their tangents or adjoints."""
         touching = self.contacts[number].touching
         return given_to(each, touching.body, touching.other)
 
     def look(self, step: StepContext) -> None:
-        """Find the contacts of a step, and add the momenta that bodies get from them."""
+        """Find the contacts of a step, and add their momenta to the bodies."""
         step.launch(self.lifts.forward, self.lift, threads=self.layout.members)
         for number, (contact, shares) in enumerate(zip(self.contacts, self._shares, strict=True)):
             for array in contact.found.values():
@@ -177,26 +170,19 @@ class Contacts:
             step.launch(self.kernels.give.forward, given, *self.known(step, number), threads=self.layout.members)
 
     def tangent(self, changes: Sequence[Changes]) -> "ContactsTangent":
-        """Return the tangent of `look`: it computes tangents of the contacts' pushes from ``changes`` of the bodies'
-        poses."""
         return ContactsTangent(self, changes)
 
     def adjoint(self, changes: Sequence[Changes]) -> "ContactsAdjoint":
-        """Return the adjoint of `look`: it turns adjoints, in ``changes``, of the contacts' pushes into adjoints of
-        poses, densities and the time step."""
         return ContactsAdjoint(self, changes)
 
 
 class ContactsTangent:
-    """The tangent of the contacts between bodies, for forward mode."""
-
     def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
         self._contacts, self._changes = contacts, changes
         self._shares = [Totals(contact, share_kinds(contacts.layout), "_dot") for contact in contacts.contacts]
         self._lift = {"lift_dot": wp.zeros_like(contacts.lift["lift"])}
 
     def look(self, step: StepContext, dot: Tangents) -> None:
-        """Add the tangents of the momenta that bodies get from contacts in `Contacts.look`."""
         contacts, members = self._contacts, self._contacts.layout.members
         step.launch(contacts.lifts.tangent, self._lift, contacts.lift, lift_sizes(dot, "_dot"), threads=members)
         for number, shares in enumerate(self._shares):
@@ -208,13 +194,10 @@ class ContactsTangent:
 
 
 def lift_sizes(of: Tangents | Adjoints, suffix: str) -> Arrays:
-    """Return tangents or adjoints of the values from which the lift is computed."""
     return {f"{name}{suffix}": of.parameters[name] for name in ("time_step", "gravity")}
 
 
 class ContactsAdjoint:
-    """The adjoint of the contacts between bodies, for reverse mode."""
-
     def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
         self._contacts, self._changes, layout = contacts, changes, contacts.layout
         vectors = [*OWN, *(f"other_{name}" for name in OWN), "lift"]
@@ -225,7 +208,7 @@ class ContactsAdjoint:
         self._sums = zeros(sums, layout.device)
 
     def look(self, step: StepContext, bar: Adjoints) -> None:
-        """Apply the adjoint of `Contacts.look`: turn adjoints of the bodies' momenta into adjoints of their poses."""
+        """Turn adjoints of the bodies' momenta into adjoints of poses, densities and the time step."""
         contacts, members = self._contacts, self._contacts.layout.members
         for number, (contact, moved) in enumerate(zip(contacts.contacts, self._moved, strict=True)):
             numbers = contacts.numbers(bar.parameters, number, "_bar")

@@ -1,6 +1,5 @@
 """A search for lost particles at the end of every step, on the device. Particles are lost if they are outside of their
-container, in a solid, too far away, or not finite. Another function finds walls that face one another at less than a
-spacing, which leave particles no room. Any solver can use this module."""
+container, in a solid, too far away, or not finite."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,12 +20,11 @@ from cortado.particles.state import Layout, State, padded
 from cortado.solvers.obstacles import FURTHEST, Obstacle, Walled, middle_of, obstacle_mesh
 
 NO_PARTICLE = 2**31 - 1
-"""Value in place of the first lost particle's number while no particle is lost."""
+"""Value in place of a particle's number while no particle is lost."""
 
 
 @cache
 def bounds_type(precision: Precision) -> Any:
-    """Make the Warp struct of the region open to particles, with tolerance and greatest distance."""
     real, vector = precision.real, precision.vector
 
     class Bounds:
@@ -39,7 +37,7 @@ def bounds_type(precision: Precision) -> Any:
         radius: real
         rim: real
         nearest: vector
-        """Corners of the box within which the precision resolves positions well enough."""
+        """``nearest`` and ``furthest`` are corners of the box that particles must not leave."""
         furthest: vector
 
     Bounds.__name__ = Bounds.__qualname__ = f"Bounds_{precision.name}"
@@ -48,16 +46,14 @@ def bounds_type(precision: Precision) -> Any:
 
 @cache
 def solids_type(precision: Precision) -> Any:
-    """Make the Warp struct of the solids that particles must not enter, as meshes about their middles."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     class Solids:
         meshes: wp.array(dtype=wp.uint64)
         still: wp.int32
-        """Number of solids that do not move, which come first."""
+        """Number of solids at rest, which come first."""
         middles: wp.array(dtype=vector)
-        """Points on which meshes are centred [m]: in space for solids at rest, in the solid's own frame for moving
-        solids."""
+        """Centres of meshes [m]: in space for solids at rest, in the solid's frame for moving solids."""
         before: wp.array2d(dtype=vector)
         """(members, solids) middles of moving solids before a step [m]."""
         turns_before: wp.array2d(dtype=matrix)
@@ -68,9 +64,7 @@ def solids_type(precision: Precision) -> Any:
         sides: wp.array(dtype=real)
         """1 where fluid is outside of a mesh, -1 where it is inside."""
         tolerances: wp.array(dtype=real)
-        """How deep in a solid a particle may be [m]."""
         reach: wp.float32
-        """Greatest distance from a surface at which particles are tested against it [m]."""
         period: vector
         """[m], 0 along an axis that is not periodic."""
         frequency: vector
@@ -82,14 +76,13 @@ def solids_type(precision: Precision) -> Any:
 
 @cache
 def lost_kernel(precision: Precision) -> Any:
-    """Make the kernel that looks for particles that were lost in a step."""
     real, vector = precision.real, precision.vector
     bounds_struct, solids_struct, matrix = bounds_type(precision), solids_type(precision), precision.matrix
     module = kernel_module(f"containment_{precision.name}")
 
     @wp.func
     def between(x: vector, lower: vector, upper: vector) -> bool:
-        """Test that a position lies in a box; False for one that is not a number."""
+        """Test that x lies in a box; False for NaN."""
         return (
             x[0] >= lower[0]
             and x[1] >= lower[1]
@@ -124,7 +117,7 @@ def lost_kernel(precision: Precision) -> Any:
         turns: wp.array2d(dtype=matrix),
         solids: solids_struct,
     ) -> vector:
-        """Return the position x in the frame of the mesh of solid k, as nearest periodic image."""
+        """Return x in the frame of the mesh of solid k, as nearest periodic image."""
         if k < solids.still:
             return nearest_image(x - solids.middles[k], solids)
         away = nearest_image(x - positions[member, k - solids.still], solids)
@@ -132,8 +125,8 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def is_deep(y: vector, k: int, scale: real, solids: solids_struct) -> bool:
-        """Test whether a place in the frame of solid k's mesh is deeper in the solid than its tolerance; False far from
-        the surface."""
+        """Test whether y, in the frame of solid k's mesh, is deeper in the solid than its tolerance; False far from the
+        surface."""
         place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
         found = wp.mesh_query_point_sign_winding_number(solids.meshes[k], place, solids.reach)
         depth = real(0.0)
@@ -144,7 +137,6 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def is_free(x: vector, member: int, solids: solids_struct) -> bool:
-        """Test that position x was not deep in any solid before the step."""
         for k in range(solids.meshes.shape[0]):
             y = seen_from(x, k, member, solids.before, solids.turns_before, solids)
             if is_deep(y, k, scale_of(k, member, solids), solids):
@@ -154,8 +146,7 @@ def lost_kernel(precision: Precision) -> Any:
     @wp.func
     def has_entered(before: vector, x: vector, member: int, solids: solids_struct) -> bool:
         """Test whether a particle is deep in a solid now and was in no solid before the step. Finding the side of a
-        surface is slow, so only surfaces within the distance moved plus the tolerance are tested: depth cannot change
-        by more."""
+        surface is slow, so only surfaces within the distance moved plus the tolerance are tested."""
         for k in range(solids.meshes.shape[0]):
             y = seen_from(x, k, member, solids.after, solids.turns, solids)
             gone = wp.length(y - seen_from(before, k, member, solids.before, solids.turns_before, solids))
@@ -197,10 +188,9 @@ def lost_kernel(precision: Precision) -> Any:
         particles. Scenes with an earlier bad step are skipped.
 
         A particle is lost if it is not finite, too far away, a mixture without volume, or went through a wall: it was
-        inside before the step and is outside after it, or then is in a solid. Fluid may cross the rim of an open cup.
-        Particles moved by a nozzle or a drain may pass walls; these have numbers from ``first_waiting`` on, in scene
-        order. ``x`` is the new state in that order. All other arrays are sorted; ``x_free`` and ``v_free`` are the new
-        state without nozzle and drains.
+        inside before the step and is outside or in a solid after it. Fluid may cross the rim of an open cup. Particles
+        from ``first_waiting`` on, in scene order, may pass walls if a nozzle or a drain moves them. ``x`` is the new
+        state in scene order; ``x_free`` and ``v_free`` are sorted and have no effect of nozzles and drains.
         """
         i = wp.tid()
         member = i // particles
@@ -232,39 +222,33 @@ def lost_kernel(precision: Precision) -> Any:
 
 
 REACH = 4.0
-"""In spacings: greatest distance from a surface at which particles are tested against it."""
+"""Greatest distance from a surface at which particles are tested against it [spacings]."""
 
 Distance = Callable[[Points], Points]
-"""Function that returns distances (n,) of points (n, d) [m] outside of a wall [m]."""
+"""Function that returns distances (n,) of points (n, d) outside of a wall [m]."""
 
 
 @dataclass(frozen=True)
 class Lost:
-    """The first particles that one scene has lost, all in one step."""
+    """The first particles that a scene has lost, all in one step."""
 
     step: int
-    """Number of the step, from 0."""
     particle: int
-    """Number of the first lost particle, in the scene's order."""
     others: int
-    """Number of further lost particles."""
 
 
 class Containment:
-    """The search for lost particles that one solver runs at the end of each step."""
-
     def __init__(
         self, walled: Walled, layout: Layout, launch: KernelLauncher, first_waiting: int, moving: MovingWalls | None
     ):
-        """Prepare the search: ``first_waiting`` is the first particle, in the scene's order, that may wait in a nozzle
-        or be removed by a drain, and ``moving`` has the poses of moving solids."""
+        """Prepare the search; particles from ``first_waiting`` on, in the scene's order, may wait in a nozzle or be
+        removed by a drain."""
         self.walled, self._precision, self._launch = walled, layout.precision, launch
         self._kernel = lost_kernel(layout.precision)
         members, device = layout.members, layout.device
         self._obstacles = (*walled.solids, *walled.moving)
         self._meshes = [obstacle_mesh(one, walled.spacing, device) for one in self._obstacles]
         self._poses = pose_arrays(members, 0, layout.precision, device) if moving is None else moving.named
-        """Poses of moving solids before and after a step."""
         self._constants: dict[str, Any] = {
             "bounds": self._made_bounds(),
             "solids": self._made_solids(device),
@@ -272,14 +256,14 @@ class Containment:
             "first_waiting": first_waiting,
         }
         self.bad_step = wp.full(members, -1, dtype=wp.int32, device=device)
-        """(members,) the first step in which a scene lost a particle; -1 while it has lost none."""
+        """(members,) first step in which a scene lost a particle, or -1"""
         self.bad_particle = wp.full(members, NO_PARTICLE, dtype=wp.int32, device=device)
-        """(members,) the first particle lost in the bad step; `NO_PARTICLE` while no particle is lost."""
+        """(members,) first particle lost in that step, or `NO_PARTICLE`"""
         self._count = wp.zeros(members, dtype=wp.int32, device=device)
         self._seen = HostCopy(self.bad_step)
 
     def reset(self, step: int = 0) -> None:
-        """Forget the particles that were lost from a step on; with step 0, all of an earlier run."""
+        """Forget the particles that were lost from a step on."""
         steps = self.bad_step.numpy() if step > 0 else np.array([-1])
         kept = (steps >= 0) & (steps < step)
         for array, well in ((self.bad_step, -1), (self.bad_particle, NO_PARTICLE), (self._count, 0)):
@@ -291,8 +275,8 @@ class Containment:
     def look(
         self, order: wp.array, x_before: wp.array, rho_0: wp.array, x_free: wp.array, v_free: wp.array, state: State
     ) -> None:
-        """Look for particles that a step has lost, given sorted positions and rest densities before the step, sorted
-        positions and velocities after it before a nozzle prescribes any, and the new state."""
+        """Look for lost particles, given sorted arrays before the step, sorted ``x_free`` and ``v_free`` after it
+        without nozzles and drains, and the new state."""
         self._launch(
             self._kernel,
             self._constants,
@@ -308,7 +292,7 @@ class Containment:
         )
 
     def lost(self) -> dict[int, Lost]:
-        """Return the particles lost since `reset` by the number of their scene; reads from the device."""
+        """Return the particles lost since `reset`, by the number of their scene; reads from the device."""
         steps = self._seen.read()
         members = np.flatnonzero(steps >= 0).tolist()
         if not members:
@@ -317,12 +301,11 @@ class Containment:
         return {b: Lost(int(steps[b]), int(particles[b]), int(counts[b]) - 1) for b in members}
 
     def is_imprecise(self, position: np.ndarray) -> bool:
-        """Test whether a position (d,) [m] is further from the origin than the precision resolves."""
         distance = float(np.abs(position).max())
         return self._precision.furthest * self.walled.spacing < distance < np.inf
 
     def where(self, position: np.ndarray) -> str:
-        """Describe in words how a particle that is now at a position (d,) [m] was lost."""
+        """Describe how a particle that is now at a position (d,) [m] was lost."""
         place = f"({', '.join(f'{x:g}' for x in position)}) m"
         if not np.isfinite(position).all():
             return "has no finite position"
@@ -338,24 +321,20 @@ class Containment:
         return f"at {place} has no finite velocity or no volume"
 
     def walls(self, member: int) -> Iterator[tuple[str, Distance]]:
-        """Yield the sides of the container and the solids of one scene, each with its name in words and a function of
-        distance; moving solids are where they are after the last step."""
+        """Yield the sides of the container and the solids of a scene after the last step, with names for messages and
+        functions of distance."""
         for side in self.walled.region.sides():
             yield "the container", side
         for one, distance in self._solids(member):
             yield f"the solid {one.name!r}", distance
 
     def _entered(self, position: np.ndarray) -> str | None:
-        """Name the solid that contains a position (d,) [m], with solids as in the first scene; None if no solid
-        does."""
         for one, distance in self._solids(0):
             if distance(position[None])[0] < -self.walled.tolerance(one):
                 return one.name
         return None
 
     def _solids(self, member: int) -> Iterator[tuple[Obstacle, Distance]]:
-        """Yield the solids of a scene with their poses after the last step, each with a function of the distance from
-        the solid."""
         yield from ((one, one.solid.distance) for one in self.walled.solids)
         poses = (self._poses[name].numpy()[member] for name in ("after", "turns", "scales"))
         for one, *pose in zip(self.walled.moving, *poses, strict=True):
@@ -395,22 +374,22 @@ class Containment:
 
 
 def _moved_distance(one: Obstacle, middle: np.ndarray, turn: np.ndarray, scale: float, points: Points) -> Points:
-    """Return distances (n,) of points (n, d) [m] outside of a solid that is turned, scaled and moved to ``middle``."""
+    """Return distances (n,) [m] of points (n, d) from a solid that is turned, scaled and moved to ``middle``."""
     d = points.shape[1]
     return np.asarray(scale * one.solid.distance((points - middle[:d]) @ turn[:d, :d] / scale))
 
 
 NARROW = 0.95
-"""In spacings: walls nearer to one another than this press on particles between them."""
+"""Gap [spacings] below which two walls press on particles between them."""
 FACING = -0.5
-"""Two walls face one another if the scalar product of their normals is below this; corners of 90 degrees have 0."""
+"""Bound on the scalar product of the normals of two walls that face one another; corners of 90 degrees have 0."""
 STEP = 1e-3
-"""In spacings: the step h of the central differences, from x - h to x + h, by which normals are computed."""
+"""Step h of the central differences from x - h to x + h for normals [spacings]."""
 
 
 def shut_in(containment: Containment, member: int, points: Points) -> str | None:
-    """Name the walls of a scene between which some of the points (n, d) [m] are shut in; None if all points have room.
-    Moving solids have their poses after the last step."""
+    """Name the walls of a scene between which points (n, d) [m] are shut in after the last step; None if all points
+    have room."""
     spacing = containment.walled.spacing
     best, found = NARROW * spacing, None
     near = [
@@ -432,6 +411,6 @@ def shut_in(containment: Containment, member: int, points: Points) -> str | None
 
 
 def _normals(distance: Distance, points: Points, step: float) -> Points:
-    """Return normals (n, d) out of a wall at points (n, d) [m], by central differences of distances over a step [m]."""
+    """Return normals (n, d) of a wall at points (n, d) [m], by central differences over a step [m]."""
     moves = step * np.eye(points.shape[1])
     return np.stack([(distance(points + move) - distance(points - move)) / (2.0 * step) for move in moves], axis=1)

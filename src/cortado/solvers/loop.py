@@ -1,18 +1,18 @@
-"""The loops of a step, which iterate until an error is small enough. Kernels decide on the device whether to continue,
-and record iterations and errors of every step, also iterations of solves by forces."""
+"""Loops of a step, which iterate until an error is small enough; kernels decide when to stop and record every step."""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Protocol
+from types import SimpleNamespace
+from typing import Protocol
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import HostCopy, KernelLauncher
-from cortado.device.modules import kernel_module
+from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_and_maximum
 from cortado.particles.state import Layout
@@ -20,41 +20,27 @@ from cortado.solvers.containment import NO_PARTICLE, Containment
 from cortado.solvers.solver import Counts
 
 UNKNOWN = 2**31 - 1
-"""Value in place of a loop's number of iterations before the number is known."""
+"""Value in place of a number of iterations while a loop runs."""
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A rule that reduces the errors of all particles, a pair of numbers each, to one or two numbers a step."""
+    """A reduction of all particles' errors, a pair of numbers each, to one or two numbers a step."""
 
     columns: tuple[str, ...]
-    """Names of these numbers in a run's diagnostics, made from the loop's name; a tolerance bounds the first."""
+    """Names of these numbers in diagnostics, formatted with the loop's name; a tolerance bounds the first."""
     is_weighted: bool
-    """True if a pair is a weighted square and its weight: the result is the root of the weighted mean. Otherwise both
-    are the error: the results are average and maximum."""
+    """True if a pair is a weighted square and its weight, reduced to the root of the weighted mean. Otherwise a pair
+    has the error twice, reduced to average and maximum."""
 
 
 AVERAGE = Measure(("{}", "greatest_{}"), is_weighted=False)
 ROOT_MEAN_SQUARE = Measure(("{}",), is_weighted=True)
 
 
-@dataclass(frozen=True)
-class ConvergenceKernels:
-    """Kernels that count iterations and steps on the device, with one thread a scene."""
-
-    decide: Any
-    """Decides whether to continue iterating."""
-    record: Any
-    """Records a loop that has ended; the last loop of a step ends the step."""
-    count_step: Any
-    """Ends a step without loops."""
-    note: Any
-    """Records the iterations that a force took in a step to solve its equations."""
-
-
 @cache
-def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> ConvergenceKernels:
-    """Make the kernels that count and stop iterations, for a precision and a measure of errors."""
+def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> SimpleNamespace:
+    """Make the kernels that count and stop iterations, with one thread for each scene."""
     real, pair = precision.real, precision.pair
     module = kernel_module(f"convergence_{precision.name}{'_weighted' * measure.is_weighted}")
 
@@ -64,7 +50,6 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
 
     @wp.func
     def root_of_mean(sums: pair, particles: int) -> pair:
-        """Return the root of the weighted mean square, and 0, from sums of weighted squares and weights."""
         mean = real(0.0)
         if sums[1] != real(0.0):
             mean = sums[0] / sums[1]
@@ -79,8 +64,8 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
     def decide(
         done: int, most: int, particles: int, tolerance: real, greatest_tolerance: real, sums, iteration, rounds, active
     ):
-        """Decide which scenes continue: add ``done`` iterations to their counts, set ``rounds`` of scenes whose error
-        is below the tolerances, and count the other scenes in ``active``."""
+        """Add ``done`` iterations to the counts, set ``rounds`` of scenes whose error is below the tolerances, and
+        subtract these scenes from ``active``."""
         b = wp.tid()
         if rounds[b] != wp.static(UNKNOWN):
             return
@@ -116,7 +101,7 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
         errors: wp.array2d(dtype=pair),
     ):
         """Record a loop's iterations, with those that were ``undecided``, and its errors; after the last loop count the
-        step. The next loop begins with all scenes."""
+        step."""
         b = wp.tid()
         n = step[b]
         iterations[n, b] = iteration[b] + undecided
@@ -139,35 +124,33 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
         b = wp.tid()
         iterations[step[b], b] = count[b]
 
-    return ConvergenceKernels(decide, record, count_step, note)
+    return by_name(decide, record, count_step, note)
 
 
 class IterativeSolve(Protocol):
-    """The iterative solution of a force's equations, the attribute ``solve`` of the force."""
+    """The iterative solution of a force's equations; a force has it as ``solve``."""
 
     name: str
-    """Name of the solve's number of iterations in the diagnostics of a run."""
+    """Name of the iterations in the diagnostics of a run."""
     count: wp.array
     """(members,) iterations of the last solve."""
 
 
 class SolveRecord:
-    """The number of iterations of a force's solve in every step, on the device until it is read."""
+    """Iterations of a force's solve in each step, on the device until they are read."""
 
     def __init__(self, steps: int, solve: IterativeSolve, layout: Layout):
         self.iterations = wp.zeros((max(steps, 1), layout.members), dtype=wp.int32, device=layout.device)
-        """(steps, members) on the device."""
+        """(steps, members)"""
         self.solve, self._kept = solve, (slice(None), 0 if layout.batch is None else slice(None))
         self._seen, self._note = HostCopy(self.iterations), convergence_kernels(layout.precision).note
         self.read(0)
 
     def read(self, steps: int) -> None:
-        """Read the iteration counts of the first ``steps`` steps from the device."""
         self.found: NDArray = self._seen.read(steps).astype(int)[self._kept]
-        """(steps,), in a batch (steps, batch), of the steps that were read."""
+        """Iterations (steps,) of the steps that were read, in a batch (steps, batch)."""
 
     def assign(self, other: "SolveRecord") -> None:
-        """Copy the counts that another record has read, both on the device and on the host."""
         wp.copy(self.iterations, other.iterations)
         self.found = other.found
 
@@ -179,51 +162,47 @@ class SolveRecord:
 
 @dataclass(frozen=True)
 class LoopLimits:
-    """Bounds on the iterations and the errors of a loop, which say when it stops."""
-
     minimum_iterations: int
     maximum_iterations: int
     tolerance: float
-    """Bound on the first number of the loop's `Measure`, such as the average of the particles' errors."""
+    """Bound on the first number of the loop's `Measure`."""
     greatest_tolerance: float
-    """Bound on the maximum of the particles' errors; infinite if there is no such bound."""
+    """Bound on the maximum of the particles' errors; may be infinite."""
 
 
 class LoopRecord:
-    """The iterations and errors of one loop in every step of a run, on the device until they are read."""
+    """Iterations and errors of one loop in each step, on the device until they are read."""
 
     def __init__(self, steps: int, loop: "Loop"):
         shape, layout = (max(steps, 1), loop.layout.members), loop.layout
         self.iterations = wp.zeros(shape, dtype=wp.int32, device=layout.device)
-        """(steps, members) on the device."""
+        """(steps, members)"""
         self.errors = wp.zeros(shape, dtype=layout.precision.pair, device=layout.device)
-        """(steps, members) errors reduced by the loop's measure, on the device."""
+        """Errors of each step (steps, members), reduced by the loop's measure."""
         self.loop = loop
         self._seen = HostCopy(self.iterations), HostCopy(self.errors)
         self.read(0)
 
     def read(self, steps: int) -> None:
-        """Read the iterations and errors of the first ``steps`` steps from the device."""
         loop, kept = self.loop, (slice(None), 0 if self.loop.layout.batch is None else slice(None))
         iterations, errors = (copy.read(steps) for copy in self._seen)
         iterations = iterations.astype(int)
         self.counts = iterations.max(axis=1)
-        """(steps,) number of iterations; in a batch that of the scene with the most."""
+        """Number of iterations of each step (steps,); in a batch, of the scene with the most."""
         self.diagnostics: dict[str, NDArray] = {loop.iterations_name: iterations[kept]}
         for number, name in enumerate(loop.columns):
             self.diagnostics[name] = errors[..., number][kept].astype(np.float64)
-        """(steps,) by name, in a batch (steps, batch), of the steps that were read."""
+        """Diagnostics (steps,) by name, in a batch (steps, batch)."""
 
     def assign(self, other: "LoopRecord") -> None:
-        """Copy the iterations and errors that another record has read, both on the device and on the host."""
         wp.copy(self.iterations, other.iterations)
         wp.copy(self.errors, other.errors)
         self.counts, self.diagnostics = other.counts, other.diagnostics
 
     @property
     def converged(self) -> NDArray:
-        """Return (steps,) or (steps, batch) booleans: the errors came below the tolerances; all True with a fixed
-        number of iterations."""
+        """Return booleans (steps,) or (steps, batch): errors are below the tolerances, or the number of iterations is
+        fixed."""
         limits, found = self.loop.limits, [self.diagnostics[name] for name in self.loop.columns]
         if limits is None or limits.minimum_iterations == limits.maximum_iterations:
             return np.ones(found[0].shape, dtype=bool)
@@ -232,8 +211,7 @@ class LoopRecord:
 
 
 class IterationLog:
-    """A `StepLog` of the records of a step's loops and of solves by forces. Without either it only has ``converged``,
-    which is True."""
+    """A `StepLog` of the records of loops and of forces' solves; without both it has only ``converged``, all True."""
 
     def __init__(self, steps: int, loops: Sequence["Loop"], solves: Sequence[IterativeSolve], layout: Layout):
         self.records = tuple(LoopRecord(steps, loop) for loop in loops)
@@ -281,16 +259,15 @@ class Loop:
         errors_name: str = "density_errors",
         measure: Measure = AVERAGE,
     ):
-        """Prepare a loop; with ``limits`` None it never iterates. The names are used in the diagnostics of a run."""
+        """Prepare a loop, which never iterates if ``limits`` is None; the names appear in the diagnostics of a run."""
         precision, device = layout.precision, layout.device
         self.limits, self.iterations_name, self.layout = limits, iterations_name, layout
         self.columns = [column.format(errors_name) for column in measure.columns]
-        """Names of the numbers to which errors are reduced."""
         self.errors = wp.zeros(layout.all_particles, dtype=precision.pair, device=device)
-        """(n,) the pair of errors of each particle for the `Measure`; every iteration writes it."""
+        """Errors (n,) of particles, one pair for each; every iteration writes them."""
         self.rounds = wp.full(layout.members, UNKNOWN, dtype=wp.int32, device=device)
-        """(members,) number of iterations of each scene of a batch, `UNKNOWN` until it is known. Iteration k must not
-        change scenes whose number is k or less."""
+        """Iterations (members,) of each scene, `UNKNOWN` until known. Iteration k must not change scenes whose number
+        is k or less."""
         self._launch, self._kernels = launch, convergence_kernels(precision, measure)
         self._sum = (
             layout.sum_of(precision.pair)
@@ -300,26 +277,25 @@ class Loop:
         self._sums = wp.zeros(layout.members, dtype=precision.pair, device=device)
         is_fixed = limits is not None and limits.minimum_iterations == limits.maximum_iterations
         self._fixed = limits.minimum_iterations if limits is not None and is_fixed else 0
-        """Number of iterations of every step if it is fixed; otherwise 0."""
+        """Number of iterations if it is fixed; otherwise 0."""
         self._iteration = wp.zeros(layout.members, dtype=wp.int32, device=device)
         self._active = wp.full(1, layout.members, dtype=wp.int32, device=device)
 
     def reset(self) -> None:
-        """Forget the iteration count of a step that was interrupted."""
         self._iteration.zero_()
         self.rounds.fill_(UNKNOWN)
         self._active.fill_(self.layout.members)
 
     def seek(self, record: LoopRecord, step: int) -> int:
-        """Prepare the loop for as many iterations as in a recorded step, and return that number. Scenes of a batch may
-        differ in it."""
+        """Prepare the loop for the iterations of a recorded step, and return their number; scenes of a batch may
+        differ."""
         if self.layout.members > 1:
             wp.copy(self.rounds, record.iterations[step])
         return int(record.counts[step])
 
     def run(self, iterate: Callable[[int], None]) -> None:
-        """Iterate until the errors are small enough. ``iterate`` takes the number of the iteration, from 0. Beyond the
-        least number of iterations a graph captures it once, with the greatest number as its argument."""
+        """Iterate until the errors are small enough. ``iterate`` takes the number of the iteration, from 0; beyond the
+        minimum, a graph captures it once, with the maximum as its argument."""
         limits = self.limits
         if limits is None:
             return
@@ -338,7 +314,7 @@ class Loop:
             wp.capture_while(self._active, once_more)
 
     def note(self, record: LoopRecord, containment: Containment, step_number: wp.array, is_last: bool) -> None:
-        """Record the iterations and errors of this step's loop; the last loop of a step counts the step."""
+        """Record this step's iterations and errors; the last loop of a step counts the step."""
         self._launch.join()
         self._launch(
             self._kernels.record,

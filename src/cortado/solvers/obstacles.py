@@ -1,10 +1,4 @@
-"""The region open to particles: the container and solids in the form that solvers use. Solids are given by wall
-particles, and by meshes for computing depths in solids. Flat faces of moving solids mirror the fluid
-(`cortado.particles.mirrors`).
-
-This module also has emitters and drains in the form that parts of a step use, and the places where their particles
-rest.
-"""
+"""The region open to particles with its solids as meshes, and emitters and drains in the form that a step uses."""
 
 import itertools
 from collections.abc import Iterator
@@ -31,20 +25,18 @@ from cortado.sph.drains import BALL, BOX, PLANE, Drained, Mouth, Pull
 from cortado.sph.emitter import Nozzle
 
 FINE = 0.2
-"""In spacings: the width of the mesh faces of round solids."""
+"""Width of the mesh faces of round solids [spacings]."""
 HEIGHT = 100.0
 """Height over width of the mesh of a plane shape."""
 DEEPEST, THINNEST = 1.0, 0.45
-"""Depths in a solid, in spacings and as a part of its thickness, beyond which particles are lost. At sharp edges,
-behind which there are few wall particles, some fluid particles enter by half a spacing."""
+"""Depths in a solid beyond which particles are lost, in spacings and as a part of its thickness. At sharp edges, behind
+which there are few wall particles, some fluid particles enter by half a spacing."""
 FURTHEST = 1e6
-"""In spacings from the region of the first particles and walls: particles beyond are lost."""
+"""Distance from the first particles and walls beyond which particles are lost [spacings]."""
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A solid, which particles cannot enter."""
-
     name: str
     solid: Solid
     is_hollow: bool
@@ -55,56 +47,51 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class NamedSolid:
-    """A solid of a scene: the number that its wall particles have, and its middle at the start."""
-
     number: int
-    """Number of its wall particles (`cortado.scene.motions.wall_numbers`)."""
+    """Number of the solid's wall particles (`cortado.scene.motions.wall_numbers`)."""
     middle: NDArray
-    """(3,) middle of the solid at the start [m]"""
+    """(3,) at the start [m]"""
 
 
 @dataclass(frozen=True)
 class Walled:
-    """The places where particles may go: the region of the container and the solids in it."""
+    """The region where particles may go: the container and the solids in it."""
 
     region: Region
-    """The container, without open sides: those across a periodic axis, and all sides if no pressure acts."""
+    """The container without sides across a periodic axis, and without all sides if no pressure acts."""
     near: Region
-    """A box around the first particles and the walls."""
     spacing: float
     """[m]"""
     solids: tuple[Obstacle, ...]
-    """Solids at rest, in their places."""
     moving: tuple[Obstacle, ...]
-    """Solids that move, each about its middle."""
+    """Moving solids, each about its middle."""
     periods: Points
-    """(d,) the lengths of the period [m], 0 for axes without one"""
+    """(d,) lengths of the period [m], 0 for axes without one"""
 
     @property
     def dimension(self) -> int:
-        """Return the number of dimensions, 2 or 3."""
         return len(self.near.lower)
 
     def tolerance(self, one: Obstacle) -> float:
-        """Return how deep in a solid a particle may be [m]: a spacing, or 0.45 of a thin solid's thickness."""
+        """Return the depth in a solid beyond which a particle is lost [m]."""
         return min(DEEPEST * self.spacing, THINNEST * one.thickness)
 
     def furthest(self, precision: Precision) -> Region:
-        """Return the box that positions must not leave [m]: a large box within which the precision resolves positions.
-        Fluid spilled over the rim of an open cup may fall on inside it."""
+        """Return the box that positions must not leave [m]. The precision limits the box, except for an open cup, over
+        whose rim fluid may spill."""
         spilled, reach = np.isfinite(self.region.rim), FURTHEST * self.spacing
         limit = np.inf if spilled else precision.furthest * self.spacing
         return Region.between(np.maximum(self.near.lower - reach, -limit), np.minimum(self.near.upper + reach, limit))
 
 
 def middle_of(one: Obstacle) -> Points:
-    """Return the middle (d,) of the box around the shape of an obstacle [m]."""
+    """Return the middle (d,) [m] of the box around an obstacle's shape."""
     lower, upper = one.solid.extent()
     return np.asarray(0.5 * (lower + upper))
 
 
 def obstacle_mesh(one: Obstacle, spacing: float, device: wp.Device) -> wp.Mesh:
-    """Make the surface mesh of an obstacle about its middle; a plane shape becomes a prism of great height."""
+    """Make the surface mesh of an obstacle about its middle; a plane shape becomes a tall prism."""
     faces = one.solid.faces(FINE * spacing)
     faces = faces.reversed() if one.is_hollow else faces
     vertices, corners = faces.vertices - middle_of(one), faces.corners
@@ -126,7 +113,6 @@ def obstacle_mesh(one: Obstacle, spacing: float, device: wp.Device) -> wp.Mesh:
 
 
 def placed_sheets(scene: Scene) -> list[PlacedSheet]:
-    """Return the sheets of a scene, with the numbers of their wall particles."""
     numbers, placed = wall_numbers(scene.solid), []
     for table in scene.solid:
         about = table.own_solid()
@@ -137,14 +123,14 @@ def placed_sheets(scene: Scene) -> list[PlacedSheet]:
 
 
 LENGTH = 4.0
-"""Length of the shortest face that mirrors, in support radii."""
+"""Length of the shortest mirroring face [support radii]."""
 ON = 1e-6
-"""In spacings: a point nearer to a face than this is on the face."""
+"""Greatest distance from a face at which a point counts as on the face [spacings]."""
 
 
 @dataclass(frozen=True)
 class FlatFaces:
-    """Flat faces of moving solids, in the frames of the solids."""
+    """Flat faces of moving solids that mirror the fluid, in the frames of the solids."""
 
     solids: Numbers
     """(f,) numbers of the faces' solids"""
@@ -156,8 +142,8 @@ class FlatFaces:
     """(f, 3) 0, and half lengths along these two vectors [m]"""
 
     def behind(self, solid: Numbers, positions: Points, feet: Points, near: float) -> Numbers:
-        """Return, for wall particles (b,), the number of the face that each is behind, or -1. The foot of a wall
-        particle ends on a face if its end is nearer to the face than ``near`` [m]."""
+        """Return for wall particles (b,) the number of the face that each is behind, or -1; ``near`` [m] is the
+        tolerance."""
         found = np.full(len(solid), -1)
         for number, (own, place, frame, size) in enumerate(
             zip(self.solids, self.places, self.frames, self.sizes, strict=True)
@@ -171,9 +157,9 @@ class FlatFaces:
 
 
 def flat_faces(scene: Scene, support: float, most: int) -> FlatFaces:
-    """Find the mirroring faces, at ``most`` so many, of a scene with a ``support`` radius [m]. They are long enough
-    edges of boxes and polygons in the plane, and sides of boxes in space. Their solids have prescribed paths, and fluid
-    slips freely along them. Other solvers, and scenes with periods, have no such faces."""
+    """Find up to ``most`` mirroring faces of a scene with a ``support`` radius [m]: long edges of plane boxes and
+    polygons, and sides of boxes in space. The faces' solids have prescribed paths, and fluid slips along them. Only
+    scenes of the projection without periods have mirroring faces."""
     found = []
     if isinstance(scene.solver, ProjectionSolver) and not np.any(scene.container.periods(scene.dimension)[1]):
         for number, table in enumerate(moving(scene.solid)):
@@ -186,7 +172,7 @@ def flat_faces(scene: Scene, support: float, most: int) -> FlatFaces:
 
 
 def _edges(solid: Solid, spacing: float) -> Iterator[tuple[Points, Points, Points]]:
-    """Yield the middle, the frame and half the size of each edge of a solid in the plane, as `FlatFaces` has them."""
+    """Yield middle, frame and half size of each edge of a plane solid, as in `FlatFaces`."""
     faces = solid.faces(spacing)
     for start, end in faces.vertices[faces.corners]:
         length = float(np.linalg.norm(end - start))
@@ -196,8 +182,7 @@ def _edges(solid: Solid, spacing: float) -> Iterator[tuple[Points, Points, Point
 
 
 def _sides(solid: Solid) -> Iterator[tuple[Points, Points, Points]]:
-    """Yield the middle, the frame and half the size of each of the six sides of a box in space; nothing for other
-    solids."""
+    """Yield middle, frame and half size of the six sides of a box in space; nothing for other solids."""
     box, outwards = (solid.cavity, -1.0) if isinstance(solid, Hollow) else (solid, 1.0)
     if isinstance(box, Box):
         for axis, sign in itertools.product(range(3), (-1.0, 1.0)):
@@ -207,7 +192,6 @@ def _sides(solid: Solid) -> Iterator[tuple[Points, Points, Points]]:
 
 
 def nozzles_of(scene: Scene, discrete: DiscreteScene) -> list[Nozzle]:
-    """Return the emitters of a scene with their particles."""
     spacing, names = scene.discretisation.spacing, [None, *(drain.name for drain in scene.drain)]
     return [
         Nozzle(
@@ -224,8 +208,7 @@ def nozzles_of(scene: Scene, discrete: DiscreteScene) -> list[Nozzle]:
 
 
 def drained_of(scene: Scene, discrete: DiscreteScene, precision: Precision) -> Drained | None:
-    """Return the drains of a scene; None for a scene without drains. Raises `InputError` if there is no place for the
-    particles that drains remove."""
+    """Return the drains of a scene, or None; raise `InputError` if removed particles would lie beyond the precision."""
     if not scene.drain:
         return None
     fluid, d, spacing = discrete.fluid, scene.dimension, scene.discretisation.spacing

@@ -1,4 +1,4 @@
-"""Tangent and adjoint of the common base of solvers of particles; a solver adds the derivatives of its own loops."""
+"""Tangent and adjoint of the base of solvers of particles; a solver adds the derivatives of its loops."""
 
 from functools import partial
 from weakref import finalize
@@ -16,8 +16,6 @@ from cortado.sph.parts import Adjoints, Carried, Shares, StepContext, Tangents
 
 
 class ParticleTangent:
-    """The tangent of a step along tangents of the parameters, part by part, in the order of the step."""
-
     def __init__(self, solver: ParticleSolver, parameters_dot: Parameters):
         self._solver = solver
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
@@ -26,13 +24,12 @@ class ParticleTangent:
         self.carried_dot = Carried(solver.carried_fields, solver.layout)
         kick = solver.kick_of(self.carried_dot)
         self.dot = Tangents(fields, solver.new_fractions(), parameters_dot, bodies, kick)
-        """Tangents of the parameters, and after `sort` of the sorted particles."""
+        """Tangents of the parameters, and after `sort` of sorted particles."""
         self.density = solver.density.new_tangent()
         self._accelerations_dot = [solver.vectors() for _ in range(len(solver.forces) + 1)]
         finalize(self, solver.launch.forget)
 
     def sort(self, context: StepContext, state_dot: State) -> None:
-        """Apply the tangent of `ParticleSolver.sort`: neighbours, density and parts at the beginning of a step."""
         solver, d = self._solver, self.dot.fields
         context.launch(
             solver.integration.sort,
@@ -51,13 +48,12 @@ class ParticleTangent:
             part.sort(context, self.dot, state_dot)
 
     def accelerate(self, context: StepContext) -> wp.array:
-        """Return the tangent of the explicit accelerations that `ParticleSolver.accelerate` computes, (n,) vectors."""
         for t, force in enumerate(self._solver.forces):
             force.tangent(context, self.dot, self._accelerations_dot[t], self._accelerations_dot[t + 1])
         return self._accelerations_dot[-1]
 
     def predict(self, context: StepContext, v_star: wp.array, x_star_dot: wp.array, v_star_dot: wp.array) -> None:
-        """Write the tangents of accelerations and of a prediction v* = v + dt a, x* = x + dt v*, and v* itself."""
+        """Write v* = v + dt a, and the tangents of v* and of x* = x + dt v*."""
         accelerations = {"acceleration": self._solver.accelerations[-1], "acceleration_dot": self.accelerate(context)}
         out = {"v_star": v_star, "x_star_dot": x_star_dot, "v_star_dot": v_star_dot}
         context.launch(self._solver.integration.predict_tangent, *self.dot.named, **accelerations, **out)
@@ -65,7 +61,6 @@ class ParticleTangent:
     def unsort(
         self, context: StepContext, x_dot: wp.array, v_dot: wp.array, state_dot: State, **carried_dot: wp.array
     ) -> None:
-        """Write the tangent of the new state from those of sorted positions and velocities."""
         solver = self._solver
         scene = {"x_scene": state_dot.positions, "v_scene": state_dot.velocities}
         context.launch(solver.integration.unsort, x=x_dot, v=v_dot, **scene)
@@ -75,8 +70,7 @@ class ParticleTangent:
 
 
 class ParticleAdjoint:
-    """The adjoint of steps, part by part, in the reverse order of a step; sums over neighbours are gathers without
-    atomics."""
+    """The adjoint of steps, part by part in reverse order; sums over neighbours are gathers without atomics."""
 
     def __init__(self, solver: ParticleSolver, steps: int):
         layout = solver.layout
@@ -93,22 +87,20 @@ class ParticleAdjoint:
             SolidShares(solver.search.moving, layout),
             [own for part in self._parts if isinstance(part, FreeSolidsAdjoint) for own in part.bodies],
         )
-        """Adjoints; those of the parameters are complete after `collect`."""
+        """Adjoints; adjoints of parameters are complete after `collect`."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
-        """Adjoints of the fields that the step carries on, valid after `unsort`."""
+        """Adjoints of the carried fields, valid after `unsort`."""
         self.density, self._acceleration_bar = solver.density.new_adjoint(), solver.vectors()
         self._collect = CapturedGraph(partial(self.bar.shares.collect, self.bar.parameters), solver.launch)
         finalize(self, solver.launch.forget)
 
     def begin(self) -> None:
-        """Set the adjoints of the parameters to 0, before a backward pass."""
         self.bar.fractions.zero_()
         self.bar.shares.clear()
         self.bar.parameters.clear()
         self.bar.solids.clear()
 
     def collect(self) -> Parameters:
-        """Return the adjoints of the parameters, summed over all steps since `begin`."""
         self._collect()
         return self.bar.parameters
 
@@ -122,14 +114,14 @@ class ParticleAdjoint:
         return free_bar
 
     def begin_step(self, context: StepContext, free_bar: State, v_star: wp.array) -> None:
-        """Write the adjoints of the fields of a step that ends with x' = x + dt v', given the result of `unsort`. v' is
-        the ``v_star`` of an explicit prediction. Earlier values are overwritten."""
+        """Write the adjoints of the fields of a step that ends with x' = x + dt ``v_star``, given the result of
+        `unsort`; earlier values are overwritten."""
         scene = {"x_scene_bar": free_bar.positions, "v_scene_bar": free_bar.velocities}
         context.launch(self._solver.integration.begin_adjoint, *self.bar.named, v_star=v_star, **scene)
 
     def predict(self, context: StepContext, within: WithinBar | None = None) -> None:
-        """Apply the adjoints of a prediction v* = v + dt a and of `accelerate`, starting from the adjoint of velocities
-        at that point; adjoints ``within`` the step are added."""
+        """Apply the adjoints of v* = v + dt a and of `accelerate`, from the adjoint of velocities; add adjoints
+        ``within`` the step."""
         fields = self.bar.fields
         if within is not None:
             add(within.v_star, fields["v"])
@@ -141,7 +133,6 @@ class ParticleAdjoint:
                 add(given, total)
 
     def accelerate(self, context: StepContext, acceleration_bar: wp.array) -> None:
-        """Apply the adjoint of `ParticleSolver.accelerate`, given the adjoint of its accelerations, (n,) vectors."""
         for force in reversed(self._solver.forces):
             passed = force.adjoint(context, acceleration_bar, self.bar)
             acceleration_bar = acceleration_bar if passed is None else passed

@@ -1,8 +1,4 @@
-"""The common base of solvers of particles: everything in a step except the loops that make the fluid incompressible.
-
-A solver of this kind is a `ParticleSolver` with loops of its own; `cortado.solvers.particle_derivatives` has the bases
-of its tangent and its adjoint.
-"""
+"""The base of solvers of particles: everything in a step except the loops that make the fluid incompressible."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,11 +30,9 @@ from cortado.sph.parts import Carried, Force, Part, PartMaker, StepContext, inte
 
 @dataclass(frozen=True)
 class ParticleSystem:
-    """A scene discretised into particles on a device, the input of solvers; `cortado.solvers.build.particle_system`
-    makes it."""
+    """A scene discretised into particles on a device; `cortado.solvers.build.particle_system` makes it."""
 
     called: str
-    """The name of the solver in messages."""
     discretisation: Discretisation
     layout: Layout
     lattice: Lattice
@@ -47,38 +41,35 @@ class ParticleSystem:
     periods: Sequence[float]
     """(3,) [m], 0 along an axis that is not periodic."""
     parts: Sequence[PartMaker]
-    """Makers of the parts that are not forces."""
     waiting: int
-    """Number of the first particle of a scene that may wait in a nozzle or be removed by a drain."""
+    """Number of the first particle that may wait in a nozzle or be removed by a drain."""
     walled: Walled
     mirrors: tuple[Points, Points]
     """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite at ends
     without a mirror."""
     faces: FlatFaces
-    """Faces of moving solids that mirror the fluid."""
     solids: Mapping[str, NamedSolid]
-    """The solids of the scene by their names."""
     sheets: Sheets | None
-    """The scene's walls of no thickness; None without any."""
+    """Walls of no thickness; None without any."""
     of_one_lane: Callable[[], "ParticleSystem"]
-    """Makes a system with the same search for neighbours and with kernels that Warp's tape can differentiate."""
+    """Makes a system with the same neighbour search and with kernels for Warp's tape."""
 
 
 class ParticleSolver(Staying):
-    """The base of solvers that take steps of one set of particles on one device; every step reuses its arrays.
+    """The base of solvers of one set of particles on one device; every step reuses its arrays.
 
     `Solver` documents the methods of its protocol. A subclass defines `step`, `replay` and `write_state`, with loops
-    also `reserve`, and if it has derivatives also `tangent`, `adjoint` and `differentiable`.
+        also `reserve`, and if it has derivatives also `tangent`, `adjoint` and `differentiable`.
     """
 
     carried_fields: tuple[StateField, ...] = ()
-    """Fields of particles that the solver itself carries from step to step."""
+    """Fields of particles that the solver carries from step to step."""
     topic = "density"
-    """Topic of the Warp modules that have the kernels of the density."""
+    """Topic of the Warp modules with the kernels of the density."""
     density_power = 2
-    """The k in p_i / n_i^k, the factor in the pressure force of a pair, with the number density n_i."""
+    """The k in p_i / n_i^k, the factor in a pair's pressure force, with the number density n_i."""
     shares: tuple[str, ...] = ()
-    """The solver's own parameters to whose adjoints every particle adds a share; see `Force.shares`."""
+    """Parameters of the solver to whose adjoints every particle adds a term; see `Force.shares`."""
 
     def __init__(self, system: ParticleSystem, requires_grad: bool = False):
         discretisation, search, layout = system.discretisation, system.search, system.layout
@@ -89,21 +80,17 @@ class ParticleSolver(Staying):
         self.layout, self.device, self.forces = layout, device, tuple(system.forces)
         self.launch = KernelLauncher(particles, device, record_tape=requires_grad)
         self.turn = Turn(device)
-        """The present user of these arrays."""
         self.density, self.integration = self.new_density(), integration_kernels(precision, requires_grad)
         self.parts = (
             *(maker.part(layout, requires_grad) for maker in system.parts),
             *(force for force in self.forces if isinstance(force, Part)),
         )
         self.free = [body for part in self.parts if isinstance(part, FreeSolidsPart) for body in part.bodies]
-        """The bodies that fluid moves."""
         self.substeps = 0
-        """Number of substeps of diffusion in each step."""
         self.carried = Carried(self.carried_fields, layout, requires_grad)
         """The carried fields of sorted particles at the start of the step."""
         of_parts = (field for part in self.parts for field in part.fields)
         self.state_fields = (POSITIONS, VELOCITIES, *of_parts, *self.carried_fields)
-        """The fields of a state."""
         check_fields(self.state_fields, layout.known)
         self.fields = Fields.zeros(particles, precision, device, requires_grad)
         self._requires_grad = requires_grad
@@ -113,51 +100,47 @@ class ParticleSolver(Staying):
         self.accelerations = [self.vectors() for _ in range(len(self.forces) + 1)]
         """``accelerations[t]`` is the sum over the first t forces; ``accelerations[0]`` is 0 and never written."""
         self.loops: tuple[Loop, ...] = ()
-        """The loops of a step, in the order in which they run."""
         self.step_number = wp.zeros(layout.members, dtype=wp.int32, device=device)
         self.containment = Containment(system.walled, layout, self.launch, system.waiting, search.moving)
         self._neighbourhood: Any = None
         self._context: StepContext | None = None
         self.generation = 0
-        """Counts how often arrays, or the launches of a step, were replaced; graphs captured before that are stale."""
         self.resize(search.capacity)
 
     def new_density(self) -> Density:
-        """Make the object that measures the number density in `sort`."""
         return Density(self.discretisation, self.topic)
 
     def wall_push(self) -> WallAction:
-        """Return the sums over walls that, multiplied by a particle's V^2 p_i / n_i^`density_power`, are its force on
+        """Return the sums over walls that, multiplied by V^2 p_i / n_i^`density_power`, are a particle's force on
         walls."""
         return WallSums(wall_slope_term(self.discretisation), self.layout)
 
     def image_loads(self) -> Any:
-        """Return the additional forces on mirroring walls, `cortado.solvers.projection.mean_stress.ImageLoads`; None if
-        no wall mirrors."""
+        """Return additional forces on mirroring walls, `cortado.solvers.projection.mean_stress.ImageLoads`; None if no
+        wall mirrors."""
         return None
 
     def kick_of(self, carried: Carried) -> wp.array | None:
-        """Return, from the ``carried`` fields, the velocity change by pressure in the previous step, or its tangent or
-        adjoint; None if no such field exists."""
+        """Return from ``carried`` the velocity change by the previous step's pressure, its tangent or its adjoint; None
+        without this field."""
         return None
 
     def vectors(self) -> wp.array:
-        """Make an array (n,) of zero vectors for a step or its derivative to work in."""
+        """Make an array (n,) of zero vectors."""
         return self._array(self.discretisation.precision.vector)
 
     def numbers(self) -> wp.array:
-        """Make an array (n,) of zeros for a step or its derivative to work in."""
+        """Make an array (n,) of zeros."""
         return self._array(self.discretisation.precision.real)
 
     def new_fractions(self) -> wp.array:
-        """Make an array (n,) of zero vectors with one number for each phase."""
+        """Make an array (n,) of zero vectors with an entry for each phase."""
         return self._array(self.discretisation.precision.fractions(self.layout.phases))
 
     def _array(self, dtype: Any) -> wp.array:
         return wp.zeros(self.layout.all_particles, dtype=dtype, device=self.device, requires_grad=self._requires_grad)
 
     def resize(self, capacity: int) -> None:
-        """Make room for lists of up to ``capacity`` neighbours."""
         if capacity != self.search.capacity:
             self.search.allocate(capacity)
             self.generation += 1
@@ -198,7 +181,7 @@ class ParticleSolver(Staying):
             wp.copy(own.rounds, given.rounds)
 
     def reserve(self, counts: Counts) -> None:
-        """Do nothing: a step without loops keeps no iterates."""
+        """Do nothing: a step without loops has no iterates."""
 
     def reset(self, step: int = 0) -> None:
         for loop in self.loops:
@@ -246,8 +229,8 @@ class ParticleSolver(Staying):
         return self.accelerations[-1]
 
     def unsort(self, context: StepContext, x: wp.array, v: wp.array, new_state: State, **carried: wp.array) -> None:
-        """Write the new state from sorted positions and velocities and from the ``carried`` arrays, one for each of
-        `carried_fields`; parts then write the values that they prescribe."""
+        """Write the new state from sorted positions, velocities and ``carried`` fields; then let parts write the values
+        that they prescribe."""
         free, ends = new_state, []
         for part in reversed(self.parts):
             ends.append((part, free))
@@ -258,8 +241,8 @@ class ParticleSolver(Staying):
             part.end(context, new_state, moved)
 
     def end_step(self, x: wp.array, v: wp.array, new_state: State, log: IterationLog) -> None:
-        """Look for lost particles, record the loops, and count the step. Sorted positions and velocities are those
-        after the step before a nozzle prescribes any."""
+        """Look for lost particles, record the loops, and count the step; ``x`` and ``v`` are sorted, before a nozzle
+        prescribes values."""
         f, containment = self.fields, self.containment
         containment.look(self.search.order, f["x"], f["rho_0"], x, v, new_state)
         for solve in log.solves:
@@ -276,7 +259,7 @@ class ParticleSolver(Staying):
             )
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
-        """Return densities (n,) of a state in the scene's order [kg / m3]; in a batch the scenes are concatenated.
+        """Return densities (n,) [kg / m3] of a state in the scene's order; in a batch the scenes are concatenated.
         Solids have the poses at the end of ``step``, counted from 0. The solver's arrays are overwritten."""
         self.reset(step)
         self.sort(state, parameters)
@@ -285,16 +268,16 @@ class ParticleSolver(Staying):
         return self.in_scene_order(self.fields["m"].numpy() * self.fields["n"].numpy())
 
     def pressures(self) -> wp.array | None:
-        """Return the pressures (n,) with which sorted particles push walls in the last step [Pa], which must not be a
-        replayed one; None for a solver or a scene without pressures."""
+        """Return the pressures (n,) [Pa] with which sorted particles push walls in the last step, which must not be a
+        replayed one; None without pressures."""
         return None
 
     def stresses(self) -> wp.array | None:
-        """Return the pressures (n,) that a gauge would read at sorted particles [Pa]."""
+        """Return the pressures (n,) that a gauge reads at sorted particles [Pa]."""
         return self.pressures()
 
     def in_scene_order(self, values: NDArray) -> NDArray:
-        """Return (n,) numbers of sorted particles in the scene's order; in a batch the scenes are concatenated."""
+        """Return values (n,) of sorted particles in the scene's order; in a batch the scenes are concatenated."""
         found = np.empty(self.layout.all_particles)
         found[self.search.order.numpy()[: len(found)]] = values
         return found
@@ -319,7 +302,6 @@ class ParticleSolver(Staying):
 
 
 def _neighbourhood(system: ParticleSystem) -> Any:
-    """Make the struct from which kernels read a particle's neighbours, with the present arrays of the search."""
     search, lattice, periods, precision = system.search, system.lattice, system.periods, system.discretisation.precision
     s = neighbourhood_type(precision)()
     s.particles = system.layout.particles

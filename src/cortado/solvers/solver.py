@@ -1,7 +1,6 @@
-"""The protocol of a solver, an algorithm that takes steps, replays a step, and computes its tangent and its adjoint.
+"""The protocol of a solver, which takes steps, replays a step, and computes its tangent and its adjoint.
 
 Rollouts, gradients, the certificate, files and reports of runs use a solver only through this protocol.
-`cortado.solvers.particles` is the common base of solvers of particles; `cortado.solvers.pcisph` is one of them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,28 +18,28 @@ from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext, Tangents
 
 Counts = tuple[int, ...]
-"""Numbers of iterations of each loop of a step; with them the step can be replayed bit for bit."""
+"""Numbers of iterations of each loop of a step, with which the step can be replayed bit for bit."""
 
 
 class StepLog(Protocol):
-    """A solver's diagnostics of each step of a run, on the device until they are read."""
+    """Diagnostics of each step of a run, on the device until they are read."""
 
     @property
     def diagnostics(self) -> Mapping[str, NDArray]:
-        """Return diagnostics (steps,) by name, in a batch (steps, batch), of the steps that were read. Every solver has
-        ``converged``. PCISPH also has ``iterations``, ``density_errors``, the average of the compressions (rho* -
+        """Return diagnostics by name, (steps,) or in a batch (steps, batch), of the steps that were read. Every solver
+        has ``converged``. PCISPH also has ``iterations``, ``density_errors``, the average of the compressions (rho* -
         rho_0)+ / rho_0, and ``greatest_density_errors``; the projection also has ``divergence``. Reports plot
-        ``density_errors``, and take whole numbers for iterations of loops."""
+        ``density_errors``, and take integer diagnostics for iterations of loops."""
 
     def read(self, steps: int) -> None:
         """Read the diagnostics of the first ``steps`` steps from the device."""
 
     def assign(self, other: Self) -> None:
-        """Copy the diagnostics that another log of the same solver and length has read."""
+        """Copy the diagnostics of another log of the same solver and length."""
 
     def seek(self, step: int) -> Counts:
-        """Return the numbers of iterations that a step of the run took, and prepare the solver's loops to repeat it;
-        steps count from 0. In a batch the scene with the most iterations sets the numbers."""
+        """Return the iterations of a step of the run, counted from 0, and prepare the solver's loops to repeat the
+        step. In a batch the scene with the most iterations sets the numbers."""
 
 
 class StepTangent(Protocol):
@@ -64,16 +63,16 @@ class StepAdjoint(Protocol):
 
 
 class PressureTangent(StepTangent, Protocol):
-    """The tangent of a solver with pressures, through which quantities and sensors can be differentiated."""
+    """The tangent of a solver with pressures."""
 
     dot: Tangents
 
     def pressures(self, rounds: Sequence[int]) -> NDArray:
-        """Return tangents (n,) of the pressures with which sorted particles push walls in the last step; ``rounds`` is
-        the number of iterations of the step's first loop in each scene."""
+        """Return tangents (n,) of the pressures of sorted particles on walls in the last step [Pa]; ``rounds`` has the
+        iterations of the step's first loop in each scene."""
 
     def stresses(self, rounds: Sequence[int]) -> NDArray:
-        """Return tangents (n,) of the pressures that a gauge would read, of sorted particles."""
+        """Return tangents (n,) of the pressures that a gauge reads at sorted particles [Pa]."""
 
 
 @dataclass(frozen=True)
@@ -83,26 +82,25 @@ class WithinBar:
     fields: Fields
     """Adjoints of the fields at the start of the step."""
     p: wp.array
-    """Adjoint (n,) of the pressures with which particles push walls."""
+    """(n,) adjoint of the pressures of particles on walls."""
     stress: wp.array | None
-    """Adjoint (n,) of the pressures that a gauge would read; None if there is no such adjoint."""
+    """(n,) adjoint of the pressures that a gauge reads; None without such an adjoint."""
     v_star: wp.array
-    """Adjoint (n,) of the velocities v* = v + dt a by explicit forces; their dependence on dt is counted elsewhere."""
+    """(n,) adjoint of v* = v + dt a by explicit forces, without the dependence of v* on dt."""
 
 
 class PressureAdjoint(StepAdjoint, Protocol):
-    """The adjoint of a solver with pressures, through which quantities and sensors can be differentiated."""
+    """The adjoint of a solver with pressures."""
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
-        """Write to ``state_bar`` the adjoint of the replayed step's state, given adjoints ``within`` the step; the
-        adjoint of the step's result is 0."""
+        """Write to ``state_bar`` the adjoint of the replayed step's state, given adjoints ``within`` the step and a
+        zero adjoint of its result."""
 
 
 class Solver(Protocol):
     """The solver of a scene, or of a batch of scenes, on one device; rollouts share it. Only the methods `make_room`
-    and `reset` wait for the device and read from it. If a solver lacks a derivative, `tangent`, `adjoint` and
-    `differentiable` raise `InputError` with one sentence.
-    """
+    and `reset` wait for the device. A solver without a derivative raises `InputError` from `tangent`, `adjoint` or
+    `differentiable`."""
 
     discretisation: Discretisation
     layout: Layout
@@ -111,10 +109,9 @@ class Solver(Protocol):
     turn: Turn
     containment: Containment
     step_number: wp.array
-    """The number (members,) of the next step, which `step` increments; it is equal in all scenes of a batch."""
+    """(members,) number of the next step, which `step` increments; equal in all scenes of a batch."""
     generation: int
-    """Counts how often arrays, or the launches of a step, were replaced; graphs captured before the last replacement
-    are stale."""
+    """Number of replacements of arrays or launches; graphs captured before the last replacement are stale."""
 
     def new_state(self, requires_grad: bool = False) -> State:
         """Make a state of this solver's particles, all 0."""
@@ -126,14 +123,13 @@ class Solver(Protocol):
         """Make a log with room for ``steps`` steps."""
 
     def set_substeps(self, substeps: int) -> None:
-        """Take ``substeps`` explicit substeps of diffusion in each step from now on."""
+        """Set the number of explicit substeps of diffusion in each step."""
 
     def reset(self, step: int = 0) -> None:
-        """Prepare to take a step; forget the counts and flags from that step on, also of an interrupted run."""
+        """Prepare to take a step; forget the counts and flags from that step on."""
 
     def make_room(self) -> bool:
-        """Lengthen lists of neighbours that were too short; return True if any were: the steps that used them must be
-        repeated."""
+        """Lengthen neighbour lists that were too short. If the result is True, repeat the steps that used the lists."""
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: Any) -> None:
         """Take one step, and record it in a log of `new_log`; the two states may be one object."""
@@ -148,7 +144,7 @@ class Solver(Protocol):
         """Write the result of the step that was replayed."""
 
     def context(self, parameters: Parameters) -> StepContext:
-        """Return the present step as its parts see it."""
+        """Return the context of the present step, which its parts read."""
 
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
         """Return the tangent of steps along tangents of the parameters (forward mode)."""
@@ -163,8 +159,7 @@ class Solver(Protocol):
         """Copy the capacities and the number of substeps of another solver, which differs only in its arrays."""
 
     def follow(self, other: Self) -> None:
-        """Prepare to replay the step that another solver is ready to replay; the solvers differ only in their
-        arrays."""
+        """Prepare to replay the step that another solver is ready to replay; only the arrays of both solvers differ."""
 
     def gradient_memory(self, log: Any) -> Mapping[str, float]:
         """Return the memory [bytes] that reverse mode through the steps of a log needs, by purpose."""

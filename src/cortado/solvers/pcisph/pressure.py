@@ -22,14 +22,12 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import adjoint_of, pair_sum, tangent_of
-from cortado.particles.wall_terms import solid_kernel
 from cortado.sph.density import density_sums
 from cortado.sph.parts import prediction_share
 
 
 @cache
 def pressure_kernels(discretisation: Discretisation) -> Kernels:
-    """Make kernels ``forward``, ``tangent``, ``adjoint`` of the pressure from the predicted density."""
     real, vector, pair_of = (
         discretisation.precision.real,
         discretisation.precision.vector,
@@ -120,13 +118,8 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     return Kernels(pressure, pressure_tangent, pressure_adjoint)
 
 
-def pressure_solid_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel that adds to the adjoints of moving solids the part due to the pressure force's adjoint
-    ``scaled_bar`` (`cortado.particles.wall_terms.solid_kernel`)."""
-    return solid_kernel(discretisation, "pcisph", _work, looped=True)
-
-
-def _work(d: Discretisation) -> Any:
+def pressure_term(d: Discretisation) -> Any:
+    """Make the work function by which ``scaled_bar`` acts on solids."""
     real, vector, slope = d.precision.real, d.precision.vector, pair_functions(d).slope
 
     def pressure_work(x_ij: vector, c_i: real, scaled_bar_i: vector, s: neighbourhood_type(d.precision)) -> real:
@@ -137,7 +130,6 @@ def _work(d: Discretisation) -> Any:
 
 @cache
 def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
-    """Make kernels ``forward``, ``tangent``, ``adjoint`` of the pressure force and the prediction that follows it."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     slope, slope_change = pair.slope, pair.slope_change
@@ -151,7 +143,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     def adjoin_pressure(
         i: int, stiffness: real, dt: real, volume: real, divergence: real, work: real, at: values, bar: adjoints
     ) -> real:
-        """Add to the adjoints of a pressure correction's inputs; return r, the adjoint of the predicted density n*."""
+        """Add to the adjoints of a pressure correction's inputs; return r, the adjoint of n*."""
         n_i = at.n[i]
         m_i = at.m[i]
         p_i = at.p_out[i]
@@ -184,7 +176,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     def force_adjoint(
         x_ij: vector, c_i: real, c_j: real, scaled_bar_i: vector, scaled_bar_ij: vector, s: neighbourhood
     ) -> tuple[vector, real, real]:
-        """Return a pair's Hessian product, its divergence, and the work of particle i's own c_i."""
+        """Return a pair's Hessian product, its divergence, and the work of c_i."""
         a = slope(x_ij, s)
         c_ij = c_i + c_j
         change = (c_ij * a) * scaled_bar_ij + (c_ij * slope_change(x_ij, scaled_bar_ij, s)) * x_ij
@@ -239,8 +231,8 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     def pressure_force_adjoint(
         s, k: int, rounds, stiffness: real, time_step, x, at: values, c, scaled_bar, x_bar, n_bar, bar: adjoints, r
     ):
-        """Compute the adjoints of c, of the pressure p, and, as r, of the density n*, from ``scaled_bar``, the adjoint
-        of the pressure acceleration over m. Every sum is a gather."""
+        """Compute the adjoints of c, p and n* (``r``) from ``scaled_bar``, the adjoint of the pressure acceleration
+        over m."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:

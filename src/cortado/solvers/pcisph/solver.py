@@ -1,23 +1,19 @@
 """Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009) as the solver of a scene: its steps, their
 tangent and adjoint, and two factors on the pressure correction delta of an iteration.
 
-`PcisphSteps.step` goes on until the density error is small; `PcisphSteps.replay` repeats a step with a known number of
-iterations and keeps every intermediate value, for the derivatives.
-
-The factors are the density-ratio relaxation of a heavy particle among lighter ones, and the pressure relaxation beside
-walls. delta is derived for particles of equal mass. The pressure of a particle with lighter neighbours moves these
-further, by the ratio of the masses. If its own density then changes by more than twice the wanted amount, the iteration
-diverges. So its pressure relaxation is multiplied by
+delta is derived for particles of equal mass, but a particle's pressure moves lighter neighbours further, by the ratio
+of the masses. The iteration diverges if a density changes by more than twice the wanted amount, so delta is multiplied
+by the density-ratio relaxation
 
     1 / (1 + e(t_i)),   t_i = V sum_j W_ij (m_i / m_j - 1),   e(t) = t^2 / (2 (t + a)) for t > 0, else 0,
 
 which is 1 among particles of equal or greater mass, and tends to 1 / (1 + t / 2), the value for a lattice. The constant
-a makes it smooth at t = 0.
+a makes e smooth at t = 0.
 
 delta is derived for a particle with a filled neighbourhood. Beside a wall the same pressure changes a particle's own
-density more, by |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = sum_b w_b G_ib. If this exceeds 2, the
-iteration overshoots and kicks the particle away. S_i is computed at the start of the step, but a particle that
-approaches a wall meets a steeper gradient, so the response is doubled: delta is multiplied by the pressure relaxation
+density more, by |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = sum_b w_b G_ib. Beyond 2 the iteration
+overshoots and kicks the particle away. A particle that approaches a wall meets a steeper gradient than at the start of
+the step, so the response is doubled: delta is multiplied by the wall relaxation
 
     y_i = 1 / (1 + |S_i|^2 / response),   response = sum_j G_j . G_j,
 
@@ -26,9 +22,9 @@ multiplied by response^(-1/2) before they are squared: in float32 the square of 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cache, partial
 from math import inf
+from types import SimpleNamespace
 from typing import Any, Self
 
 import numpy as np
@@ -43,12 +39,13 @@ from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernels
 from cortado.particles.state import Parameters, State
+from cortado.particles.wall_terms import solid_kernel
 from cortado.scene.solvers import PcisphSolver
 from cortado.solvers.build import SolverSetting, particle_system
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
-from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels, pressure_solid_kernel
+from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels, pressure_term
 from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepTangent, WithinBar
 from cortado.sph.density import density_solid_kernel, wall_slope_sums, wall_slope_term
 from cortado.sph.parts import StepContext
@@ -57,19 +54,10 @@ SOFTNESS = 0.2
 """The softness a of the density-ratio relaxation [-]."""
 
 
-@dataclass(frozen=True)
-class DensityRatio:
-    """The kernels of the density-ratio relaxation."""
-
-    total: Kernels
-    """t"""
-    relaxation: Kernels
-    """y from t and the relaxation beside walls; the adjoint kernel overwrites the adjoints of both."""
-
-
 @cache
-def density_ratio_kernels(discretisation: Discretisation) -> DensityRatio:
-    """Make the kernels of the density-ratio relaxation."""
+def density_ratio_kernels(discretisation: Discretisation) -> SimpleNamespace:
+    """Make the kernels of t, and of y from t and the relaxation beside walls; the adjoint of y overwrites the adjoints
+    of both."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, gradient = pair.weight, pair.gradient
@@ -78,7 +66,6 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatio:
 
     @fluid_sum(discretisation)
     def density_ratio_sum(x_ij: vector, m_i: real, m_j: real, s: neighbourhood) -> real:
-        """Return a pair's term W_ij (m_i / m_j - 1) of t_i / V."""
         return weight(x_ij, s) * (m_i / m_j - real(1.0))
 
     @tangent_of(density_ratio_sum)
@@ -98,7 +85,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatio:
         return (own - t_bar_i + other - t_bar_j) * gradient(x_ij, s), weight(x_ij, s) * (own - other) / m_i
 
     def relaxation(wall_y_i: real, t_i: real) -> real:
-        """Return the wall relaxation over 1 + e(t), with e(t) = t^2 / (2 (t + a)) for t > 0, else 0."""
+        """Return y_wall / (1 + e(t))."""
         excess = real(0.0)
         if t_i > real(0.0):
             excess = real(0.5) * t_i * t_i / (t_i + a)
@@ -106,15 +93,15 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatio:
 
     sums = density_ratio_sum, density_ratio_sum_tangent, density_ratio_sum_adjoint
     precision, replaced = discretisation.precision, {"y": "wall_y"}
-    return DensityRatio(
-        sum_kernels("density_ratio", modules, sums, "t", times="s.volume"),
-        pointwise_kernels(precision, modules, lambda _: relaxation, ["y"], replaced, written=["t"]),
+    return SimpleNamespace(
+        total=sum_kernels("density_ratio", modules, sums, "t", times="s.volume"),
+        relaxation=pointwise_kernels(precision, modules, lambda _: relaxation, ["y"], replaced, written=["t"]),
     )
 
 
 @cache
 def wall_kernels(discretisation: Discretisation) -> Kernels:
-    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the pressure relaxation beside walls."""
+    """Make the kernels of the pressure relaxation beside walls."""
     real, vector, neighbourhood = discretisation.types
     sums = wall_slope_sums(discretisation)
     slope, change, LANES = sums.slope, sums.change, discretisation.lanes
@@ -149,7 +136,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def scaling_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel of the adjoint of the pressure acceleration over m, with which reverse mode begins."""
+    """Make the kernel of the adjoint of the pressure acceleration over m."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
 
     @particle_kernel(discretisation.module(False, "pcisph"), "scaled_bar")
@@ -159,34 +146,10 @@ def scaling_kernel(discretisation: Discretisation) -> Any:
     return scale_adjoint
 
 
-@dataclass(frozen=True)
-class PcisphKernels:
-    """The kernels that only PCISPH needs, by topic, each with its forward, tangent and adjoint."""
-
-    wall_relaxation: Kernels
-    density_ratio: DensityRatio | None
-    """None with a single phase."""
-    pressure: Kernels
-    force: Kernels
-    scale_adjoint: wp.Kernel
-
-    @classmethod
-    def of(cls, discretisation: Discretisation, phases: int) -> "PcisphKernels":
-        """Make the kernels of PCISPH for a smoothing kernel, a precision and a number of phases."""
-        return cls(
-            wall_kernels(discretisation),
-            density_ratio_kernels(discretisation) if phases > 1 else None,
-            pressure_kernels(discretisation),
-            pressure_force_kernels(discretisation),
-            scaling_kernel(discretisation),
-        )
-
-
 class Iterates:
-    """Predicted states and pressures of the iterations of one step; a single slot is overwritten each time."""
+    """Predicted states and pressures of the iterations of one step; a run overwrites a single slot."""
 
     def __init__(self, numbers: Callable[[], wp.array], vectors: Callable[[], wp.array]):
-        """Allocate one iteration by two functions, which make arrays (n,) of zero numbers and zero vectors."""
         self._numbers, self._vectors = numbers, vectors
         self.x_star: list[wp.array] = []
         self.v_star: list[wp.array] = []
@@ -196,7 +159,6 @@ class Iterates:
         self.reserve(1)
 
     def reserve(self, iterations: int) -> None:
-        """Make room for the values of ``iterations`` iterations."""
         while len(self.x_star) <= iterations:
             self.x_star.append(self._vectors())
             self.v_star.append(self._vectors())
@@ -205,17 +167,22 @@ class Iterates:
 
 
 class PcisphSteps(ParticleSolver):
-    """The forward steps of PCISPH for one set of particles."""
-
     topic = "pcisph"
 
     def __init__(self, system: ParticleSystem, limits: LoopLimits | None, requires_grad: bool = False):
         """Prepare steps of a system; ``limits`` None leaves the pressure out."""
         super().__init__(system, requires_grad)
-        self.limits, self.kernels = limits, PcisphKernels.of(self.discretisation, self.layout.phases)
+        self.limits, own = limits, self.discretisation
+        self.kernels = SimpleNamespace(
+            wall_relaxation=wall_kernels(own),
+            density_ratio=density_ratio_kernels(own) if self.layout.phases > 1 else None,
+            pressure=pressure_kernels(own),
+            force=pressure_force_kernels(own),
+            scale_adjoint=scaling_kernel(own),
+        )
         self.wall_relaxation, self.density_ratio = self.numbers(), self.numbers()
         self.pressure_relaxation = self.numbers() if self.layout.phases > 1 else self.wall_relaxation
-        """(n,) the factor of delta [-], below 1 beside walls, and with several phases among lighter neighbours."""
+        """(n,) factor of delta [-], below 1 beside walls and among lighter neighbours"""
         self.iterates = Iterates(self.numbers, self.vectors)
         self.pressure_loop = Loop(limits, self.layout, self.launch)
         self.loops = (self.pressure_loop,)
@@ -237,7 +204,6 @@ class PcisphSteps(ParticleSolver):
             self.iterate(k, k + 1, context)
 
     def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
-        """Write the last prediction as the new state."""
         (iterations,) = counts
         it = self.iterates
         self.unsort(self.context(parameters), it.x_star[iterations], it.v_star[iterations], new_state)
@@ -246,8 +212,8 @@ class PcisphSteps(ParticleSolver):
         return None if self.limits is None else self.iterates.p[1]
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
-        """Do the part of a step before the pressure iterations: sort and compute the density (`sort`), write the
-        relaxation y, add up the explicit forces including gravity. Then predict v* = v + dt a, x* = x + dt v*."""
+        """Do all of a step before the pressure iterations: sort, compute y, add up explicit forces, and predict v* = v
+        + dt a, x* = x + dt v*."""
         it, context = self.iterates, self.sort(state, parameters)
         with context.aside():
             self._relax(context)
@@ -257,7 +223,6 @@ class PcisphSteps(ParticleSolver):
         return context
 
     def _relax(self, context: StepContext) -> None:
-        """Compute the relaxation of the pressure beside walls and among lighter neighbours."""
         kernels = self.kernels
         context.launch(kernels.wall_relaxation.forward, y=self.wall_relaxation)
         if kernels.density_ratio:
@@ -266,8 +231,7 @@ class PcisphSteps(ParticleSolver):
             context.launch(kernels.density_ratio.relaxation.forward, found)
 
     def iterate(self, k: int, slot: int, context: StepContext) -> None:
-        """Do pressure iteration k, from the predicted state in the previous slot to ``slot``; slot 0 is the only one of
-        a run."""
+        """Do pressure iteration k, from the previous slot to ``slot``; a run uses only slot 0."""
         it, kernels, before = self.iterates, self.kernels, max(slot - 1, 0)
         going = {"k": k, "rounds": self.pressure_loop.rounds}
         context.launch(
@@ -287,8 +251,6 @@ class PcisphSteps(ParticleSolver):
 
 
 class PcisphAdjoint(ParticleAdjoint):
-    """The adjoint of PCISPH steps, one step at a time, of a run with some parameters."""
-
     def __init__(self, solver: PcisphSteps, steps: int):
         super().__init__(solver, steps)
         self._solver = solver
@@ -321,8 +283,6 @@ class PcisphAdjoint(ParticleAdjoint):
     def _go_back(
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
-        """Turn the adjoint of the last prediction into the adjoint of the state, through the step in reverse: the
-        iterations, prediction with all forces, relaxation of the pressure, sorting."""
         (iterations,) = counts
         solver, it, kernels, scaled_bar = self._solver, self._solver.iterates, self._solver.kernels, self._scaled_bar
         context, known = solver.context(parameters), self.bar.named
@@ -332,7 +292,7 @@ class PcisphAdjoint(ParticleAdjoint):
             given = {"stiffness": solver.lattice.stiffness, "y": solver.pressure_relaxation, "c": it.c[k]}
             pressures = {"p_in": it.p[k], "p_out": it.p[k + 1], **pressure_bar}
             context.launch(kernels.force.adjoint, going, *known, given, pressures, scaled_bar=scaled_bar, r=self._r)
-            pushed = partial(pressure_solid_kernel, solver.discretisation)
+            pushed = partial(solid_kernel, solver.discretisation, "pcisph", pressure_term, looped=True)
             self.bar.solids.add(context.launch, pushed, going, *known, scaled_bar=scaled_bar, c=it.c[k])
             predicted = {"x_star": it.x_star[k], "v_star": it.v_star[k]}
             context.launch(kernels.pressure.adjoint, going, *known, r=self._r, scaled_bar=scaled_bar, **predicted)
@@ -353,8 +313,6 @@ class PcisphAdjoint(ParticleAdjoint):
 
 
 class PcisphTangent(ParticleTangent):
-    """The tangent of PCISPH steps, one step at a time, of a run along tangents of its parameters."""
-
     def __init__(self, solver: PcisphSteps, parameters_dot: Parameters):
         super().__init__(solver, parameters_dot)
         self._solver = solver
@@ -368,9 +326,9 @@ class PcisphTangent(ParticleTangent):
         context = solver.context(parameters)
         self.sort(context, state_dot)
         self._relax(known, context)
-        accelerations = {"acceleration": solver.accelerations[-1], "acceleration_dot": self.accelerate(context)}
         predicted = {"x_star_dot": self._x_star_dot, "v_star_dot": self._v_star_dot}
-        context.launch(solver.integration.predict_tangent, *known, **accelerations, v_star=it.v_star[0], **predicted)
+        self.predict(context, it.v_star[0], **predicted)
+        accelerations = {"acceleration": solver.accelerations[-1], "acceleration_dot": self._accelerations_dot[-1]}
         p_dot_before = self._zero_pressure
         for k in range(iterations):
             p_dot, c_dot = self._p_dot[k % 2], self._c_dot
@@ -391,7 +349,6 @@ class PcisphTangent(ParticleTangent):
     stresses = pressures
 
     def _relax(self, known: tuple[Named, ...], context: StepContext) -> None:
-        """Compute the tangent of the pressure relaxation."""
         solver, kernels = self._solver, self._solver.kernels
         y_dot = self._wall_y_dot if kernels.density_ratio else self._y_dot
         context.launch(kernels.wall_relaxation.tangent, *known, y=solver.wall_relaxation, y_dot=y_dot)
@@ -403,10 +360,7 @@ class PcisphTangent(ParticleTangent):
 
 
 class Pcisph(PcisphSteps):
-    """The solver by predictive-corrective incompressible SPH, with its derivatives; see `Solver`."""
-
     def differentiable(self) -> Self:
-        """Return a solver over this neighbour search with arrays of its own that Warp's tape can differentiate."""
         return type(self)(self.system.of_one_lane(), self.limits, requires_grad=True)
 
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
@@ -417,15 +371,12 @@ class Pcisph(PcisphSteps):
 
 
 class PcisphMaker:
-    """A maker of the PCISPH solver that the table [solver] of a scene describes."""
-
     batches = True
 
     def __init__(self, table: PcisphSolver):
         self._table = table
 
     def build(self, setting: SolverSetting) -> Solver:
-        """Make the PCISPH solver of a scene discretised into particles, on a device."""
         table, counts = self._table, (self._table.minimum_iterations, self._table.maximum_iterations)
         greatest = inf if table.maximum_density_tolerance is None else table.maximum_density_tolerance
         limits = LoopLimits(*counts, table.density_tolerance, greatest) if setting.scene.forces.pressure else None

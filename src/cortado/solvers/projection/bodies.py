@@ -1,7 +1,6 @@
-"""Rigid bodies in a step of the projection, and derivatives: see `cortado.solvers.projection.body_kernels`."""
+"""Free bodies in a step of the projection, with derivatives: see `cortado.solvers.projection.body_kernels`."""
 
 from copy import copy
-from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
@@ -17,34 +16,13 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 Arrays = dict[str, wp.array]
 
 
-@dataclass(frozen=True)
-class Start:
-    """The velocities of a body before pressures push it in a step, or tangents or adjoints of these velocities."""
-
-    motion: Arrays
-    """V_0, W_0 and L_0 by the names of kernel arguments; they take precedence over other arrays of a step."""
-    given: Arrays
-    """The parts of both momenta that contact gives."""
-
-    @classmethod
-    def of(cls, body: FreeBody | Changes) -> "Start":
-        """Return the start of a body in a step, from its velocities before and its momenta by contact."""
-        return cls({f"{name[0]}_0{name[1:]}": array for name, array in body.before.items()}, body.given)
-
-    @classmethod
-    def at_rest(cls, layout: Layout, suffix: str) -> "Start":
-        """Return zero velocities, for a step of length 0 without gravity; adjoints of these are never read."""
-        kinds = {**dict.fromkeys(("V_0", "W_0", "L_0"), layout.precision.vector), "time_step": layout.precision.real}
-        sizes = {f"{name}{suffix}": (layout.members, kind) for name, kind in kinds.items()}
-        return cls(zeros(sizes, layout.device), {})
-
-
 class Held:
-    """Arrays of particles about one body in a step, or tangents or adjoints of these with names that end in
-    ``suffix``."""
+    """Arrays of particles about one body, or tangents or adjoints with names that end in ``suffix``."""
 
-    def __init__(self, body: FreeBody, layout: Layout, start: Start, suffix: str = ""):
-        self.body, self.start, self._layout = body, start, layout
+    def __init__(self, body: FreeBody, layout: Layout, begun: FreeBody | Changes, suffix: str = ""):
+        self.body, self.given, self._layout = body, begun.given, layout
+        self.start = {f"{name[0]}_0{name[1:]}": array for name, array in begun.before.items()}
+        """V_0, W_0 and L_0 before pressures push the body, with precedence over other arrays of a step."""
         precision, vector, device = layout.precision, layout.precision.vector, layout.device
         self.known = layout.arrays(suffix, gamma_of=vector, arm=vector, sizes=precision.pair)
         self.shares = layout.arrays(suffix, pulled=vector, twisted=vector)
@@ -56,55 +34,53 @@ class Held:
         self._sums = [layout.sum_of(vector) for _ in range(2)]
         self._suffix, self._whole = suffix, layout.sum_of(precision.pair)
         self.whole: Arrays = {}
-        """The sums, over particles, of the sizes of gamma and of its torque."""
+        """Sums over particles of |gamma| and |r x gamma|."""
 
     def at_rest(self) -> "Held":
-        """Return a copy that shares the arrays of this body but begins at rest."""
+        """Return a copy that shares the arrays but begins at rest, for a step of length 0 without gravity."""
         other = copy(self)
-        other.start = Start.at_rest(self._layout, self._suffix)
+        vector, real = self._layout.precision.vector, self._layout.precision.real
+        kinds = {"V_0": vector, "W_0": vector, "L_0": vector, "time_step": real}
+        sizes = {f"{name}{self._suffix}": (self._layout.members, kind) for name, kind in kinds.items()}
+        other.start, other.given = zeros(sizes, self._layout.device), {}
         return other
 
     def add_sizes(self) -> None:
-        """Sum up the sizes of the pushes gamma and of their torques over all particles of a scene."""
         self.whole = {f"whole{self._suffix}": self._whole(self.known[f"sizes{self._suffix}"])}
 
     def sums(self) -> Arrays:
-        """Return the sums of y gamma and of y r x gamma over all particles, (members,) vectors each."""
+        """Return (members,) sums of y gamma and y r x gamma."""
         found = (total(share) for total, share in zip(self._sums, self.shares.values(), strict=True))
         return dict(zip((f"pulled_sum{self._suffix}", f"twisted_sum{self._suffix}"), found, strict=True))
 
 
 class Bodies:
-    """The free bodies of one solver of the projection, forward."""
-
     def __init__(self, part: FreeSolidsPart, discretisation: Any, layout: Layout):
         self.part, self.layout = part, layout
         self.kernels, self.motion = body_kernels(discretisation), motion_kernels(layout.precision)
-        self.held = [Held(body, layout, Start.of(body)) for body in part.bodies]
+        self.held = [Held(body, layout, body) for body in part.bodies]
         self.joints = Joints(part, part.made_of.joints, layout)
         self.drift = wp.zeros(layout.all_particles, dtype=layout.precision.real, device=layout.device)
 
     @property
     def velocities(self) -> list[Arrays]:
-        """Return V, L, W, V - V_0 and W - W_0 of each body in an iteration."""
         return [{**held.moved, **held.faster} for held in self.held]
 
     def at_rest(self) -> "Bodies":
-        """Return a copy of these bodies that begin at rest, are pushed by pressures alone, and have no hinges; so
-        `drifted` is linear in the pressures."""
+        """Return a copy of these bodies that begins at rest without hinges, so that `drifted` is linear in the
+        pressures."""
         other = copy(self)
         other.joints = Joints(self.part, (), self.layout)
         other.held, other.drift = [held.at_rest() for held in self.held], wp.zeros_like(self.drift)
         return other
 
     def known(self, context: StepContext, held: Held) -> tuple[Named, ...]:
-        """Return the kernel arguments about one body, by name."""
-        own = held.known, held.shares, held.faster, held.whole, held.start.motion
+        own = held.known, held.shares, held.faster, held.whole, held.start
         return *own, *held.body.known(context)
 
     def begin(self, context: StepContext, around: Arrays, k: wp.array) -> None:
-        """Find which particles bodies push in a step, and add the bodies' part to the pressure matrix' diagonal;
-        compute the momenta that the pressures ``k`` of the previous step would give to bodies without slip."""
+        """Compute pushes on bodies and their term in the diagonal. For bodies without slip, compute the momenta by the
+        pressures ``k`` of the previous step."""
         self.joints.begin(context)
         for held in self.held:
             context.launch(self.kernels.hold.forward, *self.known(context, held), edge=around["edge"])
@@ -121,7 +97,7 @@ class Bodies:
         known = self.known(context, held)
         context.launch(self.kernels.pull.forward, *known, y=y)
         sums = held.sums()
-        for given, total in zip(held.start.given.values(), sums.values(), strict=False):
+        for given, total in zip(held.given.values(), sums.values(), strict=False):
             add(given, total)
         context.launch(self.motion.move.forward, sums, moved, *known, threads=self.layout.members)
         return sums
@@ -136,17 +112,16 @@ class Bodies:
         return drift
 
     def loosen(self, context: StepContext, y: wp.array) -> list[Arrays]:
-        """Write the velocities that pressures y give to bodies without hinges, and return the sums by `move` for each
-        body."""
+        """Write the velocities that pressures y give to bodies without hinges, and return the sums of `move`."""
         return [self.move(context, held, y, held.moved) for held in self.held]
 
     def join(self, context: StepContext, y: wp.array) -> None:
-        """Write the velocities that pressures y give to bodies with their hinges."""
+        """Write the velocities that pressures y give to bodies with hinges."""
         self.loosen(context, y)
         self.joints.join(context, self.velocities)
 
     def settle(self, context: StepContext, y: wp.array) -> None:
-        """Write the velocities that pressures y give to bodies, as the bodies' velocities at the end of the step."""
+        """Write the velocities that pressures y give to bodies, as those at the end of the step."""
         self.join(context, y)
         for held in self.held:
             for name, array in held.body.moved.items():
@@ -154,15 +129,12 @@ class Bodies:
 
 
 class BodiesTangent:
-    """The tangent of free bodies in a step of the projection, for forward mode."""
-
     def __init__(self, bodies: Bodies, changes: list[Changes]):
         self._bodies, self._changes = bodies, changes
-        self._held = [Held(own.body, bodies.layout, Start.of(own), "_dot") for own in changes]
+        self._held = [Held(own.body, bodies.layout, own, "_dot") for own in changes]
         self._joints, self.drift = JointsTangent(bodies.joints), wp.zeros_like(bodies.drift)
 
     def at_rest(self, bodies: Bodies) -> "BodiesTangent":
-        """Return the tangent of ``bodies`` that begin at rest."""
         other = copy(self)
         other._bodies, other._held = bodies, [own.at_rest() for own in self._held]
         other._joints, other.drift = JointsTangent(bodies.joints), wp.zeros_like(self.drift)
@@ -171,7 +143,7 @@ class BodiesTangent:
     def _known(self, context: StepContext, dot: Tangents, k: int) -> tuple[Named, ...]:
         bodies, held, own = self._bodies, self._bodies.held[k], self._held[k]
         rates = {"density_dot": dot.parameters[held.body.table.weight]}
-        dots = own.known, own.shares, own.faster, own.whole, own.start.motion, rates
+        dots = own.known, own.shares, own.faster, own.whole, own.start, rates
         return *dots, *dot.named, *bodies.known(context, held)
 
     def begin(
@@ -182,7 +154,6 @@ class BodiesTangent:
         around_dot: Arrays,
         pressures: tuple[wp.array, wp.array],
     ) -> None:
-        """Apply the tangent of `Bodies.begin`, given the pressures of the previous step and their tangents."""
         kernels = self._bodies.kernels
         edges = {"edge": around["edge"], "edge_dot": around_dot["edge_dot"]}
         self._joints.begin(context, dot)
@@ -197,8 +168,6 @@ class BodiesTangent:
                     wp.copy(pressed, total)
 
     def _join(self, context: StepContext, dot: Tangents, y: wp.array, y_dot: wp.array) -> None:
-        """Write the velocities that pressures y give to bodies with their hinges, and the tangents of these
-        velocities."""
         bodies = self._bodies
         for k in range(len(self._held)):
             self._move(context, dot, k, (y, y_dot))
@@ -211,7 +180,7 @@ class BodiesTangent:
         known = self._known(context, dot, k)
         context.launch(bodies.kernels.pull.tangent, *known, y=y[0], y_dot=y[1])
         sums_dot = own.sums()
-        for given, total in zip(own.start.given.values(), sums_dot.values(), strict=False):
+        for given, total in zip(own.given.values(), sums_dot.values(), strict=False):
             add(given, total)
         out = held.moved, own.moved
         context.launch(bodies.motion.move.tangent, sums, sums_dot, *out, *known, threads=bodies.layout.members)
@@ -219,7 +188,6 @@ class BodiesTangent:
     def drifted(
         self, context: StepContext, dot: Tangents, drift_dot: wp.array, y: wp.array, y_dot: wp.array
     ) -> wp.array:
-        """Return the tangent of the drift of walls by `Bodies.drifted`."""
         self._join(context, dot, y, y_dot)
         for k in range(len(self._held)):
             drifts = {"drift_in_dot": drift_dot, "drift_dot": self.drift}
@@ -228,7 +196,6 @@ class BodiesTangent:
         return drift_dot
 
     def settle(self, context: StepContext, dot: Tangents, y: wp.array, y_dot: wp.array) -> None:
-        """Write the tangents of the free bodies' new velocities, as `Bodies.settle` writes the velocities."""
         self._join(context, dot, y, y_dot)
         for held, own, changes in zip(self._bodies.held, self._held, self._changes, strict=True):
             for name, array in held.body.moved.items():
@@ -238,12 +205,10 @@ class BodiesTangent:
 
 
 class BodiesAdjoint:
-    """The adjoint of free bodies in a step of the projection, for reverse mode."""
-
     def __init__(self, bodies: Bodies, changes: list[Changes]):
         self._bodies, self._changes = bodies, changes
         layout = bodies.layout
-        self._held = [Held(own.body, layout, Start.of(own), "_bar") for own in changes]
+        self._held = [Held(own.body, layout, own, "_bar") for own in changes]
         self.drift_bar = wp.zeros_like(bodies.drift)
         """The adjoint of the drift of one iteration."""
         self._turned, self._joints = (
@@ -258,18 +223,16 @@ class BodiesAdjoint:
     def _known(self, context: StepContext, bar: Adjoints, k: int) -> tuple[Named, ...]:
         held, own, table = self._bodies.held[k], self._held[k], self._bodies.held[k].body.table
         rates = {"density_bar": bar.parameters[table.weight], "time_step_bar": bar.parameters["time_step"]}
-        bars = own.known, own.start.motion, self._turned[k], self._sums_bar, rates
+        bars = own.known, own.start, self._turned[k], self._sums_bar, rates
         return *bars, *bar.named, *self._bodies.known(context, held)
 
     def at_rest(self, bodies: Bodies) -> "BodiesAdjoint":
-        """Return the adjoint of ``bodies`` that begin at rest."""
         other = copy(self)
         other._bodies, other._held = bodies, [own.at_rest() for own in self._held]
         other._joints = JointsAdjoint(bodies.joints)
         return other
 
     def begin(self) -> None:
-        """Set the adjoints of the bodies' arrays to 0 at the beginning of a step back."""
         self._joints.begin()
         for own in self._held:
             for array in own.known.values():
@@ -283,12 +246,11 @@ class BodiesAdjoint:
         for k in range(len(bodies.held)):
             known = self._known(context, bar, k)
             context.launch(bodies.motion.move.adjoint, bars[k], sums[k], *known, threads=bodies.layout.members)
-            for total, given in zip(self._sums_bar.values(), self._held[k].start.given.values(), strict=False):
+            for total, given in zip(self._sums_bar.values(), self._held[k].given.values(), strict=False):
                 add(total, given)
             context.launch(bodies.kernels.pull.adjoint, *known, y=y, y_bar=y_bar)
 
     def settle(self, context: StepContext, bar: Adjoints, y: wp.array, y_bar: wp.array) -> None:
-        """Apply the adjoint of `Bodies.settle`, which wrote the bodies' new velocities."""
         for own, changes in zip(self._held, self._changes, strict=True):
             for name, array in own.moved.items():
                 wp.copy(array, changes.moved[name])
@@ -300,7 +262,8 @@ class BodiesAdjoint:
                 array.zero_()
 
     def drifted(self, context: StepContext, bar: Adjoints, drift_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
-        """Apply the adjoint of `Bodies.drifted` to ``self.drift_bar``, add it to ``drift_bar`` and set it to 0."""
+        """Apply the adjoint of `Bodies.drifted` to ``self.drift_bar``, add this array to ``drift_bar``, and set it to
+        0."""
         self.carried(context, bar, self.drift_bar, y, y_bar)
         add(self.drift_bar, drift_bar)
         self.drift_bar.zero_()
@@ -325,8 +288,8 @@ class BodiesAdjoint:
         around_bar: Arrays,
         pressures: tuple[wp.array, wp.array],
     ) -> None:
-        """Apply, after `finish`, the adjoint of the momenta that `Bodies.begin` computes for bodies without slip, given
-        the pressures of the previous step and their adjoints."""
+        """Apply, after `finish`, the adjoint of the momenta of bodies without slip, given the previous step's pressures
+        and their adjoints."""
         for k, held in enumerate(self._bodies.held):
             if held.body.table.sticks:
                 for array in self._held[k].known.values():
@@ -339,7 +302,6 @@ class BodiesAdjoint:
                 context.launch(self._bodies.kernels.hold.adjoint, given, *known, edges)
 
     def finish(self, context: StepContext, bar: Adjoints, around: Arrays, around_bar: Arrays) -> None:
-        """Apply the adjoint of `Bodies.begin`: add to the adjoints of particles, surroundings and poses."""
         bodies, a_bar = self._bodies, around_bar["a_bar"]
         edges = {"edge": around["edge"], "edge_bar": around_bar["edge_bar"]}
         self._joints.finish(context, bar, self._turned)

@@ -7,16 +7,17 @@ the pressure impulses y, the body's density rho and its volume K in units of a p
     V = V_0 + dt g + sum y_i gamma_i / (rho K),   L = L_0 + sum y_i r_i x gamma_i,   W = R' I^-1 R'^T L / rho
 
 is the transpose of the body's term in the divergence, - gamma_i . (V + W x r_i). The part of this term by the wall
-velocity (V_0, W_0) is contained in the sum over all walls. Linear momentum is conserved to round-off. For a held body
-smaller matrices replace 1 / (rho K) and R' I^-1 R'^T (`cortado.sph.moving_solids`).
+velocity (V_0, W_0) is contained in the sum over all walls. For a held body smaller matrices replace 1 / (rho K) and R'
+I^-1 R'^T (`cortado.sph.moving_solids`).
 
-All particles around a light body move it. So the diagonal a_i of the iteration gets the term |gamma_i| sum_j |gamma_j|
-/ (rho K) + lambda |r_i x gamma_i| sum_j |r_j x gamma_j| / rho, with lambda the largest eigenvalue of I^-1. With this
-diagonal the body's part of the matrix has no eigenvalue above 2.
+The diagonal a_i of the iteration gets the term |gamma_i| sum_j |gamma_j| / (rho K) + lambda |r_i x gamma_i| sum_j |r_j
+x gamma_j| / rho, with lambda the largest eigenvalue of I^-1, because all particles around a light body move it. With
+this diagonal the body's part of the matrix has no eigenvalue above 2.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -30,27 +31,11 @@ from cortado.solvers.projection.wall_sums import normal_part, types_by_name
 from cortado.sph.moving_solids import free_module, move_kernels
 
 
-@dataclass(frozen=True)
-class BodyKernels:
-    """Kernels by which particles of the projection push rigid bodies, with their tangents and adjoints."""
-
-    hold: Kernels
-    """The push gamma and the arm r of each particle."""
-    measure: Kernels
-    """The sizes of gamma and r x gamma."""
-    weigh: Kernels
-    """The bodies' term in the diagonal a, from these sizes and their sums ``whole``. The adjoint writes particles'
-    shares of the adjoints of the sums and of the density."""
-    share: Any
-    """Adds the adjoint of the sums to the adjoints of the sizes."""
-    pull: Kernels
-    """The momenta y gamma and y r x gamma that the pressure impulse y of each particle gives; the adjoint starts from
-    the adjoints of the sums of these momenta."""
-
-
 @cache
-def body_kernels(discretisation: Discretisation) -> BodyKernels:
-    """Make the kernels by which the projection moves bodies, for a discretisation."""
+def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
+    """Make the kernels by which particles push bodies. ``hold`` computes gamma and r, ``measure`` |gamma| and |r x
+    gamma|, ``weigh`` the bodies' term in the diagonal a from these and their sums ``whole``, and ``pull`` the momenta y
+    gamma and y r x gamma. ``share`` adds the adjoint of ``whole`` to those of ``measure``."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, pair = precision.pair, pair_functions(discretisation)
     gradient, hessian_product, separation = pair.gradient, pair.hessian_product, pair.separation
@@ -60,7 +45,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
 
     @wp.func
     def between(a: vector, foot: vector, edge: real) -> vector:
-        """Return a vector's part along a wall's normal, plus the edge factor e times its part across the normal."""
+        """Return a's part along a wall's normal, plus e times its part across the normal."""
         part = normal(a, foot)
         return part + edge * (a - part)
 
@@ -116,8 +101,8 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
     @particle_kernel(tangent_module, "pulled_dot twisted_dot")
     @typed
     def pull_tangent(y_i, y_dot_i, gamma_of_i, gamma_of_dot_i, arm_i, arm_dot_i) -> tuple[vector, vector]:
-        """Write the tangents of `pull`; the kernel is handwritten because each iteration runs it and a generated one is
-        slower."""
+        """Write the tangents of `pull` by hand, because a generated kernel is slower and each iteration runs this
+        one."""
         turn = wp.cross(arm_dot_i, gamma_of_i) + wp.cross(arm_i, gamma_of_dot_i)
         return y_dot_i * gamma_of_i + y_i * gamma_of_dot_i, y_dot_i * wp.cross(arm_i, gamma_of_i) + y_i * turn
 
@@ -125,28 +110,19 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
         return pointwise_kernels(precision, modules, lambda _: function, results, **names)
 
     sums = ["pulled", "twisted"]
-    return BodyKernels(
-        Kernels(hold, hold_tangent, hold_adjoint),
-        made(measure, ["sizes"]),
-        made(weigh, ["a:a"], numbers=["pushed_volume", "greatest"], written=["sizes", "whole", "density"]),
-        share,
-        replace(made(pull, sums, summed=sums), tangent=pull_tangent),
+    return SimpleNamespace(
+        hold=Kernels(hold, hold_tangent, hold_adjoint),
+        measure=made(measure, ["sizes"]),
+        weigh=made(weigh, ["a:a"], numbers=["pushed_volume", "greatest"], written=["sizes", "whole", "density"]),
+        share=share,
+        pull=replace(made(pull, sums, summed=sums), tangent=pull_tangent),
     )
 
 
-@dataclass(frozen=True)
-class MotionKernels:
-    """Kernels that move rigid bodies by pressures and gravity, with their tangents and adjoints."""
-
-    move: Kernels
-    """The kernels of `cortado.sph.moving_solids.move_kernels`, given the sums of y gamma and y r x gamma."""
-    carry: Kernels
-    """The drift of walls by the velocity changes; the adjoint writes particles' shares of the changes' adjoints."""
-
-
 @cache
-def motion_kernels(precision: Precision) -> MotionKernels:
-    """Make the kernels that move rigid bodies by pressures and gravity, in a precision."""
+def motion_kernels(precision: Precision) -> SimpleNamespace:
+    """Make the kernels that move bodies by the sums of y gamma and y r x gamma, and those of the drift of walls by the
+    velocity changes."""
     real, vector = precision.real, precision.vector
 
     def carry(faster: vector, turned_faster: vector, gamma_of_i: vector, arm_i: vector) -> real:
@@ -154,4 +130,4 @@ def motion_kernels(precision: Precision) -> MotionKernels:
 
     modules, written = [free_module(precision)] * 3, ["faster", "turned_faster"]
     carries = pointwise_kernels(precision, modules, lambda _: carry, ["drift:drift_in"], written=written)
-    return MotionKernels(move_kernels(precision), carries)
+    return SimpleNamespace(move=move_kernels(precision), carry=carries)

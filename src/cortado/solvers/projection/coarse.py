@@ -1,11 +1,9 @@
 """A coarse correction of the pressure, by which enclosed water feels all of its walls within one step.
 
-An iteration of `cortado.solvers.projection.pressure` spreads a pressure by only one or two spacings. So before each
-iteration a coarse correction computes the smooth part of the error at once, on a grid with nodes two spacings apart.
-The first iteration begins with the pressure of the previous step and needs no correction. Takahashi and Lin 2016 have a
-multilevel particle solver; `cortado.solvers.projection.coarse_pressure` has the equations of this one. Another
-correction before the first iteration would double the cost and gain a tenth at most; it is made only in a cold scene,
-which has no pressure of the previous step.
+An iteration of `cortado.solvers.projection.pressure` spreads a pressure by one or two spacings; the coarse correction
+before it removes the smooth part of the error, on a grid with nodes two spacings apart. The first iteration starts from
+the previous step's pressure and needs a correction only in a cold scene. `cortado.solvers.projection.coarse_pressure`
+has the equations; Takahashi and Lin 2016 have a multilevel particle solver.
 """
 
 from collections.abc import Callable
@@ -37,19 +35,14 @@ from cortado.sph.moment_functions import round_off, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 LEAST = 1e-5
-"""The regularisation eps of all particles around a node, relative to A_II on the lattice. It reduces the correction of
-the longest wave by 0.7 % in water 100 spacings deep, and by 3 % in water 200 spacings deep."""
+"""The regularisation eps of a node's particles, relative to A_II on the lattice."""
 CLOSE = 1e-3
-"""Part of the first residual, in the norm of A^-1, at which a solve in float32 ends. Derivatives of a dam of 24 x 24
-after 80 steps, the rest in float64, agree with differences of the same run within 2e-4, and reverse with forward mode
-within 6e-5. Entirely in float32 the gradient differs by 0.9 % from the one in float64, and by 0.03 % with 3e-7 and
-twice the iterations."""
+"""Part of the first residual, in the norm of A^-1, at which a solve in float32 ends."""
 MOST = 1_000
-"""Greatest number of iterations of a solve."""
 
 
 class Coarse:
-    """The grid and the matrix of the coarse pressure correction for the particles of one solver, and its solves."""
+    """The coarse pressure correction of one solver: its grid, matrix and solves."""
 
     def __init__(
         self,
@@ -61,7 +54,7 @@ class Coarse:
         bodies: Bodies | None,
         endless: bool,
     ):
-        """Allocate for particles with a ``spacing`` [m] and free ``bodies``; an ``endless`` scene needs nothing."""
+        """Allocate for particles with a ``spacing`` [m] and free ``bodies``; an ``endless`` scene has no correction."""
         self.endless = endless
         precision, device = layout.precision, layout.device
         real, vector = precision.real, precision.vector
@@ -73,47 +66,37 @@ class Coarse:
         self._particles, self._kinds = layout, (real, vector, precision.pair)
         self._tolerance = CLOSE if precision is FLOAT32 else round_off(precision)
         self.bodies = None if bodies is None else CoarseBodies(bodies, layout, dimension)
-        """The free bodies; None without any."""
         rows = 0 if self.bodies is None else self.bodies.rows
         self._levels = Levels(precision, dimension, grid.shape, layout.members, device, rows)
         self._parts = wp.zeros((2**dimension, len(self._levels.r)), dtype=real, device=device)
-        """(corners, cells) the parts of the spread `source` that the particles of cells add."""
+        """(corners, cells) terms of cells in the spread `source`"""
         energy = 8.0 / 3.0 * (SPACING / spacing**2 if dimension == 3 else spacing**-2)  # of the gradient of a hat
         touched = (2.0 * SPACING) ** dimension
         self.spaced = {"spacing": spacing}
-        """The spacing by the name of its kernel argument."""
         self.grid = {"grid": self._sort.grid, "order": self._sort.order, "eps": LEAST * energy / touched}
-        """The grid's data by the names of kernel arguments."""
         self.pushed = layout.arrays(h=vector, N=precision.matrix, T=symmetric(precision).kind)
         """h, N and c L of the sorted particles."""
         self.sums, self.parts = layout.sum_of(precision.pair), layout.arrays(parts=precision.pair)
-        """Both sums whose ratio is alpha, and each particle's terms in them."""
         self.warm, self._none_stays = (wp.zeros(layout.members, dtype=wp.int32, device=device) for _ in range(2))
-        """By scene, whether it is warm (`cortado.solvers.projection.pressure`); and zeros for the argument
-        ``stays``."""
+        """``warm`` is 1 for warm scenes (`cortado.solvers.projection.pressure`)."""
         self._all_warm = wp.zeros(1, dtype=wp.int32, device=device)
         self._none = self.numbers()
-        """Zeros, used instead of the results of an earlier correction: those may not be finite if its run was lost."""
+        """Zeros, because the results of an earlier correction may not be finite if its run was lost."""
         self.still = layout.arrays(still=vector)["still"]
-        """Zero velocities."""
         self.unmoved = {"carried": layout.arrays(carried=real)["carried"]}
-        """Zeros for the terms of bodies in a scene without bodies."""
         self.source = layout.arrays(s_value=real, s_slope=vector, s_bent=vector, s_own=real)
-        """The particles' source that is spread to nodes."""
 
     def numbers(self) -> wp.array:
-        """Make an array (nodes,) of zeros for the nodes of all scenes."""
         return wp.zeros_like(self._levels.r)
 
     def room(self) -> dict[str, wp.array]:
-        """Make arrays for a correction's results besides a new iterate: r, e, d, the thrust and the sums of alpha."""
+        """Make arrays for a correction's results besides the iterate."""
         layout, (real, vector, pair) = self._particles, self._kinds
         kept = layout.arrays(r=real, change=real, thrust=vector)
         return {**kept, "e": self.numbers(), "sums": wp.zeros(layout.members, dtype=pair, device=layout.device)}
 
     def begin(self, context: StepContext, around: Named) -> None:
-        """Compute the matrix of a step, and record whether all scenes are warm, so that no first correction is
-        needed."""
+        """Compute the matrix of a step, and record whether all scenes are warm."""
         if self.endless:
             return
         scenes = {"scenes": len(self.warm), "warm": self.warm}
@@ -128,8 +111,8 @@ class Coarse:
             self.bodies.begin(context, self.grid, around, self._levels.B)
 
     def where_due(self, k: int, correct: Callable[[], None]) -> None:
-        """Call ``correct`` before iteration k, before the first one only if a scene is cold. An endless scene has no
-        correction: it would change the level of pressures, which moves particles that are not on a lattice."""
+        """Call ``correct`` before iteration k > 0, and before the first iteration if a scene is cold. An endless scene
+        needs no correction, which would only change the level of pressures."""
         if self.endless:
             return
         if k > 0:
@@ -145,9 +128,8 @@ class Coarse:
         self._levels.solve(e, self._tolerance, MOST)
 
     def correct(self, context: StepContext, k: int, around: Named, at: Named, new: Named, T: wp.array) -> None:
-        """Correct the pressure before iteration k: from an iterate ``at`` with A and divergence, write k, y and u of a
-        ``new`` iterate, which has `room` for further results. ``around`` has the drift of walls; ``T`` is
-        overwritten."""
+        """Correct the pressure before iteration k: from an iterate ``at`` write k, y and u of a ``new`` iterate with
+        `room`. ``around`` has the drift of walls; ``T`` is overwritten."""
         context.launch(self.residual.forward, around, at, self.source, r=new["r"])
         self.solve(context, self._none, new["e"])
         own = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
@@ -161,7 +143,6 @@ class Coarse:
         context.launch(self.length.apply.forward, out, own, at)
 
     def staying(self, k: int) -> dict[str, Any]:
-        """Return whether k is the first iteration, and the scenes that need no correction before it."""
         return {"first": int(k == 0), "stays": self.warm if k == 0 else self._none_stays}
 
     def carried(self, context: StepContext, change: wp.array) -> dict[str, wp.array]:
@@ -170,8 +151,6 @@ class Coarse:
 
 
 class CoarseTangent:
-    """The tangent of the coarse pressure correction, for forward mode."""
-
     def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesTangent | None, dot: Tangents):
         precision = layout.precision
         real, vector, six = precision.real, precision.vector, symmetric(precision).kind
@@ -185,12 +164,10 @@ class CoarseTangent:
         self._T = layout.arrays(T=six)
 
     def begin(self, context: StepContext, known: tuple[Named, ...]) -> None:
-        """Compute tangents of the coarse push; ``known`` has particles and surroundings with their tangents."""
         for kernel in self._coarse.push.tangent:
             context.launch(kernel, *known, self._coarse.pushed, self._change)
 
     def correct(self, context: StepContext, k: int, known: tuple[Named, ...], at: Named, new: Named) -> None:
-        """Write k_dot, y_dot and u_dot of the ``new`` iterate from those of the iterate ``at``, before iteration k."""
         own, change = self._coarse, {name: self._change[f"{name}_dot"] for name in ("change", "thrust", "r", "T", "u")}
         found = {f"{name}_dot": change[name] for name in ("change", "thrust", "r")}
         left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
@@ -216,8 +193,6 @@ class CoarseTangent:
 
 
 class CoarseAdjoint:
-    """The adjoint of the coarse pressure correction, for reverse mode."""
-
     def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesAdjoint | None, bar: Adjoints, faces: FaceShares):
         precision = layout.precision
         self._bar, self._faces = bar, faces
@@ -245,9 +220,9 @@ class CoarseAdjoint:
         steps: Named,
         u_bar: wp.array,
     ) -> None:
-        """Apply the adjoint of the correction before iteration k: from k_bar and y_bar of the ``new`` iterate, in
-        ``steps``, and ``u_bar``, to k and y of the iterate ``at``. Also add to its d_bar and S, from which the rest of
-        the adjoint of u is computed."""
+        """Apply the adjoint of the correction before iteration k: from k_bar and y_bar in ``steps`` and ``u_bar`` of
+        the ``new`` iterate to k and y of the iterate ``at``. Add to d_bar and S, which give the rest of the adjoint of
+        u."""
         own, through, found = self._coarse, self._through, self._steps
         left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
         bars = {"k_out_bar": steps["k_bar"], "y_bar": steps["y_bar"], "u_bar": u_bar}
@@ -271,8 +246,8 @@ class CoarseAdjoint:
         context.launch(own.residual.adjoint, steps, found, at, *known)
 
     def finish(self, context: StepContext, known: tuple[Named, ...], share: wp.array) -> None:
-        """Turn the adjoints of the coarse push h and N into those of particles and their surroundings, given their
-        ``share`` c of a coarse pressure."""
+        """Turn the adjoints of the coarse push h and N into those of particles and surroundings, given the ``share``
+        c."""
         for kernel in self._coarse.push.adjoint:
             context.launch(kernel, *known, self._bars, self._coarse.pushed)
         given = {"u": self._bars["h_bar"], "slope": self._bars["N_bar"]}

@@ -1,22 +1,23 @@
-"""A multigrid of ever coarser grids, by which solves on the coarse grid of the pressure take few iterations.
+"""A multigrid by which solves on the coarse grid of the pressure take few iterations.
 
-Each level has half of the nodes of the finer level along every axis with an even number of nodes. The matrix of each is
-R A R^T (Galerkin), with the matrix A of the finer level and bilinear R; like A, it is a sum over cells. The solve
-(`cortado.solvers.projection.coarse_solve`) smooths it by steps of Jacobi's method, x + w (r - A x), with w_I = W /
-(sqrt(A_II) sum_J |A_IJ| / sqrt(A_JJ)). With W below 2 this converges for every symmetric positive semidefinite matrix.
-With W = 1, w A has no eigenvalue above 1 (Baker, Falgout, Kolev and Yang 2011, applied to the matrix whose diagonal is
-scaled to 1). The grids are periodic, as grids of cells are.
+Each level has half of the nodes of the finer level along every axis with an even number of nodes. Its matrix is R A R^T
+(Galerkin), with the matrix A of the finer level and bilinear R, and is a sum over cells like A. The solve
+(`cortado.solvers.projection.coarse_solve`) smooths by steps of Jacobi's method, x + w (r - A x), with w_I = W /
+(sqrt(A_II) sum_J |A_IJ| / sqrt(A_JJ)). With W below 2 Jacobi's method converges for every symmetric positive
+semidefinite matrix. With W = 1, w A has no eigenvalue above 1 (Baker, Falgout, Kolev and Yang 2011, applied to the
+matrix whose diagonal is scaled to 1).
 """
 
 from functools import cache
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from cortado.device.launching import launch
-from cortado.device.modules import kernel_module
+from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.solvers.projection.coarse_nodes import node_functions
 from cortado.solvers.projection.coarse_solve import BLOCK, solve_kernel, system_type
@@ -27,20 +28,9 @@ FEWEST = 4
 W = wp.constant(1.9)
 
 
-class LevelKernels(NamedTuple):
-    """Kernels that make the matrices of ever coarser grids."""
-
-    coarsen: Any
-    """Computes the cells' parts of a level's matrix from the cells' parts of the ``fine`` level."""
-    fill: Any
-    """Computes the matrices of all levels from the parts of their cells."""
-    weigh: Any
-    """Computes the weight w of each node of all levels; w is 0 where the matrix is 0."""
-
-
 @cache
-def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
-    """Make the kernels for the matrices of coarser grids, in 2 or 3 dimensions."""
+def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
+    """Make the kernels for the matrices of coarser grids."""
     real = precision.real
     module = kernel_module(f"coarse_levels_{dimension}d_{precision.name}")
     AROUND, CORNERS, among = wp.constant(3**dimension), wp.constant(2**dimension), node_functions(dimension)
@@ -50,8 +40,8 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
 
     @wp.struct
     class Place:
-        """A node: its number in its level, and its place. Also the number of nodes of finer levels, the number of nodes
-        of its level in all scenes, the number of its scene's first node, and the shape of its level."""
+        """A node with its ``number`` in its level, the level's ``shape``, the nodes of finer levels (``start``), the
+        level's nodes in all scenes (``all``), and its scene's first node."""
 
         start: int
         all: int
@@ -62,7 +52,6 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
 
     @wp.func
     def place_of(node: int, members: int, shapes: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int64)) -> Place:
-        """Return the place of a node, given its number among the nodes of all levels."""
         level, found = int(0), Place()
         for later in range(1, starts.shape[0]):
             if node >= int(starts[later]):
@@ -83,15 +72,16 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
 
     @wp.func
     def entry_beside(rows: int, row: int, step: wp.vec3i, at: Place) -> wp.int64:
-        """Return the index of the entry of the node a step away, as `entry` does."""
+        """Return the index of `entry` for the node a step away."""
         return entry(rows, row, at.first + number_of(at.here + step, at.shape), at)
 
     @wp.func
     def share(child: int, corner: int, halved: int) -> real:
         """Return the hat function of a coarse cell's corner at a corner of one of its children, 0 to 1.
 
-        ``child`` and ``corner`` have a bit for each axis in which they are not on the side of the coarse corner,
-        ``halved`` for each one along which a coarse cell has two children."""
+        ``child`` and ``corner`` have a bit for each axis along which they are not on the coarse corner's side;
+        ``halved`` has a bit for each axis along which a coarse cell has two children.
+        """
         if ((child | ~halved) & corner) != 0:
             return real(0.0)
         bits = (child | corner) & halved
@@ -106,7 +96,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
         # out
         cells: wp.array2d(dtype=real),
     ):
-        """Add up P^T M P of the matrices M of a coarse cell's children, with a thread for each corner of each cell."""
+        """Sum P^T M P over the matrices M of a coarse cell's children, with a thread for each corner of each cell."""
         a = wp.tid() // cells.shape[1]
         cell = wp.tid() - a * cells.shape[1]
         nodes = shape[0] * shape[1] * shape[2]
@@ -151,6 +141,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def weigh(members: int, shapes, starts, A, weight):
+        """Compute w of each node of all levels, 0 where the matrix is 0."""
         at = place_of(wp.tid(), members, shapes, starts)
         own, total = A[entry(AROUND, AROUND // 2, at.number, at)], real(0.0)
         if own > real(0.0):
@@ -161,27 +152,23 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
             total = real(W) / (wp.sqrt(own) * total)
         weight[wp.tid()] = total
 
-    return LevelKernels(coarsen, fill, weigh)
+    return by_name(coarsen, fill, weigh)
 
 
 def pairs_of_corners(dimension: int) -> int:
-    """Return the number of pairs of a cell's corners, including pairs of a corner with itself."""
+    """Return the number of pairs of a cell's corners, including a corner with itself."""
     return 2**dimension * (2**dimension + 1) // 2
 
 
 class Level(NamedTuple):
-    """One of the multigrid's grids."""
-
     shape: wp.vec3i
     factor: wp.vec3i
     """Ratio of the finer grid's number of nodes to this grid's, along each axis."""
     cells: wp.array
-    """(pairs, cells) the parts of the matrix that the cells of all scenes add, by pairs of a cell's corners."""
+    """(pairs, cells) terms of the cells of all scenes in the matrix, by pairs of corners"""
 
 
 class Levels:
-    """All grids of the multigrid for a solver's coarse pressure matrix."""
-
     def __init__(
         self,
         precision: Precision,
@@ -211,11 +198,11 @@ class Levels:
             for n, factor, i, j in zip(shapes, factors, at[:-1], at[1:], strict=True)
         ]
         self.cells, self.r = self.levels[0].cells, residual[: counts[0]]
-        """(pairs, cells) the parts of the matrix that cells of the finest grid add; (nodes,) the right-hand side."""
+        """(pairs, cells) terms of the finest grid's cells in the matrix, and (nodes,) the right-hand side"""
         self.B = numbers(rows * counts[0]).reshape((rows, counts[0]))
-        """(rows, nodes) the matrix B; B^T B is added to the finest matrix."""
+        """(rows, nodes)"""
         self.count = wp.zeros(members, dtype=wp.int32, device=device)
-        """(members,) iterations of the last solve."""
+        """(members,) iterations of the last solve"""
         table = [[*n, *factor] for n, factor in zip(shapes, factors, strict=True)]
         blocks = -(-counts[0] // members // BLOCK)
         teams, team = members, 1
@@ -238,7 +225,6 @@ class Levels:
         self._weight, self._corners = weight, 2**dimension
 
     def begin(self, context: StepContext) -> None:
-        """Compute the matrices and weights of all levels from the `cells` of the finest one."""
         for finer, level in pairwise(self.levels):
             both = {"fine": finer.shape, "shape": level.shape, "factor": level.factor, "cells_fine": finer.cells}
             threads = self._corners * level.cells.shape[1]

@@ -2,47 +2,25 @@
 
 A node's hat phi is 1 at the node and falls linearly along each axis to 0 at the next nodes. The cells of the grid are
 those of a `CellSort`; node number k is at the lower corner of cell number k.
-
-Kernels of the nodes sum over the particles around each, also for the matrix A of
-`cortado.solvers.projection.coarse_pressure`.
 """
 
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from types import SimpleNamespace
 
 import warp as wp
 
 from cortado.device.cells import cell_functions, cell_grid_type
 from cortado.device.launching import bundle
-from cortado.device.modules import kernel_module
+from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import Precision, TypesByName
 
 ALONE = 0.01
-"""The factor of h^2 in the regularisation of the nodes around a particle."""
-
-
-@dataclass(frozen=True)
-class NodeFunctions:
-    """Warp functions that number the nodes of a periodic grid of any shape."""
-
-    number_of: Any
-    """The number of a node, which may be outside of the grid by up to the grid's width."""
-    node_of: Any
-    """The node with a number."""
-    step_of: Any
-    """The step from a node to itself or to one of its neighbours, by the number of the step."""
-    beside: Any
-    """The number of the node a step away from a given node of the same scene; nodes are numbered over all scenes."""
-    corner_step: Any
-    """The step from the lower corner of a cell to one of its corners."""
-    pair_of: Any
-    """The number of two corners of a cell, in any order."""
 
 
 @cache
-def node_functions(dimension: int) -> NodeFunctions:
-    """Make Warp functions that number nodes and steps between them, in 2 or 3 dimensions."""
+def node_functions(dimension: int) -> SimpleNamespace:
+    """Make Warp functions that number the nodes of a periodic grid. ``beside`` returns a node's number over all scenes,
+    ``pair_of`` the number of two corners of a cell in any order."""
     flat, CORNERS = wp.constant(dimension == 2), wp.constant(2**dimension)
 
     @wp.func
@@ -80,28 +58,14 @@ def node_functions(dimension: int) -> NodeFunctions:
         first = node // nodes * nodes
         return first + number_of(node_of(node - first, shape) + step, shape)
 
-    return NodeFunctions(number_of, node_of, step_of, beside, corner_step, pair_of)
-
-
-@dataclass(frozen=True)
-class HatFunctions:
-    """Warp functions that evaluate hat functions of a grid's nodes at particles."""
-
-    hat: Any
-    """phi, its gradient and its mixed second derivatives, for a node at one of the corners of a position's cell."""
-    at: Any
-    """A sum of hats at a particle with its derivatives: E, G and H of values e at nodes."""
-    products: Any
-    """The sum of e u over the nodes whose hats are not 0 at a particle."""
-    bend: Any
-    """H v"""
-    held: Any
-    """The regularisation eps + h^2 / 100 by which a particle keeps the values at nodes around it small."""
+    return by_name(number_of, node_of, step_of, beside, corner_step, pair_of)
 
 
 @cache
-def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
-    """Make Warp functions of the hats of nodes, in 2 or 3 dimensions."""
+def hat_functions(precision: Precision, dimension: int) -> SimpleNamespace:
+    """Make Warp functions of the hats of nodes. ``at`` returns the sum E of node values e at a particle, its gradient G
+    and its mixed second derivatives H. ``products`` sums e u over the nodes around a particle, ``bend`` is H v, and
+    ``held`` is eps + h^2 / 100."""
     real, vector = precision.real, precision.vector
     grid_type, cell_of = cell_grid_type(precision), cell_functions(precision).cell_of
     number_of, corner_step = node_functions(dimension).number_of, node_functions(dimension).corner_step
@@ -111,7 +75,7 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
 
     @wp.struct
     class Hat:
-        """The value phi of a hat function, its gradient and its mixed second derivatives yz, xz and xy."""
+        """phi, its gradient and its mixed second derivatives yz, xz and xy."""
 
         value: real
         slope: vector
@@ -127,7 +91,6 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
 
     @wp.func
     def hat(x: vector, corner: int, grid: grid_type) -> Hat:
-        """Return value and derivatives at x of the hat of the node at one of the corners of x's cell."""
         s = wp.cw_mul(x - grid.origin, grid.frequency)
         t = s - vector(wp.floor(s[0]), wp.floor(s[1]), wp.floor(s[2]))
         f, found = grid.frequency, Hat()
@@ -145,12 +108,10 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
 
     @wp.func
     def first_corner(i: int, particles: int, x: vector, grid: grid_type):
-        """Return the cell of a particle and the first node of its scene."""
         return cell_of(x, grid), (i // particles) * (grid.shape[0] * grid.shape[1] * grid.shape[2])
 
     @wp.func
     def at(i: int, particles: int, x: vector, e: wp.array(dtype=real), grid: grid_type) -> Hat:
-        """Return the sum of hats with node values e at particle i: value E, gradient G, mixed second derivatives H."""
         own, first = first_corner(i, particles, x, grid)
         found = Hat()
         for corner in range(CORNERS):
@@ -165,7 +126,6 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
     def products(
         i: int, particles: int, x: vector, e: wp.array(dtype=real), u: wp.array(dtype=real), grid: grid_type
     ) -> real:
-        """Return the sum of products e u of two fields over the nodes whose hats reach particle i."""
         own, first = first_corner(i, particles, x, grid)
         total = real(0.0)
         for corner in range(CORNERS):
@@ -175,31 +135,20 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
 
     @wp.func
     def bend(bent: vector, v: vector) -> vector:
-        """Return H v for a matrix H of mixed second derivatives yz, xz and xy, with a diagonal of 0."""
+        """Return H v for mixed second derivatives yz, xz and xy."""
         return vector(bent[2] * v[1] + bent[1] * v[2], bent[2] * v[0] + bent[0] * v[2], bent[1] * v[0] + bent[0] * v[1])
 
     @wp.func
     def held(eps: real, h: vector) -> real:
         return eps + alone * wp.dot(h, h)
 
-    return HatFunctions(hat, at, products, bend, held)
-
-
-@dataclass(frozen=True)
-class NodeKernels:
-    """Kernels that sum over the particles around each node of the coarse grid."""
-
-    add_up: Any
-    """Computes the terms of a cell's particles in A, for each pair of the cell's corners."""
-    spread: Any
-    """Computes the terms of a cell's particles in a sum over particles, for each of the cell's corners."""
-    gather: Any
-    """Computes the sum over particles at each node from the terms of cells."""
+    return by_name(hat, at, products, bend, held)
 
 
 @cache
-def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
-    """Make the kernels that sum over the particles around nodes, in 2 or 3 dimensions."""
+def node_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
+    """Make kernels that sum over the particles around nodes. ``add_up`` computes terms in A by pairs of a cell's
+    corners, ``spread`` terms in a sum by corners, and ``gather`` the sums at nodes."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     grid_type, own = cell_grid_type(precision), hat_functions(precision, dimension)
     source = bundle(s_value=real, s_slope=vector, s_bent=vector, s_own=real)
@@ -216,7 +165,6 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def add_up(grid, order, eps: real, x, m, h, N, cells: wp.array2d(dtype=real)):
-        """Sum the particles of each cell into the matrix entries of its pairs of corners; a thread is a cell."""
         cell = wp.tid()
         total, own = square(), pushes()
         for p in range(grid.starts[cell], grid.starts[cell + 1]):
@@ -236,7 +184,6 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def spread(grid, order, x, of: source, e, parts: wp.array2d(dtype=real)):
-        """Add up the source of the particles in a cell, with a thread for each cell."""
         cell, total, own = wp.tid(), row(), row()
         for corner in range(CORNERS):
             own[corner] = e[beside(cell, corner_step(corner), grid.shape)]
@@ -256,4 +203,4 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
             total += parts[corner, beside(node, -corner_step(corner), grid.shape)]
         r[node] = total
 
-    return NodeKernels(add_up, spread, gather)
+    return by_name(add_up, spread, gather)

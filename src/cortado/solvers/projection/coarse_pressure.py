@@ -9,25 +9,22 @@ With the share c of each particle, and N and h of `cortado.solvers.projection.co
     y' = y + alpha d,   u' = u - alpha D^T d / m,
     alpha = sum_i (r_i d_i + l_i) / sum_i (|D^T d|^2 / m + l_i), from 0 to 1,   l_i = m_i (1e-6 s / dt)^2.
 
-S is a smoothstep from -1e-6 to 1e-6 of dt (D u - b): 1 for compression, 0 for tension. Without l, alpha would be the
-step along d that minimises the kinetic energy, so that a correction never adds energy, whatever the clamp changes. If
-the correction is nearly 0, as in free fall, l makes alpha 1, and y' follows a small change of u linearly. Before the
-first iteration l is only in the second sum, which makes alpha 0 in free fall: a small change of u makes a pressure in a
-step, so that the next step is not cold. Free bodies add terms to A and to the denominator of alpha.
+S is a smoothstep from -1e-6 to 1e-6 of dt (D u - b): 1 for compression, 0 for tension. Without l, alpha minimises the
+kinetic energy along d, so that a correction never adds energy. Where the correction is nearly 0, as in free fall, l
+makes alpha 1. Before the first iteration l is only in the second sum, so that alpha is 0 in free fall.
 
 eps makes e small at nodes with few particles. So does h^2 / 100, which is nearly 0 in fluid and beside walls that
-enclose it. If a particle has a wall beside it and no fluid, the nodes around it share a single equation. Without these
-terms solves would then take hundreds of iterations, for example in dams that have run out. Two operations transfer
-values between nodes and particles: `spread` sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i over the
-particles of the cells around a node, in their order, and `at` gives E = sum_I phi_I e_I, its gradient G and its mixed
-second derivatives at a particle. With w = (N G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 /
-100) / m.
+enclose it, and which shortens solves where a particle has a wall beside it and no fluid. Two operations transfer values
+between nodes and particles: `spread` sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i over the particles
+of the cells around a node, in their order, and `at` gives E = sum_I phi_I e_I, its gradient G and its mixed second
+derivatives at a particle. With w = (N G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 / 100) /
+m.
 
 Free bodies are included on the grid so that a light body gives way from the first step on. Pressure impulses y give a
-body the momenta F = sum_i y_i gamma_i and T = sum_i y_i r_i x gamma_i (`cortado.solvers.projection.body_kernels`). So
-the body gets the velocities V = F / (rho K) and W = R' I^-1 R'^T T / rho, which reduce the divergence of particle i by
-(G y)_i = gamma_i . (V + W x r_i). G is symmetric and positive semidefinite: y . G y is twice the kinetic energy that y
-gives to bodies at rest. On the grid G adds
+body the momenta F = sum_i y_i gamma_i and T = sum_i y_i r_i x gamma_i (`cortado.solvers.projection.body_kernels`). The
+body gets V = F / (rho K) and W = R' I^-1 R'^T T / rho, which reduce the divergence of particle i by (G y)_i = gamma_i .
+(V + W x r_i). G is symmetric and positive semidefinite: y . G y is twice the kinetic energy that y gives to bodies at
+rest. On the grid G adds
 
     B^T B,   B_I = (F_I / sqrt(rho K), S R'^T T_I / sqrt(rho)),   S S = I^-1,
 
@@ -35,16 +32,15 @@ with F_I and T_I of y = phi_I c, to the matrix A: three rows for a body in the p
 the smaller matrices of `cortado.sph.moving_solids` replace 1 / (rho K) and I^-1.
 """
 
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
 
 from cortado.device.cells import cell_grid_type
 from cortado.device.launching import Named, bundle
-from cortado.device.modules import Kernels, kernel_module
+from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels
 from cortado.particles.state import Layout
@@ -57,24 +53,11 @@ from cortado.sph.moving_solids import hold_functions
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 
-@dataclass(frozen=True)
-class CoarsePressureKernels:
-    """Kernels of the pressure change d by a coarse pressure e; `LengthKernels` has those of its length alpha."""
-
-    correct: Any
-    correct_tangent: Any
-    """The tangent of d, given that of e."""
-    source_tangent: Any
-    """The source that is spread to nodes for the tangent of e."""
-    correct_adjoint: Any
-    """Computes, from the adjoint of d, the source that is spread to nodes for the adjoint of e."""
-    source_adjoint: Any
-    """Computes the adjoints of all inputs from lambda, the solution of A lambda = adjoint of e."""
-
-
 @cache
-def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePressureKernels:
-    """Make the kernels of the pressure change by the coarse grid, in 2 or 3 dimensions."""
+def coarse_pressure_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
+    """Make the kernels of the pressure change d by a coarse pressure e. The kernels ``source_tangent`` and
+    ``correct_adjoint`` compute the sources that are spread to nodes for the tangent and the adjoint of e;
+    ``source_adjoint`` starts from lambda, the solution of A lambda = adjoint of e."""
     real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     grid_type, hats = cell_grid_type(precision), hat_functions(precision, dimension)
     at, products, bend, held, alone = hats.at, hats.products, hats.bend, hats.held, wp.constant(real(2.0 * ALONE))
@@ -89,7 +72,7 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
     @particle_kernel(module, "change T", numbers=numbers)
     @typed
     def correct(i: int, grid, particles: int, x_i, L_i: matrix, coarse_i, weights_i, y_i, e) -> tuple[real, six]:
-        """Return the clamped change d of a particle's pressure y by the coarse pressure e, and T = d L."""
+        """Return the clamped change d of the pressure y by e, and T = d L."""
         z, least = y_i + coarse_i * at(i, particles, x_i, e, grid).value, wp.min(y_i, real(0.0))
         new = z
         if z < least:
@@ -172,7 +155,6 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
     def source_adjoint(
         i: int, grid, particles: int, eps, x_i, m_i, coarse_i, h_i, N_i: matrix, r_i, e, multiplier
     ) -> tuple[real, real, vector, matrix, real, vector]:
-        """Add to the adjoints of r, c, h, N, m and x, given the ``multiplier`` lambda."""
         f, g = at(i, particles, x_i, e, grid), at(i, particles, x_i, multiplier, grid)
         w, u = (N_i * f.slope + f.value * h_i) / m_i, (N_i * g.slope + g.value * h_i) / m_i
         both = products(i, particles, x_i, e, multiplier, grid)
@@ -183,36 +165,24 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
         m_part = wp.dot(u, w) + held(eps, h_i) * both / (m_i * m_i)
         return coarse_i * g.value, g.value * r_i, h_part, N_part, m_part, x_part
 
-    return CoarsePressureKernels(correct, correct_tangent, source_tangent, correct_adjoint, source_adjoint)
+    return by_name(correct, correct_tangent, source_tangent, correct_adjoint, source_adjoint)
 
 
 SMALL = 1e-6
 """Speed, in spacings per step, whose kinetic energy is added to the sums of alpha."""
 
 
-@dataclass(frozen=True)
-class LengthKernels:
-    """Kernels of the length alpha of a coarse correction, given the pressure change d, the thrust -D^T d / m, and as
-    ``carried`` the G d of free bodies, see `cortado.solvers.projection.coarse_pressure`."""
-
-    share: Kernels
-    """A particle's terms in both sums of alpha; the adjoint starts from the adjoint of the sums."""
-    apply: Kernels
-    """k', y' and u', given both sums; the adjoint writes particles' shares of the adjoint of the sums."""
-    every: Any
-    """Tests whether all scenes of a batch are warm."""
-
-
 @cache
-def length_kernels(precision: Precision) -> LengthKernels:
-    """Make the kernels of the length alpha of a coarse correction, in any dimension."""
+def length_kernels(precision: Precision) -> SimpleNamespace:
+    """Make the kernels of alpha, given d, the thrust -D^T d / m, and the G d of free bodies as ``carried``. ``share``
+    computes terms in both sums of alpha, ``apply`` k', y' and u' from these sums."""
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     small, typed = wp.constant(real(SMALL)), types_by_name(precision, {int: "first stays"})
     modules = [kernel_module(f"coarse_length_{precision.name}")] * 3
 
     @wp.func
     def length(sums: pair_of) -> real:
-        """Return alpha, the ratio of both sums limited to 0 ... 1; NaN stays NaN, so that it is not hidden."""
+        """Return alpha from both sums; NaN stays NaN, so that it is not hidden."""
         found = sums[0] / sums[1]
         return wp.where(found <= real(0.0), real(0.0), wp.where(found >= real(1.0), real(1.0), found))
 
@@ -225,8 +195,7 @@ def length_kernels(precision: Precision) -> LengthKernels:
 
     @typed
     def share(first, spacing, stays, time_step, m_i, r_i, change_i, carried_i, thrust_i) -> pair_of:
-        """Return a particle's addends to both sums whose ratio is alpha, which is 0 in a scene that ``stays``
-        uncorrected; m (1e-6 s / dt)^2 is added in any case."""
+        """Return a particle's terms in both sums of alpha; in a scene that ``stays`` uncorrected alpha is 0."""
         if stays != 0:
             return pair_of(real(0.0), m_i)
         v = small * spacing / time_step
@@ -253,27 +222,13 @@ def length_kernels(precision: Precision) -> LengthKernels:
     results, replaced = ["k_out", "y_out", "u_out"], {"y_out": "y", "u_out": "u"}
     written = ["sums", "change", "thrust"]
     applied = pointwise_kernels(precision, modules, lambda _: apply, results, replaced, written=written)
-    return LengthKernels(shares, applied, every)
-
-
-@dataclass(frozen=True)
-class CoarseBodyKernels:
-    """Kernels of free bodies on the coarse grid of the pressure."""
-
-    gather: Any
-    """The rows of one body in the matrix B."""
-    lift: Any
-    """The pressure c E of particles from the grid, times a factor."""
-    lift_tangent: Any
-    source_tangent: Any
-    """The term of c G c E in the source that is spread to nodes for the tangent of e."""
-    source_adjoint: Any
-    """Computes the adjoints of c and x from the adjoint of c E."""
+    return SimpleNamespace(share=shares, apply=applied, every=every)
 
 
 @cache
-def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKernels:
-    """Make the kernels of free bodies on the coarse grid, in 2 or 3 dimensions."""
+def coarse_body_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
+    """Make the kernels of free bodies on the coarse grid. ``gather`` writes a body's rows of B, and ``lift`` computes
+    ``factor`` c E of particles. The source kernels have the terms of c G c E in the tangent and the adjoint of e."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     grid_type, hats, among = cell_grid_type(precision), hat_functions(precision, dimension), node_functions(dimension)
     hat, at, beside, corner_step = hats.hat, hats.at, among.beside, among.corner_step
@@ -299,7 +254,7 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
         of: bundle(coarse=real, gamma_of=vector, arm=vector),
         B: wp.array2d(dtype=real),
     ):
-        """Write a body's rows of B from row ``first`` on, by node; ``half`` is a square root of I^-1."""
+        """Write a body's rows of B from row ``first`` on; ``half`` is a square root of I^-1."""
         node, force, torque = wp.tid(), vector(), vector()
         member = node // (grid.shape[0] * grid.shape[1] * grid.shape[2])
         for corner in range(CORNERS):
@@ -332,7 +287,6 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
     @particle_kernel(module, "lifted_dot", numbers=numbers)
     @typed
     def lift_tangent(i: int, grid, particles: int, x_i, x_dot_i, coarse_i, coarse_dot_i, e) -> real:
-        """Return the tangent of the lifted pressure c E for fixed node values e."""
         f = at(i, particles, x_i, e, grid)
         return coarse_dot_i * f.value + coarse_i * wp.dot(f.slope, x_dot_i)
 
@@ -351,24 +305,21 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
         slope = lifted_bar_i * f.slope - carried_i * g.slope
         return lifted_bar_i * f.value - carried_i * g.value, coarse_i * slope
 
-    return CoarseBodyKernels(gather, lift, lift_tangent, source_tangent, source_adjoint)
+    return by_name(gather, lift, lift_tangent, source_tangent, source_adjoint)
 
 
 class CoarseBodies:
-    """The free bodies' rows of the matrix B on the coarse grid, and their operator G."""
+    """The free bodies' rows of B, and their operator G."""
 
     def __init__(self, bodies: Bodies, layout: Layout, dimension: int):
-        """Prepare rows for a solver's bodies, given the ``layout`` of its particles."""
         precision, matrix = layout.precision, layout.precision.matrix
         self.bodies, self.kernels = bodies.at_rest(), coarse_body_kernels(precision, dimension)
         self._each = 3 * dimension - 3
         self._roots = [matrix(*_root(held.body.table.inertia).ravel()) for held in bodies.held]
         self.rows = self._each * len(bodies.held)
-        """Number of rows of all bodies."""
         self._none = layout.arrays(none=precision.real)["none"]
 
     def begin(self, context: StepContext, grid: Named, around: Named, B: wp.array) -> None:
-        """Write the bodies' rows of a step to ``B`` (rows, nodes)."""
         for number, (held, root) in enumerate(zip(self.bodies.held, self._roots, strict=True)):
             own, known = {"first": self._each * number, "half": root}, self.bodies.known(context, held)
             context.launch(self.kernels.gather, grid, own, around, *known, B=B, threads=B.shape[1])
@@ -379,28 +330,25 @@ class CoarseBodies:
 
 
 def _root(inertia: np.ndarray) -> np.ndarray:
-    """Return the square root S of I^-1, with 0 for turns about axes that have no inertia."""
+    """Return the square root S of I^-1, with 0 for turns about axes without inertia."""
     values, axes = np.linalg.eigh(np.linalg.pinv(inertia))
     found: np.ndarray = (axes * np.sqrt(np.maximum(values, 0.0))) @ axes.T
     return found
 
 
 class CoarseBodiesTangent:
-    """The tangent of free bodies on the coarse grid, for forward mode."""
-
     def __init__(self, own: CoarseBodies, bodies: BodiesTangent, dot: Tangents):
         self._own, self._bodies, self._dot = own, bodies.at_rest(own.bodies), dot
         self._none = wp.zeros_like(own.bodies.drift)
         self._lifted = {"lifted": wp.zeros_like(self._none), "lifted_dot": wp.zeros_like(self._none)}
 
     def carried(self, context: StepContext, y: wp.array, y_dot: wp.array) -> dict[str, wp.array]:
-        """Return G y and its tangent, which the next call overwrites."""
         carried = self._own.carried(context, y)
         change = self._bodies.drifted(context, self._dot, self._none, y, y_dot)
         return {"carried": carried, "carried_dot": change}
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], source: Named) -> None:
-        """Add the tangent of c G c E to the source that is spread to nodes for the tangent of e."""
+        """Add the tangent of c G c E to the source of the tangent of e."""
         kernels, lifted = self._own.kernels, self._lifted
         context.launch(kernels.lift, *known, lifted, factor=1.0)
         context.launch(kernels.lift_tangent, *known, lifted)
@@ -409,19 +357,16 @@ class CoarseBodiesTangent:
 
 
 class CoarseBodiesAdjoint:
-    """The adjoint of free bodies on the coarse grid, for reverse mode."""
-
     def __init__(self, own: CoarseBodies, bodies: BodiesAdjoint, bar: Adjoints):
         self._own, self._bodies, self._bar = own, bodies.at_rest(own.bodies), bar
         names = ("lifted", "lifted_bar", "carried_bar")
         self._lifted = {name: wp.zeros_like(own.bodies.drift) for name in names}
 
     def carried(self, context: StepContext, carried_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
-        """Apply the adjoint of G y: add to ``y_bar`` and to the adjoints of bodies and particles."""
         self._bodies.carried(context, self._bar, carried_bar, y, y_bar)
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], e: wp.array, multiplier: wp.array) -> None:
-        """Add the adjoints of - lambda . c G c E, given the ``multiplier`` lambda, to the adjoints of all inputs."""
+        """Add the adjoints of -lambda . c G c E, with the ``multiplier`` lambda, to those of all inputs."""
         kernels, (lifted, lifted_bar, carried_bar) = self._own.kernels, self._lifted.values()
         context.launch(kernels.lift, *known, e=e, lifted=lifted, factor=1.0)
         context.launch(kernels.lift, *known, e=multiplier, lifted=carried_bar, factor=-1.0)

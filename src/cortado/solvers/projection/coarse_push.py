@@ -1,16 +1,14 @@
 """The force of a smooth pressure on the coarse grid on a particle, and the divergence that this pressure has to remove.
 
-The sums over neighbours are the push h by a constant pressure c, and the moment N for its gradient. For a pressure k_j
-= c_j phi(x_j) with a linear function phi, and T = c L, D^T k of `cortado.solvers.projection.pressure` is exactly
+The push h is the force of a constant pressure c, and the moment N that of a pressure's gradient. For a pressure k_j =
+c_j phi(x_j) with a linear function phi, and T = c L, D^T k of `cortado.solvers.projection.pressure` is exactly
 
     (D^T k)_i = N_i grad phi + phi(x_i) h_i,
     N_i = -sum_j (T_j g_ij) x_ij^T - sum_j' eta_j c_j g_ij' x_ij^T,
     h_i = sum_j T_j g_ij + T_i g_i + c_i gamma_i + sum_j' (eta_i c_i + eta_j c_j) g_ij',
 
-with the images j' of particles j, whose weight eta is called h in `cortado.solvers.projection.effects`. N is the unit
-matrix inside of the fluid; h is 0 there, and beside mirrors too, but not beside wall particles. With wall particles a
-tank 20 spacings wide and 100 deep had 0.89 of its pressure after its first step; with images it has 0.99. The residual
-r of `cortado.solvers.projection.coarse_pressure` is the divergence that the coarse pressure has to remove.
+with the images j' of particles j, whose weight eta is h in `cortado.solvers.projection.effects`. Inside of the fluid
+and beside mirrors N is the unit matrix and h is 0, but not beside wall particles.
 """
 
 from functools import cache
@@ -31,9 +29,9 @@ from cortado.sph.moment_functions import cross_terms_function, moment_functions,
 
 @cache
 def coarse_sums(discretisation: Discretisation) -> Kernels:
-    """Make the Warp functions of the sums over neighbours of the push by a coarse pressure. For T = c L they are sum
-    T_j g_ij, which is h without the terms T_i g_i and c_i gamma_i, and the rows of N. The adjoint turns adjoints of h
-    and N into the adjoint of x and the symmetric part of the adjoint of T, as diagonal and other entries."""
+    """Make the sums over neighbours of the coarse push: for T = c L, sum T_j g_ij, which is h without T_i g_i and c_i
+    gamma_i, and the rows of N. The adjoint turns adjoints of h and N into that of x and the symmetric part of that of
+    T, as diagonal and other entries."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair = pair_functions(discretisation)
     packed, cross_terms = symmetric(precision), cross_terms_function(precision)
@@ -68,8 +66,8 @@ def coarse_sums(discretisation: Discretisation) -> Kernels:
 
 @cache
 def coarse_image_sums(discretisation: Discretisation) -> Kernels:
-    """Make the Warp functions of the images' terms in the push by a coarse pressure: in h, and in the rows of N. The
-    adjoint turns adjoints of h and N into the adjoints of eta_i c_i and x."""
+    """Make the images' terms in h and in the rows of N. The adjoint turns adjoints of h and N into those of eta_i c_i
+    and x."""
     (real, vector, _), pair = discretisation.types, pair_functions(discretisation)
     gradient, hessian_product, typed = pair.gradient, pair.hessian_product, types_by_name(discretisation.precision)
 
@@ -122,7 +120,7 @@ def coarse_image_sums(discretisation: Discretisation) -> Kernels:
 
 @cache
 def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of h and N, which give the force of a coarse pressure on particles, in 2 or 3 dimensions."""
+    """Make the kernels of h and N, the force of a coarse pressure on particles."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     sums, mirrors, packed = coarse_sums(discretisation), coarse_image_sums(discretisation), symmetric(precision)
@@ -193,16 +191,14 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 
 CALM = 1e-6
-"""Bound q on the divergence times the time step: r excludes tension beyond q and includes compression beyond q in full;
-between, the share is a smoothstep. When fluid at rest is released, the divergence beside upright walls is 0 to
-round-off, in float32 to 1e-7. A jump of the share would be a kink there, and round-off would choose the slope."""
+"""Bound q on the divergence times the time step: r excludes tension beyond q and includes compression beyond q, with a
+smoothstep between. The smoothstep prevents a kink where fluid at rest is released, whose divergence is round-off."""
 
 
 @cache
 def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the residual r, the part of the divergence that a coarse pressure has to remove, in 2 or 3
-    dimensions. The adjoint turns the adjoint of r into d_bar, the adjoint of D u, and S = d_bar L, which the adjoint of
-    the pressure's update uses."""
+    """Make the kernels of r, the divergence that a coarse pressure has to remove. The adjoint turns that of r into
+    d_bar, the adjoint of D u, and S = d_bar L."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     sums = projection_sums(discretisation)
@@ -228,7 +224,7 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     def residual(
         row_x, row_y, row_z, widened, time_step, n_i, L_i, gamma_i, drift_i, weights_i, image_i, coarse_i, u_i, y_i
     ) -> tuple[matrix, real, real, real, vector, vector, real]:
-        """Return A, the divergence, the residual r and the source c r of a particle."""
+        """Return A, the divergence, the residual r and the source c r."""
         A = wp.matrix_from_rows(row_x, row_y, row_z)
         D = wp.ddot(L_i, A) + wp.dot(gamma_i, u_i) - drift_i + image_i * widened
         left = D - wanted(n_i, weights_i[1], time_step)

@@ -1,12 +1,10 @@
-"""Solves (A + B^T B) e = r on the coarse grid of the pressure in one launch: conjugate gradients (Hestenes and Stiefel
-1952) with a V-cycle over the grids of `cortado.solvers.projection.coarse_levels`. The V-cycle uses A alone, without B^T
-B: each of the few rows of B costs at most one more iteration.
+"""Solves (A + B^T B) e = r on the coarse grid in one launch, by conjugate gradients (Hestenes and Stiefel 1952) with a
+V-cycle over the grids of `cortado.solvers.projection.coarse_levels`. The V-cycle uses A alone, without B^T B: each of
+the few rows of B costs at most one more iteration.
 
 One text of C++ serves both devices. On a CPU a thread solves for a scene. On a GPU a team of blocks solves for a scene;
-blocks wait for one another between the phases of an iteration, and the first block of a team processes levels with few
-nodes. A solve of twenty iterations has some hundred phases. If each were a launch, launching would take longer than
-computing. Sums are computed from partial sums over `BLOCK` nodes, so that results have the same bits for any size of a
-team.
+blocks wait for one another between phases, and a team's first block processes levels with few nodes. Sums have the same
+bits for any size of a team, because they are made of partial sums over `BLOCK` nodes.
 """
 
 from functools import cache
@@ -33,8 +31,8 @@ ON_A_CPU = """
         return T(total);
     };
 """
-"""Macros that the text of a solve needs: the scenes of a thread, `each` and `sum` over nodes, and `meet`, a barrier
-after which each thread sees the values that other threads wrote."""
+"""Functions for `SOLVE`: the scenes of a thread, `each` and `sum` over nodes, and the barrier `meet`, after which each
+thread sees the values that other threads wrote."""
 ON_A_GPU = """
     __shared__ T room[BLOCK];
     const int first = blockIdx.x / system.team, teams = gridDim.x / system.team, rank = blockIdx.x % system.team;
@@ -211,15 +209,14 @@ SOLVE = """
         if (lead) system.count.data[member] = done;
     }
 """
-"""The native code of a solve, one scene after the other. Iterations end when r . z, with the V-cycle's approximate
-solution z of A z = r, has fallen by the square of a tolerance. Nodes where the matrix is 0 have the weight 0 and the
-result 0."""
+"""Native code of a solve, one scene after the other. Iterations end when r . z, with the V-cycle's approximate solution
+z of A z = r, has fallen by the square of a tolerance. Nodes where the matrix is 0 have the result 0."""
 
 
 @cache
 def system_type(precision: Precision) -> Any:
-    """Make the struct of a solve's system: the matrices and the work arrays of all levels, concatenated; each level has
-    the nodes of all scenes."""
+    """Make the struct of a solve's system: matrices and work arrays of all levels, concatenated, each with the nodes of
+    all scenes."""
     numbers = wp.array(dtype=precision.real)
 
     @wp.struct
@@ -228,16 +225,12 @@ def system_type(precision: Precision) -> Any:
         """Six numbers for each level: the numbers of nodes along the axes, and the ratios of the finer grid's numbers
         to these."""
         starts: wp.array(dtype=wp.int64)
-        """The first node of each level."""
         members: wp.int32
-        """Number of scenes."""
         team: wp.int32
-        """Number of blocks for each scene."""
         A: numbers
         weight: numbers
-        """w of nodes, see `cortado.solvers.projection.coarse_levels`."""
+        """w of nodes (`cortado.solvers.projection.coarse_levels`)"""
         residual: numbers
-        """r, which is overwritten."""
         x_values: numbers
         z_values: numbers
         direction: numbers
@@ -245,22 +238,19 @@ def system_type(precision: Precision) -> Any:
         image: numbers
         """(A + B^T B) p"""
         rows: wp.int32
-        """Number of rows of B."""
         B: numbers
-        """The matrix B row by row; each row has the nodes of all scenes."""
+        """The rows of B, one after the other, each with the nodes of all scenes."""
         partial: numbers
-        """Partial sums of blocks."""
         gate: wp.array(dtype=wp.int32)
-        """For each team: the number of blocks that wait at a barrier, and the number of barriers passed."""
+        """Number of blocks that wait at a barrier, and number of barriers passed, for each team."""
         count: wp.array(dtype=wp.int32)
-        """(members,) iterations of the last solve."""
+        """(members,) iterations of the last solve"""
 
     return System
 
 
 @cache
 def solve_kernel(precision: Precision, dimension: int, is_cpu: bool) -> Any:
-    """Make the kernel that solves for the coarse pressure by conjugate gradients, in 2 or 3 dimensions."""
     real, system_kind = precision.real, system_type(precision)
     module = kernel_module(f"coarse_solve_{dimension}d_{precision.name}" + ("" if is_cpu else "_blocks"))
     text = f"typedef wp::{real.__name__} T;\n" + (ON_A_CPU if is_cpu else ON_A_GPU) + SOLVE
@@ -281,7 +271,6 @@ def solve_kernel(precision: Precision, dimension: int, is_cpu: bool) -> Any:
         # out
         e: wp.array(dtype=real),
     ):
-        """Solve for ``e`` by conjugate gradients, to a relative ``tolerance`` or for ``most`` iterations."""
         solve_all(wp.tid(), system, tolerance, most, e)
 
     if not is_cpu:

@@ -18,10 +18,9 @@ walls, and q is near 0 beside other walls. The projection uses:
     t = 0.2 (1.05 / (M : P / (d - 1) + 0.05) - 1), in d dimensions,
     a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m,   the diagonal of the projection's matrix.
 
-Wall particles stop even single fluid particles. But if a wave stretches rows of fluid beside a wall, these rows no
-longer match the rows of wall particles: the divergence D takes them for compressed, which damps waves and stirs still
-water. A mirror is right for any rows. So images have the weight h, and particles of mirroring walls the weight 1 - h,
-with
+If a wave stretches rows of fluid beside a wall, so that they no longer match the rows of wall particles, the divergence
+D takes the fluid for compressed, which damps waves and stirs still water. A mirror suits any rows, so images have the
+weight h, and particles of mirroring walls the weight 1 - h, with
 
     h = S(0.7, 0.9) of sum V W_i' / (nu_m + 1e-6) q,   q = 1 / (1 + ((nu - nu_m) / 0.005)^4),
 
@@ -36,13 +35,13 @@ W of the separation from an image x_j' = R x_j + o, images add
 Gradients of images are not corrected: L is the unit matrix beside mirroring walls.
 """
 
-from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from cortado.device.modules import Kernels
+from cortado.device.modules import Kernels, by_name
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import image_sum, mirror_sum
@@ -50,29 +49,25 @@ from cortado.solvers.projection.wall_sums import DIRECTION, normal_part, types_b
 from cortado.sph.moment_functions import moment_functions
 
 TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95)
-"""For each weight, the fullness below which it is 0 and the fullness above which it is 1."""
+"""Fullness below which a weight is 0, and above which the weight is 1."""
 SHARED = (0.7, 0.95)
-"""Fullness H + 2 nu below which the share of a coarse pressure is 0, and above which it is 1."""
+"""H + 2 nu below which c is 0, and above which c is 1."""
 WALLED = 0.05
-"""nu of walls at which the weights of tension, correction and repair of low densities are halved."""
+"""nu at which the weights of tension, correction and repair of low densities are halved."""
 APART = 0.005
-"""nu of walls without mirror at which q is 1/2, so that a particle beside a mirror with q near 1 is far from such
-walls. Mirrors do not mirror these walls: with images up to the foot of a solid on the floor, water at rest beside it
-moves 1.4 to 2 times as fast."""
+"""nu of walls without mirror at which q is 1/2; mirrors do not mirror these walls, so images must vanish beside
+them."""
 MIRRORED = 9.0
-"""Additional weight of mirroring walls in B. Images fill the missing neighbourhood beside them, for which K would
-correct a second time; and a block that falls from a lid must not be held by tension to its own image."""
+"""Additional weight of mirroring walls in B. Images fill the neighbourhood beside such walls, so K must not correct a
+second time, and tension must not hold a falling block to its image."""
 REGULAR = 0.05
-"""The number added to the diagonal of M before M is inverted."""
+"""Number added to the diagonal of M before M is inverted."""
 NEWTON = 0.033
-"""Two thirds of a step of Newton's method towards the inverse of M, J + J (I - M J) = J + 0.05 J (J - I). Inside of the
-fluid M is nearly I, and J follows only 95 % of M's changes: rows that pass one another seem to be squeezed, which slows
-films on a gentle slope. With a full step films flow 1 to 2 % too fast, and water at rest moves faster. At surfaces,
-where M is far from I, the step would widen jets."""
+"""Two thirds of a Newton step towards the inverse of M, J + J (I - M J) = J + 0.05 J (J - I). Without the step films on
+a gentle slope are too slow; with a full step water at rest moves faster."""
 ALONG = 0.2
-"""The part of the missing gradient along a wall that is corrected. On the lattice, with Wendland C2, the first row
-lacks 25 % of a pressure's gradient along the wall. With 0, water at rest sinks along upright walls in a lasting vortex.
-With 1, divergences are right, but the gradient of the second row is 6 % too great and it rises."""
+"""Part of the missing gradient along a wall that is corrected. With 0, water at rest sinks along upright walls in a
+lasting vortex; with 1, the second row rises."""
 
 
 @cache
@@ -88,28 +83,11 @@ def away_function(precision: Precision) -> Any:
     return away
 
 
-@dataclass(frozen=True)
-class EffectFunctions:
-    """Warp functions of the weights, the gradient correction and the diagonal of one particle in the projection."""
-
-    weights: Any
-    """(sigma, f, u, r) from M, nu, and nu of mirroring walls."""
-    correction: Any
-    """L from M, gamma, nu, the parts of gamma and nu by mirroring walls, and 0.05 a_0."""
-    inverse: Any
-    """1.05 (M + 0.05 I)^-1"""
-    diagonal: Any
-    """a from L, Q, g, gamma, m and 0.05 a_0."""
-    share: Any
-    """The share c of a coarse pressure from M and nu."""
-    back: Any
-    """Turns adjoints of L, a, weights and c into adjoints of M, Q, g, gamma, nu, gamma and nu of mirroring walls, and
-    m."""
-
-
 @cache
-def effect_functions(precision: Precision, dimension: int, module: Any) -> EffectFunctions:
-    """Make the functions of a particle's weights and corrections in 2 or 3 dimensions, in a Warp module."""
+def effect_functions(precision: Precision, dimension: int, module: Any) -> SimpleNamespace:
+    """Make Warp functions of one particle for L, a, c and the weights; ``behind`` is nu of mirroring walls, and
+    ``least`` is 0.05 a_0. ``back`` turns adjoints of L, a, weights and c into those of M, Q, g, gamma, nu, gamma and nu
+    of mirroring walls, and m."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     own = moment_functions(precision, dimension)
     fullness, invert, smoothstep = own.fullness, own.inverse, own.smoothstep
@@ -140,7 +118,7 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
 
     @wp.func
     def walled_correction(M: matrix, gamma: vector, least: real) -> matrix:
-        """Return the correction t P - (1 + t) C along a wall; M_zz = 1 in the plane has no effect."""
+        """Return t P - (1 + t) C; M_zz = 1 in the plane has no effect."""
         N = wp.outer(gamma, gamma) / (wp.dot(gamma, gamma) + direction * least)
         across = M * N - N * M * N
         P, whole = unit() - N, real(1.0) + regular
@@ -158,7 +136,7 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
 
     @wp.func
     def diagonal(L: matrix, Q: matrix, g: vector, gamma: vector, m: real, least: real) -> real:
-        """Return the diagonal a of the pressure matrix; L and Q are symmetric: tr(L Q L) = (L L) : Q."""
+        """Return a, where tr(L Q L) = (L L) : Q as L and Q are symmetric."""
         own_part = L * g + gamma
         return (wp.dot(own_part, own_part) + least) / m + wp.ddot(L * L, Q)
 
@@ -182,42 +160,29 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         M_bar, Q_bar = real(0.5) * (by_M + wp.transpose(by_M)), real(0.5) * (by_Q + wp.transpose(by_Q))
         return M_bar, Q_bar, by_g, by_gamma, by_mirror, by_nu, by_behind, by_m
 
-    return EffectFunctions(weights, correction, inverse, diagonal, share, back)
+    return by_name(weights, correction, inverse, diagonal, share, back)
 
 
 EVEN = (0.7, 0.9)
-"""Ratio of the images' part of the density to the wall particles' part: below the first number h is 0, above the second
-h is 1. With 0.5 and 0.8 waves are the same, but spray thrown at a wall in long steps passes through it."""
+"""Ratio of the images' part of the density to the wall particles' part, below which h is 0 and above which h is 1. With
+0.5 and 0.8, spray thrown at a wall in long steps passes through it."""
 LEAST = 1e-6
 """Wall coverage nu below which no wall is within reach."""
 
 
-@dataclass(frozen=True)
-class ImageSums:
-    """Warp functions of the sums over images of the fluid in flat walls, and over the walls that mirror."""
-
-    weights: Kernels
-    """sum V W_i', without an adjoint"""
-    lift: Kernels
-    """sum (h_i y_i + h_j y_j) g_i', for arrays y and h. From this sum's adjoints f: sum g_i' . (f_i - R f_j), and the
-    adjoint of x."""
-    echo: Any
-    """sum (c_i + c_j) g_i'"""
-    spread: Kernels
-    """sum (u_i - R u_j) . g_i', without an adjoint"""
-    sweep: Kernels
-    """sum g_i' . (what mirrors have swept), where solids move, without an adjoint"""
-    walls: Kernels
-    """Sums over walls that mirror about a position: along their normals, nu, and the drift along their normals."""
-    behind: Kernels
-    """The wall coverage nu alone; the adjoint is its gradient."""
-    mirror_of: Any
-    """The number of the walls that mirror about a position."""
-
-
 @cache
-def image_sums(discretisation: Discretisation) -> ImageSums:
-    """Make the sums over images of the fluid in flat walls, for a discretisation."""
+def image_sums(discretisation: Discretisation) -> SimpleNamespace:
+    """Make the sums over images of the fluid in flat walls, and over mirroring walls.
+
+    - ``weights``: sum V W_i'
+    - ``lift``: sum (h_i y_i + h_j y_j) g_i'. The adjoint turns adjoints f into sum g_i' . (f_i - R f_j) and that of x.
+    - ``echo``: sum (c_i + c_j) g_i'
+    - ``spread``: sum (u_i - R u_j) . g_i'
+    - ``sweep``: sum g_i' . swept, where solids move
+    - ``walls``: over mirroring walls, the sums along normals, of nu, and of the drift
+    - ``behind``: nu of mirroring walls; the adjoint is its gradient
+    - ``mirror_of``: the number of the walls that mirror about a position
+    """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
@@ -291,7 +256,7 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
     @mirror_sum(discretisation)
     @typed
     def mirror_walls_back(x_ij, v_j, mirror_bar_i, behind_bar_i, sweep_bar_i, foot, mirrors: int, s) -> vector:
-        """Return the adjoint of x, given the adjoints of the sums; the adjoint of the drift is -``sweep_bar``."""
+        """Return the adjoint of x; the adjoint of the drift is -``sweep_bar``."""
         bent = hessian_product(x_ij, normal(mirror_bar_i - sweep_bar_i * v_j, foot), s)
         return s.volume * (bent + behind_bar_i * gradient(x_ij, s))
 
@@ -307,22 +272,22 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
     def behind_back(x_ij: vector, mirrors: int, s: neighbourhood) -> vector:
         return s.volume * gradient(x_ij, s)
 
-    return ImageSums(
-        Kernels(image_weights, image_weights_tangent, None),
-        Kernels(lift, lift_tangent, lift_back),
-        echo,
-        Kernels(spread, spread_tangent, None),
-        Kernels(sweep, sweep_tangent, None),
-        Kernels(mirror_walls, mirror_walls_tangent, mirror_walls_back),
-        Kernels(behind, behind_tangent, behind_back),
-        mirror_of,
+    return SimpleNamespace(
+        weights=Kernels(image_weights, image_weights_tangent, None),
+        lift=Kernels(lift, lift_tangent, lift_back),
+        echo=echo,
+        spread=Kernels(spread, spread_tangent, None),
+        sweep=Kernels(sweep, sweep_tangent, None),
+        walls=Kernels(mirror_walls, mirror_walls_tangent, mirror_walls_back),
+        behind=Kernels(behind, behind_tangent, behind_back),
+        mirror_of=mirror_of,
     )
 
 
 @cache
 def image_share(precision: Precision, dimension: int, module: Any) -> tuple[Any, Any]:
-    """Make two Warp functions: the share h of an image, given its part of the density and the nu of walls, and the
-    derivatives of h."""
+    """Make Warp functions of the weight h of images, and of its derivatives, from the parts of the density and the nu
+    of walls."""
     real, smoothstep = precision.real, moment_functions(precision, dimension).smoothstep
     away = away_function(precision)
     first, last, least, apart = (wp.constant(real(value)) for value in (*EVEN, LEAST, APART))

@@ -1,21 +1,21 @@
 """Hinges between free bodies and other solids in a step of the projection, with derivatives.
 
-A hinge keeps a point of a body A at a point of another solid B. In A's frame the point is at a. So its arm from A's
+A hinge keeps a point of a body A at a point of another solid B. In A's frame the point is at a, so its arm from A's
 middle is R a at the start of a step, and R' a at the predicted pose of A. The velocity changes V - V_0 and W - W_0
 (`cortado.sph.free_solids`), whatever their cause, must satisfy at the end of the step
 
     b = (V - V_0)_A + (W - W_0)_A x R'_A a_A - (the same of B) + (p'_A - p'_B) / dt = 0,
 
-where p' = c' + R' a is the predicted place of each point. For this A gets the momentum lambda at R_A a_A, and B gets -
-lambda. So momentum is conserved, and angular momentum too, because both act at one point. The remaining gap is of the
-order of dt^4, and the next step removes it. In space a hinge with the axis n also keeps two of the three angles: with P
-= I - n n^T A gets the angular momentum P lambda, B the opposite, and
+where p' = c' + R' a is the predicted place of each point. For this A gets the momentum lambda at R_A a_A, and B gets
+-lambda, so momentum and angular momentum are conserved. The remaining gap is of the order of dt^4, and the next step
+removes it. In space a hinge with the axis n also keeps two of the three angles: with P = I - n n^T A gets the angular
+momentum P lambda, B the opposite, and
 
     b = P ((W - W_0)_A - (W - W_0)_B) + n x (n'_A - n'_B) / dt = 0.
 
 Each of these equations is a row, and rows with the same body are coupled: b is b_0 + K lambda with 3 x 3 blocks K_kl,
 and a step solves K lambda = - b_0 once for each pressure by block elimination. A solid with a prescribed motion gets no
-momentum. So pressures always move bodies with their hinges; only the approximate coarse grid treats the bodies as free.
+momentum. Only the approximate coarse grid treats bodies as free of hinges.
 """
 
 from collections.abc import Sequence
@@ -32,19 +32,19 @@ from cortado.sph.moving_solids import hold_functions
 
 POSES = ("turns_before", "after", "turns")
 ROW = ("give", "take", "other_give", "other_take", "apart")
-"""Names of the arrays of a row: see `joint_kernels`."""
+"""Arrays of a row, see `joint_kernels`."""
 
 
 @cache
 def joint_kernels(precision: Precision) -> SimpleNamespace:
     """Make the kernels of hinges, with a thread for each scene.
 
-    The kernels ``point`` and ``lean`` compute a row's four matrices and its gap divided by the time step. The matrix
-    ``give`` maps lambda to its moment on a body, and ``take`` maps a body's W - W_0 to its term in b. Then ``weigh``
-    adds a body's term to a block of K, ``read`` computes b from velocities, and ``push`` adds the effect of lambda to
-    velocities. For whole systems ``factor`` eliminates, ``solve`` computes lambda = - K^-1 b, also with the transpose
-    of K, ``lengthen`` adds K' lambda to a tangent of b, and ``spread`` the outer product of the adjoint of b and lambda
-    to the adjoint of K."""
+    ``point`` and ``lean`` compute four matrices of a row, and its gap over the time step. ``give`` maps lambda to its
+    moment on a body, and ``take`` maps a body's W - W_0 to its term in b. ``weigh`` adds a body's term to a block of K,
+    ``read`` computes b from velocities, and ``push`` adds the effect of lambda to velocities. ``factor`` eliminates,
+    ``solve`` computes lambda = -K^-1 b, also with the transpose of K, ``lengthen`` adds K' lambda to a tangent of b,
+    and ``spread`` adds to the adjoint of K.
+    """
     real, vector, matrix, holds = precision.real, precision.vector, precision.matrix, hold_functions(precision)
     spin, held = holds.spin, holds.kind
     module = kernel_module(f"joints_derivative_{precision.name}")
@@ -177,16 +177,20 @@ def joint_kernels(precision: Precision) -> SimpleNamespace:
                 for j in range(k + 1, rows):
                     factors[i * rows + j, b] = factors[i * rows + j, b] - part * factors[k * rows + j, b]
 
+    @wp.func
+    def factor_of(i: int, j: int, rows: int, transposed: int, factors: wp.array2d(dtype=matrix), b: int) -> matrix:
+        """Return the factor in row i and column j, or that of the transpose."""
+        if transposed == 1:
+            return wp.transpose(factors[j * rows + i, b])
+        return factors[i * rows + j, b]
+
     @kernel
     def solve(rows, transposed, factors, inverses, wanted, pushes):
         b = wp.tid()
         for i in range(rows):
             x = wanted[i, b]
             for j in range(i):
-                if transposed == 1:
-                    x = x - wp.transpose(factors[j * rows + i, b]) * pushes[j, b]
-                else:
-                    x = x - factors[i * rows + j, b] * pushes[j, b]
+                x = x - factor_of(i, j, rows, transposed, factors, b) * pushes[j, b]
             if transposed == 1:
                 x = wp.transpose(inverses[i, b]) * x
             pushes[i, b] = x
@@ -194,10 +198,7 @@ def joint_kernels(precision: Precision) -> SimpleNamespace:
             i = rows - 1 - n
             x = pushes[i, b]
             for j in range(i + 1, rows):
-                if transposed == 1:
-                    x = x - wp.transpose(factors[j * rows + i, b]) * pushes[j, b]
-                else:
-                    x = x - factors[i * rows + j, b] * pushes[j, b]
+                x = x - factor_of(i, j, rows, transposed, factors, b) * pushes[j, b]
             if transposed == 0:
                 x = inverses[i, b] * x
             pushes[i, b] = x

@@ -1,5 +1,4 @@
-"""Hinges between free bodies and other solids in a step of the projection, and derivatives: see
-`cortado.solvers.projection.joint_kernels`."""
+"""Hinges of a step of the projection, with derivatives: see `cortado.solvers.projection.joint_kernels`."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,7 +9,6 @@ from typing import Any
 import warp as wp
 
 from cortado.device.launching import Named
-from cortado.device.modules import Kernels
 from cortado.particles.state import Layout, zeros
 from cortado.scene.hinges import Joint
 from cortado.solvers.projection.joint_kernels import ROW, joint_kernels
@@ -19,21 +17,19 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 Arrays = dict[str, wp.array]
 GUARD = {"float32": 1e-5, "float64": 1e-10}
-"""By precision, the part of its trace that is added to each diagonal block of K. Along directions in which neither body
-can move, K and b are 0, and so are lambda and its derivative. Along other directions this part of b remains. Along the
-axis of a hinge, where K and b of the angles are 0, the whole trace is added."""
+"""Part of its trace added to each diagonal block of K, which makes lambda 0 along directions in which neither body can
+move. Along the axis of a hinge, where K of the angles is 0, the whole trace is added."""
 BARS = ("turned_before_bar", "after_bar", "turned_bar")
 
 
 class JointArrays:
-    """The arrays of the hinges of one solver in a step, or tangents or adjoints with names that end in ``suffix``."""
+    """Arrays of the hinges in a step, or tangents or adjoints with names that end in ``suffix``."""
 
     def __init__(self, rows: int, layout: Layout, suffix: str = ""):
         matrix, vector, self._suffix = layout.precision.matrix, layout.precision.vector, suffix
         kinds = {**dict.fromkeys(ROW, matrix), "apart": vector}
         sizes = {f"{name}{suffix}": (layout.members, kind) for name, kind in kinds.items()}
         self.rows = [zeros(sizes, layout.device) for _ in range(rows)]
-        """Results of the kernels `point` or `lean`."""
         many = {"blocks": (rows * rows, matrix), "wanted": (rows, vector), "pushes": (rows, vector)}
         self.whole = zeros(
             {f"{name}{suffix}": ((count, layout.members), kind) for name, (count, kind) in many.items()}, layout.device
@@ -42,19 +38,14 @@ class JointArrays:
         blocks, wanted, pushes = self.whole.values()
         self.entries = [{f"wanted{suffix}": wanted[k], f"push{suffix}": pushes[k]} for k in range(rows)]
         """b and lambda of each row."""
-        self.blocks = [[{f"block{suffix}": blocks[k * rows + column]} for column in range(rows)] for k in range(rows)]
-
-    def block(self, pair: "Pair") -> Arrays:
-        """Return the block of K to which a pair of rows adds."""
-        return self.blocks[pair.block[0]][pair.block[1]]
+        self.blocks = {(k, n): {f"block{suffix}": blocks[k * rows + n]} for k in range(rows) for n in range(rows)}
 
     def side(self, k: int, other: bool) -> Arrays:
-        """Return the matrices of a row for its body, or for the other one, by the names of the first."""
+        """Return the matrices ``give`` and ``take`` of a row for the hinge's first or second body."""
         way = "other_" if other else ""
         return {f"{name}{self._suffix}": self.rows[k][f"{way}{name}{self._suffix}"] for name in ("give", "take")}
 
     def clear(self) -> None:
-        """Set all to 0."""
         for group in (*self.rows, self.whole):
             for array in group.values():
                 array.zero_()
@@ -62,37 +53,35 @@ class JointArrays:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the hinges' equations: three numbers that must be 0."""
+    """Three equations of a hinge."""
 
     joint: Joint
     straight: bool
-    """True for the row that keeps the axis, False for the one that keeps the point."""
+    """True for the row that keeps the axis, False for the row that keeps the point."""
 
     @property
     def share(self) -> float:
-        """Return 1 if lambda is a momentum, 0 if lambda is only an angular momentum."""
+        """Return 1 if lambda is a momentum, 0 if lambda is an angular momentum."""
         return 0.0 if self.straight else 1.0
 
     @property
     def sides(self) -> list[tuple[int, bool]]:
-        """Return the numbers of the row's free bodies, each with True if it is the hinge's second solid."""
+        """Return the numbers of the row's free bodies, each with True for the hinge's second solid."""
         return [(body, other) for body, other in ((self.joint.body, False), (self.joint.other, True)) if body >= 0]
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A row and a column of K that are coupled by a body."""
+    """A row and a column of K that a body couples."""
 
     block: tuple[int, int]
-    """Their numbers."""
     body: int
-    """Number of the body among the free bodies."""
     far: tuple[bool, bool]
-    """For the row and for the column, True if the body is the hinge's second solid."""
+    """For row and column, True if the body is the hinge's second solid."""
 
 
 class Joints:
-    """The hinges of one solver between bodies and other solids, forward."""
+    """The hinges of one solver."""
 
     def __init__(self, part: FreeSolidsPart, joints: Sequence[Joint], layout: Layout):
         self.part, self.layout = part, layout
@@ -118,11 +107,11 @@ class Joints:
 
     @cached_property
     def kernels(self) -> SimpleNamespace:
-        """Make the kernels on first use, because scenes without such hinges need none."""
+        """Make the kernels on first use, because scenes without hinges need none."""
         return joint_kernels(self.layout.precision)
 
     def poses(self, row: Row) -> tuple[Named, ...]:
-        """Return the poses of both solids of a row, with tangents, and the poses at the start of the step."""
+        """Return the poses of both solids of a row, with tangents, and the poses at the start of the run."""
         joint, each = row.joint, self.part.made_of.walls.each
         named = {**each[self.number(row)], **{f"other_{name}": array for name, array in each[joint.against].items()}}
         known: dict[str, Any] = {} if joint.axis is None else {"axis": self.layout.precision.vector(*joint.axis)}
@@ -132,16 +121,13 @@ class Joints:
         return named, known
 
     def number(self, row: Row) -> int:
-        """Return the number of a row's body among the solids that move."""
         return self.part.bodies[row.joint.body].table.number
 
-    def frame(self, row: Row) -> Kernels:
-        """Return the kernels that compute the matrices of a row."""
-        found: Kernels = self.kernels.lean if row.straight else self.kernels.point
-        return found
+    def frame(self, row: Row) -> Any:
+        return self.kernels.lean if row.straight else self.kernels.point
 
     def coefficients(self, pair: Pair) -> Named:
-        """Return the numbers by which `weigh` knows one of `pairs`."""
+        """Return the arguments of `weigh` for one of `pairs`."""
         row, column = (self.rows[k] for k in pair.block)
         own = {"row_share": row.share, "share": column.share, "sign": 1.0 if pair.far[0] == pair.far[1] else -1.0}
         guard = GUARD[self.layout.precision.name] if row is column else 0.0
@@ -153,72 +139,64 @@ class Joints:
         return {name: (take if name.startswith("take") else give)[name] for name in take}
 
     def begin(self, step: StepContext) -> None:
-        """Compute the matrices of all rows in a step, and eliminate."""
         members = self.layout.members
         self.own.whole["blocks"].zero_()
         for row, arrays in zip(self.rows, self.own.rows, strict=True):
             place = {"place": step.parameters[f"{row.joint.name}.position"]}
             step.launch(self.frame(row).forward, arrays, place, *self.poses(row), threads=members)
         for pair in self.pairs:
-            known = self.sides(self.own, pair), self.coefficients(pair), self.own.block(pair)
+            known = self.sides(self.own, pair), self.coefficients(pair), self.own.blocks[pair.block]
             step.launch(self.kernels.weigh.forward, *known, *self.part.bodies[pair.body].known(step), threads=members)
         if self.rows:
             step.launch(self.kernels.factor, self.own.whole, self.factors, rows=len(self.rows), threads=members)
 
     def solve(self, step: StepContext, wanted: wp.array, pushes: wp.array, transposed: int = 0) -> None:
-        """Write - K^-1 times ``wanted``, or the same with the transpose of K."""
+        """Write -K^-1 times ``wanted``; with ``transposed``, use the transpose of K."""
         known = {"rows": len(self.rows), "transposed": transposed, "wanted": wanted, "pushes": pushes}
         if self.rows:
             step.launch(self.kernels.solve, self.factors, known, threads=self.layout.members)
 
     def read(self, step: StepContext, moved: Sequence[Arrays]) -> None:
-        """Write lambda for bodies whose hinges are not enforced yet: ``moved`` has the results of `move_kernels` for
-        each body."""
+        """Write lambda, given the velocities ``moved`` of bodies without hinges by `move_kernels`."""
         for k, row in enumerate(self.rows):
-            known = self.velocities(row, moved), self.own.rows[k], self.own.entries[k], self.numbers(row)
-            step.launch(self.kernels.read.forward, *known, threads=self.layout.members)
+            step.launch(self.kernels.read.forward, *self.known(k, row, moved), threads=self.layout.members)
         self.solve(step, self.own.whole["wanted"], self.own.whole["pushes"])
 
-    def numbers(self, row: Row) -> Named:
-        """Return the numbers by which `read` knows a row."""
-        return {"share": row.share, "is_free": row.joint.other >= 0}
+    def known(self, k: int, row: Row, moved: Sequence[Arrays]) -> tuple[Named, ...]:
+        """Return the arguments of `read`."""
+        numbers = {"share": row.share, "is_free": row.joint.other >= 0}
+        return self.velocities(row, moved), self.own.rows[k], self.own.entries[k], numbers
 
     def velocities(self, row: Row, moved: Sequence[Arrays], suffix: str = "") -> Arrays:
-        """Return the velocity changes of both bodies of a row, or tangents or adjoints, by the argument names of
-        `read`."""
+        """Return the velocity changes of both bodies of a row, or tangents or adjoints, by argument names of `read`."""
         own = moved[row.joint.body]
         other = own if row.joint.other < 0 else moved[row.joint.other]
         names = [f"{name}{suffix}" for name in ("faster", "turned_faster")]
         return {name: own[name] for name in names} | {f"other_{name}": other[name] for name in names}
 
     def ends(self) -> Iterator[tuple[int, int, bool, Named]]:
-        """Yield each row's number with each of its bodies, whether that is the other one, and what `push` knows."""
+        """Yield row number, body number, whether the body is the hinge's second solid, and arguments of `push`."""
         for k, row in enumerate(self.rows):
             for body, other in row.sides:
                 yield k, body, other, {"share": row.share, "sign": -1.0 if other else 1.0}
 
     def push(self, step: StepContext, moved: Sequence[Arrays]) -> None:
-        """Add the effect of lambda to the velocities ``moved``."""
         for k, body, other, known in self.ends():
             arrays = self.own.side(k, other), self.own.entries[k], moved[body]
             own = self.part.bodies[body].known(step)
             step.launch(self.kernels.push.forward, *arrays, known, *own, threads=self.layout.members)
 
     def join(self, step: StepContext, moved: Sequence[Arrays]) -> None:
-        """Replace the velocities that hinged bodies would have without hinges by velocities that satisfy the hinges'
-        equations."""
+        """Replace velocities of bodies without hinges by velocities that satisfy the hinges."""
         self.read(step, moved)
         self.push(step, moved)
 
 
 class JointsTangent:
-    """The tangent of hinges, for forward mode."""
-
     def __init__(self, joints: Joints):
         self._joints, self._dots = joints, JointArrays(len(joints.rows), joints.layout, "_dot")
 
     def begin(self, step: StepContext, dot: Tangents) -> None:
-        """Apply the tangent of `Joints.begin`."""
         of, dots, members = self._joints, self._dots, self._joints.layout.members
         dots.whole["blocks_dot"].zero_()
         for k, row in enumerate(of.rows):
@@ -229,8 +207,8 @@ class JointsTangent:
         for pair in of.pairs:
             body = of.part.bodies[pair.body]
             rates = {"density_dot": dot.parameters[body.table.weight]}
-            known = of.sides(of.own, pair), of.coefficients(pair), of.own.block(pair), *body.known(step)
-            changes = of.sides(dots, pair), dots.block(pair), rates
+            known = of.sides(of.own, pair), of.coefficients(pair), of.own.blocks[pair.block], *body.known(step)
+            changes = of.sides(dots, pair), dots.blocks[pair.block], rates
             step.launch(of.kernels.weigh.tangent, *changes, *known, threads=members)
 
     def join(self, step: StepContext, dot: Tangents, moved: Sequence[Arrays], moved_dot: Sequence[Arrays]) -> None:
@@ -238,9 +216,8 @@ class JointsTangent:
         of, dots, members = self._joints, self._dots, self._joints.layout.members
         of.read(step, moved)
         for k, row in enumerate(of.rows):
-            known = of.velocities(row, moved), of.own.rows[k], of.own.entries[k], of.numbers(row)
             changes = of.velocities(row, moved_dot, "_dot"), dots.rows[k], dots.entries[k]
-            step.launch(of.kernels.read.tangent, *changes, *known, threads=members)
+            step.launch(of.kernels.read.tangent, *changes, *of.known(k, row, moved), threads=members)
         if of.rows:
             step.launch(of.kernels.lengthen, of.own.whole, dots.whole, rows=len(of.rows), threads=members)
         of.solve(step, dots.whole["wanted_dot"], dots.whole["pushes_dot"])
@@ -254,15 +231,12 @@ class JointsTangent:
 
 
 class JointsAdjoint:
-    """The adjoint of hinges, for reverse mode."""
-
     def __init__(self, joints: Joints):
         self._joints, self._bars = joints, JointArrays(len(joints.rows), joints.layout, "_bar")
         names, members = [f"{way}{name}" for way in ("", "other_") for name in BARS], joints.layout.members
         self._poses = zeros(dict.fromkeys(names, (members, joints.layout.precision.vector)), joints.layout.device)
 
     def begin(self) -> None:
-        """Set all adjoints to 0 at the beginning of a step back."""
         self._bars.clear()
 
     def join(
@@ -273,8 +247,8 @@ class JointsAdjoint:
         moved_bar: Sequence[Arrays],
         turned: Sequence[Arrays],
     ) -> None:
-        """Apply the adjoint of `Joints.join`: turn adjoints of the corrected velocities into adjoints of the
-        uncorrected velocities ``moved`` and of each body's further turn, ``turned``."""
+        """Apply the adjoint of `Joints.join`: turn adjoints of joined velocities into those of the velocities ``moved``
+        and of each body's turn."""
         of, bars, members = self._joints, self._bars, self._joints.layout.members
         of.read(step, moved)
         bars.whole["pushes_bar"].zero_()
@@ -286,20 +260,18 @@ class JointsAdjoint:
             step.launch(of.kernels.push.adjoint, *pushed, *arrays, threads=members)
         of.solve(step, bars.whole["pushes_bar"], bars.whole["wanted_bar"], transposed=1)
         for k, row in enumerate(of.rows):
-            known = of.velocities(row, moved), of.own.rows[k], of.own.entries[k], of.numbers(row)
             changes = of.velocities(row, moved_bar, "_bar"), bars.rows[k], bars.entries[k]
-            step.launch(of.kernels.read.adjoint, *changes, *known, threads=members)
+            step.launch(of.kernels.read.adjoint, *changes, *of.known(k, row, moved), threads=members)
         if of.rows:
             step.launch(of.kernels.spread, of.own.whole, bars.whole, rows=len(of.rows), threads=members)
 
     def finish(self, step: StepContext, bar: Adjoints, turned: Sequence[Arrays]) -> None:
-        """Apply the adjoint of `Joints.begin`: add to the adjoints of poses, of densities and of the hinges' places."""
         of, bars, members = self._joints, self._bars, self._joints.layout.members
         for pair in of.pairs:
             body = of.part.bodies[pair.body]
             rates = {"density_bar": bar.parameters[body.table.weight]}
-            known = of.sides(of.own, pair), of.coefficients(pair), of.own.block(pair), *body.known(step)
-            changes = of.sides(bars, pair), bars.block(pair), rates, turned[pair.body]
+            known = of.sides(of.own, pair), of.coefficients(pair), of.own.blocks[pair.block], *body.known(step)
+            changes = of.sides(bars, pair), bars.blocks[pair.block], rates, turned[pair.body]
             step.launch(of.kernels.weigh.adjoint, *changes, *known, threads=members)
         for k, row in enumerate(of.rows):
             place = f"{row.joint.name}.position"

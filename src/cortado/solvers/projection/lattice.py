@@ -1,6 +1,4 @@
-"""Constants of the projection on the lattice of the rest spacing, and the grid of its coarse correction, in float64 and
-without Warp.
-"""
+"""Constants of the projection on the rest lattice, and the grid of its coarse correction, in float64 without Warp."""
 
 import itertools
 from dataclasses import dataclass
@@ -13,17 +11,14 @@ from cortado.scene.discrete_scene import DiscreteScene
 from cortado.scene.scene import Scene
 
 MARGIN = 1.05
-"""Factor by which the relaxation is below the one that suits the lattice's stiffest wave."""
 SMOOTHED = 1.0 / 3.0
-"""Density waves with more than this part of the stiffest wave's stiffness are repaired about equally fast."""
+"""Part of the greatest stiffness above which density waves are repaired about equally fast."""
 DEPARTURE = 0.05
 """Part of a_0 that is added to the diagonal, which is small for particles with few neighbours."""
 
 
 @dataclass(frozen=True)
 class ProjectionConstants:
-    """The constants of the projection for a smoothing kernel and a particle spacing."""
-
     spacing: float
     """[m]"""
     relaxation: float
@@ -31,7 +26,7 @@ class ProjectionConstants:
     least_diagonal: float
     """[1 / m2], `DEPARTURE` times a_0 = sum_j |g_ij|^2."""
     nearest_weight: float
-    """V W of two particles that are one spacing apart [-]."""
+    """V W of two particles one spacing apart [-]."""
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "ProjectionConstants":
@@ -50,16 +45,15 @@ class ProjectionConstants:
         return cls(spacing, 1.0 / (MARGIN * stiffest), DEPARTURE * square, nearest)
 
     def repair_relaxations(self, repairs: int) -> list[float]:
-        """Return omega of each repair of the density, by Chebyshev's roots (Golub and Varga 1961). For waves with
-        stiffness between `SMOOTHED` and 1 times the greatest, these Jacobi iterations leave the least possible part of
-        the error. The greatest omega comes first, because later repairs smooth the waves that it excites."""
+        """Return omega of each repair by Chebyshev's roots (Golub and Varga 1961), for waves from `SMOOTHED` to 1 times
+        the greatest stiffness. The greatest omega comes first, because later repairs smooth the waves that it
+        excites."""
         middle, half = 0.5 * (1.0 + SMOOTHED), 0.5 * (1.0 - SMOOTHED)
         roots = np.cos(np.pi * (np.arange(repairs) + 0.5) / repairs)
         return [self.relaxation / float(middle - half * root) for root in roots]
 
 
 def lattice_constants(scene: Scene, discrete: DiscreteScene) -> ProjectionConstants:
-    """Compute the projection's constants on the rest lattice of a scene."""
     lattice = discrete.kernel, scene.discretisation.spacing, discrete.lattice.support, scene.dimension
     return ProjectionConstants.of(*lattice)
 
@@ -69,17 +63,16 @@ SPACING = 2.0
 
 
 def endless(discrete: DiscreteScene) -> bool:
-    """Return True if all axes are periodic: then the level of pressure in a coarse correction is undetermined."""
+    """Return True if all axes are periodic, so that a coarse correction leaves the level of pressure undetermined."""
     return bool((np.asarray(discrete.periods) > 0.0).all())
 
 
 def coarse_grid(scene: Scene, discrete: DiscreteScene, particles: int) -> Grid:
-    """Make the grid of the coarse correction around the region that particles can reach; beyond, the grid is periodic.
-    The number of nodes along each axis is 4 to 7 times a power of two, so that each coarser grid has half as many.
+    """Make the periodic grid of the coarse correction around the region that particles can reach. The number of nodes
+    along each axis is 4 to 7 times a power of two, so that each coarser grid has half as many.
 
-    Nodes lie on the lower walls of a container, and the first row of particles half a spacing above them. If the cells
-    beside a wall contained a single row of particles, some combinations of nodes would push no particle, and solves
-    would be slow.
+    Nodes lie on a container's lower walls, half a spacing below the first row of particles: cells with a single row of
+    particles would make solves slow.
     """
     reach, most = SPACING * scene.discretisation.spacing, max(4 * particles, 512)
     grid = Grid.around(discrete.near.lower, discrete.near.upper, discrete.periods, reach, most)

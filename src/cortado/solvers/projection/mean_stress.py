@@ -1,7 +1,5 @@
 """Values read from a step of the projection: the pressure that a gauge reads, and the forces on walls that mirror.
 
-A gauge reads the mean normal stress at a particle by the projection's pressures.
-
 Particle j pushes i with the force -V (T_i + T_j) g_ij / dt, where T = k L, and wall particle b with -V k_i b_ib / dt,
 where b_ib is the term of b in gamma_i. The momentum flux of these forces is spread evenly along the lines from particle
 to particle, and to the point s_b of the wall's surface (the virial of Irving and Kirkwood 1950):
@@ -9,8 +7,8 @@ to particle, and to the point s_b of the wall's surface (the virial of Irving an
     dt p_i = (-1/2 sum_j x_ij . (T_i + T_j) g_ij - k_i r_i) / d,   r_i = sum_b b_ib . (x_i - s_b),
 
 in d dimensions, where images have the weight h and mirroring walls the weight 1 - h
-(`cortado.solvers.projection.effects`). The multiplier k / dt itself is not a stress beside a wall, where neighbours are
-missing. It scatters among uneven particles, exactly so that the forces do not scatter.
+(`cortado.solvers.projection.effects`). The multiplier k / dt is not a stress beside a wall, where neighbours are
+missing, and scatters among uneven particles.
 
 Kernels divide impulses, k or dt p, by the time step.
 
@@ -19,8 +17,8 @@ of the part h of the forces on their own wall particles,
 
     sum (h_i p_i + h_j p_j) g_i' - h_i p_i gamma_m,
 
-summed over the images by one solid, or by all walls, with gamma_m of its mirroring wall particles. So walls receive
-exactly the momentum that the fluid loses to them. Loads are read rarely, so h is differentiated separately here.
+summed over the images by one solid, or by all walls, with gamma_m of its mirroring wall particles. Walls receive
+exactly the momentum that the fluid loses to them.
 """
 
 from dataclasses import replace
@@ -48,13 +46,11 @@ from cortado.sph.moment_functions import moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents, integration_module
 
 TOPIC = "mean_stress"
-"""Topic of the Warp modules here; the dimension is appended if kernels depend on it."""
 
 
 class MeanStress:
-    """The mean normal stress dt p of the sorted particles of a step, with its derivatives. ``around`` has the
-    particles' surroundings (`cortado.solvers.projection.surroundings`), and ``at`` has k and T of the last
-    iteration."""
+    """The mean normal stress dt p of the sorted particles of a step. ``around`` has their surroundings, and ``at`` has
+    k and T of the last iteration."""
 
     def __init__(self, discretisation: Discretisation, layout: Layout, dimension: int, faces: int):
         self._faces = FaceShares(discretisation, layout, faces)
@@ -75,15 +71,14 @@ class MeanStress:
         return found
 
     def tangent(self, context: StepContext, dot: Tangents, around: tuple[Named, ...], at: Named) -> NDArray:
-        """Return the tangent (n,) of the stress impulses dt p; ``around`` and ``at`` include tangents."""
+        """Return the tangent (n,) of dt p; ``around`` and ``at`` include tangents."""
         found, walls = self._arrays["q"], self._totals(context, *around)
         dots = {f"{name}_dot": one.tangent(context, dot, ALL_WALLS, *around) for name, one in self._walls.items()}
         context.launch(self._kernels.tangent, *dot.named, *around, at, walls, dots, q_dot=found)
         return np.array(found.numpy())
 
     def adjoint(self, context: StepContext, bar: Adjoints, around: tuple[Named, ...], at: Named) -> None:
-        """Apply the adjoint of the stress: from ``q_bar`` in ``at`` add to the adjoints of k, particles and
-        ``around``."""
+        """From ``q_bar`` in ``at`` add to the adjoints of k, particles and ``around``."""
         (own, pairs), reach_bar = self._kernels.adjoint, self._arrays["reach_bar"]
         context.launch(own, *bar.named, at, self._totals(context, *around), reach_bar=reach_bar)
         context.launch(pairs, *bar.named, *around, at)
@@ -93,7 +88,7 @@ class MeanStress:
 
 
 def spread_term(d: Discretisation) -> Any:
-    """Return the pair's term -1/2 x_ij . (T_i + T_j) g_ij of the mean stress."""
+    """Return a pair's term -1/2 x_ij . (T_i + T_j) g_ij."""
     real, vector, gradient = d.precision.real, d.precision.vector, pair_functions(d).gradient
     six, times = symmetric(d.precision).kind, symmetric(d.precision).times
 
@@ -105,7 +100,7 @@ def spread_term(d: Discretisation) -> Any:
 
 @cache
 def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of dt p, given r as the first component of the sum of the arrays ``reach`` and ``mirrors``."""
+    """Make the kernels of dt p, given r as the first component of ``reach`` + ``mirrors``."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     neighbourhood, (six, pack) = neighbourhood_type(precision), (symmetric(precision).kind, symmetric(precision).pack)
@@ -153,7 +148,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
     @particle_kernel(adjoint_module, "q_bar +k_bar reach_bar")
     def own_adjoint(k_i: real, reach_i: vector, mirrors_i: vector, q_bar_i: real) -> tuple[real, real, vector]:
-        """Replace the adjoint of q by the adjoint of the sum over neighbours, and add to the adjoints of k and r."""
+        """Replace the adjoint of q by that of the sum over neighbours, and add to the adjoints of k and r."""
         bar = per * q_bar_i
         return bar, -bar * (reach_i[0] + mirrors_i[0]), vector(-bar * k_i, real(0.0), real(0.0))
 
@@ -163,7 +158,6 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def mean_stress_adjoint(
         x_part: vector, T_part: six, x_lift: vector, lifted: real, k_i: real, L_i: matrix, image_i: real
     ) -> tuple[vector, real, real, matrix]:
-        """Add to the adjoints of x, image shares, k and L; T is k L."""
         diagonal, others = vector(T_part[0], T_part[1], T_part[2]), vector(T_part[3], T_part[4], T_part[5])
         k_part = wp.dot(T_part, pack(L_i)) + image_i * lifted
         return x_part + x_lift, k_i * lifted, k_part, k_i * whole(diagonal, real(0.5) * others)
@@ -172,7 +166,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 
 def _reach_work(d: Discretisation) -> Any:
-    """Make the work function of the wall term (r, 0, 0) of the mean stress by a solid's walls."""
+    """Make the work function of the wall term (r, 0, 0)."""
     real, gradient, normal = d.precision.real, pair_functions(d).gradient, normal_part(d)
 
     @types_by_name(d.precision, {d.precision.vector: "reach"})
@@ -185,7 +179,7 @@ def _reach_work(d: Discretisation) -> Any:
 
 
 def _mirror_work(d: Discretisation) -> Any:
-    """Make the work function of the wall term (-h r, 0, 0), which gives mirroring walls the weight 1 - h."""
+    """Make the work function of the wall term (-h r, 0, 0), so that mirroring walls have the weight 1 - h."""
     real, gradient, normal = d.precision.real, pair_functions(d).gradient, normal_part(d)
 
     @types_by_name(d.precision, {d.precision.vector: "reach"})
@@ -198,7 +192,7 @@ def _mirror_work(d: Discretisation) -> Any:
 
 @cache
 def pressed_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of a pressure p = k / dt from its impulse k."""
+    """Make the kernels of p = k / dt from an impulse k."""
     real, modules = precision.real, [integration_module(precision, False, topic="impulses")] * 3
 
     def pressed(time_step: real, impulse_i: real) -> real:
@@ -209,12 +203,11 @@ def pressed_kernels(precision: Precision) -> Kernels:
 
 @cache
 def image_load_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the sum over images by the walls of ``solid``; the argument ``y`` is p."""
+    """Make the kernels of the sum over images by the walls of ``solid``; ``y`` is p."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     gradient, hessian_product = pair.gradient, pair.hessian_product
     module, tangent_module, adjoint_module = discretisation.modules("image_loads")
-    LANES, lane = discretisation.lanes, discretisation.lane
 
     @image_sum(discretisation)
     def load(
@@ -222,7 +215,7 @@ def image_load_kernels(discretisation: Discretisation) -> Kernels:
     ) -> vector:
         return (owned * (image_i * y_i + image_j * y_j) * s.volume) * gradient(x_ij, s)
 
-    typed = TypesByName(real, {neighbourhood: "s", vector: "x x_dot x_ij x_dot_ij f f_ij total total_dot x_bar"})
+    typed = types_by_name(discretisation.precision)
 
     @image_sum(discretisation)
     @typed
@@ -239,38 +232,21 @@ def image_load_kernels(discretisation: Discretisation) -> Kernels:
         c = owned * (image_i * y_i + image_j * y_j) * s.volume
         return owned * s.volume * wp.dot(gradient(x_ij, s), f_ij), c * hessian_product(x_ij, f_ij, s)
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
-    def image_load(s, solid: int, x, y, image, total):
-        i = s.first + wp.tid() // LANES
-        found = load(i, x, y, image, solid, s)
-        if lane() == 0:
-            total[i] = found
+    @particle_kernel(module, "total", [over(load, "found")], numbers=["solid"])
+    def image_load(found: vector) -> vector:
+        return found
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    @typed.arrays
-    def image_load_tangent(s, solid: int, x, x_dot, y, y_dot, image, image_dot, total_dot):
-        i = s.first + wp.tid() // LANES
-        found = load_tangent(i, x, x_dot, y, y_dot, image, image_dot, solid, s)
-        if lane() == 0:
-            total_dot[i] = found
+    @particle_kernel(tangent_module, "total_dot", [over(load_tangent, "found")], numbers=["solid"])
+    def image_load_tangent(found: vector) -> vector:
+        return found
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    @typed.arrays
-    def image_load_adjoint(s, solid: int, x, y, image, f, y_bar, image_bar, x_bar):
-        i = s.first + wp.tid() // LANES
-        widened, x_part = load_back(i, x, y, image, f, solid, s)
-        if lane() == 0:
-            y_bar[i] = y_bar[i] + image[i] * widened
-            image_bar[i] = image_bar[i] + y[i] * widened
-            x_bar[i] = x_bar[i] + x_part
+    back = over(load_back, "widened x_part")
+
+    @particle_kernel(adjoint_module, "+y_bar +image_bar +x_bar", [back], numbers=["solid"])
+    def image_load_adjoint(widened: real, x_part: vector, y_i: real, image_i: real) -> tuple[real, real, vector]:
+        return image_i * widened, y_i * widened, x_part
 
     return Kernels(image_load, image_load_tangent, image_load_adjoint)
-
-
-def mirrored_term(discretisation: Discretisation) -> WallTerm:
-    """Return the wall term -h y gamma_m of a solid, with the adjoint ``f``."""
-    return WallTerm(discretisation, "image_loads", _mirrored_work, "f")
 
 
 def _mirrored_work(d: Discretisation) -> Any:
@@ -284,13 +260,13 @@ def _mirrored_work(d: Discretisation) -> Any:
 
 
 class ImageLoads:
-    """The forces of images divided by a particle's volume, vectors (n,) [N / m^d], of the sorted particles of a step.
-    The next call overwrites these device arrays."""
+    """The forces (n,) of images over a particle's volume [N / m^d], of sorted particles; the next call overwrites the
+    arrays."""
 
     def __init__(self, density: Surroundings):
         self._density, self._layout = density, density.layout
         self._kernels = image_load_kernels(density.discretisation)
-        self._walls = WallSums(mirrored_term(density.discretisation), density.layout)
+        self._walls = WallSums(WallTerm(density.discretisation, "image_loads", _mirrored_work, "f"), density.layout)
         self._faces = FaceShares(density.discretisation, density.layout, density.faces)
 
     def total(self, step: StepContext, solid: int, p: wp.array) -> wp.array:
@@ -301,7 +277,6 @@ class ImageLoads:
         return found
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int, p: wp.array, p_dot: wp.array) -> wp.array:
-        """Return the tangents of the forces, after forward mode of the step."""
         found, around = self._vectors["total_dot"], self._tangent
         around.measure(step, dot)
         known = {"y": p, "image": self._density.around["image"]}
@@ -313,7 +288,6 @@ class ImageLoads:
     def adjoint(
         self, step: StepContext, bar: Adjoints, solid: int, p: wp.array, total_bar: wp.array, p_bar: wp.array
     ) -> None:
-        """Add to the adjoints of particles, solids and pressures, given the adjoint of the forces."""
         around = self._adjoint
         around.begin()
         known = {"y": p, "image": self._density.around["image"]}

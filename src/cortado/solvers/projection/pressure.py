@@ -12,34 +12,33 @@ an iteration from y, an extrapolation of k (Nesterov 1983), is
     v = v* - D^T y / m,   z+ = y + omega (D v - b) / a,   z- = y + omega D v / a,
     k' = z+ if z+ > 0;  sigma z- if z- < 0;  else 0,   y' = k' + beta (k' - k).
 
-b = (1 - f) max(1 - n, 0) / dt lets scattered fluid come together before it resists. The first k and v are defined
-below. sigma, which is near 1 for surrounded particles, admits tension. At the corners of the clamp and of the maximum
-one of the two derivatives is used. The result is v* - D^T k / m.
+b = (1 - f) max(1 - n, 0) / dt lets scattered fluid come together before it resists. sigma, which is near 1 for
+surrounded particles, admits tension. The result is v* - D^T k / m.
 
 A step begins with the pressure of the previous step: the first k is f times the last k, and the first v is v* + f w,
 with the previous step's kick w = -D^T k / m.
 
-The exception is a particle that this kick would move towards a wall, gamma . w > 0, by more than a tenth of a spacing
-in the step. Between walls less than a spacing apart such a particle has come from one wall to the other. The pressure
-that repelled it from the first wall would throw it at the second, harder in each step. So it begins with v* and no
-pressure; this choice has no derivative.
+A particle that this kick would move towards a wall, gamma . w > 0, by more than a tenth of a spacing begins with v* and
+no pressure. Between walls less than a spacing apart, the pressure that repels it from one wall would throw it at the
+other, harder in each step. The choice has no derivative.
 
-A scene is shut if every particle has a share c of the coarse pressure. Then tension is admitted beside walls too, sigma
-= 1, because fluid that fills a container cannot leave the walls. This choice has no derivative either.
+A scene is shut if every particle has a share c of the coarse pressure. In a shut scene tension is admitted beside walls
+too, sigma = 1, because fluid that fills a container cannot leave the walls.
 
-A scene is warm if any particle begins with a pressure, and otherwise cold, as in the first step of a run. In a cold
-scene a coarse correction also precedes the first iteration (`cortado.solvers.projection.steps`).
+A scene is warm if any particle begins with a pressure, and otherwise cold. In a cold scene a coarse correction also
+precedes the first iteration.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from cortado.device.launching import bundle
-from cortado.device.modules import Kernels
+from cortado.device.modules import Kernels, by_name
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels
@@ -50,26 +49,13 @@ from cortado.solvers.projection.wall_sums import types_by_name, weights_type
 from cortado.sph.moment_functions import symmetric
 
 
-@dataclass(frozen=True)
-class ClampFunctions:
-    """Warp functions of one particle for the clamp of its pressure."""
-
-    wanted: Any
-    """The wanted divergence b of n, f and dt."""
-    wanted_tangent: Any
-    """The tangent of b, given n, f, dt and their tangents."""
-    parts: Any
-    """The weights of the slopes of z+ and sigma z- in the slope of k'."""
-
-
 @cache
-def clamp_functions(precision: Precision) -> ClampFunctions:
-    """Make the Warp functions of the pressure's clamp, in a precision."""
+def clamp_functions(precision: Precision) -> SimpleNamespace:
+    """Make Warp functions for the clamp of a pressure: b, its tangent, and the weights of slopes."""
     real = precision.real
 
     @wp.func
     def wanted(n: real, full: real, dt: real) -> real:
-        """Return b = (1 - f) max(1 - n, 0) / dt, the divergence with which scattered fluid comes together."""
         return (real(1.0) - full) * wp.max(real(1.0) - n, real(0.0)) / dt
 
     @wp.func
@@ -81,9 +67,8 @@ def clamp_functions(precision: Precision) -> ClampFunctions:
 
     @wp.func
     def parts(up: real, down: real):
-        """Return the weights of the slopes of z+ and of sigma z- in the slope of k': 1 and 0, or at a corner the mean
-        of both sides. Fluid in rigid motion is on the corner z+ = z- = 0 everywhere; inside sigma is 1, and the slopes
-        are equal."""
+        """Return the weights of the slopes of z+ and sigma z-: 1 or 0, and at a corner the mean of both sides. Fluid in
+        rigid motion is at the corner z+ = z- = 0 everywhere."""
         rise, fall = real(0.0), real(0.0)
         if up > real(0.0):
             rise = real(1.0)
@@ -96,23 +81,13 @@ def clamp_functions(precision: Precision) -> ClampFunctions:
                 fall = real(0.5)
         return rise, fall
 
-    return ClampFunctions(wanted, wanted_tangent, parts)
-
-
-@dataclass(frozen=True)
-class PressureKernels:
-    """The kernels of one iteration of the projection's pressure."""
-
-    update: Kernels
-    """k' and y'. Their adjoint is three kernels: one of the clamp, and two of D, without and with a further adjoint of
-    A."""
-    whole_adjoint: wp.Kernel
-    """Adds to the adjoint of A the part that comes from the adjoint of D."""
+    return by_name(wanted, wanted_tangent, parts)
 
 
 @cache
-def pressure_kernels(discretisation: Discretisation, dimension: int) -> PressureKernels:
-    """Make the kernels of one pressure iteration, in 2 or 3 dimensions."""
+def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
+    """Make the kernels of a pressure iteration. The adjoint of ``update`` is three kernels: of the clamp, and of D
+    without and with an adjoint of A, to which ``whole_adjoint`` adds the part from D."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, sums = precision.pair, projection_sums(discretisation)
     packed, matrix = symmetric(precision), precision.matrix
@@ -145,9 +120,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     def update(
         s, omega: real, beta: real, time_step, x, n, of: shared, at, k_out, y_out, T, error: wp.array(dtype=pair_of)
     ):
-        """Do a pressure iteration. ``error`` is a pair: the squared unwanted divergence times the time step, weighted
-        with c, and c, which is 1 inside and beside walls and 0 at free surfaces. A and the divergence are written to
-        ``at``; T is y' L."""
+        """Do a pressure iteration; write A and the divergence to ``at``, and y' L to T. ``error`` is the pair c (dt
+        e)^2 and c, with the unwanted divergence e and the c of `effects`."""
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient(i, x, at.u, s)
         widened = spread(i, x, at.u, s)
@@ -241,8 +215,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         return d_bar_i * L_i
 
     def divergence_adjoint_of(name: str, back: Any, kind: Any, times: Callable[..., Any]) -> wp.Kernel:
-        """Make the kernel that turns the adjoint of D, and for a full matrix S also the adjoint of A, into that of
-        u."""
+        """Make the kernel that turns the adjoint of D, and with a full matrix S also that of A, into that of u."""
 
         @typed.arrays
         def divergence_adjoint(s, x, g, of, u, A, d_bar, S: wp.array(dtype=kind), bar, u_bar):
@@ -267,20 +240,16 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
 
     even = divergence_adjoint_of("divergence_adjoint", sums.divergence_back, six, packed.times)
     uneven = divergence_adjoint_of("divergence_adjoint_whole", sums.velocity_gradient.adjoint, matrix, whole_times)
-    return PressureKernels(
-        Kernels(update, update_tangent, (clamp_adjoint, even, uneven)),
-        whole_adjoint,
-    )
+    updates = Kernels(update, update_tangent, (clamp_adjoint, even, uneven))
+    return SimpleNamespace(update=updates, whole_adjoint=whole_adjoint)
 
 
 TOWARDS = 0.1
-"""In spacings: how far the kick of the previous step may move a particle towards a wall in a step. In dams, jets, a
-beach and a fountain no kick exceeded this, except for particles that wait in a nozzle."""
+"""Distance beyond which the previous step's kick must not move a particle towards a wall in a step [spacings]."""
 
 
 @cache
 def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the first pressure and velocity of a step, in 2 or 3 dimensions."""
     precision, modules = discretisation.precision, discretisation.modules(f"projection_{dimension}d")
     real, vector, weights4 = precision.real, precision.vector, weights_type(precision)
     towards = wp.constant(real(TOWARDS))
@@ -290,7 +259,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     def start(
         spacing, time_step, k_before_i, kick_before_i, weights_i, beside_i, surfaced, v_star_i
     ) -> tuple[weights4, real, real, vector]:
-        """Return the weights, k, y and u of a particle; k, y and the kick are 0 if the kick would move it towards a
+        """Return weights, k, y and u of a particle; k, y and the kick are 0 if the kick would move it towards a
         wall."""
         full, tension = weights_i[1], weights_i[0]
         if wp.dot(kick_before_i, beside_i) > real(0.0) and time_step * wp.length(kick_before_i) > towards * spacing:
@@ -308,7 +277,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     def begin(
         particles: int, spacing: real, time_step, k_before, kick_before, beside, v_star, surfaced, weights, first, warm
     ):
-        """Write k, y and u of the first iterate of a step, and weights; ``warm`` is 0 for each scene before."""
+        """Write weights, and k, y and u of a step's first iterate; set ``warm`` to 1 in scenes with a pressure."""
         i, member = wp.tid(), wp.tid() // particles
         kept, pressure, _same, velocity = begun(
             spacing, time_step[member], k_before[i], kick_before[i], weights[i], beside[i], surfaced[member], v_star[i]

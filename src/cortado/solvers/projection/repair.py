@@ -1,21 +1,21 @@
-"""Repairs of the density change positions only. They are Jacobi iterations from x', the positions after the shift:
+"""Repairs of the density, which change positions only, are Jacobi iterations from x', the positions after the shift:
 
     lambda' = z if z > 0, else r z,   z = lambda + omega_k (n(x_k) - 1) / a,
     d = -(sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m,   x_k+1 = x' + d min(1, s / 6 |d|),
 
 with images in n and d (`cortado.solvers.projection.effects`).
 
-The repairs of a step move a particle by at most a sixth of a spacing s. If walls leave no room, or press on the
-particles between them, densities cannot be right, and unbounded repairs would throw a particle through a wall.
+The bound of a sixth of a spacing s matters where walls leave no room: unbounded repairs would throw a particle through
+a wall.
 
-Each iteration has its own omega_k (`cortado.solvers.projection.lattice`). Velocities are not changed: otherwise a
-repair would act once more in the next step. The factor r of `cortado.solvers.projection.effects` restricts repairs of
-low densities to the interior. g and a are those at the start of the step; n is that of the positions x_k, over the
+Each iteration has its own omega_k (`cortado.solvers.projection.lattice`). Velocities are not changed, because a repair
+would act once more in the next step. The factor r of `cortado.solvers.projection.effects` restricts repairs of low
+densities to the interior. g and a are those at the start of the step; n is that of the positions x_k, over the
 neighbours at the start.
 """
 
-from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -25,7 +25,6 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.particle_kernels import over, particle_kernel
-from cortado.particles.wall_terms import solid_kernel
 from cortado.solvers.projection.effects import image_sums
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
@@ -33,23 +32,12 @@ from cortado.solvers.projection.wall_sums import weights_type
 from cortado.sph.density import density_sums
 
 FARTHEST = 1.0 / 6.0
-"""In spacings: the greatest displacement of a particle by the repairs of a step. In dams, with an obstacle, on a beach
-and with a falling cube repairs moved particles by at most 0.155."""
-
-
-@dataclass(frozen=True)
-class RepairKernels:
-    """The kernels of one repair of the density."""
-
-    measure: Kernels
-    """The multiplier lambda' from the density n(x_k)."""
-    move: Kernels
-    """The positions x_k+1 from lambda'."""
+"""Greatest displacement of a particle by the repairs of a step [spacings]."""
 
 
 @cache
-def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKernels:
-    """Make the kernels of one repair of the density, in 2 or 3 dimensions."""
+def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
+    """Make the kernels of lambda' from n(x_k), and of x_k+1 from lambda'."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, weights4 = precision.pair, weights_type(precision)
     sums, densities = projection_sums(discretisation), density_sums(discretisation)
@@ -79,8 +67,8 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     @wp.kernel(module=module)
     @typed.arrays
     def measure(s, omega: real, of, x_now, c_in, c_out, excess, error: wp.array(dtype=pair_of)):
-        """Compute lambda' from densities; ``c`` is lambda, ``excess`` n - 1, and ``error`` the compression, twice (for
-        a sum and a maximum)."""
+        """Compute lambda' from densities; ``c`` is lambda, ``excess`` n - 1, and ``error`` has the compression
+        twice."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x_now, s)
         surplus = image_weights(i, x_now, s) - behind(i, x_now, mirror_of(x_now[i], i // s.particles, s), s)
@@ -133,7 +121,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     def move(
         pushed: vector, lifted: vector, spacing: real, m_i: real, gamma_i: vector, c_i: real, x_moved_i: vector
     ) -> tuple[real, vector]:
-        """Move a particle by the repair's lambda', within the bound; ``held`` is the part of the full displacement."""
+        """Move a particle by lambda' within the bound; ``held`` is the part of the full displacement."""
         back = (pushed + lifted + c_i * gamma_i) / m_i
         most, length, part = farthest * spacing, wp.length(back), real(1.0)
         if length > most:
@@ -155,7 +143,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     def begin_adjoint(
         m_i: real, x_now_i: vector, x_moved_i: vector, held_i: real, x_now_bar_i: vector
     ) -> tuple[real, vector, vector]:
-        """Apply the adjoint of the particle's own terms in x_k+1; f is the adjoint of the sum over neighbours."""
+        """Apply the adjoint of the particle's terms in x_k+1; f is the adjoint of the sum over neighbours."""
         back = (x_moved_i - x_now_i) / held_i
         bar = along(x_now_bar_i, back, held_i)
         return wp.dot(bar, back) / m_i, x_now_bar_i, -bar / m_i
@@ -184,18 +172,12 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         n_now_bar[i] = per * z_bar
         c_bar[i] = z_bar
 
-    return RepairKernels(
-        Kernels(measure, measure_tangent, measure_adjoint),
-        Kernels(move, move_tangent, (begin_adjoint, move_adjoint)),
-    )
+    measures = Kernels(measure, measure_tangent, measure_adjoint)
+    return SimpleNamespace(measure=measures, move=Kernels(move, move_tangent, (begin_adjoint, move_adjoint)))
 
 
-def repair_solid_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel from the adjoints of densities n(x_k) to those of solids (`SolidShares.add`)."""
-    return solid_kernel(discretisation, "projection", _work)
-
-
-def _work(d: Discretisation) -> Any:
+def repair_term(d: Discretisation) -> Any:
+    """Make the work function by which adjoints of n(x_k) act on solids."""
     real, vector, weight = d.precision.real, d.precision.vector, pair_functions(d).weight
 
     def repair_work(

@@ -1,13 +1,13 @@
 """Particles stay on their side of a sheet: a position at the end of a step on the other side is moved back.
 
-In the frame of a sheet, about its middle, a particle is at y_0 before the step and at y after the step. A face of the
-sheet has the normal n, and h = n . (y - a) is the particle's height above it. If the path from y_0 to y crosses the
-face, or ends nearer to it than e = s / 20, the particle is put back on the side of y_0:
+In the frame of a sheet a particle is at y_0 before the step and at y after the step. A face of the sheet has the normal
+n, and h = n . (y - a) is the particle's height above it. If the path from y_0 to y crosses the face, or ends nearer to
+it than e = s / 20, the particle is put back on the side of y_0:
 
     y' = y + (e sign h_0 - h) n.
 
 This is done up to three times, each time with the face that the path meets first. If the path still crosses the sheet,
-as in a sharp corner, the particle keeps its place relative to the sheet, y' = y_0. Velocities are not changed.
+as in a sharp corner, the particle keeps its place relative to the sheet, y' = y_0.
 
 If a pose changes by c', w' and g' (`MovingWalls`), a point x of the solid moves by t(x) = c' + w' x (x - c) + g' (x -
 c). With N = R n, a relative change D = x' - t(x) becomes D - N (N . D + e sign h_0 g'), and then t is added again.
@@ -29,16 +29,15 @@ from cortado.particles.wall_terms import share_kinds
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 NEAREST = 0.05
-"""In spacings: e, the least distance of a particle from a sheet at the end of a step."""
+"""Least distance e of a particle from a sheet at the end of a step [spacings]."""
 ROUNDS = 3
-"""Greatest number of times that a particle is put back in a step."""
+"""Greatest number of times that a particle is moved back in a step."""
 NONE = -1
-"""Value in place of a face's number."""
 
 
 @cache
 def side_kernels(precision: Precision) -> Kernels:
-    """Make the kernels that keep particles on their side of sheet k, where ``least`` is e."""
+    """Make the kernels that keep particles on their side of sheet k; ``least`` is e."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     neighbourhood, sheets_of = neighbourhood_type(precision), sheets_type(precision)
     (scale_of, seen_from), (query, meets, goes_through) = sheet_functions(precision), face_functions(precision)
@@ -49,7 +48,6 @@ def side_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def way_of(x: vector, x_now: vector, k: int, member: int, s: neighbourhood, sheets: sheets_of):
-        """Return the places of a particle at the start and at the end of a step in the frame of the sheet."""
         start = seen_from(x, s.before, s.turns_before, k, member, s, sheets)
         return start, seen_from(x_now, s.after, s.turns, k, member, s, sheets)
 
@@ -67,7 +65,7 @@ def side_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def time_of(start: vector, y: vector, face: int, least: real, sheets: sheets_of) -> real:
-        """Return the part of the path at which a particle meets a face; 1 if it only ends too near the face, otherwise
+        """Return the part of the path at which a particle meets a face, 1 if it only ends too near the face, otherwise
         2."""
         n, a = sheets.faces.normals[face], sheets.faces.places[face, 0]
         side = side_of(start, face, sheets)
@@ -86,7 +84,7 @@ def side_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def kept(start: vector, end: vector, k: int, least: real, sheets: sheets_of):
-        """Return y', the faces by which it was moved, and 1 if it stays beside the sheet, else 0."""
+        """Return y', the faces by which y was moved, and 1 if the particle stays beside the sheet, else 0."""
         y, used = end, wp.vec3i(NONE, NONE, NONE)
         rounds = int(ROUNDS)
         for round in range(rounds):
@@ -201,28 +199,25 @@ def side_kernels(precision: Precision) -> Kernels:
 
 
 class Sides:
-    """Keeps the particles of a solver on their sides of all sheets, one sheet after the other; with several sheets each
-    is treated a second time."""
+    """Keeps a solver's particles on their sides of all sheets, one after the other; with several sheets twice."""
 
     def __init__(self, sheets: Sheets, spacing: float, layout: Layout):
-        """Prepare for particles a ``spacing`` [m] apart."""
         self._kernels, self._sheets, count = side_kernels(layout.precision), sheets, len(sheets.numbers)
         self._known: dict[str, Any] = {"sheets": sheets.struct, "least": NEAREST * spacing}
         self._passes = [*range(count)] * (1 if count == 1 else 2)
         vector = layout.precision.vector
         self._kept = [layout.arrays(x=vector)["x"] for _ in self._passes]
         self._none = layout.arrays("_bar", **share_kinds(layout.precision))
-        """Shares of a sheet that does not move."""
+        """Adjoints for sheets that do not move; nothing reads them."""
 
     def keep(self, step: StepContext, x_now: wp.array) -> wp.array:
-        """Return the positions (n,) of sorted particles at the end of a step, given the positions without sheets."""
+        """Return positions (n,) of sorted particles at the end of a step, given the positions without sheets."""
         for k, x_kept in zip(self._passes, self._kept, strict=True):
             step.launch(self._kernels.forward, self._known, k=k, x_now=x_now, x_kept=x_kept)
             x_now = x_kept
         return x_now
 
     def tangent(self, step: StepContext, dot: Tangents, x_now: wp.array, x_now_dot: wp.array) -> None:
-        """Replace the tangent of the positions without sheets by the tangent of the returned positions of `keep`."""
         self.keep(step, x_now)
         for k, x_kept in zip(self._passes, self._kept, strict=True):
             own = {"x_now": x_now, "x_kept": x_kept, "x_now_dot": x_now_dot}
@@ -230,8 +225,8 @@ class Sides:
             x_now = x_kept
 
     def adjoint(self, step: StepContext, bar: Adjoints, x_now: wp.array, x_now_bar: wp.array) -> None:
-        """Replace the adjoint of the returned positions of `keep` by that of the positions without sheets. Add to the
-        adjoints of solids and of positions at the start of the step."""
+        """Apply the adjoint of `keep`: replace ``x_now_bar``, and add to the adjoints of solids and of positions at the
+        start of the step."""
         self.keep(step, x_now)
         given = [x_now, *self._kept]
         for k, before, x_kept in reversed([*zip(self._passes, given, self._kept, strict=False)]):

@@ -1,6 +1,5 @@
-"""The velocity projection as the solver of a scene: steps, the tangent of a replayed step, and the adjoint, which is
-the tangent's transpose. Every sum is a gather.
-"""
+"""The velocity projection as the solver of a scene, with the tangent and the adjoint of a replayed step; every sum is a
+gather."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,6 +13,7 @@ from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.errors import InputError
 from cortado.particles.state import Parameters, State
+from cortado.particles.wall_terms import solid_kernel
 from cortado.scene.solvers import ProjectionSolver
 from cortado.solvers.build import SolverSetting, particle_system
 from cortado.solvers.loop import LoopLimits
@@ -23,7 +23,7 @@ from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse import CoarseAdjoint, CoarseTangent
 from cortado.solvers.projection.lattice import coarse_grid, endless, lattice_constants
 from cortado.solvers.projection.mean_stress import pressed_kernels
-from cortado.solvers.projection.repair import repair_solid_kernel
+from cortado.solvers.projection.repair import repair_term
 from cortado.solvers.projection.steps import IMPULSE, KICK, ProjectionSteps
 from cortado.solvers.projection.surroundings import SurroundingsAdjoint, SurroundingsTangent
 from cortado.solvers.projection.wall_sums import FaceShares
@@ -33,8 +33,6 @@ from cortado.sph.parts import StepContext
 
 
 class ProjectionTangent(ParticleTangent):
-    """The tangent of steps of the projection, one step at a time, along tangents of a run's parameters."""
-
     density: SurroundingsTangent
 
     def __init__(self, solver: ProjectionSteps, parameters_dot: Parameters):
@@ -49,8 +47,7 @@ class ProjectionTangent(ParticleTangent):
         self._A_dot = wp.zeros_like(solver.iterates[0]["A"])
         free = [part for part in self._parts if isinstance(part, FreeSolidsTangent)]
         self._bodies = None if solver.bodies is None else BodiesTangent(solver.bodies, free[0].bodies)
-        own = solver.layout, self._bodies, self.dot
-        self._coarse = CoarseTangent(solver.coarse, *own)
+        self._coarse = CoarseTangent(solver.coarse, solver.layout, self._bodies, self.dot)
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
         solver, kernels = self._solver, self._solver.kernels
@@ -104,7 +101,6 @@ class ProjectionTangent(ParticleTangent):
         return found
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
-        """Compute the tangents of the first pressure impulse k and of the iterations."""
         solver, kernels = self._solver, self._solver.kernels.pressure
         beginning = solver.kernels.beginning
         before = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
@@ -125,20 +121,17 @@ class ProjectionTangent(ParticleTangent):
             self._bodies.settle(context, self.dot, solver.iterates[iterations]["y"], self._y_dot)
 
     def _correct(self, context: StepContext, known: tuple[Named, ...], k: int, change: dict[str, wp.array]) -> None:
-        """Compute the tangent of the coarse correction before iteration k."""
         before = {**self._solver.iterates[k], **change}
         drift = self._drift(context, before)
         self._coarse.correct(context, k, (drift, *known), before, self._solver.corrected[k])
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> dict[str, wp.array]:
-        """Return the tangent of the drift of walls that free bodies move; empty without free bodies."""
         if self._bodies is None:
             return {}
         drift_dot = self._around["drift_dot"]
         return {"drift_dot": self._bodies.drifted(context, self.dot, drift_dot, at["y"], self._y_dot)}
 
     def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array]) -> None:
-        """Write the tangent of the velocities u = v* - D^T y / m by the pressure y of an iterate."""
         solver, kernels = self._solver, self._solver.kernels.velocity
         pull = {**self._pull, "y": at["y"], "y_dot": self._y_dot}
         context.launch(kernels.pull_tangent, *known, pull)
@@ -148,8 +141,6 @@ class ProjectionTangent(ParticleTangent):
 
 
 class ProjectionAdjoint(ParticleAdjoint):
-    """The adjoint of steps of the projection, one step at a time, of a run with some parameters."""
-
     density: SurroundingsAdjoint
 
     def __init__(self, solver: ProjectionSteps, steps: int):
@@ -161,15 +152,14 @@ class ProjectionAdjoint(ParticleAdjoint):
         self.bar = replace(self.bar, kick=self._kick_before_bar)
         self._A_bar = wp.zeros_like(solver.iterates[0]["A"])
         self._faces = FaceShares(solver.discretisation, solver.layout, len(solver.system.faces.solids))
-        six = solver.pull.dtype
-        pull = solver.layout.arrays(T=six, S=six)
-        self._pull, self._push = pull["T"], pull["S"]
+        self._pull, push = (wp.zeros_like(solver.pull) for _ in range(2))
         self._m_unused, self._k_before_bar, self._n_now_bar = (solver.numbers() for _ in range(3))
-        self._k_bar, self._y_bar, self._c_bar, self._d_bar, self._q_bar = (solver.numbers() for _ in range(5))
+        self._k_bar, self._y_bar, self._c_bar, d_bar, self._q_bar = (solver.numbers() for _ in range(5))
         free = [part for part in self._parts if isinstance(part, FreeSolidsAdjoint)]
         self._bodies = None if solver.bodies is None else BodiesAdjoint(solver.bodies, free[0].bodies)
-        own = solver.layout, self._bodies, self.bar
-        self._coarse = CoarseAdjoint(solver.coarse, *own, self._faces)
+        self._steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": d_bar, "S": push}
+        self._drift_bar = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}
+        self._coarse = CoarseAdjoint(solver.coarse, solver.layout, self._bodies, self.bar, self._faces)
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         self._begin(state_bar, parameters)
@@ -213,8 +203,7 @@ class ProjectionAdjoint(ParticleAdjoint):
     def _go_back(
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
-        """Turn the adjoints that `_begin` wrote into the adjoint of the state, through the step in reverse: velocities
-        that follow, repairs, shift, iterations, first k, prediction with all forces, sorting."""
+        """Turn the adjoints that `_begin` wrote into the adjoint of the state, through the step in reverse."""
         solver, kernels, context = self._solver, self._solver.kernels, self._solver.context(parameters)
         known = (*self.bar.named, self._around, solver.around)
         last = solver.iterates[counts[0]]
@@ -246,7 +235,6 @@ class ProjectionAdjoint(ParticleAdjoint):
         self.sort(context, state_bar, **{IMPULSE: self._k_before_bar, KICK: self._kick_before_bar})
 
     def _mend(self, context: StepContext, known: tuple[Named, ...], repairs: int) -> None:
-        """Apply the adjoint of the density repairs; the result is the adjoint of the positions before the repairs."""
         solver, kernels = self._solver, self._solver.kernels.repair
         begin, move = kernels.move.adjoint
         for k in reversed(range(repairs)):
@@ -261,13 +249,11 @@ class ProjectionAdjoint(ParticleAdjoint):
             own = {**own, "x": at["x_now"]}
             self._faces.add(context, self.bar, context.fields.named(), solver.around, u=self._f, spread=new["c"])
             self._faces.add(context, self.bar, solver.around, own, weighted=self._n_now_bar)
-            densities = partial(repair_solid_kernel, solver.discretisation)
+            densities = partial(solid_kernel, solver.discretisation, "projection", repair_term)
             self.bar.solids.add(context.launch, densities, *known, own)
         add(self._x_now_bar, self._x_moved_bar)
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
-        """Apply the adjoint of the pressure iterations; the results are the adjoints of v*, of the first k and of the
-        first u."""
         solver = self._solver
         if self._bodies is not None:
             self._bodies.settle(context, self.bar, solver.iterates[iterations]["y"], self._y_bar)
@@ -279,18 +265,13 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._coarse.finish(context, known, solver.around["coarse"])
 
     def _correct(self, context: StepContext, known: tuple[Named, ...], k: int) -> None:
-        """Apply the adjoint of the coarse correction before iteration ``k``, to the adjoints of its pressure and
-        velocity."""
         solver, at = self._solver, self._solver.iterates[k]
-        steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar, "S": self._push}
-        drift = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}
-        self._coarse.correct(context, k, (drift, *known), at, solver.corrected[k], steps, self._u_bar)
+        self._coarse.correct(context, k, (self._drift_bar, *known), at, solver.corrected[k], self._steps, self._u_bar)
         wp.copy(self._f, self._u_bar)
-        self._diverge(context, known, solver.kernels.pressure.update.adjoint[1], at, steps)
+        self._diverge(context, known, solver.kernels.pressure.update.adjoint[1], at, self._steps)
         add(self._f, self._u_bar)
 
     def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array]) -> None:
-        """Apply the adjoint of u = v* - D^T y / m; the results are the adjoints of v* and of y."""
         solver, velocity = self._solver, self._solver.kernels.velocity
         found = {"u": at["u"], "u_bar": self._u_bar, "kick_bar": self._kick_bar, "v_star": solver.v_star}
         steps = {"f": self._f, "T": self._pull, "y": at["y"]}
@@ -301,13 +282,11 @@ class ProjectionAdjoint(ParticleAdjoint):
     def _back(
         self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], beta: float, moves: bool
     ) -> None:
-        """Apply the adjoint of one pressure iteration: from the adjoints of k' and y' to those of k, y and u. With
-        ``moves`` A has an adjoint too, because the iteration's A moves particles."""
+        """Apply the adjoint of one pressure iteration, from k' and y' to k, y and u. With ``moves`` A has an adjoint
+        too, because the iteration's A moves particles."""
         solver, pressure = self._solver, self._solver.kernels.pressure
-        clamp, divergence, whole = pressure.update.adjoint
-        steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar, "S": self._push}
-        drift = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}
-        context.launch(clamp, *known, at, solver.relaxed, steps, **drift, beta=beta)
+        (clamp, divergence, whole), steps = pressure.update.adjoint, self._steps
+        context.launch(clamp, *known, at, solver.relaxed, steps, **self._drift_bar, beta=beta)
         if moves:
             context.launch(pressure.whole_adjoint, *known, steps, A_bar=self._A_bar)
             divergence, steps = whole, {**steps, "S": self._A_bar}
@@ -316,8 +295,7 @@ class ProjectionAdjoint(ParticleAdjoint):
     def _diverge(
         self, context: StepContext, known: tuple[Named, ...], kernel: wp.Kernel, at: dict[str, wp.array], steps: Named
     ) -> None:
-        """Turn the adjoints d_bar and S in ``steps`` into the adjoint of u, by a kernel for one of the two kinds of
-        S."""
+        """Turn the adjoints d_bar and S in ``steps`` into the adjoint of u."""
         context.launch(kernel, *known, at, steps, u_bar=self._u_bar)
         around = context.fields.named(), self._solver.around
         self._faces.add(context, self.bar, *around, u=at["u"], spread=steps["d_bar"])
@@ -326,7 +304,7 @@ class ProjectionAdjoint(ParticleAdjoint):
 
 
 class Projection(ProjectionSteps):
-    """The solver by a projection that pushes and pulls incompressible SPH fluid, with derivatives; see `Solver`."""
+    """The projection solver with derivatives; see `Solver`."""
 
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
         return ProjectionTangent(self, parameters_dot)
@@ -336,16 +314,13 @@ class Projection(ProjectionSteps):
 
 
 class ProjectionMaker:
-    """A maker of the projection solver that the table [solver] of a scene describes."""
-
     batches = True
 
     def __init__(self, table: ProjectionSolver):
         self._table = table
 
     def build(self, setting: SolverSetting) -> Solver:
-        """Make the projection solver of a scene that is cut into particles, on a device. Without pressure there is no
-        projection, and the steps of all solvers are equal."""
+        """Make the projection solver, or without pressure PCISPH, as then the steps of all solvers are equal."""
         system, table = particle_system(setting), self._table
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)
@@ -355,15 +330,11 @@ class ProjectionMaker:
             )
         grid = coarse_grid(setting.scene, setting.discrete, system.layout.particles)
         constants = lattice_constants(setting.scene, setting.discrete)
+        limits = LoopLimits(table.iterations, table.iterations, 0.0, 0.0)
+        if table.tolerance is not None:
+            limits = LoopLimits(table.iterations, table.maximum_iterations, table.tolerance, inf)
         own = table.repairs, table.velocities_follow, grid, endless(setting.discrete)
-        return Projection(system, constants, pressure_limits(table), *own)
+        return Projection(system, constants, limits, *own)
 
 
 maker = ProjectionMaker
-
-
-def pressure_limits(table: ProjectionSolver) -> LoopLimits:
-    """Return the bounds on iterations and errors at which the projection's pressure loop stops."""
-    if table.tolerance is None:
-        return LoopLimits(table.iterations, table.iterations, 0.0, 0.0)
-    return LoopLimits(table.iterations, table.maximum_iterations, table.tolerance, inf)

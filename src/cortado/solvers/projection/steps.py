@@ -1,11 +1,7 @@
 """A step of the projection: pressures that make velocities divergence-free, a shift of particles, and repairs of the
 density.
 
-`ProjectionSteps.step` overwrites its iterates; `ProjectionSteps.replay` keeps them all, for
-`cortado.solvers.projection.solver`.
-
-Besides the repairs of density a step changes particles in three ways (`moving_kernels`): by the velocity, x + dt v; by
-the shift delta; and optionally by velocities that follow the new positions.
+A step moves particles by dt v and by the shift delta, repairs densities, and optionally corrects velocities.
 
 Particles of the interior are shifted towards regions with fewer particles (Lind et al. 2012; Skillen, Lind, Stansby and
 Rogers 2013). Pairs that are nearer than 0.65 s are moved apart everywhere. The rate follows the velocity gradient and
@@ -15,15 +11,13 @@ the tension, so that the shift does not stir a fluid at rest:
     grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
     r = 20 dt |grad v| + 60 c^2 / (c + 0.004)^1.5,   c = w dt^2 max(-p, 0) / (rho s^2),
 
-with smooth bounds of 0.5 on r, and of 0.1 s on |delta|. Under tension particles clump at the rate sqrt(-p / rho) / s
-(the tensile instability, Monaghan 2000), so the shift is faster there. P projects out the direction of the surface, g +
-gamma. u and w are weights of `cortado.solvers.projection.effects`: u is 0 at surfaces; w, by which low densities are
-repaired, is 0 near surfaces and beside walls. The shift does not change velocities: with a correction by (delta . grad)
-v the fluid gains energy. In spray and in thin sheets pairs without the term p would come as near as 0.00 s. Repairs do
-not separate such pairs, because their density is too low.
+with smooth bounds of 0.5 on r, and of 0.1 s on |delta|. Under tension particles clump (the tensile instability,
+Monaghan 2000), so the shift is faster there. P projects out the direction of the surface, g + gamma. u and w are
+weights of `cortado.solvers.projection.effects`: u is 0 at surfaces; w, by which low densities are repaired, is 0 near
+surfaces and beside walls. The shift does not change velocities, because a correction by (delta . grad) v adds energy.
 
-With ``velocities_follow`` velocities are corrected, to first order, to the velocity field at the places to which the
-shift and the repairs move particles (Xu, Stansby and Laurence 2009):
+With ``velocities_follow`` velocities follow, to first order, the positions after the shift and the repairs (Xu, Stansby
+and Laurence 2009):
 
     v' = v - A (1.05 (M + 0.05 I)^-1) (x_K - x - dt v),   A = sum_j v_ij g_ij^T,
 
@@ -32,9 +26,8 @@ where x_K are the positions after the last repair, and A is that of the last ite
 The repairs of density begin from x + dt v + delta.
 """
 
-from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
@@ -52,10 +45,10 @@ from cortado.solvers.projection.coarse import Coarse
 from cortado.solvers.projection.effects import effect_functions
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.mean_stress import ImageLoads, MeanStress, pressed_kernels
-from cortado.solvers.projection.pressure import PressureKernels, beginning_kernels, pressure_kernels
-from cortado.solvers.projection.repair import RepairKernels, repair_kernels
+from cortado.solvers.projection.pressure import beginning_kernels, pressure_kernels
+from cortado.solvers.projection.repair import repair_kernels
 from cortado.solvers.projection.sides import Sides
-from cortado.solvers.projection.sums import VelocityKernels, velocity_kernels
+from cortado.solvers.projection.sums import velocity_kernels
 from cortado.solvers.projection.surroundings import Surroundings
 from cortado.solvers.projection.wall_sums import ProjectionPush, types_by_name
 from cortado.solvers.solver import Counts
@@ -64,27 +57,25 @@ from cortado.sph.moment_functions import symmetric
 from cortado.sph.parts import Carried, StepContext, integration_module
 
 RATE = 20.0
-"""Factor of dt |grad v| in the rate r of the shift."""
 GREATEST = 0.5
-"""Smooth bound on 20 dt |grad v|: a faster shift overshoots, and its derivatives grow from step to step."""
+"""Smooth bound on 20 dt |grad v|; a faster shift overshoots."""
 FARTHEST = 0.1
-"""In spacings: the greatest shift of a particle in a step."""
+"""Greatest shift of a particle in a step [spacings]."""
 SURFACE = 0.03
 """|g| s below which the direction of a surface is unknown."""
 AWAY = 4.0
 """Factor by which near pairs are moved apart faster than other particles are shifted."""
 LEAST = 1e-5
-"""The softness e in 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|; at rest the value is 0, and smooth."""
+"""Softness e in 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|; the value is 0 and smooth at rest."""
 PULLED = 60.0
-"""Factor of the rate of the shift where the pressure pulls."""
+"""Factor of the rate of the shift under tension."""
 WEAK = 0.004
 """The c below which the effect of tension is about quadratic in c."""
 
 
 @cache
 def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the shift delta, which spreads particles evenly, by A = sum_j v_ij g_ij^T, k = dt p and
-    surroundings; ``beside`` is gamma."""
+    """Make the kernels of the shift delta, with A = sum_j v_ij g_ij^T, k = dt p and ``beside`` = gamma."""
     precision, modules = d.precision, d.modules(f"projection_{dimension}d")
     real, vector, typed = precision.real, precision.vector, types_by_name(precision)
     inverse = effect_functions(precision, dimension, modules[0]).inverse
@@ -112,8 +103,8 @@ def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
 
 @cache
 def following_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of velocities v' that follow the shift and the repairs; the adjoint of v overwrites the adjoint
-    of v'."""
+    """Make the kernels of velocities v' that follow the shift and the repairs; the adjoint of v overwrites that of
+    v'."""
     precision, modules = d.precision, d.modules(f"projection_following_{dimension}d")
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     inverse = effect_functions(precision, dimension, modules[0]).inverse
@@ -127,8 +118,7 @@ def following_kernels(d: Discretisation, dimension: int) -> Kernels:
 
 @cache
 def moving_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of the positions before the first repair; the adjoint of delta overwrites the adjoint of these
-    positions."""
+    """Make the kernels of positions before the first repair; the adjoint of delta overwrites that of the positions."""
     modules = [integration_module(precision, forward, topic="moving") for forward in (True, False, False)]
     real, vector = precision.real, precision.vector
 
@@ -139,44 +129,16 @@ def moving_kernels(precision: Precision) -> Kernels:
 
 
 IMPULSE = "pressure_impulse"
-"""The name of k = dt p in a state."""
+"""Name of k = dt p in a state."""
 KICK = "pressure_kick"
-"""The name, in a state, of the kick -D^T k / m that a step's pressures added to velocities."""
+"""Name, in a state, of the kick -D^T k / m that a step's pressures add to velocities."""
 MOMENTUM = 8.0 / (1.0 + 101.0**0.5)
-"""beta of the first iteration, (t - 1) / t' with t' = (1 + sqrt(1 + 4 t^2)) / 2 (Nesterov 1983). The sequence begins at
-t = 5 instead of 1, because the first k comes from the previous step. Later iterations, which begin with a coarse
-correction, have beta = 0: with momentum many would not converge. Errors shrink from step to step if iterations leave
-between -1/3 and 1 of them: two iterations do so up to 1.6 times the stiffness of the lattice's stiffest wave."""
-
-
-@dataclass(frozen=True)
-class ProjectionKernels:
-    """The kernels that only the projection needs, by topic."""
-
-    beginning: Any
-    velocity: VelocityKernels
-    pressure: PressureKernels
-    shift: Any
-    moving: Any
-    repair: RepairKernels
-
-    @classmethod
-    def of(cls, discretisation: Discretisation, dimension: int) -> "ProjectionKernels":
-        """Make all kernels of the projection, in 2 or 3 dimensions."""
-        own = discretisation, dimension
-        return cls(
-            beginning_kernels(*own),
-            velocity_kernels(*own),
-            pressure_kernels(*own),
-            shift_kernels(*own),
-            moving_kernels(discretisation.precision),
-            repair_kernels(*own),
-        )
+"""beta of the first iteration, (t - 1) / t' with t' = (1 + sqrt(1 + 4 t^2)) / 2 (Nesterov 1983); t = 5 because the
+first k comes from the previous step. Later iterations have beta = 0: with momentum after a coarse correction, many
+would not converge."""
 
 
 class ProjectionSteps(ParticleSolver):
-    """The forward steps of the projection for one set of particles."""
-
     topic = "projection"
     density: Surroundings
     density_power = 0
@@ -192,12 +154,22 @@ class ProjectionSteps(ParticleSolver):
         grid: Grid,
         endless: bool,
     ):
-        """Prepare steps with pressure iterations within ``limits`` and ``repairs`` repairs of density each; velocities
-        ``follow`` the shift and the repairs, or are not corrected. A coarse ``grid`` corrects the pressure between
+        """Prepare steps with pressure iterations within ``limits`` and ``repairs`` repairs of density each. With
+        ``follow`` velocities follow the shift and the repairs. A coarse ``grid`` corrects the pressure between
         iterations, in a cold scene also before the first iteration, and never in an ``endless`` scene."""
         self.constants = constants
         super().__init__(system)
-        self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
+        own = self.discretisation, system.walled.dimension
+        self.kernels = SimpleNamespace(
+            beginning=beginning_kernels(*own),
+            velocity=velocity_kernels(*own),
+            pressure=pressure_kernels(*own),
+            shift=shift_kernels(*own),
+            moving=moving_kernels(self.discretisation.precision),
+            repair=repair_kernels(*own),
+        )
+        self.relaxed = {"omega": constants.relaxation}
+        self.spaced = {**self.density.constants, "spacing": constants.spacing}
         precision = self.layout.precision
         real, vector = precision.real, precision.vector
         self.pull = self.layout.arrays(T=symmetric(precision).kind)["T"]
@@ -205,23 +177,21 @@ class ProjectionSteps(ParticleSolver):
         kinds = {"u": vector, "A": precision.matrix, "d": real, "y": real, "k": real}
         self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real, "held": real}
         self.iterates = [self.layout.arrays(**self._iterate_kinds)]
-        """u, A and the divergence of u, y and k before each iteration; the last slot has u and y = k after all
-        iterations."""
+        """Iterates before each iteration: u, A, the divergence of u, y and k; the last slot has the final u and y =
+        k."""
         self.repaired = [self.layout.arrays(**self._repair_kinds)]
-        """x_k, lambda and n - 1 before each repair, and the part of the full displacement by which a particle moved to
-        x_k."""
+        """Values before each repair: positions x_k, lambda, n - 1, and the part of the full displacement that moved a
+        particle."""
         self.x_star, self.v_star, self.kick, self.x_moved, self.delta = (self.vectors() for _ in range(5))
         self.sides = None if system.sheets is None else Sides(system.sheets, constants.spacing, self.layout)
-        """The object that keeps particles on their sides of sheets; None without sheets."""
-        self.following = following_kernels(self.discretisation, system.walled.dimension) if follow else None
-        """The kernels of velocities that follow the shift and the repairs; None if velocities do not follow."""
+        """Keeps particles on their sides of sheets; None without sheets."""
+        self.following = following_kernels(*own) if follow else None
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
         self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
-        """The bodies that fluid moves; None without any."""
-        own = self.discretisation, self.layout, system.walled.dimension
-        self.coarse = Coarse(*own, grid, constants.spacing, self.bodies, endless)
+        dimension, spacing = system.walled.dimension, constants.spacing
+        self.coarse = Coarse(self.discretisation, self.layout, dimension, grid, spacing, self.bodies, endless)
         self.corrected = [self._new_corrected()]
-        """The iterates, after the coarse correction, from which pressure iterations begin."""
+        """Iterates after the coarse correction, from which pressure iterations begin."""
         self.repair_relaxations = constants.repair_relaxations(repairs)
         """omega of each repair."""
         self.loops = (
@@ -238,7 +208,6 @@ class ProjectionSteps(ParticleSolver):
 
     @property
     def around(self) -> dict[str, wp.array]:
-        """Return the surroundings of particles, by name; see `cortado.solvers.projection.surroundings`."""
         return self.density.around
 
     def wall_push(self) -> ProjectionPush:
@@ -248,16 +217,6 @@ class ProjectionSteps(ParticleSolver):
     def image_loads(self) -> ImageLoads | None:
         mirrors = np.isfinite(self.system.mirrors).any() or len(self.system.faces.solids)
         return ImageLoads(self.density) if mirrors else None
-
-    @cached_property
-    def relaxed(self) -> dict[str, float]:
-        """Return the relaxation omega of the pressure iterations by the name of its kernel argument."""
-        return {"omega": self.constants.relaxation}
-
-    @cached_property
-    def spaced(self) -> dict[str, float]:
-        """Return the surroundings' constants and the spacing by the names of kernel arguments."""
-        return {**self.density.constants, "spacing": self.constants.spacing}
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
         context = self.predict(state, parameters)
@@ -309,24 +268,21 @@ class ProjectionSteps(ParticleSolver):
 
     @cached_property
     def _pressures(self) -> dict[str, wp.array]:
-        """Make arrays of pressures on first use, because most runs need none."""
         return {"push": self.numbers(), "stress": self.numbers()}
 
     @cached_property
     def mean_stress(self) -> MeanStress:
-        """Make the kernels and arrays of mean stresses on first use."""
         own = self.discretisation, self.layout, self.system.walled.dimension
         return MeanStress(*own, len(self.system.faces.solids))
 
     @property
     def parameters(self) -> Parameters:
-        """Return the parameters of the last step."""
         assert self._context is not None
         return self._context.parameters
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
-        """Do all of a step before the pressure iterations: sort and measure the density (`sort`), add up the explicit
-        forces, gravity among them, predict v* = v + dt a, and write the first iterate."""
+        """Do all of a step before the pressure iterations: sort, add up explicit forces, predict v* = v + dt a, and
+        write the first iterate."""
         context, kernels, first = self.sort(state, parameters), self.kernels, self.iterates[0]
         if self.bodies is not None:
             self.bodies.begin(context, self.around, self.carried[IMPULSE])
@@ -357,7 +313,6 @@ class ProjectionSteps(ParticleSolver):
         self.press(context, new)
 
     def momentum(self, k: int) -> float:
-        """Return the extrapolation factor beta of iteration k."""
         return MOMENTUM if k == 0 else 0.0
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> wp.array:
@@ -366,17 +321,16 @@ class ProjectionSteps(ParticleSolver):
         return drift if self.bodies is None else self.bodies.drifted(context, drift, at["y"])
 
     def press(self, context: StepContext, at: dict[str, wp.array]) -> None:
-        """Write the velocities u = v* - D^T y / m by the y of an iterate, and the pull y L."""
+        """Write u = v* - D^T y / m and the pull y L by the y of an iterate."""
         own = {"y": at["y"], "u": at["u"], "T": self.pull, "kick": self.kick}
         context.launch(self.kernels.velocity.velocity.forward, self.around, own, v_star=self.v_star)
 
     def settle(self, context: StepContext, last: int) -> None:
-        """Write the new velocities of free bodies by the k of a slot."""
         if self.bodies is not None:
             self.bodies.settle(context, self.iterates[last]["y"])
 
     def move(self, context: StepContext, last: int) -> None:
-        """Write the positions after moving by the new velocities and the shift, with the k of a slot."""
+        """Write the positions after moving by the new velocities and the shift."""
         kernels, first = self.kernels, self.repaired[0]
         flow = {"A": self.last_gradient(last), "k": self.iterates[last]["k"]}
         context.launch(kernels.shift.forward, self.around, self.spaced, flow, delta=self.delta)
@@ -386,11 +340,11 @@ class ProjectionSteps(ParticleSolver):
         first["c"].zero_()
 
     def last_gradient(self, slot: int) -> wp.array:
-        """Return A, the velocity gradient sums of the last iteration, given the slot with its result."""
+        """Return A of the last iteration, given the slot with its result."""
         return self.corrected[max(slot - 1, 0)]["A"]
 
     def mend(self, context: StepContext, k: int, before: int, after: int) -> None:
-        """Repair densities the k-th time, from the positions of slot ``before`` to those of slot ``after``."""
+        """Do repair k, from the positions of slot ``before`` to those of slot ``after``."""
         kernels, at, new = self.kernels.repair, self.repaired[before], self.repaired[after]
         measured = {"x_now": at["x_now"], "c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
         relaxed = {"omega": self.repair_relaxations[k], "error": self.loops[1].errors}

@@ -1,17 +1,12 @@
-"""Sums over neighbours of the projection, with their derivatives, and the velocity after applying pressures to the
-predicted velocity, v* - D^T y / m, see `cortado.solvers.projection.pressure`; g_ij = V grad W_ij.
+"""Sums over neighbours of the projection, and the velocity u = v* - D^T y / m of `cortado.solvers.projection.pressure`,
+with derivatives; g_ij = V grad W_ij."""
 
-The operators for the force of pressures and the divergence of velocities are each other's transpose. They take most of
-the computing time, forward and in reverse.
-"""
-
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from types import SimpleNamespace
 
 import warp as wp
 
-from cortado.device.modules import Kernels
+from cortado.device.modules import Kernels, by_name
 from cortado.device.precision import arithmetic
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
@@ -21,44 +16,29 @@ from cortado.solvers.projection.wall_sums import types_by_name
 from cortado.sph.moment_functions import cross_terms_function, moment_functions, symmetric
 
 CROWDED = 0.25
-"""R: the greatest additional weight of close pairs in a shift (Monaghan 2000). Without a bound the derivative of the
-shift is so steep among clumped particles that gradients of a splash are ten orders of magnitude greater."""
+"""R, the greatest additional weight of close pairs in a shift (Monaghan 2000); without a bound gradients of a splash
+grow by ten orders of magnitude."""
 APART = 0.65
-"""In spacings: the distance below which a shift moves pairs apart. With 0.6 and 0.7 particles of a dam break 25 deep
-come equally seldom within half a spacing. With 0.7 and 0.8 the energy rises more: with 0.7 by 0.03 instead of 0.02 % in
-a dam 12 deep."""
+"""Distance below which a shift moves pairs apart [spacings]."""
 UNEQUAL = 2.0
-"""Additional weight of a lighter neighbour in the diagonal of the projection's matrix. Without it an iteration
-overshoots if many heavy particles push one light particle: on the lattice 1.2 and 1.5 times at mass ratios of 100 and
-1,000, and 2.3 times for one light particle among heavy ones. With it a step is as long as among equal masses."""
-
-
-@dataclass(frozen=True)
-class ProjectionSums:
-    """Warp functions of the projection's sums over neighbours; a symmetric matrix is returned as its diagonal and its
-    entries yz, xz and xy."""
-
-    moments: Kernels
-    """M = -sum g_ij x_ij^T, Q = sum h_ij g_ij g_ij^T / m_j, g = sum g_ij, the crowding sum (1 + R q / (1 + q / 4))
-    g_ij, with h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2 and q = (W_ij / W(s))^4, for 1 / (V W(s)) ``per_nearest``;
-    sum p_ij with p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij, which moves pairs apart, for 1 / (0.65 s)^2
-    ``per_apart``; and sum V W_ij, to which what fills lists up adds. The adjoint is that of x and m, with ``n_bar`` of
-    the last sum."""
-    force: Kernels
-    """sum_j T_j g_ij, for T = k L, which T_i g_i completes. From the force's adjoints f: the symmetric part of sum f_ij
-    g_ij^T, and the adjoint of x."""
-    velocity_gradient: Kernels
-    """The rows of A = sum v_ij g_ij^T; the velocity gradient is A M^-1. From the adjoint of A: the adjoint of v without
-    A_bar_i g_i, and the adjoint of x."""
-    divergence_back: Any
-    """The adjoints of v and x if the adjoint of A is symmetric: S = d L for an adjoint d of the divergence L : A."""
-    push: Kernels
-    """sum (c_i + c_j) g_ij. From this sum's adjoints f: sum g_ij . f_ij, and the adjoint of x."""
+"""Additional weight of a lighter neighbour in the diagonal; without it an iteration overshoots if heavy particles push
+a light one."""
 
 
 @cache
-def projection_sums(discretisation: Discretisation) -> ProjectionSums:
-    """Make the sums over neighbours of the projection, for a discretisation."""
+def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
+    """Make the sums over neighbours; a symmetric matrix is its diagonal and its entries yz, xz and xy.
+
+    - ``moments``: M = -sum g_ij x_ij^T; Q = sum h_ij g_ij g_ij^T / m_j with h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2;
+      g = sum g_ij; the crowding sum (1 + R q / (1 + q / 4)) g_ij with q = (W_ij / W(s))^4; sum p_ij with
+      p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij; and sum V W_ij. ``per_nearest`` is 1 / (V W(s)), ``per_apart``
+      1 / (0.65 s)^2.
+    - ``force``: sum_j T_j g_ij with T = k L. The adjoint turns adjoints f into the symmetric part of sum f_ij g_ij^T.
+    - ``velocity_gradient``: the rows of A = sum v_ij g_ij^T; the velocity gradient is A M^-1. The adjoint of v
+      lacks the term A_bar_i g_i.
+    - ``divergence_back``: the adjoints of v and x for a symmetric adjoint S = d L of A, with the adjoint d of L : A.
+    - ``push``: sum (c_i + c_j) g_ij. The adjoint turns adjoints f into sum g_ij . f_ij.
+    """
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     packed, cross_terms = symmetric(discretisation.precision), cross_terms_function(discretisation.precision)
@@ -70,24 +50,24 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
-        """Return the entries yz, xz and xy of the symmetric matrix (a b^T + b a^T) / 2."""
+        """Return the entries yz, xz and xy of (a b^T + b a^T) / 2."""
         return real(0.5) * (cross_terms(a, b) + cross_terms(b, a))
 
     @wp.func
     def mobility(m_i: real, m_j: real) -> real:
-        """Return h_ij / m_j, the weight of a pair in the diagonal, greater for a lighter neighbour."""
+        """Return h_ij / m_j."""
         r = (m_i - m_j) * reciprocal(m_i + m_j)
         return (real(1.0) + unequal * r * r) * reciprocal(m_j)
 
     @wp.func
     def slope_of_h(m_i: real, m_j: real) -> real:
-        """Return the derivative of the weight h_ij with respect to the mass m_i."""
+        """Return the derivative of h_ij with respect to m_i."""
         per_both = reciprocal(m_i + m_j)
         return real(4.0) * unequal * (m_i - m_j) * m_j * per_both * per_both * per_both
 
     @wp.func
     def closeness(near: real) -> real:
-        """Return the weight 1 + R q / (1 + q / 4), q = near^4, by which close pairs count more in a shift."""
+        """Return 1 + R q / (1 + q / 4), q = near^4."""
         q = near * near * near * near
         return real(1.0) + crowded * q * reciprocal(real(1.0) + real(0.25) * q)
 
@@ -99,12 +79,12 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
 
     @wp.func
     def nearness(x_ij: vector, per_apart: real) -> real:
-        """Return 1 - |x_ij|^2 / (0.65 s)^2, at least 0, with 1 / (0.65 s)^2 as ``per_apart``."""
+        """Return max(1 - |x_ij|^2 / (0.65 s)^2, 0)."""
         return wp.max(real(1.0) - per_apart * wp.dot(x_ij, x_ij), real(0.0))
 
     @wp.func
     def parted(x_ij: vector, change: vector, per_apart: real) -> vector:
-        """Return the derivative of the pair's push apart p_ij along a change of x_ij."""
+        """Return the derivative of p_ij along a change of x_ij."""
         w = nearness(x_ij, per_apart)
         return w * (w * change - (real(4.0) * per_apart * wp.dot(x_ij, change)) * x_ij)
 
@@ -234,32 +214,19 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
             ((c_i + c_j) * s.volume) * hessian_product(x_ij, f_ij, s),
         )
 
-    return ProjectionSums(
-        Kernels(moments, moments_tangent, moments_back),
-        Kernels(force, force_tangent, force_back),
-        Kernels(velocity_gradient, velocity_gradient_tangent, velocity_gradient_back),
-        divergence_back,
-        Kernels(push, push_tangent, push_back),
+    return SimpleNamespace(
+        moments=Kernels(moments, moments_tangent, moments_back),
+        force=Kernels(force, force_tangent, force_back),
+        velocity_gradient=Kernels(velocity_gradient, velocity_gradient_tangent, velocity_gradient_back),
+        divergence_back=divergence_back,
+        push=Kernels(push, push_tangent, push_back),
     )
 
 
-@dataclass(frozen=True)
-class VelocityKernels:
-    """The kernels of u = v* - D^T y / m, the predicted velocity v* corrected by the pressure y."""
-
-    velocity: Kernels
-    """u and the kick u - v*; their adjoint starts from the f of all particles that `own_adjoint` writes."""
-    pull_tangent: wp.Kernel
-    """T = y L with its tangent; the tangent of the velocity reads both of neighbours."""
-    own_adjoint: wp.Kernel
-    """Runs before the adjoint of the velocity: turns the adjoints of u and of the kick into those of v* and f."""
-    time_adjoint: wp.Kernel
-    """Adds the term from v* = v + dt a to the adjoint of dt."""
-
-
 @cache
-def velocity_kernels(discretisation: Discretisation, dimension: int) -> VelocityKernels:
-    """Make the kernels of the velocity after applying pressures, in 2 or 3 dimensions."""
+def velocity_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
+    """Make the kernels of u and the kick u - v*. The kernel ``pull_tangent`` runs before the tangent, and
+    ``own_adjoint`` before the adjoint; ``time_adjoint`` adds the term from v* = v + dt a to the adjoint of dt."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     sums, mirrors, packed = projection_sums(discretisation), image_sums(discretisation), symmetric(precision)
@@ -272,13 +239,12 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     @particle_kernel(module, "kick u", [over(sums.force.forward, "total"), over(mirrors.lift.forward, "lifted")])
     @typed
     def velocity(total, lifted, m_i, y_i, T_i, g_i, gamma_i, v_star_i) -> tuple[vector, vector]:
-        """Return the kick -D^T y / m by the pressure y, and the velocity u = v* + kick; T is y L."""
+        """Return the kick -D^T y / m and u = v* + kick; T is y L."""
         change = -(total + lifted + times(T_i, g_i) + y_i * gamma_i) / m_i
         return change, v_star_i + change
 
     @particle_kernel(tangent_module, "T T_dot")
     def pull_tangent(y_i: real, y_dot_i: real, L_i: matrix, L_dot_i: matrix) -> tuple[six, six]:
-        """Return the pull T = y L of a pressure, and its tangent."""
         return y_i * pack(L_i), y_dot_i * pack(L_i) + y_i * pack(L_dot_i)
 
     both = [over(sums.force.tangent, "total"), over(mirrors.lift.tangent, "lifted")]
@@ -313,7 +279,6 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     def velocity_adjoint(
         diagonal, others, x_part, widened, x_lift, y_i, L_i, gamma_i, image_i, f_i
     ) -> tuple[real, real, matrix, vector, vector]:
-        """Add to the adjoints of y, L, gamma and x, given f of all particles; T is y L."""
         A = whole(diagonal, others)
         y_part = wp.ddot(L_i, A) + wp.dot(gamma_i, f_i) + image_i * widened
         return y_part, y_i * widened, y_i * A, y_i * f_i, x_part + x_lift
@@ -329,6 +294,5 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     def time_adjoint(acceleration_i: vector, v_bar_i: vector) -> real:
         return wp.dot(v_bar_i, acceleration_i)
 
-    return VelocityKernels(
-        Kernels(velocity, velocity_tangent, velocity_adjoint), pull_tangent, own_adjoint, time_adjoint
-    )
+    velocities = Kernels(velocity, velocity_tangent, velocity_adjoint)
+    return SimpleNamespace(velocity=velocities, **vars(by_name(pull_tangent, own_adjoint, time_adjoint)))

@@ -1,6 +1,5 @@
-"""The surroundings of particles, with their derivatives: the number density (`cortado.sph.density`), the moments of
-neighbours, sums over walls, and the quantities of `cortado.solvers.projection.effects`.
-"""
+"""Surroundings of particles: number density (`cortado.sph.density`), moments of neighbours, sums over walls, and the
+quantities of `cortado.solvers.projection.effects`, with derivatives."""
 
 from functools import cache, partial
 from typing import Any
@@ -12,13 +11,14 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.state import Layout
+from cortado.particles.wall_terms import solid_kernel
 from cortado.solvers.projection.effects import effect_functions, image_share, image_sums
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.sums import APART, projection_sums
 from cortado.solvers.projection.wall_sums import (
     FaceShares,
-    beside_solid_kernel,
     beside_sums,
+    beside_term,
     edge_functions,
     weights_type,
 )
@@ -28,7 +28,7 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 
 def entries(precision: Precision) -> dict[str, Any]:
-    """Return names and types of the entries of a particle's surroundings."""
+    """Return names and types of the surroundings."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
     own |= {"normal": vector, "whole": vector, "normal_drift": real, "whole_drift": real, "edge": real}
@@ -38,15 +38,14 @@ def entries(precision: Precision) -> dict[str, Any]:
 
 
 def bar_entries(precision: Precision) -> dict[str, Any]:
-    """Return names and types of the adjoints of surroundings to which several kernels add: all except Q, because only a
-    depends on Q."""
+    """Return names and types of the adjoints of surroundings, without Q, which only a depends on."""
     return {name: kind for name, kind in entries(precision).items() if name != "Q"}
 
 
 @cache
 def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of n, of the moments of neighbours, and of L, a and the weights computed from these. Between the
-    adjoint's two kernels the adjoints of M and Q are six numbers each, M_pull and Q_pull."""
+    """Make the kernels of all surroundings. Between the adjoint's two kernels the adjoints of M and Q are six numbers
+    each, M_pull and Q_pull."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
@@ -80,7 +79,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     @wp.kernel(module=module)
     @typed.arrays
     def surroundings(s, least: real, per_nearest: real, per_apart: real, x, v, m, n, of, surfaced: wp.array(dtype=int)):
-        """Write a particle's surroundings; ``surfaced`` is 0 for each scene before."""
+        """Write surroundings; set ``surfaced`` to 1 in scenes with a free surface."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g, crowd, apart, near = moments(i, x, m, per_nearest, per_apart, s)
         normal, entire, nu, normal_drift, whole_drift = beside(i, x, v, s)
@@ -127,7 +126,6 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def surroundings_tangent(
         s, least: real, per_nearest: real, per_apart: real, x, x_dot, v, v_dot, m, m_dot, of, n_dot, dot
     ):
-        """Write the tangent of surroundings, computed from the gradient of each entry."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g_i_dot, crowd_dot, apart_dot, near_dot = moments_tangent(
             i, x, x_dot, m, m_dot, per_nearest, per_apart, s
@@ -200,8 +198,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     @wp.kernel(module=adjoint_module, enable_backward=False)
     @typed.arrays
     def own_adjoint(least: real, m, n_bar, of, m_bar, bar, M_pull, Q_pull):
-        """Add to the adjoints of the moments, given the adjoints of L, a, the weights and all other quantities computed
-        from moments."""
+        """Add to the adjoints of the moments, given the adjoints of the quantities computed from moments."""
         i = wp.tid()
         M_bar, Q_bar, g_bar, gamma_bar, mirror_bar, nu_bar, behind_bar, m_i_bar = back(
             of.M[i],
@@ -259,7 +256,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 
 class Surroundings(Density):
-    """The measurement of the number density n and of all surroundings that the projection needs."""
+    """The measurement of the number density n and of all surroundings."""
 
     def __init__(
         self,
@@ -275,9 +272,8 @@ class Surroundings(Density):
         self.around = layout.arrays(**entries(layout.precision))
         per_nearest, per_apart = 1.0 / constants.nearest_weight, (APART * constants.spacing) ** -2
         self.constants = {"least": constants.least_diagonal, "per_nearest": per_nearest, "per_apart": per_apart}
-        """Constants by the names of kernel arguments."""
         self.surfaced = wp.zeros(layout.members, dtype=wp.int32, device=layout.device)
-        """By scene, whether it has a free surface: a particle without a share of the coarse pressure."""
+        """(members,) 1 if a scene has a free surface, a particle without a share of the coarse pressure."""
 
     def measure(self, context: StepContext) -> None:
         self.surfaced.zero_()
@@ -291,8 +287,6 @@ class Surroundings(Density):
 
 
 class SurroundingsTangent(DensityTangent):
-    """The tangent of the measured surroundings, for forward mode."""
-
     _density: Surroundings
 
     def __init__(self, surroundings: Surroundings):
@@ -305,8 +299,6 @@ class SurroundingsTangent(DensityTangent):
 
 
 class SurroundingsAdjoint(DensityAdjoint):
-    """The adjoint of the measured surroundings, for reverse mode."""
-
     _density: Surroundings
 
     def __init__(self, surroundings: Surroundings):
@@ -322,10 +314,9 @@ class SurroundingsAdjoint(DensityAdjoint):
             array.zero_()
 
     def measure(self, context: StepContext, bar: Adjoints) -> None:
-        """Turn the adjoints of n and of all surroundings into the adjoints of positions, masses and solids."""
         own, known = self._density, (*bar.named, self.around, self._density.around)
         for kernel in own.kernels.adjoint:
             context.launch(kernel, *known, self._moments, own.constants)
-        bar.solids.add(context.launch, partial(beside_solid_kernel, own.discretisation), *known)
+        bar.solids.add(context.launch, partial(solid_kernel, own.discretisation, "projection", beside_term), *known)
         images = {"density": self.around["images_bar"], "swept": self.around["sweep_bar"]}
         self._faces.add(context, bar, context.fields.named(), own.around, images)

@@ -27,19 +27,18 @@ work W that is linear in adjoints,
 because the lift is the transpose of the spread. B is the slope of the push by a coarse pressure. Warp differentiates W
 with respect to the poses of the solid before and after the step. Gradients with respect to particle positions are in
 other modules, except the part through the edge factor e.
-
-`types_by_name` returns the types of the projection's quantities by name, for these and all other sums.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property, partial
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from cortado.device.launching import Named, bundle
-from cortado.device.modules import Kernels
+from cortado.device.modules import Kernels, by_name
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.mirrors import FACES, reflections
 from cortado.particles.moving_walls import turn_functions
@@ -47,33 +46,22 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, 
 from cortado.particles.pair_sums import wall_sum
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout
-from cortado.particles.wall_terms import ALL_WALLS, WallTerm, share_kinds, solid_kernel
+from cortado.particles.wall_terms import ALL_WALLS, WallTerm, share_kinds
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.sph.density import WallSums, wall_slope_term
 from cortado.sph.moment_functions import moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 EDGED = (0.1, 0.4)
-"""The squared part of a wall's push that is not along normals: e is 0 below the first number and 1 above the second.
-This part is below 0.02 along flat walls and in corners of a box, 0.3 at 1.5 spacings from an edge, and 0.75 diagonally
-in front of it."""
+"""Squared part of a wall's push across normals, below which e is 0 and above which e is 1. It is below 0.02 along flat
+walls and in corners of a box, 0.3 at 1.5 spacings from an edge, and 0.75 diagonally in front of an edge."""
 DIRECTION = 0.01
-"""In parts of 0.05 a_0: gamma^2 below which the direction of a wall is unknown."""
-
-
-@dataclass(frozen=True)
-class EdgeFunctions:
-    """Warp functions of one particle for the edge factor e, with derivatives."""
-
-    edge: Any
-    """e of normal, whole and 0.05 a_0."""
-    back: Any
-    """Turns the adjoint of e into the adjoints of normal and whole."""
+"""gamma^2 below which the direction of a wall is unknown, in parts of 0.05 a_0."""
 
 
 @cache
-def edge_functions(precision: Precision, dimension: int, module: Any) -> EdgeFunctions:
-    """Make the functions of the edge factor e in 2 or 3 dimensions, in a Warp module."""
+def edge_functions(precision: Precision, dimension: int, module: Any) -> SimpleNamespace:
+    """Make Warp functions of e from normal, whole and 0.05 a_0, and of the adjoints of normal and whole."""
     real, vector, smoothstep = precision.real, precision.vector, moment_functions(precision, dimension).smoothstep
     e_0, e_1, direction = (wp.constant(real(value)) for value in (*EDGED, DIRECTION))
 
@@ -87,12 +75,12 @@ def edge_functions(precision: Precision, dimension: int, module: Any) -> EdgeFun
         by_normal, by_whole, _least = wp.grad(edge)(normal, whole, least)
         return bar * by_normal, bar * by_whole
 
-    return EdgeFunctions(edge, back)
+    return by_name(edge, back)
 
 
 @cache
 def normal_part(discretisation: Discretisation) -> Any:
-    """Make the Warp function that projects a vector on the normal of a wall at the ``foot`` of a wall particle."""
+    """Make the Warp function that projects a vector on the wall normal at the ``foot`` of a wall particle."""
     vector = discretisation.precision.vector
 
     @wp.func
@@ -104,7 +92,7 @@ def normal_part(discretisation: Discretisation) -> Any:
 
 @cache
 def beside_sums(discretisation: Discretisation) -> Kernels:
-    """Make the projection's sums over the wall particles beside a fluid particle: normal, whole, nu and the drifts."""
+    """Make the sums over walls beside a particle: normal, whole, nu and the drifts."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
@@ -119,8 +107,8 @@ def beside_sums(discretisation: Discretisation) -> Kernels:
     @wall_sum(discretisation, grows=beside)
     @typed
     def beside_tangent(x_ij, x_dot_ij, v_j, v_dot_j, foot, turn_dot, s) -> tuple[vector, vector, real, real, real]:
-        """Return the tangent of a wall particle's terms. A turning wall turns its push; the rest of its motion changes
-        the push as if the wall did not turn."""
+        """Return the tangent of a wall particle's terms: a turning wall turns its push, and ``rest`` is the remaining
+        motion."""
         rest = x_dot_ij - wp.cross(turn_dot, x_ij)
         whole, bent = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, rest, s)
         part = normal(whole, foot)
@@ -139,14 +127,7 @@ def beside_sums(discretisation: Discretisation) -> Kernels:
     return Kernels(beside, beside_tangent, beside_back)
 
 
-def beside_solid_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel that adds the adjoints of the sums over walls to those of solids
-    (`cortado.particles.wall_terms.SolidShares.add`)."""
-    return solid_kernel(discretisation, "projection", _work)
-
-
 def _normal_work(d: Discretisation) -> Any:
-    """Make the work function of the wall term normal / V of a solid."""
     real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
 
     def normal_work(x_ij: vector, push_bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)) -> real:
@@ -155,7 +136,8 @@ def _normal_work(d: Discretisation) -> Any:
     return normal_work
 
 
-def _work(d: Discretisation) -> Any:
+def beside_term(d: Discretisation) -> Any:
+    """Make the work function by which adjoints of the sums over walls act on solids."""
     real, vector, pair = d.precision.real, d.precision.vector, pair_functions(d)
     weight, gradient, normal = pair.weight, pair.gradient, normal_part(d)
 
@@ -174,8 +156,7 @@ def _work(d: Discretisation) -> Any:
         foot: vector,
         s: neighbourhood_type(d.precision),
     ) -> real:
-        """Return the work of these sums, also over walls that mirror; the adjoint of the drift of these is
-        -``sweep_bar``."""
+        """Return the work of these sums, also over mirroring walls, whose drift has the adjoint -``sweep_bar``."""
         whole, by_mirror = gradient(x_ij, s), mirrored * (mirror_bar_i - sweep_bar_i * v_j)
         part = wp.dot(normal(whole, foot), normal_bar_i + normal_drift_bar_i * v_j + by_mirror)
         part += wp.dot(whole, whole_bar_i + whole_drift_bar_i * v_j)
@@ -186,8 +167,8 @@ def _work(d: Discretisation) -> Any:
 
 @cache
 def push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of gamma_s / V from the sums over the walls of a solid and over all walls, all without V;
-    ``least`` is 0.05 a_0 / V^2."""
+    """Make the kernels of gamma_s / V from the sums over a solid's walls and over all walls, without V; ``least`` is
+    0.05 a_0 / V^2."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
 
@@ -205,7 +186,7 @@ def push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
 
 
 class ProjectionPush:
-    """The sums along which pressures of the projection push walls: a `cortado.sph.density.WallAction`."""
+    """Sums along which pressures push walls: a `cortado.sph.density.WallAction`."""
 
     def __init__(
         self,
@@ -215,7 +196,6 @@ class ProjectionPush:
         volume: float,
         dimension: int,
     ):
-        """Prepare the sums over walls, for a particle's ``volume`` at rest [m^d]."""
         self._kernels, self._layout = push_kernels(discretisation, dimension), layout
         normal_term = WallTerm(discretisation, "projection", _normal_work, "push_bar")
         terms = {"normal": normal_term, "whole": wall_slope_term(discretisation)}
@@ -235,15 +215,13 @@ class ProjectionPush:
         return found
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
-        """Add to the adjoints of positions and solids, given the adjoint of the total; the adjoint of v* is not
-        changed."""
+        """Add to the adjoints of positions and solids, given the adjoint of the total."""
         bars = self._arrays
         step.launch(self._kernels.adjoint, self._totals(step, solid), self._least, bars, push_bar=total_bar)
         for name, sums, over in self._each(solid):
             sums.adjoint(step, bar, over, bars[f"{name}_bar"], v_star_bar)
 
     def _each(self, solid: int) -> Iterator[tuple[str, WallSums, int]]:
-        """Yield the name of each sum, the sum, and the solid over whose walls it is taken."""
         for own, over in ((self._sums, solid), (self._all_sums, ALL_WALLS)):
             yield from ((name, sums, over) for name, sums in own.items())
 
@@ -261,13 +239,12 @@ class ProjectionPush:
 
 
 NUMBERS = ("image", "density", "weighted", "spread", "swept", "k", "q")
-"""Names of the adjoints h, b, c, d, e, k and q in W; B is the ``slope``."""
+"""The adjoints h, b, c, d, e, k and q in W; B is the ``slope``."""
 
 
 @cache
 def face_share_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel that adds adjoints of images to those of one solid, and adds to the adjoint of x through
-    ``swept``."""
+    """Make the kernel that turns adjoints of images into those of one solid, and through ``swept`` into that of x."""
     d = replace(discretisation, lanes=1, taped=True)
     precision = d.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
@@ -365,10 +342,9 @@ def face_share_kernel(discretisation: Discretisation) -> Any:
 
 
 class FaceShares:
-    """The particles' shares of the adjoints of solids by images in their faces."""
+    """The particles' contributions, through images, to the adjoints of solids."""
 
     def __init__(self, discretisation: Discretisation, layout: Layout, faces: int):
-        """Prepare the adjoint of images in so many ``faces``; without any, nothing is added."""
         self._kernel, self._faces = partial(face_share_kernel, discretisation), faces
         own = {"u": layout.precision.vector, "slope": layout.precision.matrix}
         self._nothing = layout.arrays(**own, **dict.fromkeys(NUMBERS, layout.precision.real)) if faces else {}
@@ -376,8 +352,8 @@ class FaceShares:
     def add(
         self, context: StepContext, bar: Adjoints, *groups: Named, over: int = ALL_WALLS, **arrays: wp.array
     ) -> None:
-        """Add the shares of all images, or of the images by one solid, ``over``, from adjoints given as ``arrays``;
-        missing ones are 0. ``groups`` contain h as ``image``."""
+        """Add the contributions of images in all walls, or in those of the solid ``over``. Missing ``arrays`` of
+        adjoints are 0; ``groups`` contain h as ``image``."""
         if self._faces:
             known = {**self._nothing, **{name: array for group in groups for name, array in group.items()}, **arrays}
             bar.solids.add(context.launch, self._kernel, *bar.named, known, over=over)
@@ -385,13 +361,12 @@ class FaceShares:
 
 @cache
 def weights_type(precision: Precision) -> Any:
-    """Return the Warp type of a particle's four weights (sigma, f, u, r)."""
     return wp.types.vector(length=4, dtype=precision.real)
 
 
 def types_by_name(precision: Precision, more: Mapping[Any, str] | None = None) -> TypesByName:
-    """Return the types of names in sums and kernels: vectors, matrices, symmetric matrices as six numbers, and numbers
-    for all other names. ``more`` are additional names, which take precedence."""
+    """Return the types of names in sums and kernels; other names are numbers. ``more`` has names that take
+    precedence."""
     common = {
         neighbourhood_type(precision): "s",
         precision.vector: "x v u g f h gamma beside mirror normal whole crowd apart arm kick thrust delta foot turn "
