@@ -87,8 +87,8 @@ class TriangleTree:
         return np.sort(self.order[pairs], axis=1)
 
     def beside(self, other: "TriangleTree", reach: float) -> Numbers:
-        """Return pairs (m, 2) of triangles of this and another tree whose boxes are at most ``reach`` [m] apart along
-        every axis."""
+        """Return pairs (m, 2) of triangles of two trees whose boxes are at most ``reach`` [m] apart along every
+        axis."""
         pairs = np.ones((1, 2), dtype=np.int64)
         leaves = np.array([len(self.starts) - 1, len(other.starts) - 1])
         while (pairs < leaves).any():
@@ -216,8 +216,7 @@ def _through(triangles: Points) -> Points:
 
 
 def _within_triangle(triangle: Points, points: Points) -> tuple[Which, Points]:
-    """Test (n,) which points (n, 2) are in a triangle (3, 3), projected along the last axis, and return its height (n,)
-    there."""
+    """Test (n,) which points (n, 2) are in a triangle (3, 3) seen along the last axis; also return its height (n,)."""
     a, b, c = triangle
     across = (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]
     if across == 0.0:
@@ -270,8 +269,7 @@ SEEN = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Mesh(Solid):
-    """The solid within a closed surface of triangles: all points with a winding number of at least 1. Parts are closed
-    and may overlap."""
+    """The solid within closed triangles: all points with a winding number of at least 1. Parts may overlap."""
 
     vertices: Points
     """(m, 3) [m]"""
@@ -306,8 +304,8 @@ class Mesh(Solid):
         return self._ends
 
     def distance(self, points: Points) -> Points:
-        """Return the `Solid.distance` to round-off, but inside overlapping parts the depth below the surface of one
-        part, which is too small."""
+        """Return the `Solid.distance`; inside overlapping parts, the depth below the surface of one part, which is too
+        small."""
         return self._looked_up(points, np.inf)[1]
 
     def distance_up_to(self, points: Points, reach: float) -> Points:

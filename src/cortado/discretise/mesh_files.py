@@ -1,5 +1,4 @@
-"""Solids from files of triangles (STL, OBJ, PLY and glTF, read by trimesh), with checks of their unit of length and
-thickness."""
+"""Solids from files of triangles, read by trimesh, with checks of their unit of length and thickness."""
 
 import os
 import re
@@ -67,8 +66,8 @@ def mesh_in_file(path: str) -> FoundMesh:
 
 
 def triangles_in_file(path: str) -> tuple[Points, Numbers]:
-    """Read the vertices (m, 3), in the file's unit of length, and the triangles (k, 3) of a surface that need not be
-    closed; raise `InputError`."""
+    """Read the vertices (m, 3), in the file's unit, and triangles (k, 3) of a possibly open surface; raise
+    `InputError`."""
     _checked_file(path)
     vertices, triangles, _ = read_triangles(path)
     if not np.isfinite(vertices).all():

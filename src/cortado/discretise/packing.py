@@ -44,8 +44,8 @@ class PointsAround:
         return self._looked(particles, np.zeros(len(particles), dtype=bool), most=1)["counts"] > 0
 
     def sums(self, particles: Points, blind: Which) -> Points:
-        """Return the sums (n,) of the points' weighted kernels [1 / m^d] at particles (n, d) [m]; ``blind`` (n,)
-        particles do not see air."""
+        """Return the sums (n,) of weighted kernels [1 / m^d] at particles (n, d) [m]; ``blind`` (n,) ones do not see
+        air."""
         return np.asarray(self._looked(particles, blind)["sums"])
 
     def lists(self, particles: Points, blind: Which) -> tuple[Int32s, Int32s, Int32s]:
@@ -117,8 +117,7 @@ class PointsAround:
 
 
 HIGHEST, AIM, LOWEST = 0.5 * SLACK, (-6e-3, -1e-3), -9e-3
-"""Bounds on the density of a packed particle, relative to the lattice's; with a higher density, pressure would drive
-particles apart."""
+"""Bounds on the relative excess of a packed particle's density; with more, pressure would drive particles apart."""
 ROUNDS = 6
 LISTED = 0.6
 """Distance beyond the support within which pairs are listed, for later rounds [spacings]."""
@@ -133,8 +132,8 @@ DAMPING, MOST_INNER_ROUNDS = 0.02, 20
 
 
 def density_errors(around: PointsAround, sums: Points, stays: Which) -> Points:
-    """Return the relative excess (n,) of densities over the lattice's, from sums of kernels (n,) [1 / m^d]; at least 0
-    for particles that stay."""
+    """Return the relative excess (n,) of densities from sums of kernels (n,) [1 / m^d]; 0 or more for ``stays``
+    (n,)."""
     errors = around.volume * sums - (1.0 - SLACK)
     return np.where(stays, np.maximum(errors, 0.0), errors)
 
@@ -240,8 +239,7 @@ ROUND_OFF = 1e-9
 """Relative tolerance of distances between lattice neighbours."""
 MANY = 20_000
 GRAINS = 2.0**13
-"""Moves are multiples of 1 / `GRAINS` spacings, so that round-off, which differs between machines, does not change
-positions."""
+"""Moves are multiples of 1 / `GRAINS` spacings, which hides round-off that differs between machines."""
 
 
 @dataclass(frozen=True)
@@ -270,8 +268,8 @@ class Packing:
         return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 
     def settled(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Pack particles as `packed` says. If some remain compressed, as in wedges, those at least as compressed as
-        their neighbours are removed."""
+        """Pack particles as `packed` says; of compressed ones, remove those at least as compressed as their
+        neighbours."""
         kept, found = np.arange(len(particles)), self._at_rest(particles, stays)
         for _ in range(MOST_OUT):
             crowded = self._crowded(found, stays[kept])
@@ -283,8 +281,8 @@ class Packing:
         return np.asarray(particles[kept] + grain * np.rint((found - particles[kept]) / grain)), kept
 
     def _crowded(self, particles: Points, stays: Which) -> Numbers:
-        """Return the indices (m,) of free particles, among n (n, d) [m], that are compressed, and at least as much as
-        every free neighbour."""
+        """Return the indices (m,) of free, compressed particles that are at least as compressed as all free
+        neighbours."""
         errors = np.round(self.errors(particles, np.ones(len(particles), dtype=bool)), DIGITS)
         over = np.flatnonzero((errors > COMPRESSED) & ~stays)
         points, reach = particles[over], BESIDE * self.lattice.support
@@ -303,8 +301,7 @@ class Packing:
         return found
 
     def _settled_near(self, wrong: Which, particles: Points, stays: Which) -> Points:
-        """Return particles (n, d) [m] after moves near the particles in ``wrong`` (n,); only their neighbourhood is
-        computed."""
+        """Return particles (n, d) [m] after moves in the neighbourhood of the particles in ``wrong`` (n,)."""
         support, near = self.lattice.support, self.lattice.support + self.lattice.spacing
         movable = self._near(particles, wrong, near) & ~stays
         region = self._near(particles, movable, support)

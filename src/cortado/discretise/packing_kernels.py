@@ -84,8 +84,8 @@ def separation(x_i: vector, x_j: vector, around: Around) -> vector:
 
 @cache
 def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
-    """Build the kernels of a packing for a smoothing kernel, and the structs ``around``, ``placed``, ``grid`` and
-    ``equations`` of their arguments."""
+    """Build the kernels of a packing, and the structs ``around``, ``placed``, ``grid`` and ``equations`` of their
+    arguments."""
     functions = smoothing_functions(smoothing, FLOAT64)
     weight, slope = functions.weight, functions.slope
     module = kernel_module(f"packing_{smoothing.name}")

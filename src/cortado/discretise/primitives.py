@@ -57,8 +57,7 @@ class Box(Solid):
 
 @dataclass(frozen=True)
 class Round(Solid):
-    """All points within a radius of a segment centred at the origin: a capsule, or a sphere (in 2-D a disc) if the
-    segment has no length."""
+    """All points within a radius of a segment centred at the origin: a capsule, a sphere or, in 2-D, a disc."""
 
     half: Points
     """(d,) vector from the middle of the segment to its end [m]."""
@@ -110,8 +109,7 @@ class Revolved(Solid):
     """A solid of revolution about an axis of space through the origin."""
 
     profile: Solid
-    """Cross-section through the axis, in 2-D, with straight edges: coordinates are across the axis, to both sides, and
-    along it."""
+    """Cross-section through the axis, in 2-D, with straight edges: coordinates across the axis and along it."""
     axis: int
 
     def extent(self) -> tuple[Points, Points]:
@@ -203,8 +201,8 @@ class Polygon(Solid):
         return enclosed_moments(edges, np.full(len(edges), -1.0 if clockwise else 1.0))
 
     def thinnest(self) -> float:
-        """Return the smallest thickness between nearly parallel sides without a common corner [m]; infinite without
-        facing sides."""
+        """Return the smallest thickness [m] between facing sides without a common corner; infinite without facing
+        sides."""
         starts, sides = self.corners, np.roll(self.corners, -1, axis=0) - self.corners
         lengths = np.linalg.norm(sides, axis=1)
         along = sides / lengths[:, None]
@@ -243,8 +241,8 @@ def _standing(direction: Points) -> Points:
 
 
 def block_around(solid: Solid, spacing: float) -> Block:
-    """Return the lattice ``lower + (i + 1/2) spacing`` [m] in the box around a solid, whose last cells may extend by
-    less than half a spacing beyond the box."""
+    """Return the lattice ``lower + (i + 1/2) spacing`` [m] in the box around a solid, or up to half a spacing
+    beyond."""
     lower, upper = solid.extent()
     return block_between(lower, upper + 0.5 * spacing, spacing)
 

@@ -64,7 +64,7 @@ class Region:
         return np.maximum(from_faces, self._from_axis(points) - self.radius)
 
     def sides(self) -> Iterator[Callable[[Points], Points]]:
-        """Yield, for each side at a finite position, a function from points to their distances from the side, positive
+        """Yield, for each side at a finite position, a function from points to distances from the side, positive
         inside."""
         for axis in np.flatnonzero(self.across == 0.0).tolist():
             for at, inwards in ((self.lower[axis], 1.0), (self.upper[axis], -1.0)):
@@ -105,8 +105,8 @@ class Region:
         return np.sqrt(squares)
 
     def escaped(self, before: Points, after: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which particles crossed a wall between ``before`` (n, d) [m], inside, and ``after`` (n, d) [m],
-        except over the rim of an open cup."""
+        """Test (n,) which particles crossed a wall, but no rim, between ``before`` (n, d) [m] and ``after`` (n, d)
+        [m]."""
         through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
         return np.asarray(through & self.is_below_rim(before) & self.is_below_rim(after))
 
@@ -168,8 +168,7 @@ class Domain:
         return images, np.all((images >= lower) & (images < upper), axis=1)
 
     def ends(self, lower: Points, upper: Points) -> tuple[Points, Points, Points]:
-        """Return the lower ends from which `within` counts images, finite along periods, and the corners of its region
-        (d,) [m]."""
+        """Return the lower ends from which `within` counts images, and the corners of its region, each (d,) [m]."""
         begin, lengths = np.array(self.lower), np.array(self.lengths)
         start = np.where(np.isfinite(lower), lower, begin)
         end = np.where(np.isfinite(upper), upper, begin + lengths)
@@ -204,8 +203,8 @@ WITHOUT_PERIODS = Domain((), ())
 
 
 def _independent(axes: Points, lengths: Points) -> Points:
-    """Return a maximal independent set of translations (m, k) between periodic images, projected by ``axes`` (d, k),
-    the longest first."""
+    """Return a maximal independent set of translations (m, k) between images, projected by ``axes`` (d, k), longest
+    first."""
     left, found = np.where(lengths[:, None] > 0.0, axes, 0.0), []
     for _ in lengths:
         sizes = np.linalg.norm(left, axis=1)

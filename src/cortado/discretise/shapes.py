@@ -26,8 +26,7 @@ NEARBY = 4
 EXCESS = 0.003
 """Largest relative difference between the volumes of a stretched lattice's cells and of the shape."""
 MOST_STRETCHED = 0.03
-"""Largest logarithm of the stretching along an axis, for which the density differs by at most 1 %, also beside
-walls."""
+"""Largest logarithm of the stretching along an axis, for a density right within 1 %, also beside walls."""
 
 
 class Rows:
@@ -44,8 +43,8 @@ class Rows:
 
 
 def bisected(holds: Callable[[Points], Which], low: Points, high: Points, halvings: int) -> tuple[Points, Points]:
-    """Return, by bisection, bounds (n,) of where a condition on numbers (n,) stops being true; it is true at ``low``
-    (n,) and false at ``high`` (n,)."""
+    """Return bounds (n,) of where a condition on numbers (n,), true at ``low`` (n,) and false at ``high`` (n,), stops
+    being true."""
     for _ in range(halvings):
         middle = 0.5 * (low + high)
         good = holds(middle)
@@ -129,8 +128,8 @@ def disc(radius: float, spacing: float, dimension: int) -> Points:
 
 
 def across(direction: ArrayLike) -> Points:
-    """Return unit vectors (d - 1, d), perpendicular to a unit vector (d,) and to one another, as near as possible to
-    axes of space."""
+    """Return unit vectors (d - 1, d) perpendicular to a unit vector (d,) and to one another, nearly along axes of
+    space."""
     frame = [np.asarray(direction, dtype=np.float64)]
     for axis in np.argsort(np.abs(frame[0]), kind="stable")[:-1]:
         vector = np.eye(len(frame[0]))[axis]
@@ -292,8 +291,7 @@ def _compression(densities: NDArray[Any]) -> float:
 def _check_meeting(
     bodies: NDArray[np.str_], positions: Points, point: Numbers, other: Numbers, seen: NDArray[Any]
 ) -> None:
-    """Raise `InputError` if particles are crowded only by particles of other bodies; ``seen`` (k,) is the density that
-    a pair contributes."""
+    """Raise `InputError` if only particles of other bodies crowd particles; ``seen`` (k,) is a pair's density."""
     foreign = bodies[point] != bodies[other]
     together = np.bincount(point, seen)
     added = np.bincount(point, seen * foreign)

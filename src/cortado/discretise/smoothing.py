@@ -100,7 +100,7 @@ def _waves(spacing: float, dimension: int, count: int = 25) -> np.ndarray:
 
 
 def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return V_0 = (1 - SLACK) / sum_j W_ij [m^d]. With the mass rho_0 V_0 the lattice's density is (1 - SLACK)
+    """Return V_0 = (1 - SLACK) / sum_j W_ij [m^d]: with the mass rho_0 V_0 the lattice has the density (1 - SLACK)
     rho_0."""
     distances = np.linalg.norm(lattice_offsets(spacing, support, dimension), axis=1)
     return float((1.0 - SLACK) / kernel.weight(distances, dimension, support).sum())

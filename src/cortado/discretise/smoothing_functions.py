@@ -17,8 +17,7 @@ from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C2, WENDLAND_C4, SmoothingKernel
 
 Radial = tuple[Any, Any, Any]
-"""Warp functions w(q), f(q, 1 / q) with f = w' / q for the gradient, and f' / q of the same arguments for the
-Hessian."""
+"""Warp functions w(q), f(q, 1 / q) = w' / q for the gradient, and f' / q of the same arguments for the Hessian."""
 
 
 def _cubic_spline(precision: Precision) -> Radial:

@@ -1,5 +1,4 @@
-"""Solids with signed distances, faces, volume and moments, in float64. Points are (n, d) [m]; distances (n,) [m] are
-negative inside."""
+"""Solids with faces and moments, in float64. Points are (n, d) [m]; distances (n,) [m] are negative inside."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -38,8 +37,8 @@ def box_faces(half: Points) -> Faces:
 
 
 def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -> Faces:
-    """Return the faces of the part of a box, between corners (d,) [m], below a plane with a unit normal (d,) and a
-    height along the normal [m]."""
+    """Return the faces of the part of a box, between corners (d,) [m], below a plane at ``height`` [m] along its normal
+    (d,)."""
     from scipy.spatial import ConvexHull
 
     ends = corners_of(lower, upper)
@@ -202,8 +201,7 @@ class Solid(ABC):
         return self.faces(fine)
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
-        """Return distances up to ``reach`` [m]; beyond only signs and lower bounds are exact. Solids with many faces
-        compute these distances faster."""
+        """Return distances up to ``reach`` [m], beyond which only signs and lower bounds are exact."""
         return self.distance(points)
 
     def own_feet(self, fine: float) -> tuple[Points, Points] | None:

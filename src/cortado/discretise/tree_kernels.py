@@ -70,8 +70,7 @@ def nearest_of_triangle(p: vector, a: vector, b: vector, c: vector) -> vector:
 @wp.kernel(module=_module, enable_backward=False)
 @typed.arrays
 def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach: real, nearest, squares):
-    """Find the nearest point of the triangles and its squared distance; without a triangle within ``reach``, the point
-    and ``reach`` squared."""
+    """Find the nearest point of the triangles, and its squared distance, up to ``reach``; else the point itself."""
     i = first + wp.tid()
     p = points[i]
     best = reach * reach

@@ -179,8 +179,8 @@ class RestLattice:
         return self.kernel.weight(np.linalg.norm(separations, axis=1), self.dimension, self.support)
 
     def sums(self, separations: Points) -> Points:
-        """Return W, and the gradient of W times the spacing, (m, 1 + d), at separations (m, d) [m], relative to the sum
-        of W on the lattice [-]."""
+        """Return W, and the gradient of W times the spacing, (m, 1 + d) [-], relative to the sum of W on the
+        lattice."""
         gradients = self.kernel.gradient(separations, self.support)
         both = np.column_stack([self.weights(separations), self.spacing * gradients])
         return np.asarray(both / self.weights(self.offsets).sum())
@@ -244,8 +244,7 @@ def wall_layers(lattice: RestLattice) -> WallLayers:
 
 
 STIFFNESS = 3e-3
-"""Penalty on the relative change of a weight, compared with an error of the density. A weight that densities do not
-determine remains a flat wall's."""
+"""Penalty on relative changes of weights, compared with errors of the density, towards a flat wall's weights."""
 UNEVEN_STIFFNESS = 0.06
 """Penalty as `STIFFNESS` for particles off a lattice; with 0.003 some would have no weight, and fluid would leak."""
 LEAST, ROUNDS = 0.6, 4

@@ -1,5 +1,4 @@
-"""Materials, lights, cameras, and the tables [picture] and [render]. Simulations do not depend on them. Colours are
-linear, from 0 to 1."""
+"""Materials, lights, cameras, and the tables [picture] and [render]. Colours are linear, from 0 to 1."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -37,8 +37,7 @@ from cortado.scene.tables import MISSING, FieldPath, check_name, field_error, fi
 DEEPEST = 0.25
 """Largest initial overlap of free bodies with walls and each other [spacings]."""
 FINE, MOST = 0.5, 40
-"""Distance between the points at which overlaps are tested [spacings], and the maximum number of points along an
-axis."""
+"""Distance between the points at which overlaps are tested [spacings], and most points along an axis."""
 
 
 def check_free_bodies(scene: SceneTables) -> None:
@@ -141,8 +140,8 @@ def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, s
 
 
 def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float) -> Points | None:
-    """Return a point (d,) where a particle of a body overlaps the other body, shifted by ``shift`` (d,) [m]; None
-    without overlap."""
+    """Return a point (d,) of overlap between a body and another one shifted by ``shift`` (d,) [m]; None without
+    overlap."""
     from scipy.spatial import cKDTree
 
     one = _near(first.particles(spacing), np.array(second.extent(spacing)) + shift, spacing)
@@ -330,8 +329,7 @@ def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
 
 
 def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
-    """Check that a body is inside the container, first with its bounding box, as creating the particles of a long body
-    would take too long."""
+    """Check that a body is inside the container, first with its bounding box, as its particles may be too many."""
     spacing = scene.discretisation.spacing
     if scene.container.contains(corners(*fluid.extent(spacing)), 1e-6 * spacing).all():
         return

@@ -1,5 +1,4 @@
-"""Quantities over time, steady or interpolated between values of a scene or a CSV file, and checks of a solid's motion
-keys."""
+"""Quantities over time, from constants, lists or CSV files, and checks of a solid's motion keys."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -58,8 +57,7 @@ class Knots:
         return found if not self.ramp else self.begun + self._weights(times)[0] * (found - self.begun)
 
     def rates(self, times: NDArray) -> NDArray:
-        """Return time derivatives, (n,) or (n, components), at times (n,) [s]; at a knot, the derivative just after
-        it."""
+        """Return time derivatives, (n,) or (n, components), at times (n,) [s], just after a knot."""
         found = self._slopes(times)
         if not self.ramp:
             return found
@@ -110,8 +108,8 @@ class Knots:
 
 
 def fastest(moved: Iterable[tuple[float, Knots]], times: NDArray) -> NDArray[np.float64]:
-    """Return the greatest speed between each of the times (k,) [s] and the next, 0 for the last, as a sum of factors
-    times norms of rates."""
+    """Return the greatest sum of rates times factors between each of the times (k,) [s] and the next; 0 for the
+    last."""
     inner = _within(times).ravel()
     sizes = [factor * np.linalg.norm(one.rates(inner).reshape(len(inner), -1), axis=1) for factor, one in moved]
     most = sum(sizes, np.zeros(len(inner))).reshape(-1, len(WITHIN)).max(axis=1)
@@ -338,8 +336,7 @@ def _check_times(path: FieldPath, times: Sequence[float] | None) -> None:
 
 
 def check_over_time(path: FieldPath, table: Any, values: str, constant: str) -> None:
-    """Check that a table has increasing ``times`` from 0 on and equally many ``values`` but no ``constant``, both given
-    as names of keys."""
+    """Check a table's increasing ``times`` from 0 on, with as many ``values`` and no ``constant``, given by keys."""
     times: Sequence[float] = table.times or ()
     given = getattr(table, values)
     _check_times(path, table.times)

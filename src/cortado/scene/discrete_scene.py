@@ -1,5 +1,4 @@
-"""Discretisation of a scene: initial particles, walls, and constants of the lattice, with NumPy in float64 for all
-devices and precisions."""
+"""Discretisation of a scene: initial particles, walls, and constants of the lattice, with NumPy in float64."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -48,8 +47,7 @@ if TYPE_CHECKING:
 WHOLE = 1e-6
 """Largest relative length by which a solid that fills a period may be shorter than the period."""
 OFF_SHEETS = 0.25
-"""Smallest initial distance between a sheet and fluid [spacings], below which particles on both sides repel each
-other."""
+"""Smallest initial distance of fluid from a sheet [spacings], below which particles on both sides repel each other."""
 NEAREST_PLACE = 0.4
 """Smallest distance from surfaces of the points where weights of walls are fitted [spacings]."""
 
@@ -204,8 +202,8 @@ def _weighed(
 
 
 def mirrors_of(scene: Scene) -> tuple[Points, Points]:
-    """Return the coordinates of flat walls that mirror the fluid, (3,) at the lower and at the upper ends [m]; infinite
-    for ends without images."""
+    """Return the coordinates of flat walls that mirror the fluid, (3,) at the lower and at the upper ends [m]; else
+    infinite."""
     nowhere = np.full(3, np.inf)
     if not isinstance(scene.solver, ProjectionSolver):
         return -nowhere, nowhere
@@ -305,7 +303,7 @@ def _velocities(scene: Scene, fluid: FluidSample) -> Points:
 
 
 def _off_sheets(scene: Scene, fluid: FluidSample) -> Points:
-    """Return initial positions (n, d) [m], with lattice particles that a sheet cuts moved `OFF_SHEETS` away from the
+    """Return initial positions (n, d) [m], with lattice particles that a sheet cuts `OFF_SHEETS` away from the
     sheet."""
     found, least = fluid.positions.copy(), OFF_SHEETS * scene.discretisation.spacing
     for table in scene.solid:

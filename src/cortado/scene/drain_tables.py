@@ -15,8 +15,7 @@ from cortado.scene.shape_tables import File, check_order
 from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity, usable_file
 
 PRESCRIBED, BLENDED = 3.0, 3.0
-"""Thickness of the shell around a sink in which the sink prescribes the flow, and of the transition outside the shell
-[spacings]."""
+"""Thickness of the shell around a sink with prescribed flow, and of the transition outside the shell [spacings]."""
 
 
 class BoxDrain(Table):
@@ -53,8 +52,7 @@ class BoxDrain(Table):
 
 
 class PlaneDrain(Table):
-    """A plane that takes every particle which crosses it along `direction`; an upward direction limits the fluid
-    level."""
+    """A plane that takes every particle which crosses it along `direction`; if upward, it limits the fluid level."""
 
     shape: Literal["plane"]
     """Kind of the drain."""
@@ -275,8 +273,8 @@ PARTS = 16
 
 
 def open_sphere(room: Room, place: Points, radius: float) -> float:
-    """Return the open solid angle [sr], in 2-D angle [rad], at a place (d,) [m]: of the directions along which no wall
-    is closer than a radius [m]."""
+    """Return the open solid angle [sr], in 2-D angle [rad], without walls closer than ``radius`` [m] to a place (d,)
+    [m]."""
     k = np.arange(DIRECTIONS) + 0.5
     if len(place) == 2:
         turn = 2.0 * np.pi * k / DIRECTIONS

@@ -1,5 +1,4 @@
-"""Emitters, columns of particles that wait upstream of an opening and leave at one speed: their tables and
-parameters."""
+"""Emitters, columns of particles that leave at one speed: their tables and parameters."""
 
 import math
 from dataclasses import dataclass, replace
@@ -151,8 +150,8 @@ class EmitterTable(FluidBody, FlowTable):
         return math.inf if self.fed_by else self.time_for(self.supply(spacing) * spacing * self.area(spacing))
 
     def lasting(self, time: float, spacing: float) -> Self:
-        """Return the table with a volume that lasts until a time [s] and leaves a complete column; unchanged if a
-        volume is given or the column lasts."""
+        """Return the table with a volume that lasts until a time [s]; unchanged with a volume or a long enough
+        column."""
         if self.volume is not None or self.dry_after(spacing) >= time:
             return self
         column = self.layers(spacing) * spacing * self.area(spacing)
@@ -258,8 +257,7 @@ def check_columns(scene: Any) -> None:
 
 
 def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:
-    """Return for each emitter its name, the index of its first particle among ``count`` particles, and its
-    particles."""
+    """Return for each emitter its name, the index of its first of ``count`` particles, and its particles."""
     made = [emitter.sample(scene.discretisation.spacing) for emitter in scene.emitter]
     ends = count - np.cumsum([0, *(len(sample.upstream) for sample in made[::-1])])[::-1]
     names = [emitter.name for emitter in scene.emitter]

@@ -30,8 +30,8 @@ DIGITS = 6
 
 
 def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGuard[RegionFluid]:
-    """Test whether a body's particles may be off the lattice: its surface cuts cells, or a solid is closer than
-    ``reach`` [m]."""
+    """Test whether a body's particles may be off the lattice: its surface cuts cells, or a solid is within ``reach``
+    [m]."""
     if not isinstance(fluid, RegionFluid) or fluid.cuts_cells(spacing):
         return isinstance(fluid, RegionFluid)
     return bool(len(room.solids) and (room.from_solids(fluid.particles(spacing), reach) < reach).any())
@@ -45,7 +45,7 @@ class CutBody:
     """[m]"""
 
     def distance(self, points: Points, reach: float) -> Points:
-        """Return the distances (n,) [m] of points (n, d) [m] from the body, negative inside; ``reach`` is as in
+        """Return the distances (n,) [m] of points (n, d) [m] from the body, negative inside, as in
         `Room.from_solids`."""
         return np.maximum(self.fluid.distance(points, self.spacing, reach), self.room.distance(points, reach))
 
@@ -54,8 +54,8 @@ class CutBody:
         return np.clip(0.5 - self.distance(points, 0.5 * self.spacing) / self.spacing, 0.0, 1.0)
 
     def volume(self, depth: float = 0.0, beside_cuts: bool = False) -> float:
-        """Return the volume [m^d] of the part deeper than ``depth`` [m] below the surface, in all cells or only beside
-        cut cells."""
+        """Return the volume [m^d] deeper than ``depth`` [m] below the surface, in all cells or only beside cut
+        cells."""
         dimension, fine = self.room.dimension, self.spacing / FINER
         cells, reach = self.fluid.block(self.spacing).grown(1).points(), depth + self.spacing
         cells = cells[self._beside_cuts(cells)] if beside_cuts else cells
@@ -130,8 +130,7 @@ class Surroundings:
         return points[shares > 0.0], shares[shares > 0.0]
 
     def _air_around(self, body: CutBody, reach: float) -> tuple[Points, Points]:
-        """Return the air of one body as in `air`: points nearer to this body than to others, within half a period of
-        it."""
+        """Return the air of one body: points nearer to this body than to others, within half a period of it."""
         points = body.fluid.lattice(body.spacing, reach + body.spacing)
         middle = 0.5 * np.sum(body.fluid.extent(body.spacing), axis=0)
         within = ((self.lengths == 0.0) | (np.abs(points - middle) < 0.5 * self.lengths)).all(axis=1)
@@ -177,8 +176,7 @@ class FluidSample:
     """(n, d) positions of particles in reserve or taken by drains [m]."""
 
     def jittered(self, most: float) -> Points:
-        """Return positions (n, d) [m] with random offsets of up to ``most`` [m] for particles whose position is not
-        prescribed."""
+        """Return positions (n, d) [m] with random offsets of up to ``most`` [m], except for prescribed positions."""
         moves = np.random.default_rng(0).uniform(-most, most, self.positions.shape)
         return np.where(self.is_placed[:, None], self.positions, self.positions + moves)
 
@@ -296,8 +294,7 @@ class FluidMasses:
 
     @property
     def off(self) -> dict[str, str]:
-        """Return, by phase, words about each mass that differs from the prescribed mass by more than `EXCESS`,
-        relative."""
+        """Return, by phase, words about each mass that differs from the prescribed mass by more than `EXCESS`."""
         return {
             name: f"{given:.4g} kg of {name}, where {self.asked[name]:.4g} kg were asked for"
             for name, given in self.given.items()

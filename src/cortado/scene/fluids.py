@@ -71,7 +71,7 @@ class Fluid(FluidBody):
         return super().in_dimension(dimension, path)
 
     def velocities(self, points: Points) -> Points:
-        """Return initial velocities (n, d) [m/s] for the particles' positions (n, d) [m], with spin about their
+        """Return initial velocities (n, d) [m/s] for all particles' positions (n, d) [m], with spin about their
         mean."""
         found = np.tile(np.array(self.velocity, dtype=np.float64), (len(points), 1))
         if self.angular_velocity is None:
@@ -129,8 +129,8 @@ class RegionFluid(Fluid):
         return False
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Return lattice points (n, d) [m] in the box around the shape, extended by ``reach`` [m], with the volume of a
-        particle for each."""
+        """Return lattice points (n, d) [m] in the box around the shape, extended by ``reach`` [m]; cells fit between
+        flat faces."""
         return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
 
 

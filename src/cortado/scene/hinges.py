@@ -116,8 +116,7 @@ class Hold:
 
     @classmethod
     def of(cls, table: SolidTable, dimension: int, hinges: Sequence[HingeTable] = ()) -> Self:
-        """Return the degrees of freedom of a free body, from its hinge fixed in space or else from its key
-        `freedom`."""
+        """Return the degrees of freedom of a free body, from its hinge to space or else from its key `freedom`."""
         for hinge in hinges:
             if hinge.solid == table.name and hinge.to is None:
                 arm = in_frame(table, hinge.position)
@@ -144,7 +143,7 @@ def inertia_about(hold: Hold, mass: Mass) -> np.ndarray:
 
 
 def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dimension: int) -> None:
-    """Check each hinge: free body, at most one hinge to space per body, initial motion about the axis, no closed
+    """Check that hinges hold free bodies, at most one to space each, fit the initial motion, and form no closed
     chains."""
     joined = {solid.name: {solid.name} for solid in solids}
     for index, hinge in enumerate(hinges):
@@ -168,8 +167,7 @@ def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dim
 
 
 def _check_joint(hinge: HingeTable, solids: Sequence[SolidTable], joined: dict[str, set[str]], path: FieldPath) -> None:
-    """Check a hinge between two solids and merge their two groups in ``joined``, the sets of connected solids by
-    name."""
+    """Check a hinge between two solids and merge their groups in ``joined``, sets of connected solids by name."""
     assert hinge.to is not None
     ends = [hinge.solid, hinge.to]
     others = [solid.name for solid in solids if solid.moves and solid.name != hinge.solid]
@@ -219,8 +217,7 @@ def hinge_parameters(hinge: HingeTable, dimension: int) -> list[Parameter]:
 def number_of(
     name: str, of: str, end: str, unit: str, what: str, value: float, values: Range, change: float
 ) -> Parameter:
-    """Create a scalar parameter of a spring or a hinge; its typical change is ``change`` if the value is 0 or may be
-    negative."""
+    """Create a scalar parameter, whose typical change is ``change`` if the value is 0 or may be negative."""
     own = np.asarray(value, dtype=np.float64)
 
     def changed(source: Source, at: NDArray[Any]) -> NDArray[np.float64]:

@@ -61,8 +61,7 @@ class Thinning(RheologyTable):
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
     """n [-]: with n < 1 the fluid is shear-thinning, with n > 1 shear-thickening."""
     least_shear_rate: Annotated[float, quantity("1/s", gt=0.0)] = 0.01
-    """Regularisation of the power law at rest [1/s]: the law uses sqrt(shear_rate² + least_shear_rate²) as shear
-    rate."""
+    """Regularisation at rest [1/s]: the law uses sqrt(shear_rate² + least_shear_rate²) as shear rate."""
 
     def thickest(self, viscosity: float) -> float:
         return viscosity * max(self.least_shear_rate ** (self.flow_index - 1.0), 1.0)

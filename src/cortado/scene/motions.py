@@ -1,5 +1,4 @@
-"""Changes while a scene runs: parameters over time, moving solids, and the names of solids' state fields and
-parameters."""
+"""Parameters over time, moving solids, and the names of solids' state fields and parameters."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -141,8 +140,7 @@ def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
 
 
 def wall_numbers(solids: Sequence[SolidTable]) -> dict[str, int]:
-    """Return the number of each solid in wall particles, by name: 0, 1, ... if it moves, -2, -3, ... if at rest; the
-    container has -1."""
+    """Return the number of each solid in wall particles: 0, 1, ... if it moves, -2, -3, ... at rest (-1: container)."""
     resting = [solid for solid in solids if not solid.moves]
     numbers = {solid.name: number for number, solid in enumerate(moving(solids))}
     return numbers | {solid.name: -2 - number for number, solid in enumerate(resting)}
@@ -178,8 +176,7 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
 
 
 def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
-    """Return a bound of the distance from a solid's middle to its furthest point [m]; parameters in ``values`` replace
-    the scene's."""
+    """Return a bound of the distance [m] from a solid's middle to its furthest point, for parameters ``values``."""
     furthest = np.abs(solid.own_solid().extent()).max(axis=0)
     return float(np.linalg.norm(furthest) * values.get(scale_name(solid.name), 1.0))
 
@@ -207,14 +204,12 @@ restitution_name = ending("restitution")
 
 
 def weight_name(solid: SolidTable) -> str:
-    """Return the name of the parameter for a free body's density [kg/m3] or mass [kg], depending on the key of its
-    table."""
+    """Return the name of the parameter for a free body's density [kg/m3] or mass [kg], whichever its table gives."""
     return (density_name if solid.mass is None else mass_name)(solid.name)
 
 
 def mass_of_one(solid: SolidTable) -> Mass:
-    """Return the mass and the inertia of a free body for a density of 1 or a mass of 1, depending on the key of its
-    table."""
+    """Return a free body's mass and inertia for a density of 1 or a mass of 1, whichever its table gives."""
     even = Mass.of(solid.shape_about()[0])
     size = even.volume if solid.mass is None else 1.0
     if solid.inertia is not None:
@@ -354,8 +349,7 @@ class Pose:
         return self.turning_bars(np.linalg.solve(_jacobian(_in_space(self.angles)).T, _in_space(bar)))
 
     def turning_bars(self, t: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Convert the derivative ``t`` (3,) with respect to a further rotation of R into derivatives with respect to
-        fields, by name."""
+        """Convert the derivative ``t`` (3,) with respect to a further rotation of R into those of fields, by name."""
         name, dimension = self.name, len(self.position)
         bars = {rotation_name(name): _angles(_jacobian(self.begun).T @ self.turned.T @ t, dimension)}
         if not self.is_free:

@@ -201,8 +201,7 @@ def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
 
 
 def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved: Collection[str]) -> dict[str, Any]:
-    """Check the keys of a table by the annotations of a factory's arguments, and return the arguments. Raise a
-    `SceneError` about the first wrong key."""
+    """Return the arguments of a factory, checked by annotations; raise a `SceneError` about the first wrong key."""
     arguments = _arguments(factory)
     if arguments is None:
         return dict(keys)
@@ -236,8 +235,7 @@ def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
 
 
 def _adapter(argument: Argument) -> tuple[TypeAdapter | None, str]:
-    """Return the check of a value, None without a check, and a description of valid values. Only plain types and types
-    of scene fields are checked."""
+    """Return the check of a plain type or scene field type, else None, and a description of valid values."""
     annotation: Any = TYPES.get(argument.annotation) if isinstance(argument.annotation, type) else argument.annotation
     if annotation is None or get_origin(annotation) is not Annotated:
         return None, "given"
@@ -259,8 +257,7 @@ def _checked(name: str, value: Any, argument: Argument | None) -> Any:
 
 
 def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any], method: str) -> Any:
-    """Build a part by a factory from the keys of a table, and check that the part has the named method; raise a
-    `SceneError`."""
+    """Build a part from the keys of a table, and check that it has the named method; raise a `SceneError`."""
     called = f'of the kind "{entry.name}"'
     with _told("", entry, f"{called} cannot be made:"):
         found = factory(**keys)
@@ -272,8 +269,7 @@ def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any]
 
 
 class PackageTable(Table):
-    """A table whose kind an installed package registers. All keys except `kind` are arguments of the registered
-    factory."""
+    """A table whose kind an installed package registers. Other keys than `kind` are arguments of its factory."""
 
     model_config = ConfigDict(extra="allow")
     group: ClassVar[str]

@@ -3,7 +3,7 @@
 n is the number of fluid particles, in the order of the scene; d is the scene's dimension.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ from cortado.scene.parameters import BY_NAME, Axis, Parameter, Range, Role, Sour
 
 
 def reference_density(fractions: np.ndarray, rest_density: np.ndarray) -> np.ndarray:
-    """Return the mixtures' rest densities m (n,) [kg/m3] from mass fractions (n, phases) and rest densities (phases,)
+    """Return the mixtures' rest densities m (n,) from mass fractions (n, phases) and rest densities (phases,)
     [kg/m3]."""
     return 1.0 / (fractions / rest_density).sum(axis=1)
 
@@ -105,7 +105,7 @@ class Tilt:
         return sine, np.where(size < SMALL, -1.0 / 3.0 + size**2 / 30.0 - size**4 / 840.0, derivative)
 
 
-class Known(Mapping[str, Parameter]):
+class Known(dict[str, Parameter]):
     """Parameters by name: the registry's, and those of forces and a solver. Two tables are equal only if identical."""
 
     __eq__, __hash__ = object.__eq__, object.__hash__
@@ -113,7 +113,7 @@ class Known(Mapping[str, Parameter]):
     def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
         """Add the parameters ``own`` of forces and a solver, each with its owner in words; `TIME` may occur several
         times. Raises `InputError` if two parameters share a name, or a name of kernel arguments."""
-        self._by_name = dict(BY_NAME)
+        super().__init__(BY_NAME)
         arguments = {argument(name): name for name in BY_NAME}
         for parameter, whose in dict(own).items():
             name = parameter.name
@@ -123,8 +123,8 @@ class Known(Mapping[str, Parameter]):
                     f"have its own: give {whose.replace('a ', 'the ')} another name."
                 )
             arguments[argument(name)] = name
-            self._by_name[name] = parameter
-        self.own = tuple(p for p in self._by_name.values() if p.name not in BY_NAME)
+            self[name] = parameter
+        self.own = tuple(p for p in self.values() if p.name not in BY_NAME)
         self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
         """Names of the parameters on which steps depend."""
         self.state = tuple(name for name, p in self.items() if p.role is Role.STATE)
@@ -140,15 +140,6 @@ class Known(Mapping[str, Parameter]):
         """Test whether a value has an axis of time: one row for each step or knot."""
         parameter = self[name]
         return parameter.axis is Axis.STEP and np.ndim(value) == parameter.rank + 1
-
-    def __getitem__(self, name: str) -> Parameter:
-        return self._by_name[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._by_name)
-
-    def __len__(self) -> int:
-        return len(self._by_name)
 
 
 class _Passing:
@@ -192,8 +183,7 @@ SUM_TOLERANCE = 0.01
 
 
 def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
-    """Return the scene's value of each ``known`` parameter that it has, in the shape that users write, without
-    alternative parameters such as a tilt."""
+    """Return the scene's values of ``known`` parameters, as users write them, without alternatives such as a tilt."""
     phases, positions = len(source.scene.phase), source.positions.shape
     found = {}
     for name, parameter in known.items():

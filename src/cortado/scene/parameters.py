@@ -1,5 +1,4 @@
-"""Registry of parameters: name, unit, shape, range, value in a scene, and typical change of each; also the quantities
-of particles."""
+"""Registry of parameters, with units, shapes, ranges and values in a scene, and of the quantities of particles."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -360,8 +359,7 @@ def is_load(name: object) -> bool:
 
 
 def check_readable(name: object, what: str, fields: tuple[str, ...]) -> str:
-    """Return the name of a quantity, of one of the ``fields`` of a state, or of a load on a solid; raise `InputError`
-    for any other."""
+    """Return the name of a quantity, of one of the ``fields``, or of a load on a solid; else raise `InputError`."""
     return str(name) if is_load(name) else check_quantity(name, what, fields)
 
 

@@ -24,8 +24,8 @@ class Clock:
     """Length of the previous step, which bounds the next one, if steps are adaptive [s]; otherwise 0."""
 
     def times(self, steps: NDArray, time_step: float) -> NDArray:
-        """Return times (frames,) [s] after ``steps`` (frames,) more steps of ``time_step`` [s], bit for bit as in an
-        uninterrupted run with equal steps."""
+        """Return times (frames,) [s] after more ``steps`` (frames,) of ``time_step`` [s], bit for bit as without a
+        break."""
         return (self.time - self.steps * time_step) + (self.steps + steps) * time_step
 
     def after(self, steps: int, time_step: float) -> "Clock":

@@ -154,8 +154,8 @@ def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
 
 
 def _millimetres(scene: SceneTables) -> str | None:
-    """Return a warning that lengths may be in millimetres, as the fluid is very heavy; None if the mass is plausible,
-    or if gravity is not the Earth's in metres."""
+    """Return a warning about lengths in millimetres if the fluid is very heavy and gravity the Earth's in metres; else
+    None."""
     densities, spacing = {phase.name: phase.rest_density for phase in scene.phase}, scene.discretisation.spacing
     cells = sum(fluid.count(spacing) * densities[fluid.phase] for fluid in scene.fluid)
     mass, strength = cells * spacing**scene.dimension, np.linalg.norm(scene.forces.gravity)

@@ -150,8 +150,7 @@ def viscosity_sentence(scene: SceneTables, where: str) -> str | None:
 
 
 THROUGH = 1.5
-"""Smallest length by which a solid must extend through a wall so that fluid rests in the corner between them
-[spacings]."""
+"""Smallest length by which a solid must extend through a wall so that fluid in the corner rests [spacings]."""
 FACING = 0.9
 """Smallest component of a face's unit normal along an axis to which the face counts as perpendicular."""
 
@@ -190,8 +189,7 @@ def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
 
 
 ONE_LAYER, TWO_LAYERS = 1.1, 1.5
-"""Smallest thickness of walls without leaks [spacings], with one layer of wall particles, and with two (for supports
-beyond two spacings)."""
+"""Smallest thickness of walls without leaks [spacings], with one and with two layers of wall particles."""
 DEPTHS = np.arange(1, 9) / 8.0
 """Fractions of this thickness at which the solid is tested below its surface."""
 MARGIN = 1e-3

@@ -22,8 +22,7 @@ class SensorTable(Table):
     @field_validator("name")
     @classmethod
     def _check_name(cls, name: str) -> str:
-        """Refuse a name that a spreadsheet would take for a formula: one that begins with a sign, also a full-width
-        one."""
+        """Refuse a name that a spreadsheet takes for a formula, also with a full-width sign."""
         plain = unicodedata.normalize("NFKC", name).strip()
         if plain[:1] in tuple("=+-@") or not name.isprintable():
             wanted = "one line of text that begins with none of = + - @, as it heads a column of a table"
@@ -100,8 +99,7 @@ class WallForceTable(SensorTable):
     about: Corner = None
     """(d,) Reference point of the torque [m]; the origin if left out."""
     on: Text | None = None
-    """Name of a moving solid that carries and turns the region and the reference point, from their positions at the
-    start of the scene."""
+    """Name of a moving solid that carries and turns the region and the reference point from their initial positions."""
     axes: Axes = "world"
     """Axes of force and torque for a region on a solid: "world", or "body" for axes that turn with the solid."""
 

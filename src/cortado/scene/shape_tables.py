@@ -202,8 +202,7 @@ class Container(Table):
 
     @abstractmethod
     def extent(self) -> tuple[Points, Points] | None:
-        """Return the lower and the upper corner of the box around the container, each (d,) [m]; None without a
-        container."""
+        """Return the lower and the upper corner (d,) [m] of the box around the container; None without a container."""
 
     @abstractmethod
     def region(self, dimension: int) -> Region:

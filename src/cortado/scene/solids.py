@@ -163,8 +163,8 @@ class SolidTable(Coloured):
 
     @abstractmethod
     def thinnest(self, spacing: float) -> float:
-        """Return the thickness of the thinnest part [m]; infinite for a mesh whose sheets are all thicker than a few
-        spacings [m]."""
+        """Return the thickness of the thinnest part [m]; infinite for a mesh without sheets thinner than a few
+        spacings."""
 
     def in_container(self, container: Container, path: FieldPath) -> Self:
         """Return the table, found at ``path``, with unbounded shapes cut to the container."""

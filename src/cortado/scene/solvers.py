@@ -132,8 +132,8 @@ class PackageSolver(SolverTable, PackageTable):
 
 
 def what_suits(solver: Any, container: Any) -> Suits:
-    """Return keys of other tables that suit a solver, for tables that set none of these keys; ``solver`` is a table or
-    its contents."""
+    """Return keys that suit a solver, given as a table or its contents, for other tables that set none of these
+    keys."""
     if _table_of(solver) != "ProjectionSolver":
         return ()
     periodic = container.get("periodic") if isinstance(container, Mapping) else getattr(container, "periodic", None)

@@ -63,8 +63,8 @@ def _extent(scene: SceneTables) -> tuple[Points, Points]:
 
 
 def _room(scene: SceneTables) -> tuple[Points, Points]:
-    """Return the box of the container: lower and upper corner, each (d,) [m]. Without a container, return the box
-    around fluids and solids, or around outlets."""
+    """Return the corners, each (d,) [m], of the container's box, or else of the box around fluids, solids or
+    outlets."""
     ends = scene.container.extent()
     if ends is not None:
         return ends
@@ -84,8 +84,7 @@ beside walls, by the form of the viscous force."""
 
 
 DEPTH_FACTORS = {"cubic_spline": 1.8, "wendland_c2": 1.6, "wendland_c4": 1.2}
-"""C by the kernel in the limit C s^(3/2) / (H sqrt(g)) for resting fluid of depth H, with a support of 2 spacings s;
-1.1 to 1.4 times the limit diverges."""
+"""C by the kernel in the limit C s^(3/2) / (H sqrt(g)) for resting fluid of depth H, with a support of 2 spacings s."""
 
 
 RESTING, RUNNING = 0.63, 0.4
@@ -99,8 +98,7 @@ FRICTION_STEP = 0.25
 """nu dt / s² up to which free bodies without slip move correctly, within 2 % for a disc that settles between walls."""
 
 BESIDE, THROUGH = 0.4, 0.25
-"""Largest motion of fluid in a step that keeps it out of a solid, in spacings and as a fraction of the solid's
-thickness."""
+"""Largest motion of fluid in a step beside a solid, in spacings and as a fraction of the solid's thickness."""
 
 
 def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
@@ -130,8 +128,7 @@ def broken_limits(scene: SceneTables, values: Arrays, time_step: float) -> list[
 
 
 def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> str:
-    """Return advice for a run that diverged, with the `stability_limits` that the time step [s] exceeds; ``values`` of
-    parameters replace the scene's."""
+    """Return advice for a run that diverged with a time step [s]; ``values`` of parameters replace the scene's."""
     if scene.solver.chooses:
         return "try a smaller solver.courant or solver.greatest_time_step, or more pressure iterations"
     broken = broken_limits(scene, values, time_step)
@@ -213,8 +210,7 @@ def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
 
 
 def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
-    """Test whether the viscous force is computed implicitly, at the end of a step; ``values`` of parameters replace the
-    scene's."""
+    """Test whether the viscous force is computed implicitly; ``values`` of parameters replace the scene's."""
     values = values or {}
     if scene.forces.viscosity != "stress" or scene.forces.viscous_solve == "explicit":
         return False
@@ -271,8 +267,7 @@ def _kinematic(scene: SceneTables, values: Arrays) -> float:
 
 
 def _beside_solids(scene: SceneTables, first: float, gravity: Points, values: Arrays) -> float:
-    """Return the longest step [s] for fluid with an initial speed ``first`` [m/s] beside solids; infinite without
-    solids that fluid can reach from outside."""
+    """Return the longest step [s] for fluid with an initial speed ``first`` [m/s] beside solids; may be infinite."""
     spacing, found = scene.discretisation.spacing, [inf]
     for solid in scene.solid:
         speed = first + sqrt(2.0 * fall_to(scene, solid, gravity, values))
@@ -302,8 +297,7 @@ def _depth_limits(scene: SceneTables, gravity: Points) -> Points:
 
 
 def _covers_floor(scene: SceneTables, upright: Points) -> Points:
-    """Return a mask (k,): True if the fluid is as wide as the container, to a spacing, along all axes but ``upright``
-    (k,)."""
+    """Return a mask (k,): True if the fluid is as wide as the container along all axes but ``upright`` (k,)."""
     ends = scene.container.extent()
     if ends is None:
         return np.zeros(len(upright), dtype=bool)

@@ -41,8 +41,7 @@ FieldPath = Sequence[str | int]
 
 @dataclass(frozen=True, repr=False)
 class FieldError:
-    """An error in a field, whose ``repr`` hides the value found, as pydantic would put a value of any length into
-    messages."""
+    """An error in a field; ``repr`` hides the value found, which may be of any length, from pydantic's messages."""
 
     path: tuple[str | int, ...]
     found: Any
@@ -247,8 +246,7 @@ def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
 
 
 def _homes(whole: Schema, path: FieldPath) -> list[str]:
-    """Return the other paths in a JSON schema that end with the same key, such as ``forces.gravity``; empty if there
-    are more than `MOST_HOMES`."""
+    """Return the other paths in a JSON schema with the same last key; empty if there are more than `MOST_HOMES`."""
     key, own = path[-1], tuple(part for part in path if not isinstance(part, int))
     found = [home for home in dict.fromkeys(_fields(whole, whole, ())) if home[-1] == key and home != own]
     words = [field_name(home) if len(home) > 1 else f"{key} at the top of the file" for home in found]
@@ -273,8 +271,7 @@ def _is_out_of_size(number: float, schema: Schema) -> bool:
 
 
 def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | int]]:
-    """Return the part of a JSON schema at a location from pydantic, and its path. The path omits names of union
-    members."""
+    """Return the part of a JSON schema at a location from pydantic, and its path without names of union members."""
     part, path = whole, list[str | int]()
     for step in location:
         if "discriminator" in part:
@@ -362,8 +359,7 @@ class Table(BaseModel, metaclass=Documented):
         return schema
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """Return the table for 2 or 3 dimensions, with checked vectors and default vectors of ``dimension``
-        components."""
+        """Return the table for 2 or 3 dimensions, with checked vectors, of which defaults are cut to ``dimension``."""
         vectors = [name for name, field in type(self).model_fields.items() if PER_AXIS in field.metadata]
         defaults = {name: getattr(self, name)[:dimension] for name in vectors if name not in self.model_fields_set}
         placed = self.model_copy(update=defaults)
