@@ -108,7 +108,7 @@ class Tilt:
 class Known(dict[str, Parameter]):
     """Parameters by name: the registry's, and those of forces and a solver. Two tables are equal only if identical."""
 
-    __eq__, __hash__ = object.__eq__, object.__hash__
+    __eq__, __hash__ = object.__eq__, object.__hash__  # type: ignore[assignment]
 
     def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
         """Add the parameters ``own`` of forces and a solver, each with its owner in words; `TIME` may occur several
