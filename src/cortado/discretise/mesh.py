@@ -26,6 +26,7 @@ class TriangleTree:
     corners: Points
     """(k, 3, 3) leaf after leaf [m]"""
     order: Numbers
+    """(k,) original indices"""
     starts: NDArray[np.int32]
     """(leaves + 1,) first triangle of each leaf, and the number of triangles."""
     boxes: Points
@@ -126,6 +127,7 @@ class TriangleTree:
 
 
 def _starts(count: int, level: int) -> Numbers:
+    """Return the first triangle of each node of a level, followed by the number of triangles, (2^level + 1,)."""
     return (np.arange(2**level + 1) * count) >> level
 
 
@@ -204,6 +206,7 @@ def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]
 
 
 def _sides(triangles: Points) -> Points:
+    """Return the sides (3 n, 2, 2) of triangles (n, 3, 3), projected along the last axis."""
     return np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)[..., :2].reshape(-1, 2, 2)
 
 
@@ -312,6 +315,7 @@ class Mesh(Solid):
         return self._looked_up(points, reach)[1]
 
     def holds(self, points: Points) -> Which:
+        """Test (n,) which points (n, 3) [m] are inside."""
         return np.any([tree.windings(points) > 0 for tree in self._trees], axis=0)
 
     def nearest(self, points: Points) -> Points:

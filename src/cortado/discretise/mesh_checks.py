@@ -41,6 +41,7 @@ class Edges:
     ends: Numbers
     """(e, 2) indices of the edge's vertices, the lower index first."""
     names: Numbers
+    """(k, 3) index of the edge on each side of the triangles."""
     ways: Numbers
     """(k, 3) 1 if a side runs from the lower vertex index to the higher, otherwise -1."""
 
@@ -97,6 +98,7 @@ def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tupl
 
 
 def _distinct(vertices: Points) -> tuple[Points, Numbers]:
+    """Return the distinct vertices, and the new index of each vertex."""
     order = np.lexsort(vertices.T)
     new = np.append(True, (np.diff(vertices[order], axis=0) != 0.0).any(axis=1))
     names = np.empty(len(vertices), dtype=np.int64)
@@ -112,6 +114,7 @@ def _further_apart(vertices: Points, names: Numbers, tolerance: float) -> tuple[
 
 
 def _connected(links: Numbers, count: int) -> Numbers:
+    """Return the connected component (count,) of each node; ``links`` (m, 2) are pairs of nodes."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

@@ -74,6 +74,7 @@ class PointsAround:
 
     @property
     def volume(self) -> float:
+        """Return the volume of a particle [m^d] that gives the lattice its rest density."""
         return rest_volume(self.lattice.kernel, self.lattice.spacing, self.lattice.support, self.lattice.dimension)
 
     @cached_property

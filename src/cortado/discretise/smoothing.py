@@ -37,6 +37,7 @@ class SmoothingKernel:
         return smoothing_kernel, (self.name,)
 
     def normalisation(self, dimension: int, support: float) -> float:
+        """Return sigma [1 / m^d]."""
         return self.normalisations[dimension - 2] / support**dimension
 
     def weight(self, distance: np.ndarray, dimension: int, support: float) -> np.ndarray:

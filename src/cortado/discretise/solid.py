@@ -56,6 +56,7 @@ def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -
 
 
 def polygon_faces(corners: Points) -> Faces:
+    """Return the edges of a polygon (m, 2) [m], given clockwise or counterclockwise."""
     following = np.roll(corners, -1, axis=0)
     (x, y), (x_next, y_next) = (corners - corners[0]).T, (following - corners[0]).T
     area = (x * y_next - x_next * y).sum()
@@ -303,4 +304,5 @@ class Mass:
         return cls(moments.volume, about - moments.second)
 
     def in_volumes(self, unit: float) -> "Mass":
+        """Return volume and inertia divided by ``unit`` [m^d]."""
         return Mass(self.volume / unit, self.inertia / unit)

@@ -58,6 +58,7 @@ def ring(radius: float, spacing: float) -> Points:
 
 
 def _cells(lower: float, upper: float, count: int) -> Points:
+    """Return the centres (count,) of equal cells between two ends."""
     return lower + (upper - lower) * (np.arange(count) + 0.5) / count
 
 
@@ -191,9 +192,11 @@ class RestLattice:
         return np.hstack([np.full((len(flat), 1), distance), flat])
 
     def plane_weight(self, distance: float) -> float:
+        """Return the sum of W [1 / m^d] over a lattice plane at a distance [m]."""
         return float(self.weights(self._to_plane(distance)).sum())
 
     def plane_slope(self, distance: float) -> float:
+        """Return the derivative of `plane_weight` [1 / m^(d + 1)]."""
         return float(self.kernel.gradient(self._to_plane(distance), self.support)[:, 0].sum())
 
 

@@ -90,6 +90,7 @@ class Light:
     azimuth: float
     """Azimuth of the sun to the right of the initial direction of the camera [degrees]."""
     elevation: float
+    """[degrees] above the floor"""
     lamp: Numbers
     strip: Numbers
     sunlight: Numbers

@@ -124,10 +124,12 @@ class FlowTable(Table):
 
     @property
     def begun(self) -> float:
+        """[m3/s (m2/s in 2-D)]"""
         return (self.flow_rates or (self.flow_rate or 0.0,))[0]
 
     @property
     def greatest(self) -> float:
+        """[m3/s (m2/s in 2-D)]"""
         return max(self.flow_rates or (self.flow_rate or 0.0,))
 
     def _at(self, times: Points) -> Points:

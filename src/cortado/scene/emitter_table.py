@@ -176,6 +176,7 @@ class EmitterTable(FluidBody, FlowTable):
         return max(self.sides or (2.0 * (self.radius or 0.0),))
 
     def opening(self, spacing: float) -> Points:
+        """Return positions (n, d) of a layer of particles in the opening [m]."""
         return np.array(self.outlet) + self._cross_section(spacing)
 
     def sample(self, spacing: float) -> EmitterSample:

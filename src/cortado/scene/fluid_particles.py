@@ -168,6 +168,7 @@ class FluidSample:
     """Prescribed volume [m^d] of each body outside of walls; for points, the volume of the particles."""
     bodies: tuple[CutBody, ...]
     is_packed: NDArray[np.bool_]
+    """(n,) True for particles of `bodies`."""
     is_placed: NDArray[np.bool_]
     """(n,) True for a particle with a prescribed position: a point of a file, or a particle in an emitter."""
     emitters: tuple[tuple[str, int, EmitterSample], ...]
