@@ -13,32 +13,28 @@ from cortado.discretise.shapes import Numbers, Points, Which, grid, launch_on_cp
 from cortado.discretise.solid import Faces, Moments, Solid, enclosed_moments
 
 LEAF = 8
-"""Most triangles in a leaf of the tree."""
 BITS = 10
-"""Bits of each coordinate by which points are sorted, so that points near in space are near in memory."""
+"""Bits of each coordinate by which points are sorted along a curve."""
 SPREAD = ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249))
-"""Shifts and masks that spread the bits of a number to every third place."""
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleTree:
-    """A tree of triangles, split recursively across the longest side of the box around their centres.
-
-    `cortado.discretise.tree_kernels` defines the numbers of the nodes.
-    """
+    """A tree of triangles, split recursively across the longest side of the box around their centres;
+    `cortado.discretise.tree_kernels` numbers the nodes."""
 
     corners: Points
-    """(k, 3, 3) corners of the triangles, leaf after leaf [m]"""
+    """(k, 3, 3) leaf after leaf [m]"""
     order: Numbers
-    """(k,) index of each triangle in the original order"""
+    """(k,) original indices"""
     starts: NDArray[np.int32]
-    """(leaves + 1,) first triangle of each leaf, and the number of triangles"""
+    """(leaves + 1,) first triangle of each leaf, and the number of triangles."""
     boxes: Points
-    """(2 leaves, 6) lower and upper corner of each node's box [m]; row 0 is unused"""
+    """(2 leaves, 6) lower and upper corner of each node's box [m]; row 0 is unused."""
 
     @classmethod
     def of(cls, corners: Points) -> "TriangleTree":
-        """Build the tree of at least one triangle, from their corners (k, 3, 3) [m]."""
+        """Build the tree of at least one triangle with corners (k, 3, 3) [m]."""
         count, middles = len(corners), corners.mean(axis=1)
         levels = max(int(np.ceil(np.log2(count / LEAF))), 0)
         order = np.arange(count)
@@ -57,14 +53,13 @@ class TriangleTree:
         return cls(ordered, order, starts.astype(np.int32), np.concatenate([np.zeros((1, 6)), *boxes[::-1]]))
 
     def moved(self, scale: float, shift: Points) -> "TriangleTree":
-        """Return the tree with coordinates multiplied by a positive scale and then shifted by (3,) [m]."""
         corners, boxes = scale * self.corners + shift, scale * self.boxes + np.tile(shift, 2)
         return TriangleTree(corners, self.order, self.starts, boxes)
 
     def nearest(self, points: Points, reach: float = np.inf) -> tuple[Points, Points]:
-        """Return the points (n, 3) of the triangles nearest to points (n, 3) [m], and their distances (n,) [m]. Without
-        a triangle within ``reach`` [m], return the point itself and ``reach``."""
-        order = np.arange(len(points)) if np.isfinite(reach) else _along_a_curve(points)  # these take long enough
+        """Return the nearest points (n, 3) of the triangles to points (n, 3) [m], and their distances (n,) [m]; without
+        a triangle within ``reach`` [m], the point and ``reach``."""
+        order = np.arange(len(points)) if np.isfinite(reach) else _along_a_curve(points)
         nearest, squares = np.empty((len(points), 3)), np.empty(len(points))
         self.ask("find_nearest", points[order], reach=reach, nearest=nearest, squares=squares)
         found, away = np.empty_like(nearest), np.empty_like(squares)
@@ -72,14 +67,14 @@ class TriangleTree:
         return found, away
 
     def windings(self, points: Points) -> NDArray[np.int32]:
-        """Return the winding numbers (n,) of the triangles, which must be closed, around points (n, 3) [m]."""
+        """Return the winding numbers (n,) of closed triangles around points (n, 3) [m]."""
         found = np.empty(len(points), dtype=np.int32)
         self.ask("find_windings", points, windings=found)
         return found
 
     def crossings(self, names: Numbers, tolerance: float) -> Numbers:
-        """Return the pairs (m, 2) of triangles that cross: an edge of one passes through the other by more than a
-        tolerance [m] on both sides. Triangles do not cross at common vertices, which have equal ``names`` (k, 3)."""
+        """Return the pairs (m, 2) of triangles that cross: an edge of one passes through the other by more than
+        ``tolerance`` [m] on both sides. Common vertices, with equal ``names`` (k, 3), are no crossings."""
         count, ordered = len(self.corners), np.ascontiguousarray(names[self.order], dtype=np.int32)
         counts, places, others = (np.zeros(size, dtype=np.int32) for size in (count, count + 1, 1))
         given = {"names": ordered, "tolerance": tolerance, "counts": counts}
@@ -93,8 +88,8 @@ class TriangleTree:
         return np.sort(self.order[pairs], axis=1)
 
     def beside(self, other: "TriangleTree", reach: float) -> Numbers:
-        """Return pairs (m, 2) of a triangle of this tree and one of another tree, if their boxes are at most a reach
-        [m] apart along every axis."""
+        """Return pairs (m, 2) of triangles of two trees whose boxes are at most ``reach`` [m] apart along every
+        axis."""
         pairs = np.ones((1, 2), dtype=np.int64)
         leaves = np.array([len(self.starts) - 1, len(other.starts) - 1])
         while (pairs < leaves).any():
@@ -114,8 +109,6 @@ class TriangleTree:
         return np.column_stack([self.order[pairs[:, 0]], other.order[pairs[:, 1]]])
 
     def ask(self, kernel: str, points: Points, **arguments: Any) -> None:
-        """Launch one of the `tree_kernels` for points (n, 3) [m], with its other arguments, including its output
-        arrays."""
         from cortado.device.modules import start_warp
 
         start_warp()
@@ -139,7 +132,6 @@ def _starts(count: int, level: int) -> Numbers:
 
 
 def _near(first: Points, second: Points, reach: float) -> Which:
-    """Test (n,) which boxes (n, 6) are at most a reach apart along every axis."""
     apart = np.maximum(first[:, :3] - second[:, 3:], second[:, :3] - first[:, 3:])
     return np.asarray((apart <= reach).all(axis=1))
 
@@ -156,23 +148,21 @@ def _along_a_curve(points: Points) -> Numbers:
 
 
 LYING = 10.0
-"""In units of the distance at which the sides of a triangle are examined: nearer triangles count as lying on it."""
 THIN = 1e-15
-"""Relative to the width of a triangle: smaller pieces are left out."""
 
 
 def outer_surface(
     corners: Points, pairs: Numbers, holds: Callable[[Points], Which], reach: float
 ) -> tuple[Points, Points]:
-    """Return the surface of a union of closed parts, as pieces (n, 3, 3) [m] of their triangles, cut where parts meet.
-    Also return the pieces' weights (n,) in surface integrals. A weight is 0 if both sides of a piece are inside or both
-    outside, and less than 1 if several triangles lie on each other.
+    """Return the surface of a union of closed parts as pieces (n, 3, 3) [m] of triangles, cut where parts meet, with
+    weights (n,) for surface integrals. A piece with both sides inside or both outside has the weight 0, and one of
+    several triangles that lie on each other less than 1.
 
     Args:
         corners: (k, 3, 3) of all triangles, counterclockwise as seen from outside [m].
         pairs: (m, 2) indices of all triangles that may meet away from their own edges.
         holds: tests (n,) which points (n, 3) [m] are inside some part.
-        reach: distance from a triangle at which its sides are examined [m].
+        reach: distance from a triangle at which its sides are tested [m].
     """
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
@@ -193,8 +183,8 @@ def outer_surface(
 
 
 def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]:
-    """Cut a triangle (3, 3) into pieces (n, 3, 3) that none of the triangles (m, 3, 3) crosses. Also count for each
-    piece (n,) the triangles, including itself, within ``reach`` of its centre."""
+    """Cut a triangle (3, 3) into pieces (n, 3, 3) that none of the triangles (m, 3, 3) crosses. Also return for each
+    piece the number (n,) of triangles, including itself, within ``reach`` of its centre."""
     side, normal = corners[1] - corners[0], np.cross(corners[1] - corners[0], corners[2] - corners[0])
     if not normal.any():
         return np.zeros((0, 3, 3)), np.zeros(0)
@@ -216,7 +206,7 @@ def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]
 
 
 def _sides(triangles: Points) -> Points:
-    """Return the sides (3 n, 2, 2) of triangles (n, 3, 3), seen from above."""
+    """Return the sides (3 n, 2, 2) of triangles (n, 3, 3), projected along the last axis."""
     return np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)[..., :2].reshape(-1, 2, 2)
 
 
@@ -229,7 +219,7 @@ def _through(triangles: Points) -> Points:
 
 
 def _within_triangle(triangle: Points, points: Points) -> tuple[Which, Points]:
-    """Test (n,) which points (n, 2) are in a triangle (3, 3), seen from above, and return its height (n,) there."""
+    """Test (n,) which points (n, 2) are in a triangle (3, 3) seen along the last axis; also return its height (n,)."""
     a, b, c = triangle
     across = (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]
     if across == 0.0:
@@ -241,8 +231,8 @@ def _within_triangle(triangle: Points, points: Points) -> tuple[Which, Points]:
 
 
 def _pieces(segments: Points, lower: float, upper: float) -> Points:
-    """Return triangles (n, 3, 2), counterclockwise, that fill columns between segments (s, 2, 2) over an interval of
-    the first axis. A new column starts where a segment starts or ends, or where two cross."""
+    """Return counterclockwise triangles (n, 3, 2) that fill the columns between segments (s, 2, 2) over an interval of
+    the first axis. Columns begin where segments start, end or cross."""
     order = np.argsort(segments[:, :, 0], axis=1)[..., None]
     (start, below), (end, above) = np.moveaxis(np.take_along_axis(segments, order, axis=1), (1, 2), (0, 1))
     leans = end > start
@@ -273,38 +263,32 @@ def _pieces(segments: Points, lower: float, upper: float) -> Points:
 
 
 LOW_DISCREPANCY = 0.7548776662466927 ** np.array([1.0, 2.0])
-"""Increments along two axes of a sequence that fills a square evenly: powers of 1 / p, where p^3 = p + 1."""
+"""Increments along two axes of a sequence that fills a square evenly: powers of 1 / p, where p³ = p + 1."""
 BESIDE = 1e-12
-"""Relative to the length of a mesh: distance from a triangle at which both its sides are tested for being inside."""
+"""Distance from a triangle at which its sides are tested, relative to the length of a mesh."""
 SEEN = 1e-3
-"""Relative to the spacing of surface points: distance outside the surface where another part of the solid is sought."""
+"""Distance outside the surface at which other parts of the solid are sought, in spacings of surface points."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh(Solid):
-    """The solid within a closed surface of triangles: all points with a winding number of at least 1.
-
-    Parts may overlap: each part is closed, and the solid is their union. `cortado.discretise.mesh_checks` finds parts
-    and reports faulty triangles.
-    """
+    """The solid within closed triangles: all points with a winding number of at least 1. Parts may overlap."""
 
     vertices: Points
     """(m, 3) [m]"""
     triangles: Numbers
-    """(k, 3) indices of the vertices of each triangle, counterclockwise as seen from outside"""
+    """(k, 3) indices of the vertices of each triangle, counterclockwise as seen from outside."""
     parts: Sequence[Numbers] = ()
-    """Triangles of each part; if empty, all triangles are one part that does not cross itself."""
+    """Triangles of each part; empty for one part without crossings."""
     known_trees: Sequence[TriangleTree] = ()
-    """Trees of the parts, if already built."""
 
     def moved(self, scale: float, shift: Points) -> "Mesh":
-        """Return the solid with coordinates multiplied by a positive scale and then shifted by (3,) [m]."""
         trees = [tree.moved(scale, shift) for tree in self._trees]
         return Mesh(scale * self.vertices + shift, self.triangles, self.parts, trees)
 
     @cached_property
     def corners(self) -> Points:
-        """Return the corners (k, 3, 3) of all triangles [m]."""
+        """(k, 3, 3) [m]"""
         return self.vertices[self.triangles]
 
     @property
@@ -323,8 +307,8 @@ class Mesh(Solid):
         return self._ends
 
     def distance(self, points: Points) -> Points:
-        """Return the `Solid.distance` to round-off. Inside overlapping parts it is the depth below the surface of one
-        of them, which is too small."""
+        """Return the `Solid.distance`; inside overlapping parts, the depth below the surface of one part, which is too
+        small."""
         return self._looked_up(points, np.inf)[1]
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
@@ -347,7 +331,6 @@ class Mesh(Solid):
         return Faces(self.vertices, self.triangles)
 
     def _looked_up(self, points: Points, reach: float) -> tuple[Points, Points]:
-        """Return the nearest points (n, 3) of the surface, and the distances (n,), of at most a reach [m]."""
         found, best = np.empty_like(points), np.full(len(points), np.inf)
         for tree in self._trees:
             places, away = tree.nearest(points, reach)
@@ -357,12 +340,8 @@ class Mesh(Solid):
         return found, best
 
     def own_feet(self, fine: float) -> tuple[Points, Points]:
-        """Return points evenly spread over the triangles by area, for `Solid.own_feet`.
-
-        The triangles are ordered so that neighbours in space follow one another, and a point is placed after every
-        equal portion of area. Several points in one triangle form a low-discrepancy sequence (Roberts 2018, R2), folded
-        into it.
-        """
+        """Return points evenly spread over the triangles by area, for `Solid.own_feet`: one after every equal portion
+        of area along the tree, in a low-discrepancy sequence (Roberts 2018, R2) within each triangle."""
         order = np.concatenate([part[tree.order] for part, tree in zip(self._numbers, self._trees, strict=True)])
         areas = self.areas()[order]
         total = areas.sum()
@@ -400,7 +379,7 @@ class Mesh(Solid):
         return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
 
     def areas(self) -> Points:
-        """Return the area (k,) of each triangle [m2]."""
+        """(k,) [m2]"""
         return 0.5 * np.linalg.norm(self._across, axis=1)
 
     @cached_property

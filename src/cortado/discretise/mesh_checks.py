@@ -1,4 +1,4 @@
-"""Checks that turn triangles into a solid, or else report in a sentence what is wrong, where, and what to do."""
+"""Checks that turn triangles into a solid, or report what is wrong, where, and the remedy."""
 
 from dataclasses import dataclass
 
@@ -10,20 +10,18 @@ from cortado.discretise.shapes import Numbers, Points, Which, whole_origin
 from cortado.errors import InputError
 
 SAME = 1e-6
-"""Relative to the length of a mesh: if edges are open, vertices within this distance are merged, as float32 may have
-rounded them apart."""
+"""Largest distance of vertices that are merged to close a mesh, relative to its length."""
 COARSE, TOLD = 0.02, 1e-3
-"""Relative to the length of a mesh: rounding of coordinates in a file above which the file is refused, or noted."""
+"""Rounding of coordinates in a file above which the file is refused or noted, relative to the length of the mesh."""
 ASIDE = 1e-6
-"""Relative to the length of a mesh: distance from a surface at which its sides are examined."""
+"""Distance from a surface at which its sides are tested, relative to the length of the mesh."""
 CROSSED = 1e-7
-"""Relative to the length of a mesh: least depth by which crossing triangles intersect; less counts as a touch."""
+"""Smallest depth of a crossing of triangles, relative to the length of the mesh."""
 LOOKED_AT = 8192
-"""Most triangles whose sides are examined."""
 SAME_WAY = 1e-6
 """Angle [rad] below which triangles lie on each other, where two bodies touch."""
 TOGETHER = 1e-3
-"""The same angle for float32 coordinates, used only to count the directions in which a surface continues."""
+"""Angle [rad] as `SAME_WAY`, for float32 coordinates, for counting the directions in which a surface continues."""
 MEETING = (
     "{what} has {edges} at which three triangles or more meet without closing, the first at {place}, so that nothing "
     "says what is inside: delete faces that divide its inside or stick out of it."
@@ -40,18 +38,15 @@ TURNED = (
 
 @dataclass(frozen=True)
 class Edges:
-    """The edges of triangles that share vertices."""
-
     ends: Numbers
-    """(e, 2) indices of the edges' vertices, the lower one first"""
+    """(e, 2) indices of the edge's vertices, the lower index first."""
     names: Numbers
-    """(k, 3) index of the edge on each side of the triangles"""
+    """(k, 3) index of the edge on each side of the triangles."""
     ways: Numbers
-    """(k, 3) 1 if a side runs from the lower vertex index to the higher, otherwise -1"""
+    """(k, 3) 1 if a side runs from the lower vertex index to the higher, otherwise -1."""
 
     @classmethod
     def of(cls, triangles: Numbers) -> "Edges":
-        """Find the edges of triangles (k, 3)."""
         sides = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1)
         ends = np.sort(sides, axis=-1)
         span = int(triangles.max(initial=0)) + 1
@@ -61,7 +56,7 @@ class Edges:
 
     @property
     def counts(self) -> Numbers:
-        """Return the number (e,) of triangles that meet at each edge."""
+        """Return the number (e,) of triangles at each edge."""
         return np.bincount(self.names.ravel(), minlength=len(self.ends))
 
     def close(self) -> Which:
@@ -69,7 +64,7 @@ class Edges:
         return np.asarray(np.bincount(self.names.ravel(), self.ways.ravel(), len(self.ends)) == 0.0)
 
     def check(self, vertices: Points, what: str) -> None:
-        """Raise `InputError`, a sentence that calls the mesh ``what``, if the triangles are not closed."""
+        """Raise `InputError` if the triangles are not closed; ``what`` is the name of the mesh."""
         unbalanced, counts = ~self.close(), self.counts
         for wrong, edge, sentence in (
             (unbalanced & (counts > 2), "edge", MEETING),
@@ -81,21 +76,16 @@ class Edges:
                 raise InputError(sentence.format(what=what, edges=counted(int(wrong.sum()), edge), place=place))
 
     def place(self, edge: int, vertices: Points) -> str:
-        """Return the middle of an edge, in words."""
         return place_in_file(vertices[self.ends[edge]].mean(axis=0))
 
 
 def place_in_file(place: Points) -> str:
-    """Write a point in words, for a sentence."""
     return f"({', '.join(f'{value:.7g}' for value in place)}) in the file"
 
 
 def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tuple[Points, Numbers]:
-    """Return triangles (k, 3) and vertices (m, 3), with vertices merged that are equal or closer than a tolerance.
-
-    Triangles with a repeated vertex, duplicates, and pairs that are back to back, as where two bodies touch, are
-    removed.
-    """
+    """Return vertices (m, 3) and triangles (k, 3), with vertices merged that are equal or closer than ``tolerance``,
+    without triangles that repeat a vertex, duplicates, and pairs back to back."""
     vertices, names = _distinct(vertices)
     if tolerance > 0.0:
         vertices, names = _further_apart(vertices, names, tolerance)
@@ -108,7 +98,7 @@ def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tupl
 
 
 def _distinct(vertices: Points) -> tuple[Points, Numbers]:
-    """Return the distinct vertices, and the index of each given vertex among them."""
+    """Return the distinct vertices, and the new index of each vertex."""
     order = np.lexsort(vertices.T)
     new = np.append(True, (np.diff(vertices[order], axis=0) != 0.0).any(axis=1))
     names = np.empty(len(vertices), dtype=np.int64)
@@ -117,7 +107,6 @@ def _distinct(vertices: Points) -> tuple[Points, Numbers]:
 
 
 def _further_apart(vertices: Points, names: Numbers, tolerance: float) -> tuple[Points, Numbers]:
-    """Merge vertices of `_distinct` that are closer than a tolerance, and return vertices and indices as it does."""
     from scipy.spatial import cKDTree
 
     groups = _connected(cKDTree(vertices).query_pairs(tolerance, output_type="ndarray"), len(vertices))
@@ -125,7 +114,7 @@ def _further_apart(vertices: Points, names: Numbers, tolerance: float) -> tuple[
 
 
 def _connected(links: Numbers, count: int) -> Numbers:
-    """Return the connected component (count,) of each of ``count`` nodes connected by links (m, 2)."""
+    """Return the connected component (count,) of each node; ``links`` (m, 2) are pairs of nodes."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -134,12 +123,9 @@ def _connected(links: Numbers, count: int) -> Numbers:
 
 
 def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, what: str) -> Numbers:
-    """Number the bodies of a closed mesh from 0 on, and return the body's number (k,) for each triangle (k, 3).
-
-    Neighbours around an edge belong to one body if the solid is between them. Raises `InputError`, a sentence that
-    calls the mesh ``what``, at an edge from which the surface continues in more than two directions; ``origin`` (3,) is
-    the place of the mesh in the file.
-    """
+    """Return the number (k,) of the body of each triangle (k, 3) of a closed mesh, from 0 on. Neighbours around an edge
+    belong to one body if the solid is between them. Raises `InputError` at an edge from which the surface continues in
+    more than two directions. ``origin`` (3,) is the position of the mesh in the file."""
     names = edges.names.ravel()
     sides = np.argsort(names, kind="stable")
     first = np.append(0, np.cumsum(edges.counts))[:-1]
@@ -168,8 +154,8 @@ def _angles(edge: Points, opposite: Points) -> Points:
 
 
 def _directions(angles: Points, ways: Numbers) -> int:
-    """Return the number of directions in which a surface continues from an edge shared by triangles at angles [rad]
-    with orientations (m,). Triangles that lie on each other with opposite orientations cancel."""
+    """Return in how many directions a surface continues from an edge, with triangles at ``angles`` (m,) [rad] and with
+    orientations ``ways`` (m,); triangles that lie on each other with opposite orientations cancel."""
     order = np.argsort(angles)
     angles, ways = angles[order], ways[order]
     groups = np.cumsum(np.diff(angles, prepend=angles[0]) > TOGETHER)
@@ -178,8 +164,8 @@ def _directions(angles: Points, ways: Numbers) -> int:
 
 
 def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
-    """Return the pairs (m / 2, 2) of triangles around an edge (m,) that bound the same wedge of solid: one that starts
-    it and the next that ``ends`` (m,) it. If two lie on each other, the ending one comes first."""
+    """Return the pairs (m / 2, 2) of triangles around an edge (m,) that bound the same wedge of solid: one starts the
+    wedge, and the next one in ``ends`` (m,) ends it. Of two that lie on each other, the ending one comes first."""
     turned = np.mod(angles - angles[np.argmin(ends)] + 0.5 * SAME_WAY, 2.0 * np.pi)
     order = np.lexsort((~ends, np.floor(turned / SAME_WAY)))
     begun, ended, pairs = list[int](), list[int](), []
@@ -195,8 +181,8 @@ def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
 def parts_of(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, crossings: Numbers, some: Numbers, beside: Points
 ) -> tuple[tuple[Numbers, ...], int | None, int | None]:
-    """Sort triangles into parts without overlapping bodies inside a part; return no parts if the mesh does not cross
-    itself. Also return a triangle at which a body crosses itself, and one of a body inside another, or None.
+    """Sort triangles into parts whose bodies do not overlap; return no parts if the mesh does not cross itself. Also
+    return a triangle at which a body crosses itself, and a triangle of a body inside another, or None.
 
     Args:
         mesh: closed.
@@ -219,7 +205,7 @@ def parts_of(
     if len(pieces) == 1:
         return ((np.arange(len(labels)),) if within.any() else ()), crossing, None
     around = np.array([around[owners == piece].sum(axis=0) for piece in pieces])
-    inside = np.zeros((len(pieces), len(pieces)), dtype=bool)  # of the first, some place beside the second
+    inside = np.zeros((len(pieces), len(pieces)), dtype=bool)  # a point beside the second is inside the first
     wholly = inside.copy()
     seen = np.searchsorted(pieces, owners[seen])
     for number in range(len(pieces)):
@@ -239,7 +225,7 @@ def parts_of(
 
 
 def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
-    """Return the owner (bodies,) of each body: for a cavity the smallest body around it, for others the body itself.
+    """Return the owner (bodies,) of each body: for a cavity the smallest body around it, for others the body.
     ``around`` (bodies, s) are each body's winding numbers at points beside the bodies ``seen`` (s,)."""
     owners = np.arange(len(volumes))
     for cavity in np.flatnonzero(volumes < 0.0):
@@ -251,7 +237,7 @@ def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
 
 
 def _apart(met: np.ndarray, sizes: list[int]) -> list[list[int]]:
-    """Divide numbers into few groups, largest first, so that no two in a group have met."""
+    """Divide numbers into few groups, largest first, such that ``met`` is False for any two in a group."""
     groups: list[list[int]] = []
     for number in sorted(range(len(sizes)), key=lambda one: -sizes[one]):
         free = next((group for group in groups if not met[number, group].any()), None)
@@ -270,22 +256,17 @@ def _volume(corners: Points) -> float:
 
 @dataclass(frozen=True, eq=False)
 class FoundMesh:
-    """The solid in a file of triangles, with notes about the file."""
-
     mesh: Mesh
-    """The mesh in the file's unit of length, about an origin of its own."""
+    """Mesh in the file's unit of length, relative to ``origin``."""
     origin: Points
-    """(3,) position of that origin in the file: near the middle of a mesh that is far from the file's origin, otherwise
-    0."""
+    """(3,) position in the file: near the middle of a mesh far from the file's origin, otherwise 0."""
     notes: tuple[str, ...]
-    """Sentences about features that are probably unintended."""
     left_out: int
-    """Number of triangles that were removed because they have no area or are duplicates."""
 
 
 def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float = 0.0) -> FoundMesh:
-    """Build the solid enclosed by triangles (k, 3) with vertices (m, 3); raise `InputError`, a sentence that calls the
-    mesh ``what``. Coordinates in the file are whole multiples of ``rounding``, unless that is 0."""
+    """Build the solid enclosed by triangles (k, 3) with vertices (m, 3), whose coordinates are multiples of
+    ``rounding`` unless that is 0; raise `InputError` if they enclose none. ``what`` is the name of the mesh."""
     used = vertices[triangles.ravel()]
     if not np.isfinite(used).all():
         wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
@@ -325,8 +306,8 @@ def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float 
 def _solid_parts(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, origin: Points, what: str
 ) -> tuple[tuple[Numbers, ...], tuple[str, ...]]:
-    """Return the parts of a closed mesh, whose bodies have labels (k,), and notes about it; raise `InputError` if it is
-    inside out. ``origin`` (3,) is the mesh's position in the file."""
+    """Return the parts of a closed mesh, whose bodies have ``labels`` (k,), and notes; raise `InputError` if the mesh
+    is inside out. ``origin`` (3,) is the mesh's position in the file."""
     size = np.ptp(mesh.corners, axis=(0, 1)).max()
     crossings = tree.crossings(mesh.triangles, CROSSED * size)
     some = np.unique(np.append(np.arange(0, len(labels), -(-len(labels) // LOOKED_AT)), crossings[:LOOKED_AT]))
@@ -354,8 +335,8 @@ def _solid_parts(
 
 
 def _inside_out(wrong: np.ndarray, labels: Numbers, seen: Numbers, what: str, corners: Points) -> str:
-    """Return the error message for a mesh whose normals point inwards. Of the triangles tested, ``wrong`` marks those
-    with inward normals, ``seen`` has the bodies; ``labels`` has all bodies, ``corners`` (3, 3) an example."""
+    """Return the error message for inward normals. Of the tested triangles, ``wrong`` marks those with inward normals,
+    and ``seen`` has their bodies; ``corners`` (3, 3) are an example."""
     if wrong.all():
         return (
             f"The normals of {what} point inwards, so that its inside would be outside: turn all of its triangles "

@@ -1,5 +1,4 @@
-"""Solids from files of triangles (STL, OBJ, PLY and glTF, read by trimesh). Their unit of length and their thickness
-are checked against the particle spacing and the container."""
+"""Solids from files of triangles, read by trimesh, with checks of their unit of length and thickness."""
 
 import os
 import re
@@ -19,22 +18,18 @@ from cortado.errors import InputError, Words, shown, warn
 from cortado.files.disk import reason, regular_file
 
 SUFFIXES = (".stl", ".obj", ".ply", ".gltf", ".glb")
-"""Suffixes of files with triangles."""
 MOST_BYTES = 2**30
-"""Largest size of a file [byte]."""
 LEAST_THICKNESS = 0.5
-"""In spacings. In the plane, water 16 spacings deep on one or both sides leaks within 0.2 s through walls 0.2 spacings
-thick; walls 0.3 thick hold it for 1 s, with either solver."""
+"""Smallest allowed thickness of a wall [spacings]; water leaks through walls of 0.2."""
 SHARE = 0.01
-"""Fraction of the surface that may be too thin without a warning."""
 ALONG = 0.9
-"""Least cosine of the angle between one side of a sheet and the reversed other side; wedges have a smaller cosine."""
+"""Smallest cosine between one side of a sheet and the reversed other side; wedges have a smaller cosine."""
 TOO_LARGE = 100.0
-"""Size, relative to the container (or to 100 spacings without one), above which a mesh seems to be in another unit."""
+"""Size, relative to the container or to 100 spacings, above which a mesh seems to be in another unit."""
 PROBES, STEPS, HALVINGS = 20_000, 16, 12
-"""Number of surface points at which thickness is measured, of steps for each, and of bisections of the last step."""
+"""Number of surface points where thickness is measured, of steps for each, and of bisections of the last step."""
 BEYOND = 1e-3
-"""Relative to the length of the steps: distance behind a solid from which its back is examined."""
+"""Distance behind a solid from which its back is tested, relative to the length of the steps."""
 
 
 def read_mesh(
@@ -44,18 +39,17 @@ def read_mesh(
     support: float | None = None,
     container: tuple[Points, Points] | None = None,
 ) -> Mesh:
-    """Read the solid in a file, and check it for particles with a spacing [m] and a support [m]. A body of fluid may
-    have any thickness.
+    """Read the solid in a file, and check it for particles with a spacing [m] and a support [m].
 
-    Raises `InputError`, a sentence that names the file and says what is wrong, where, and what to do; warns with
-    `CortadoWarning` about features that are probably unintended.
+    Raises `InputError` with the file, what is wrong, where, and the remedy; warns with `CortadoWarning` about features
+    that are probably unintended.
 
     Args:
         path: the file's path.
         scale: factor of its lengths, such as 0.001 for millimetres.
         spacing: [m].
-        support: [m]; None for a body of fluid.
-        container: lower and upper corner, each (3,) [m], of the box around the container of the fluid, if there is one.
+        support: [m]; None for a body of fluid, which may have any thickness.
+        container: lower and upper corner, each (3,) [m], of the box around the container; None without a container.
     """
     found, what = mesh_in_file(path), repr(path)
     mesh = found.mesh.moved(scale, np.zeros(3))
@@ -67,14 +61,13 @@ def read_mesh(
 
 
 def mesh_in_file(path: str) -> FoundMesh:
-    """Read the solid in a file, in its own unit of length, checked by itself; raise `InputError`."""
     stat = _checked_file(path)
     return _found(path, stat.st_mtime_ns, stat.st_size)
 
 
 def triangles_in_file(path: str) -> tuple[Points, Numbers]:
-    """Read the vertices (m, 3), in the file's unit of length, and the triangles (k, 3) of a file. The surface need not
-    be closed. Raises `InputError`."""
+    """Read the vertices (m, 3), in the file's unit, and triangles (k, 3) of a possibly open surface; raise
+    `InputError`."""
     _checked_file(path)
     vertices, triangles, _ = read_triangles(path)
     if not np.isfinite(vertices).all():
@@ -83,7 +76,6 @@ def triangles_in_file(path: str) -> tuple[Points, Numbers]:
 
 
 def _checked_file(path: str) -> os.stat_result:
-    """Return the status (`os.stat`) of a mesh file; raise `InputError` if it cannot be one."""
     if Path(path).suffix.lower() not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}: export the mesh as one of these.")
     try:
@@ -97,15 +89,13 @@ def _checked_file(path: str) -> os.stat_result:
 
 @lru_cache(maxsize=8)
 def _found(path: str, changed: int, size: int) -> FoundMesh:
-    """Read each version of a file, identified by its time of change and its size, only once."""
     vertices, triangles, rounding = read_triangles(path)
     return found_mesh(vertices, triangles, repr(path), rounding)
 
 
 def read_triangles(path: str) -> tuple[Points, Numbers, float]:
-    """Read the vertices (m, 3) and triangles (k, 3), at least one, of all bodies in a file, placed as in the file's
-    scene, in its unit of length. Also return the rounding step of coordinates, 0 if not float32. Raises
-    `InputError`."""
+    """Read the vertices (m, 3) and at least one triangle (k, 3) of all bodies in a file, placed as in the file's scene,
+    in its unit of length. Also return the rounding step of coordinates, 0 if not float32. Raises `InputError`."""
     rounding, is_single = 0.0, _is_single(path)
     vertices, triangles, count, others = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0, False
     scene = _scene(path)
@@ -155,7 +145,6 @@ def _scene(path: str) -> Any:
 
 
 def _check_unit(mesh: Mesh, what: str, scale: float, spacing: float, container: tuple[Points, Points] | None) -> None:
-    """Raise `InputError`, a sentence that calls the mesh ``what``, if the mesh is far too large or too small."""
     length = float(np.ptp(mesh.extent(), axis=0).max())
     room = None if container is None else float(np.ptp(container, axis=0).max())
     beside = 100.0 * spacing if room is None else room
@@ -174,21 +163,17 @@ def _check_unit(mesh: Mesh, what: str, scale: float, spacing: float, container: 
 
 @dataclass(frozen=True)
 class Thickness:
-    """Thicknesses of a solid below points of its surface; each point represents the same area."""
-
     points: Points
     """(n, 3) [m]"""
     lengths: Points
-    """(n,) lengths from each point straight through the solid to its other side [m]; infinite if not found"""
+    """(n,) length from the point straight through the solid [m]; infinite if not found."""
     is_sheet: np.ndarray
-    """(n,) True if the surface on the other side is nearly parallel to that at the point"""
+    """(n,) True if the surface on the other side is nearly parallel."""
 
     def share(self, which: np.ndarray) -> float:
-        """Return the fraction of the surface that a selection (n,) of the points represents."""
         return float(np.count_nonzero(which) / max(len(which), 1))
 
     def place(self, which: np.ndarray) -> str:
-        """Describe the position of the thinnest of the selected points, in words."""
         thinnest = self.points[which][np.argmin(self.lengths[which])]
         return f"({', '.join(f'{value:g}' for value in thinnest)}) m"
 
@@ -199,7 +184,6 @@ class Thickness:
 
 
 def thickness_of(mesh: Mesh, reach: float) -> Thickness:
-    """Measure the thickness of a mesh where it is below a reach [m]."""
     points, outward = mesh.own_feet(float(np.sqrt(mesh.areas().sum() / PROBES)))
     depths = reach * (np.arange(STEPS) + 1.0) / STEPS
     inside = np.array([mesh.holds(points - depth * outward) for depth in depths])
@@ -214,8 +198,8 @@ def thickness_of(mesh: Mesh, reach: float) -> Thickness:
 
 
 def _thickness_notes(mesh: Mesh, origin: Points, what: str, spacing: float, support: float) -> Iterator[str]:
-    """Yield sentences about a mesh that is thin compared with the support [m]; raise `InputError` if it cannot keep
-    fluid out. ``origin`` (3,) is the mesh's origin in the file, times the scale [m]."""
+    """Yield sentences about a mesh that is thin compared with the support [m]; raise `InputError` if fluid would pass.
+    ``origin`` (3,) is the mesh's position in the file, times the scale [m]."""
     found, least = thickness_of(mesh, support), LEAST_THICKNESS * spacing
     found = replace(found, points=origin + found.points)
     sheet, sharp = (found.lengths < least) & found.is_sheet, (found.lengths < least) & ~found.is_sheet

@@ -1,9 +1,8 @@
-"""Packing of particles, so that the fluid has its rest density everywhere, in float64.
+"""Packing of particles until the fluid has its rest density everywhere, in float64.
 
-In Colagrossi et al. (2012) and in Negi and Ramachandran (2021) particles repel each other until they fill a shape
-evenly. Here nonlinear least squares (Gauss-Newton) give every particle the density of the lattice, and keep particles
-from coming too near each other. Walls count with their weights, and air counts as if it were fluid. Only particles near
-a surface move, because those on a lattice have the rest density from the start.
+Colagrossi et al. (2012) and Negi and Ramachandran (2021) use repulsion. This packing instead solves nonlinear least
+squares (Gauss-Newton), which give every particle the density of the lattice and keep close pairs apart. Walls count
+with their weights, and air counts as fluid.
 """
 
 from contextlib import nullcontext
@@ -14,47 +13,45 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.shapes import Numbers, Points, Which, launch_on_cpu, pairs_within, shared
+from cortado.discretise.shapes import Numbers, Points, Which, in_space, launch_on_cpu, pairs_within, shared
 from cortado.discretise.smoothing import SLACK, lattice_offsets, rest_volume
 from cortado.discretise.walls import RestLattice
 from cortado.files.terminal import timed_note
 
 Int32s = NDArray[np.int32]
 MOST_CELLS = 2_000_000
-"""Most cells of a grid; for widely spread points several cells share one entry."""
 NO_LIMIT = 2**31 - 1
 
 
 @dataclass(frozen=True, eq=False)
 class PointsAround:
-    """The neighbours of particles, found by cells: first the particles, if any, then fixed points of air and walls."""
+    """Neighbours of particles, found by cells: first the particles, if any, then fixed points of air and walls."""
 
     lattice: RestLattice
-    """The lattice of the fluid at rest."""
     points: Points
     """(m, d) [m]"""
     weights: Points
-    """(m,) weight of each in the density, a particle being 1 [-]"""
+    """(m,) relative to a particle [-]"""
     air: tuple[int, int]
-    """Index of the first point of air, which ``blind`` particles do not see, and the index after the last."""
+    """Index of the first point of air, which ``blind`` particles do not see, and index after the last."""
     lengths: Points
-    """(d,) the lengths of the period [m], 0 for axes without one"""
+    """(d,) [m]; 0 along other axes"""
     reach: float
-    """Distance within which neighbours are found [m]."""
+    """[m]"""
 
     def near(self, particles: Points) -> Which:
         """Test (n,) which particles (n, d) [m] have a point within the reach."""
         return self._looked(particles, np.zeros(len(particles), dtype=bool), most=1)["counts"] > 0
 
     def sums(self, particles: Points, blind: Which) -> Points:
-        """Return the sums (n,) of the points' weighted kernels [1 / m^d] at particles (n, d) [m]. Particles that are
-        ``blind`` (n,) do not see air; the reach is the support."""
+        """Return the sums (n,) of weighted kernels [1 / m^d] at particles (n, d) [m]; ``blind`` (n,) ones do not see
+        air."""
         return np.asarray(self._looked(particles, blind)["sums"])
 
     def lists(self, particles: Points, blind: Which) -> tuple[Int32s, Int32s, Int32s]:
         """Return neighbour lists of the first n points, now at ``particles`` (n, d) [m]: start (n,) and end (n,) of
-        each list, and the neighbours' indices, with gaps between lists. A list has only points of higher index within
-        the reach."""
+        each list, and indices of neighbours. A list has only points of higher index within the reach; between lists are
+        gaps."""
         room = len(lattice_offsets(self.lattice.spacing, self.reach, self.lattice.dimension))
         while True:
             starts = (room * np.arange(len(particles) + 1)).astype(np.int32)
@@ -65,7 +62,6 @@ class PointsAround:
             room = int(counts.max())
 
     def _looked(self, particles: Points, blind: Which, **given: Any) -> dict[str, Any]:
-        """Return the outputs of the kernel ``look_around``, by name."""
         count = len(particles)
         given = {"are_own": False, "most": NO_LIMIT, "starts": np.zeros(count + 1, dtype=np.int32), **given}
         found = {"others": np.zeros(1, dtype=np.int32), "counts": np.zeros(count, dtype=np.int32), **given}
@@ -78,12 +74,11 @@ class PointsAround:
 
     @property
     def volume(self) -> float:
-        """Return the volume of a particle [m^d], with which the sum of kernels on the lattice gives its density."""
+        """Return the volume of a particle [m^d] that gives the lattice its rest density."""
         return rest_volume(self.lattice.kernel, self.lattice.spacing, self.lattice.support, self.lattice.dimension)
 
     @cached_property
     def kernels(self) -> Any:
-        """Build the `packing_kernels` for the lattice's smoothing kernel."""
         from cortado.device.modules import start_warp
 
         start_warp()
@@ -93,12 +88,10 @@ class PointsAround:
 
     @cached_property
     def in_space(self) -> Points:
-        """Return the points (m, 3) in the form that kernels use [m]."""
         return in_space(self.points)
 
     @cached_property
     def on_cpu(self) -> Any:
-        """Return the points as the kernels' struct ``Around``."""
         around, dimension = self.kernels.around(), self.lattice.dimension
         around.x, around.weights = shared(self.in_space), shared(self.weights)
         around.air, around.behind_air = self.air
@@ -110,7 +103,6 @@ class PointsAround:
 
     @cached_property
     def _by_cell(self) -> tuple[Any, Any]:
-        """Return the points sorted by cells as wide as the reach, and the grid of these cells."""
         from cortado.device.grid import Grid
 
         ends = self.points.min(axis=0), self.points.max(axis=0)
@@ -125,47 +117,36 @@ class PointsAround:
         return placed, grid
 
 
-def in_space(points: Points) -> Points:
-    """Return points (..., d) as (..., 3), with 0 along a missing axis."""
-    return np.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, 3 - points.shape[-1])])
-
-
 HIGHEST, AIM, LOWEST = 0.5 * SLACK, (-6e-3, -1e-3), -9e-3
-"""Bounds on the density of a packed particle, relative to the lattice's. It is not above, because pressure would then
-drive particles apart in the first step."""
+"""Bounds on the relative excess of a packed particle's density; with more, pressure would drive particles apart."""
 ROUNDS = 6
-"""Most rounds of least squares before the moving particles are chosen again."""
 LISTED = 0.6
-"""Distance [spacings] beyond the support within which pairs are listed, for later rounds."""
+"""Distance beyond the support within which pairs are listed, for later rounds [spacings]."""
 NEAR = 0.9
-"""Distance [spacings] below which pairs of particles repel each other."""
+"""Distance below which pairs of particles repel each other [spacings]."""
 PUSH = 0.1
 """Weight of a pair that is one spacing too close, relative to a density error of 100 %."""
 FARTHEST = 0.15
-"""Largest move [spacings] of a particle in a round, because the linearisation holds only nearby."""
+"""Largest move of a particle in a round, in which the linearisation holds [spacings]."""
 DAMPING, MOST_INNER_ROUNDS = 0.02, 20
-"""For the linear least squares: among nearly equally good solutions, the damping prefers the one with least motion."""
+"""Damping of the linear least squares, which prefers small moves, and most iterations."""
 
 
 def density_errors(around: PointsAround, sums: Points, stays: Which) -> Points:
-    """Return the relative excess (n,) of densities over the lattice's, from sums of kernels (n,) [1 / m^d]. For
-    particles that stay, a density below the lattice's counts as no error (0)."""
+    """Return the relative excess (n,) of densities from sums of kernels (n,) [1 / m^d]; 0 or more for ``stays``
+    (n,)."""
     errors = around.volume * sums - (1.0 - SLACK)
     return np.where(stays, np.maximum(errors, 0.0), errors)
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """The linearisation, at given positions, of densities and of distances of close pairs. It multiplies by the
-    derivatives without building a matrix."""
-
     kernels: Any
     equations: Any
-    """The derivatives, in the form that kernels use."""
     sums: Points
-    """(n,) sums of kernels at the particles [1 / m^d]"""
+    """(n,) [1 / m^d]"""
     distances: Points
-    """(m,) distances of close pairs [m]"""
+    """(m,) distances of close pairs [m]."""
 
     def multiply(self, moves: Points) -> tuple[Points, Points]:
         """Return the changes of the sums (n,) [1 / m^d] and of the distances (m,) [m] for moves (n, 3) [m]."""
@@ -174,7 +155,6 @@ class Linearised:
         return changes, approaches
 
     def multiply_back(self, changes: Points, approaches: Points) -> Points:
-        """Return the product (n, 3) with the transpose of the derivatives."""
         moves = np.zeros((len(changes), 3))
         self._launch(self.kernels.multiply_back, moves=moves, changes=changes, approaches=approaches)
         return moves
@@ -184,9 +164,8 @@ class Linearised:
 
 
 class Relaxation:
-    """The least-squares problem for the positions of particles, the first n of the points around, of which ``free``
-    (n,) ones may move. Those that stay do not see air. Neighbour pairs are listed once for all iterations, because no
-    particle moves far enough to get new neighbours."""
+    """Least-squares problem for the positions of the first n of the points around, of which the ``free`` (n,) ones move
+    and the ``stays`` (n,) ones do not see air. Pairs are listed once, because moves are small."""
 
     def __init__(self, around: PointsAround, stays: Which, free: Which):
         starts, ends, listed = around.lists(around.points[: len(free)], stays)
@@ -194,7 +173,6 @@ class Relaxation:
         self._given = {"around": around.on_cpu, "free": free, "starts": starts, "ends": ends, "listed": listed}
 
     def relaxed(self) -> Points:
-        """Return particles (n, d) [m] after at most `ROUNDS` least-squares steps that move the free particles."""
         spacing, places = self._around.lattice.spacing, self._around.in_space[: len(self._free)]
         first, dimension = places.copy(), self._around.points.shape[1]
         for _ in range(ROUNDS):
@@ -206,7 +184,6 @@ class Relaxation:
         return places[:, :dimension].copy()
 
     def _solved(self) -> Points:
-        """Return moves (n, 3) [spacings] from the current positions."""
         from scipy.sparse.linalg import LinearOperator, lsmr
 
         spacing, count = self._around.lattice.spacing, len(self._free)
@@ -231,7 +208,7 @@ class Relaxation:
         return np.asarray(found.reshape(-1, 3))
 
     def linearised(self, close: float) -> Linearised:
-        """Return the derivatives at the current positions, including those of distances below ``close`` [m]."""
+        """Return the derivatives at the current positions; pairs are close below ``close`` [m]."""
         kernels, count, most = self._around.kernels, len(self._free), self._most
         at_its_place = self._around.lattice.weights(np.zeros((1, self._around.lattice.dimension)))[0]
         sums, distances = np.full(count, at_its_place), np.empty(most)
@@ -258,48 +235,42 @@ MOST_LOOKS, MOST_ROUNDS = 12, 36
 COMPRESSED, DIGITS = 0.03, 6
 """Relative excess of density above which a particle may be removed, and decimals to which excesses are compared."""
 BESIDE, MOST_OUT = 10.0, 40
-"""Removals happen one at a time within this many supports, as each gives its neighbours room; and the most removals."""
+"""Distance [supports] within which one particle is removed at a time, and most removals."""
 ROUND_OFF = 1e-9
-"""Relative tolerance by which lattice neighbours may seem further apart than they are."""
+"""Relative tolerance of distances between lattice neighbours."""
 MANY = 20_000
-"""Number of particles above which packing prints a line, because it takes seconds or minutes."""
 GRAINS = 2.0**13
-"""Particles move in whole multiples of 1 / `GRAINS` spacings, so that round-off, which differs between machines, does
-not show in their positions."""
+"""Moves are multiples of 1 / `GRAINS` spacings, which hides round-off that differs between machines."""
 
 
 @dataclass(frozen=True)
 class Packing:
-    """A packing of particles among fixed points of air and of walls."""
-
     lattice: RestLattice
-    """The lattice of the fluid at rest."""
     fixed: Points
-    """(m, d) points of air and of walls [m]"""
+    """(m, d) points of air, then of walls [m]."""
     weights: Points
-    """(m,) weight of each in the density, a particle being 1 [-]"""
+    """(m,) relative to a particle [-]"""
     air: int
-    """Number of the fixed points that are air; these come first."""
+    """Number of points of air, which come first."""
     lengths: Points
-    """(d,) the lengths of the period [m], 0 for axes without one"""
+    """(d,) [m]; 0 along other axes"""
 
     def packed(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
         """Return rest positions (m, d) [m] of particles (n, d) [m], and the indices (m,) of the particles for which
-        there is room. Particles marked by ``stays`` (n,) do not move. The last few results are cached."""
+        there is room. Particles in ``stays`` (n,) do not move. The last few results are cached."""
         arrays = self.fixed, self.weights, self.lengths, particles, stays
         found, kept = _packed(self.lattice, particles.shape, self.air, *(array.tobytes() for array in arrays))
         return found.copy(), kept
 
     def errors(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Points:
         """Return the relative excess (m,) of density over the lattice's for ``some`` of particles (n, d) [m]. For
-        particles that ``stays`` (n,) marks, air is not counted and a lack of density counts as 0."""
+        particles in ``stays`` (n,), air does not count and the excess is at least 0."""
         around = self._around(particles, self.lattice.support)
         return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 
     def settled(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Compute the result of `packed`. Particles already at rest density stay. While some are compressed, as in
-        wedges or small bodies rounded up to a whole particle, those more compressed than, or equal to, their neighbours
-        are removed."""
+        """Pack particles as `packed` says; of compressed ones, remove those at least as compressed as their
+        neighbours."""
         kept, found = np.arange(len(particles)), self._at_rest(particles, stays)
         for _ in range(MOST_OUT):
             crowded = self._crowded(found, stays[kept])
@@ -311,8 +282,8 @@ class Packing:
         return np.asarray(particles[kept] + grain * np.rint((found - particles[kept]) / grain)), kept
 
     def _crowded(self, particles: Points, stays: Which) -> Numbers:
-        """Return the indices (m,) of free particles, among n (n, d) [m], that are compressed, and at least as much as
-        every free neighbour. ``stays`` (n,) marks particles that are not free."""
+        """Return the indices (m,) of free, compressed particles that are at least as compressed as all free
+        neighbours."""
         errors = np.round(self.errors(particles, np.ones(len(particles), dtype=bool)), DIGITS)
         over = np.flatnonzero((errors > COMPRESSED) & ~stays)
         points, reach = particles[over], BESIDE * self.lattice.support
@@ -322,7 +293,6 @@ class Packing:
         return np.delete(over, np.unique(less))
 
     def _at_rest(self, particles: Points, stays: Which) -> Points:
-        """Return the rest positions (n, d) [m] of all particles (n, d) [m]."""
         found = particles
         for _ in range(MOST_LOOKS):
             wrong = self._wrong(found, stays)
@@ -332,8 +302,7 @@ class Packing:
         return found
 
     def _settled_near(self, wrong: Which, particles: Points, stays: Which) -> Points:
-        """Return particles (n, d) [m] after moves of those near particles that are ``wrong`` (n,). Only the
-        neighbourhood is examined, because the rest may be very large."""
+        """Return particles (n, d) [m] after moves in the neighbourhood of the particles in ``wrong`` (n,)."""
         support, near = self.lattice.support, self.lattice.support + self.lattice.spacing
         movable = self._near(particles, wrong, near) & ~stays
         region = self._near(particles, movable, support)
@@ -356,7 +325,7 @@ class Packing:
         return np.asarray((errors > HIGHEST) | (errors < LOWEST))
 
     def _near(self, particles: Points, some: Which, reach: float) -> Which:
-        """Test (n,) which particles are at most ``reach`` [m] from any particle of a selection."""
+        """Test (n,) which particles are at most ``reach`` [m] from a selected particle."""
         others = particles[some]
         weights, reach = np.ones(len(others)), reach * (1.0 + ROUND_OFF)
         found = PointsAround(self.lattice, others, weights, (0, 0), self.lengths, reach)
@@ -369,14 +338,13 @@ class Packing:
         return PointsAround(self.lattice, points, weights, (count, count + self.air), self.lengths, reach)
 
     def _among(self, others: Points) -> "Packing":
-        """Return this packing with additional fixed particles (m, d) [m]."""
         weights = np.append(self.weights, np.ones(len(others)))
         return replace(self, fixed=np.concatenate([self.fixed, others]), weights=weights)
 
 
 @lru_cache(maxsize=8)
 def _packed(lattice: RestLattice, shape: tuple[int, int], air: int, *arrays: bytes) -> tuple[Points, Numbers]:
-    """Pack particles as `Packing.packed` does, and cache the result: one scene is often simulated more than once."""
+    """Call `Packing.settled` with a cache, as scenes are often simulated more than once."""
     *numbers, stays = arrays
     fixed, weights, lengths, particles = (np.frombuffer(one) for one in numbers)
     packing = Packing(lattice, fixed.reshape(-1, shape[1]), weights, air, lengths)

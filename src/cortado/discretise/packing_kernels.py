@@ -1,8 +1,7 @@
-"""Kernels of the packing, in float64: neighbour search, densities, and products with their derivatives.
+"""Kernels of the packing, in float64: neighbour search, densities, and products with derivatives.
 
-Each pair is listed once, with its first particle, and adds to the sums of both particles. So these kernels run in one
-thread, and thus in a fixed order. They add by a read and a write, because ``+=`` is a slower atomic addition. Sums over
-the neighbours of one particle are gathers, which run on several cores.
+A pair appears once, in the list of its first particle, and adds to the sums of both particles. Kernels over pairs
+therefore run in one thread, with a fixed order, and add by a read and a write, as ``+=`` is a slower atomic addition.
 """
 
 from functools import cache
@@ -24,52 +23,51 @@ cell_of, wrap, below, above = _cells.cell_of, _cells.wrap, _cells.below, _cells.
 
 @wp.struct
 class Around:
-    """The neighbours of particles in a packing, with their weights in the density."""
+    """Neighbours of particles, with their weights in the density."""
 
     x: wp.array(dtype=vector)
     """[m]"""
     weights: wp.array(dtype=real)
-    """Weight of each in the density, a particle being 1 [-]."""
+    """relative to a particle [-]"""
     air: wp.int32
-    """Index of the first point that blind particles do not see."""
+    """Index of the first point of air, which blind particles do not see, and index after the last."""
     behind_air: wp.int32
-    """Index after the last of these points."""
     is_periodic: wp.bool
     period: vector
-    """[m], 0 along an axis without one"""
+    """[m]; 0 without period"""
     frequency: vector
-    """1 / period [1 / m], or 0"""
+    """1 / period [1/m]"""
     per_support: real
-    """1 / h [1 / m]"""
+    """1 / h [1/m]"""
     normalisation: real
-    """sigma of the kernel [1 / m^d]"""
+    """sigma [1 / m^d]"""
 
 
 @wp.struct
 class Placed:
-    """Points around particles, in the order of their cells."""
+    """Points in the order of their cells."""
 
     x: wp.array(dtype=vector)
     """[m]"""
     numbers: wp.array(dtype=wp.int32)
-    """Numbers of the points."""
+    """Indices of the points."""
 
 
 @wp.struct
 class Equations:
-    """The derivatives of densities, and of the distances of pairs that are too close. Both are stored by lists of pairs
-    in which at least one particle may move; the pairs whose first particle is i begin at ``starts[i]``."""
+    """Derivatives of densities and of the distances of close pairs. Pairs with at least one free particle are stored in
+    lists; the pairs of particle i begin at ``starts[i]``."""
 
     starts: wp.array(dtype=wp.int32)
     others: wp.array(dtype=wp.int32)
     """Second particle of each pair within the support."""
     gradients: wp.array(dtype=vector)
-    """Derivative of either particle's sum of kernels with respect to their separation [1 / m^(d + 1)]."""
+    """Derivative of a pair's kernel with respect to its separation [1 / m^(d + 1)]."""
     own: wp.array(dtype=vector)
-    """Derivative of a particle's sum over fixed points with respect to its own position [1 / m^(d + 1)]."""
+    """Derivative of a particle's sum over fixed points with respect to its position [1 / m^(d + 1)]."""
     close_starts: wp.array(dtype=wp.int32)
     close_others: wp.array(dtype=wp.int32)
-    """Second particle of each pair that is too close."""
+    """Second particle of each close pair."""
     directions: wp.array(dtype=vector)
     """Unit vectors from the second particle to the first."""
 
@@ -86,8 +84,8 @@ def separation(x_i: vector, x_j: vector, around: Around) -> vector:
 
 @cache
 def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
-    """Build the kernels of a packing for a smoothing kernel, and the structs ``around``, ``placed``, ``grid`` and
-    ``equations`` of their arguments."""
+    """Build the kernels of a packing, and the structs ``around``, ``placed``, ``grid`` and ``equations`` of their
+    arguments."""
     functions = smoothing_functions(smoothing, FLOAT64)
     weight, slope = functions.weight, functions.slope
     module = kernel_module(f"packing_{smoothing.name}")
@@ -100,9 +98,9 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
     def look_around(
         first: int, x, blind, are_own: bool, around, placed, grid, reach: real, most: int, starts, counts, sums, others
     ):
-        """Count the points ``around`` within reach of particles at x, up to ``most``; list them from ``starts`` on
+        """Count the points ``around`` within ``reach`` of particles at x, up to ``most``; list them from ``starts`` on
         while there is room; and sum their weighted kernels. ``blind`` particles do not see air. If ``are_own``,
-        particle i is point i and no neighbour of itself."""
+        particle i is point i, and only later points count."""
         i = first + wp.tid()
         x_i = x[i]
         c = cell_of(x_i, grid)
@@ -168,7 +166,6 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def multiply(equations, moves, changes, approaches):
-        """Add the changes of sums of kernels and distances by the particles' moves."""
         i = wp.tid()
         move = moves[i]
         change = wp.dot(equations.own[i], move)

@@ -1,4 +1,4 @@
-"""Solids of simple shapes described by formulas, and lattice points within solids, in float64."""
+"""Solids of simple shapes, and lattice points within solids, in float64."""
 
 from dataclasses import dataclass
 
@@ -13,6 +13,7 @@ from cortado.discretise.solid import (
     box_faces,
     cut_box_faces,
     enclosed_moments,
+    nearest_on_edges,
     outer_edges,
     polygon_faces,
     revolved_faces,
@@ -20,7 +21,7 @@ from cortado.discretise.solid import (
 )
 
 FACING = 0.9
-"""Least cosine of the angle between one side of a polygon and the reversed other side at which the two form a sheet."""
+"""Smallest cosine between one side of a polygon and the reversed other side at which the two form a sheet."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Box(Solid):
     """A box centred at the origin, with sides along the axes."""
 
     half: Points
-    """(d,) half of its sides [m]"""
+    """(d,) half of its sides [m]."""
 
     def extent(self) -> tuple[Points, Points]:
         return -self.half, self.half
@@ -56,11 +57,10 @@ class Box(Solid):
 
 @dataclass(frozen=True)
 class Round(Solid):
-    """A round solid, all points within a radius of a segment centred at the origin: a capsule, or a sphere (in 2-D a
-    disc) if the segment has no length."""
+    """All points within a radius of a segment centred at the origin: a capsule, a sphere or, in 2-D, a disc."""
 
     half: Points
-    """(d,) from the middle of the segment to its end [m]"""
+    """(d,) vector from the middle of the segment to its end [m]."""
     radius: float
     """[m]"""
 
@@ -88,7 +88,6 @@ class Round(Solid):
         return upright.moved(_standing(along), np.zeros(len(along)))
 
     def moments(self) -> Moments:
-        """Return the moments of a cylinder and two half balls at its ends."""
         dimension, length, r = len(self.half), float(np.linalg.norm(self.half)), self.radius
         disc, ball = (2.0 * r, np.pi * r**2) if dimension == 2 else (np.pi * r**2, 4.0 / 3.0 * np.pi * r**3)
         rod = 2.0 * length * disc
@@ -100,7 +99,6 @@ class Round(Solid):
         return Moments(rod + ball, np.zeros(dimension), second)
 
     def _within(self, points: Points) -> Points:
-        """Return the nearest points (n, d) of the segment."""
         square = float(self.half @ self.half)
         along = np.clip(points @ self.half / square, -1.0, 1.0) if square > 0.0 else np.zeros(len(points))
         return np.asarray(along[:, None] * self.half)
@@ -111,8 +109,7 @@ class Revolved(Solid):
     """A solid of revolution about an axis of space through the origin."""
 
     profile: Solid
-    """Cross-section in a plane through the axis, in 2-D, with straight edges: coordinates are across the axis (to both
-    sides), and along it."""
+    """Cross-section through the axis, in 2-D, with straight edges: coordinates across the axis and along it."""
     axis: int
 
     def extent(self) -> tuple[Points, Points]:
@@ -137,7 +134,7 @@ class Revolved(Solid):
         return revolved_moments(outer_edges(self.profile.faces(np.inf)), self.axis)
 
     def _flat(self, points: Points) -> Points:
-        """Return the distance from the axis, and the height, (n, 2) [m]."""
+        """Return distances from the axis, and heights, (n, 2) [m]."""
         across = np.linalg.norm(np.delete(points, self.axis, axis=1), axis=1)
         return np.column_stack([across, points[:, self.axis]])
 
@@ -149,7 +146,7 @@ class HalfSpace(Solid):
     normal: Points
     """(d,) unit vector upwards"""
     height: float
-    """Height of the plane along the normal [m]."""
+    """[m] along the normal"""
     lower: Points
     """(d,) [m]"""
     upper: Points
@@ -183,7 +180,7 @@ class Polygon(Solid):
     """A polygon in 2-D, whose sides do not cross."""
 
     corners: Points
-    """(m, 2) [m], clockwise or counterclockwise"""
+    """(m, 2) [m], clockwise or counterclockwise."""
 
     def extent(self) -> tuple[Points, Points]:
         return self.corners.min(axis=0), self.corners.max(axis=0)
@@ -193,15 +190,7 @@ class Polygon(Solid):
         return np.where(self._holds(points), -away, away)
 
     def nearest(self, points: Points) -> Points:
-        best, found = np.full(len(points), np.inf), np.empty_like(points)
-        for first, last in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
-            side = last - first
-            along = np.clip((points - first) @ side / (side @ side), 0.0, 1.0)
-            place = first + along[:, None] * side
-            square = ((points - place) ** 2).sum(axis=1)
-            nearer = square < best
-            best, found[nearer] = np.minimum(best, square), place[nearer]
-        return found
+        return nearest_on_edges(points, np.stack([self.corners, np.roll(self.corners, -1, axis=0)], axis=1))
 
     def faces(self, fine: float) -> Faces:
         return polygon_faces(self.corners)
@@ -212,8 +201,8 @@ class Polygon(Solid):
         return enclosed_moments(edges, np.full(len(edges), -1.0 if clockwise else 1.0))
 
     def thinnest(self) -> float:
-        """Return the least thickness between nearly parallel sides without a common corner [m]; infinite if no two
-        sides face each other."""
+        """Return the smallest thickness [m] between facing sides without a common corner; infinite without facing
+        sides."""
         starts, sides = self.corners, np.roll(self.corners, -1, axis=0) - self.corners
         lengths = np.linalg.norm(sides, axis=1)
         along = sides / lengths[:, None]
@@ -245,20 +234,19 @@ class Polygon(Solid):
 
 
 def _standing(direction: Points) -> Points:
-    """Return the rotation matrix (d, d) that turns the last axis to a unit vector (d,)."""
+    """Return the rotation matrix (d, d) that rotates the last axis to a unit vector (d,)."""
     frame = np.stack([*across(direction), direction], axis=1)
     frame[:, 0] *= np.linalg.det(frame)
     return frame
 
 
 def block_around(solid: Solid, spacing: float) -> Block:
-    """Return the lattice ``lower + (i + 1/2) spacing`` [m] in the box around a solid. Its last cells may extend beyond
-    the box by less than half a spacing."""
+    """Return the lattice ``lower + (i + 1/2) spacing`` [m] in the box around a solid, or up to half a spacing
+    beyond."""
     lower, upper = solid.extent()
     return block_between(lower, upper + 0.5 * spacing, spacing)
 
 
 def points_inside(solid: Solid, spacing: float) -> Points:
-    """Return the lattice points (n, d) [m] in the box around a solid that are inside the solid."""
     points = block_around(solid, spacing).points()
     return np.asarray(points[solid.distance_up_to(points, spacing) < 0.0])

@@ -1,4 +1,5 @@
-"""The room for fluid: inside the region of a container, outside of solids, and within one period of periodic axes."""
+"""The room for fluid: inside the region of a container, outside of solids, and within one period of periodic axes.
+Points are (n, d) [m]; distances (n,) [m] are negative inside."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from cortado.discretise.shapes import Points, apart, wrapped
 from cortado.discretise.solid import Placed, Solid
 
 TOLERANCE = 0.5
-"""In spacings: largest distance of a particle outside its container. Walls push nearer ones back; light fluid among
+"""Largest distance of a particle outside its container [spacings], from which walls push it back; light fluid among
 heavier fluid is pressed out so far at times."""
 
 
@@ -25,50 +26,46 @@ class Region:
     upper: Points
     """(d,) [m]"""
     base: Points
-    """(d,) a point on the axis of the cylinder [m]"""
+    """(d,) point on the axis of the cylinder [m]."""
     across: Points
     """(d,) 1 for the axes of space across the cylinder, 0 for the axis along it. All are 0 without a cylinder, and 1
     for a sphere, whose centre is ``base``."""
     radius: float = np.inf
-    """Radius of the cylinder or the sphere [m]."""
+    """Radius of the cylinder or sphere [m]."""
     rim: float = np.inf
     """Height of the open end of a cylinder along its axis [m]; infinite if it has a lid."""
 
     @classmethod
     def between(cls, lower: Points, upper: Points) -> "Region":
-        """Return the region of a box between corners (d,) [m]."""
         return cls(lower, upper, np.zeros(len(lower)), np.zeros(len(lower)))
 
     @classmethod
     def everywhere(cls, dimension: int) -> "Region":
-        """Return the region of all of space."""
         return cls.between(np.full(dimension, -np.inf), np.full(dimension, np.inf))
 
     @classmethod
     def ball(cls, centre: Points, radius: float) -> "Region":
-        """Return the region of a sphere, or a disc in 2-D, about a centre (d,) [m], with a radius [m]."""
         everywhere = cls.everywhere(len(centre))
         return cls(everywhere.lower, everywhere.upper, centre, np.ones(len(centre)), radius)
 
     @classmethod
     def cylinder(cls, base: Points, radius: float, height: float, axis: int) -> "Region":
-        """Return the region of a cylinder along an axis of space, standing on the centre of its base (d,) [m]."""
+        """Return a cylinder along an axis of space, with the centre of its base (d,) [m]."""
         across = np.where(np.arange(len(base)) == axis, 0.0, 1.0)
         lower, upper = base - radius * across, base + radius * across
         upper[axis] += height
         return cls(lower, upper, base, across, radius)
 
     def distance(self, points: Points) -> Points:
-        """Return the distances (n,) [m] of points (n, d) [m] from the region, negative inside. Beyond an edge or a
-        corner it is the distance from the nearer face, which is too small."""
+        """Return distances, which beyond an edge or a corner are too small."""
         from_faces = np.full(len(points), -np.inf)
-        for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):  # as short rows take NumPy long
+        for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):  # NumPy is slow with short rows
             from_faces = np.maximum(from_faces, np.maximum(lower - x, x - upper))
         return np.maximum(from_faces, self._from_axis(points) - self.radius)
 
     def sides(self) -> Iterator[Callable[[Points], Points]]:
-        """Yield, for each side at a finite position, a function from points (n, d) [m] to their distances (n,) from the
-        side, positive inside [m]."""
+        """Yield, for each side at a finite position, a function from points to distances from the side, positive
+        inside."""
         for axis in np.flatnonzero(self.across == 0.0).tolist():
             for at, inwards in ((self.lower[axis], 1.0), (self.upper[axis], -1.0)):
                 if np.isfinite(at):
@@ -77,7 +74,6 @@ class Region:
             yield lambda points: np.asarray(self.radius - self._from_axis(points))
 
     def nearest(self, points: Points) -> Points:
-        """Return the nearest points (n, d) [m] of the region to given points (n, d) [m]."""
         boxed = np.clip(points, self.lower, self.upper)
         across = (boxed - self.base) * self.across
         from_axis = np.linalg.norm(across, axis=1, keepdims=True)
@@ -85,15 +81,15 @@ class Region:
         return np.asarray(boxed - inwards * across)
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which points (n, d) [m] are inside, or outside by at most the tolerance [m]."""
+        """Test (n,) which points (n, d) [m] are at most ``tolerance`` [m] outside."""
         found = self._from_axis(points) <= self.radius + tolerance
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):
             found &= (x >= lower - tolerance) & (x <= upper + tolerance)
         return np.asarray(found)
 
     def cell_shares(self, points: Points, spacing: float) -> Points:
-        """Return the fraction (n,) of the cell, a spacing [m] wide, around each point (n, d) [m] that is inside the
-        region. Along a cylinder's side cells are taken as aligned with the side."""
+        """Return the fraction (n,) inside the region of the cell, a spacing [m] wide, around each point (n, d) [m];
+        cells at a cylinder's side are taken as aligned with the side."""
         half, found = 0.5 * spacing, np.ones(len(points))
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):
             width = np.minimum(x + half, upper) - np.maximum(x - half, lower)
@@ -101,8 +97,7 @@ class Region:
         return np.asarray(found * np.clip((self.radius - self._from_axis(points)) / spacing + 0.5, 0.0, 1.0))
 
     def _from_axis(self, points: Points) -> Points:
-        """Return distances (n,) [m] of points (n, d) [m] from the axis of the cylinder, or from the sphere's centre; 0
-        for other regions."""
+        """Return distances from a cylinder's axis or a sphere's centre; 0 for other regions."""
         squares = np.zeros(len(points))
         for x, base, is_across in zip(points.T, self.base, self.across, strict=True):
             if is_across:
@@ -110,13 +105,12 @@ class Region:
         return np.sqrt(squares)
 
     def escaped(self, before: Points, after: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which particles crossed a wall between ``before`` (n, d) [m] and ``after`` (n, d) [m]. Particles
-        may pass over the rim of an open cup, and those outside before do not count."""
+        """Test (n,) which particles crossed a wall, but no rim, between ``before`` (n, d) [m] and ``after`` (n, d)
+        [m]."""
         through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
         return np.asarray(through & self.is_below_rim(before) & self.is_below_rim(after))
 
     def is_below_rim(self, points: Points) -> np.ndarray:
-        """Test (n,) which points (n, d) [m] are below the rim of an open cup; without a rim all are."""
         if not np.isfinite(self.rim):
             return np.ones(len(points), dtype=bool)
         return np.asarray(points @ (1.0 - self.across) < self.rim)
@@ -132,21 +126,20 @@ def _from_plane(points: Points, axis: int, at: float, inwards: float) -> Points:
 
 
 ALONG = 1e-3
-"""Angle [rad] below which two directions count as equal, so that images along them are not distinguished."""
+"""Angle [rad] below which images in two directions are not distinguished."""
 
 
 @dataclass(frozen=True)
 class Domain:
-    """One period of a scene. Positions may leave the period, and each place interacts with all images of particles."""
+    """One period of a scene; positions may leave it, and particles interact with all images."""
 
     lower: tuple[float, ...]
-    """(d,) Start of the period [m]; 0 along an axis that is not periodic."""
+    """(d,) [m]; 0 without period"""
     lengths: tuple[float, ...]
-    """(d,) Length of the period [m]; 0 along an axis that is not periodic."""
+    """(d,) [m]; 0 without period"""
 
     @classmethod
     def of(cls, lower: Points, lengths: Points) -> Self:
-        """Build the domain of a period with start (d,) [m] and lengths (d,) [m], which are 0 along other axes."""
         axes = lengths > 0.0
         return cls(tuple(np.where(axes, lower, 0.0).tolist()), tuple(np.where(axes, lengths, 0.0).tolist()))
 
@@ -157,18 +150,17 @@ class Domain:
         return vector(*self.lower, *rest), vector(*self.lengths, *rest), vector(*frequency, *rest)
 
     def wrapped(self, points: Points) -> Points:
-        """Return the images of points (..., d) [m] inside the period; coordinates along other axes do not change."""
         lower = np.array(self.lower)
         return lower + wrapped(points - lower, np.array(self.lengths)) if any(self.lengths) else points
 
     def shortest(self, ways: Points) -> Points:
-        """Return the vectors (n, d) [m] to the nearest images, from vectors (n, d) [m] to any images."""
+        """Return the vectors (n, d) [m] to the nearest images of points."""
         return apart(ways, np.array(self.lengths)) if any(self.lengths) else ways
 
     def within(self, points: Points, lower: Points, upper: Points) -> tuple[Points, np.ndarray]:
-        """Return the images of points (n, d) [m] that lie in a region between corners (d,) [m], or above its lower
-        corner if no image does, and a mask (n,) of those inside. An infinite end is replaced by that of the period, if
-        any; a region longer than the period is the whole period."""
+        """Return the images of points (n, d) [m] in a region between corners (d,) [m], and a mask (n,) of the points
+        with an image inside. Infinite ends become the ends of the period, and a region longer than the period the
+        period."""
         start, lower, upper = self.ends(lower, upper)
         lengths = np.array(self.lengths)
         images = start + wrapped(points - start, lengths) if lengths.any() else points
@@ -176,8 +168,7 @@ class Domain:
         return images, np.all((images >= lower) & (images < upper), axis=1)
 
     def ends(self, lower: Points, upper: Points) -> tuple[Points, Points, Points]:
-        """Return the lower ends from which `within` counts images, finite along periods, and the corners of its region
-        (d,) [m]."""
+        """Return the lower ends from which `within` counts images, and the corners of its region, each (d,) [m]."""
         begin, lengths = np.array(self.lower), np.array(self.lengths)
         start = np.where(np.isfinite(lower), lower, begin)
         end = np.where(np.isfinite(upper), upper, begin + lengths)
@@ -186,12 +177,9 @@ class Domain:
         return start, np.where(lengths > 0.0, start, lower), np.where(lengths > 0.0, end, upper)
 
     def ways(self, points: Points, place: Points, reach: float, seen: Callable[[Points], Points]) -> list[Points]:
-        """Return ``seen`` of the vectors from a place (d,) to all images of points (n, d) within a reach [m]: arrays
+        """Return ``seen`` of the vectors from a place (d,) to all images of points (n, d) within ``reach`` [m]: arrays
         (n, k), each for one image of every point. ``seen`` is a linear function of vectors (n, d), such as their
-        component across a direction.
-
-        Images with equal ``seen`` count once, as the image inside the period.
-        """
+        component across a direction. Images with equal ``seen`` count once, as the image inside the period."""
         steps, inverse, shifts = self.images(reach, seen)
         way = seen(self.wrapped(points) - place)
         if len(steps):
@@ -200,7 +188,7 @@ class Domain:
 
     def images(self, reach: float, seen: Callable[[Points], Points]) -> tuple[Points, Points, Points]:
         """Return the translations (m, k) [m] between images with different ``seen``, their inverse (k, m), and shifts
-        (i, k) [m]. The shifts lead from the nearest image to all images within a reach [m] of a place."""
+        (i, k) [m] from the nearest image to all images within ``reach`` [m]."""
         lengths = np.array(self.lengths)
         steps = _independent(seen(np.eye(len(lengths))), lengths) if lengths.any() else np.zeros((0, 0))
         if not len(steps):
@@ -212,12 +200,11 @@ class Domain:
 
 
 WITHOUT_PERIODS = Domain((), ())
-"""The domain without periodic axes."""
 
 
 def _independent(axes: Points, lengths: Points) -> Points:
-    """Return translations (m, k) between periodic images, projected by ``axes`` (d, k): a maximal independent set, the
-    longest projections first."""
+    """Return a maximal independent set of translations (m, k) between images, projected by ``axes`` (d, k), longest
+    first."""
     left, found = np.where(lengths[:, None] > 0.0, axes, 0.0), []
     for _ in lengths:
         sizes = np.linalg.norm(left, axis=1)
@@ -232,42 +219,36 @@ def _independent(axes: Points, lengths: Points) -> Points:
 
 @dataclass(frozen=True)
 class Room:
-    """The room for fluid: a region without the solids in it, which repeat with every period."""
+    """A region without the solids in it, which repeat with every period."""
 
     region: Region
     solids: Sequence[Solid]
     periods: Points
-    """(d,) Lengths of the periods [m], 0 for axes that are not periodic."""
+    """(d,) [m]; 0 along other axes"""
 
     @property
     def dimension(self) -> int:
-        """Return the number of dimensions, 2 or 3."""
         return len(self.periods)
 
     def from_solids(self, points: Points, reach: float = np.inf) -> Points:
-        """Return distances (n,) [m] of points (n, d) [m] from the nearest solid, negative inside; infinite without
-        solids. Beyond a reach [m] only the sign and a size of at least the reach are sure."""
+        """Return distances from the nearest solid, infinite without solids. Beyond ``reach`` [m] only their signs and
+        lower bounds are exact."""
         if not self.solids:
             return np.full(len(points), np.inf)
         images = [points + shift for shift in self.shifts()]
         return np.min([solid.distance_up_to(image, reach) for image in images for solid in self.solids], axis=0)
 
     def distance(self, points: Points, reach: float = np.inf) -> Points:
-        """Return distances (n,) [m] of points (n, d) [m] from the room, negative inside, exact up to a reach [m]."""
         return np.maximum(self.region.distance(points), -self.from_solids(points, reach))
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which points (n, d) [m] are inside, or outside by at most the tolerance [m]."""
         return self.region.contains(points, tolerance) & (self.from_solids(points, abs(tolerance)) >= -tolerance)
 
     def cell_shares(self, points: Points, spacing: float) -> Points:
-        """Return the fraction (n,) of the cell, a spacing [m] wide, around each point (n, d) [m] that is inside the
-        room. Along the surfaces of solids cells are taken as aligned with the surface."""
         within = self.region.cell_shares(points, spacing)
         return within * np.clip(self.from_solids(points, 0.5 * spacing) / spacing + 0.5, 0.0, 1.0)
 
     def images(self, solid: Solid) -> list[Solid]:
-        """Return a solid and its copies, shifted by one period."""
         turn = np.eye(self.dimension)
         return [solid, *(Placed(solid, shift, turn) for shift in self.shifts()[1:])]
 

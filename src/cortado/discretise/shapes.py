@@ -1,8 +1,5 @@
-"""Arrays of points in float64: lattice blocks and discs, pairs of neighbouring points, and their density.
-
-Pairs are also found across the ends of periods. Kernels for these arrays run on the CPU (`launch_on_cpu`), because
-scenes are discretised there, whichever device a simulation uses.
-"""
+"""Arrays of points in float64: lattice blocks and discs, pairs of neighbours, also across periods, and their density.
+Kernels for these arrays run on the CPU, on which all scenes are discretised."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -22,28 +19,23 @@ Which = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
 ROUND_OFF = 1e-6
-"""Fraction of a spacing by which a length may be shorter than a whole number of cells: 0.25 / 0.05 counts as 5."""
+"""Fraction of a spacing by which a length may be shorter than its number of cells: 0.25 / 0.05 counts as 5."""
 
 NEARBY = 4
-"""Largest difference, along an axis, between the number of points of a stretched lattice and the number that fits."""
+"""Largest difference, along an axis, between the numbers of points of a stretched lattice and of the rest lattice."""
 EXCESS = 0.003
-"""Largest relative difference between the number of points of a stretched lattice and the number for its volume."""
+"""Largest relative difference between the volumes of a stretched lattice's cells and of the shape."""
 MOST_STRETCHED = 0.03
-"""Largest logarithm of the stretching of a lattice along an axis: up to this value the density is that of the rest
-lattice within 1 %, also beside walls."""
+"""Largest logarithm of the stretching along an axis, for a density right within 1 %, also beside walls."""
 
 
 class Rows:
-    """A base of dataclasses whose fields are arrays with a common first axis."""
-
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Concatenate the rows of several objects of this class."""
         names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
         return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in names))
 
     def some(self, which: Any) -> Self:
-        """Return the rows selected by an array index: a slice, numbers or a mask (n,)."""
         return type(self)(*(getattr(self, field.name)[which] for field in fields(self)))  # type: ignore[arg-type]
 
     def __len__(self) -> int:
@@ -51,8 +43,8 @@ class Rows:
 
 
 def bisected(holds: Callable[[Points], Which], low: Points, high: Points, halvings: int) -> tuple[Points, Points]:
-    """Return, by bisection, bounds (n,) of where a condition on numbers (n,) stops being true; it is true at ``low``
-    (n,) and false at ``high`` (n,)."""
+    """Return bounds (n,) of where a condition on numbers (n,), true at ``low`` (n,) and false at ``high`` (n,), stops
+    being true."""
     for _ in range(halvings):
         middle = 0.5 * (low + high)
         good = holds(middle)
@@ -67,22 +59,19 @@ class Block:
     first: Points
     """(d,) [m]"""
     counts: Points
-    """(d,) whole numbers, as floats: they may be larger than any array."""
+    """(d,) integers as floats, which may be larger than any array."""
     spacings: Points
-    """(d,) between points along each axis [m]"""
+    """(d,) [m]"""
 
     @cached_property
     def size(self) -> float:
-        """Return the number of points."""
         return float(np.prod(self.counts))
 
     @cached_property
     def extent(self) -> tuple[Points, Points]:
-        """Return the first and the last point, each (d,) [m]."""
         return self.first, self.first + (self.counts - 1.0) * self.spacings
 
     def grown(self, cells: int) -> "Block":
-        """Return this lattice with ``cells`` additional cells on every side."""
         return Block(self.first - cells * self.spacings, self.counts + 2 * cells, self.spacings)
 
     def points(self) -> Points:
@@ -92,17 +81,17 @@ class Block:
 
 
 def block_between(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
-    """Return the points ``lower + (i + 1/2) spacing`` whose cells lie within the box; lower and upper (d,) [m]."""
+    """Return the points ``lower + (i + 1/2) spacing`` whose cells are inside the box between corners (d,) [m]."""
     first = np.asarray(lower, dtype=np.float64)
     counts = whole_cells(np.asarray(upper, dtype=np.float64) - first, spacing)
     return Block(first + 0.5 * spacing, counts, np.full(len(first), spacing))
 
 
 def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
-    """Return points ``lower + (i + 1/2) spacing`` of a box whose sides are whole cells; lower and upper (d,) [m]. For
-    other boxes the lattice is stretched along some axes and compressed along others, by `MOST_STRETCHED` at most. The
-    number of points matches the volume within `EXCESS`, if possible from below, because compressed fluid bursts apart.
-    If no lattice does both, return the points whose cells lie inside."""
+    """Return points ``lower + (i + 1/2) spacing`` that fill a box between corners (d,) [m]. If a side is no integer
+    number of cells, the lattice is stretched along some axes and compressed along others, at most by `MOST_STRETCHED`.
+    The number of points matches the volume within `EXCESS`, rather from below, because compressed fluid bursts apart.
+    If no lattice does both, only cells inside have points."""
     first, last = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cells, plain = (last - first) / spacing, block_between(lower, upper, spacing)
     if (np.abs(cells - np.rint(cells)) <= ROUND_OFF).all() or not plain.counts.all():
@@ -128,7 +117,7 @@ def block_about(centre: ArrayLike, half: ArrayLike, spacing: float) -> Block:
 
 
 def lattice(counts: Points, spacing: float) -> Points:
-    """Return a lattice (n, d) [m] symmetric about the origin, with the given number of points (d,) along each axis."""
+    """Return a lattice (n, d) [m] symmetric about the origin, with ``counts`` (d,) points along the axes."""
     return Block(-0.5 * (counts - 1.0) * spacing, counts, np.full(len(counts), spacing)).points()
 
 
@@ -139,11 +128,8 @@ def disc(radius: float, spacing: float, dimension: int) -> Points:
 
 
 def across(direction: ArrayLike) -> Points:
-    """Return unit vectors (d - 1, d), perpendicular to a unit vector (d,) and to one another.
-
-    They start from the axes of space most nearly perpendicular to the direction; for one along an axis they are the
-    others.
-    """
+    """Return unit vectors (d - 1, d) perpendicular to a unit vector (d,) and to one another, nearly along axes of
+    space."""
     frame = [np.asarray(direction, dtype=np.float64)]
     for axis in np.argsort(np.abs(frame[0]), kind="stable")[:-1]:
         vector = np.eye(len(frame[0]))[axis]
@@ -154,7 +140,7 @@ def across(direction: ArrayLike) -> Points:
 
 def whole_origin(points: Points) -> Points:
     """Return an origin (d,) [m] near the middle of points (n, d) [m] that are far from 0 relative to their extent,
-    otherwise 0. It is a multiple of a power of two, so that subtracting it causes no rounding."""
+    otherwise 0. The origin is a multiple of a power of two, so that subtracting it causes no rounding."""
     lower, upper = points.min(axis=0), points.max(axis=0)
     step = 2.0 ** np.ceil(np.log2(max((upper - lower).max(), np.finfo(np.float64).tiny)))
     return np.asarray(step * np.round((0.5 * lower + 0.5 * upper) / step))
@@ -171,21 +157,19 @@ def grid(axes: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def in_space(vectors: Any) -> Any:
-    """Return vectors (..., d) as (..., 3), with a third component 0 for those of the plane."""
     return np.pad(vectors, [(0, 0)] * (np.ndim(vectors) - 1) + [(0, 3 - np.shape(vectors)[-1])])
 
 
 def corners(lower: Points, upper: Points) -> Points:
-    """Return the corners (2^d, d) of a box."""
+    """(2^d, d)"""
     return np.array(list(product(*zip(lower, upper, strict=True))), dtype=np.float64)
 
 
 CHUNK = 8192
-"""Number of points whose neighbours are searched at a time, to limit the memory."""
 
 Period = tuple[Points, Points]
 Pairs = tuple[Numbers, Numbers, Points]
-"""The first and the second point of each pair, and how far apart they are [m]; each (m,)."""
+"""First and second point of each pair, and their distance [m]; each (m,)."""
 
 
 def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 0.0, lengths: ArrayLike = 0.0) -> Pairs:
@@ -216,7 +200,7 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
 
 
 def apart(separations: Points, lengths: ArrayLike) -> Points:
-    """Return separations (m, d) [m] of pairs, to the nearest image for periods ``lengths`` (d,) [m]."""
+    """Return separations (m, d) [m] to the nearest image for periods ``lengths`` (d,) [m]."""
     lengths = np.asarray(lengths, dtype=np.float64)
     if not lengths.any():
         return separations
@@ -224,8 +208,8 @@ def apart(separations: Points, lengths: ArrayLike) -> Points:
 
 
 def _around(some: Points, others: Points, reach: float, lengths: Points) -> Numbers:
-    """Return the indices of the ``others`` (m, d) [m] in the box around ``some`` (n, d) [m], extended by ``reach`` [m].
-    Return all indices if an axis is periodic, or if ``some`` is empty."""
+    """Return the indices of the ``others`` (m, d) [m] in the box around ``some`` (n, d) [m], extended by ``reach`` [m];
+    all indices if an axis is periodic, or if ``some`` is empty."""
     if lengths.any() or not len(some):
         return np.arange(len(others))
     beyond = reach * (1.0 + 1e-9)
@@ -234,7 +218,7 @@ def _around(some: Points, others: Points, reach: float, lengths: Points) -> Numb
 
 
 def wrapped(positions: Points, lengths: Points) -> Points:
-    """Return positions (..., d) inside [0, length) on periodic axes; rounding never gives the length itself."""
+    """Return positions (..., d) inside [0, length) on periodic axes, also after rounding."""
     if not lengths.any():
         return positions
     safe = np.where(lengths > 0.0, lengths, 1.0)
@@ -243,17 +227,15 @@ def wrapped(positions: Points, lengths: Points) -> Points:
 
 
 MOST_AVERAGE_COMPRESSION = 0.1
-"""Largest mean of (n - 1)+ over the first particles, where n is the number density; a more compressed lattice bursts
-apart."""
+"""Largest mean of max(n - 1, 0) over the initial particles, where n is the relative number density."""
 MOST_DENSITY = 1.5
-"""Largest number density of a first particle; on a disturbed lattice whose particles are all half a spacing apart it is
-1.4."""
+"""Largest relative number density of an initial particle; particles half a spacing apart have 1.4."""
 NOTED_COMPRESSION = 0.03
 """Mean compression above which a warning is given; a lattice disturbed by a tenth of a spacing has 0.02."""
 NOTED_DENSITY = 0.5
-"""If no number density exceeds this value, the particles hardly form a fluid."""
+"""Relative number density below which the particles hardly form a fluid."""
 AT_ONE_PLACE = 1e-3
-"""In spacings: particles closer than this count as coincident."""
+"""Distance of coincident particles [spacings]."""
 
 
 def check_crowding(
@@ -266,11 +248,11 @@ def check_crowding(
     period: Period,
     bodies: Sequence[str] | NDArray[np.str_] = (),
 ) -> str | None:
-    """Return a warning about particles that are crowded, or that hardly touch each other; None otherwise. Raise
-    `InputError` if they would burst apart, and say so if two sound bodies overlap.
+    """Return a warning about particles that are crowded, or that hardly touch each other; None for others. Raise
+    `InputError` if they would burst apart, with both names if two bodies overlap.
 
     Args:
-        what: they in words, in the plural.
+        what: the particles in words, in the plural.
         positions: (n, d) [m].
         kernel: W.
         support: radius [m].
@@ -281,7 +263,7 @@ def check_crowding(
     """
     point, other, distances = pairs_within(positions, positions, support, *period)
     seen = volume * kernel.weight(distances, positions.shape[1], support)
-    densities = np.bincount(point, seen)  # over that of the lattice
+    densities = np.bincount(point, seen)  # relative to the lattice
     average, greatest = _compression(densities), densities.max()
     inside = float(np.quantile(densities, 0.75))  # away from the surface
     fit = spacing * inside ** (-1.0 / positions.shape[1])
@@ -309,8 +291,7 @@ def _compression(densities: NDArray[Any]) -> float:
 def _check_meeting(
     bodies: NDArray[np.str_], positions: Points, point: Numbers, other: Numbers, seen: NDArray[Any]
 ) -> None:
-    """Raise `InputError` where particles are crowded only by those of other bodies: (k,) pairs, and what a particle
-    adds to the density at another one."""
+    """Raise `InputError` if only particles of other bodies crowd particles; ``seen`` (k,) is a pair's density."""
     foreign = bodies[point] != bodies[other]
     together = np.bincount(point, seen)
     added = np.bincount(point, seen * foreign)
@@ -329,8 +310,8 @@ def _check_meeting(
 
 
 def check_apart(what: str, positions: Points, spacing: float, period: Period) -> None:
-    """Raise `InputError`, a sentence that begins with ``what``, if two particles (n, d) [m] coincide. The period starts
-    at a corner (d,) and has lengths (d,) [m], 0 along other axes."""
+    """Raise `InputError`, which begins with ``what``, if two particles (n, d) [m] coincide. The period starts at a
+    corner (d,) and has lengths (d,) [m], 0 along other axes."""
     first, second, _ = pairs_within(positions, positions, AT_ONE_PLACE * spacing, *period)
     pairs = np.flatnonzero(first < second)
     if pairs.size:
@@ -343,7 +324,7 @@ def check_apart(what: str, positions: Points, spacing: float, period: Period) ->
 
 
 def nearest(positions: Points) -> NDArray:
-    """Return the distance (n,) [m] from each of at least two particles (n, d) [m] to its nearest neighbour."""
+    """Return the distance (n,) [m] of each of at least two particles (n, d) [m] to its nearest neighbour."""
     from scipy.spatial import cKDTree
 
     return cKDTree(positions).query(positions, k=2)[0][:, 1]
@@ -359,8 +340,8 @@ def _in_bands() -> Any:
 
 
 def launch_on_cpu(kernel: Any, threads: int, in_bands: bool = True, **arguments: Any) -> None:
-    """Launch a kernel with arguments by name; it writes to the NumPy arrays among them. All cores share the threads in
-    bands (`cortado.device.launching`) if no two threads write to one element, otherwise one core runs all."""
+    """Launch a kernel with arguments by name, which writes to NumPy arrays: on all cores if ``in_bands``, as no two
+    threads write to one element, otherwise on one core."""
     from cortado.device.launching import launch
     from cortado.device.threads import WARP
 

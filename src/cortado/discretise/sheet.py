@@ -1,5 +1,4 @@
-"""Sheets, walls without thickness, in float64: open surfaces of edges in the plane, of triangles in space. Also their
-wall particles and the weights of these in the density."""
+"""Sheets, walls without thickness, in float64, with their wall particles: edges in 2-D, triangles in 3-D."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,50 +9,43 @@ import numpy as np
 from cortado.discretise.mesh import TriangleTree
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import ROUND_OFF, Numbers, Points, Which, in_space, launch_on_cpu
-from cortado.discretise.solid import Faces, Solid
+from cortado.discretise.solid import Faces, Solid, nearest_on_edges
 from cortado.discretise.solid_walls import DENSITY, WallPoints, frames, surface_points
 from cortado.discretise.walls import Places, RestLattice, WallLayers, uneven_changes, wall_weights
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet(Solid):
-    """A surface with fluid on both sides. It has no inside, so distances from it are never negative."""
+    """A surface with fluid on both sides. Distances from it are never negative, as it has no inside."""
 
     vertices: Points
     """(m, d) [m]"""
     corners: Numbers
-    """(k, d) indices of the vertices of each edge or triangle"""
+    """(k, d) indices of the vertices of each edge or triangle."""
 
     @classmethod
     def along(cls, places: Points) -> "Sheet":
-        """Return the sheet along a polyline (m, 2) [m], or the flat one in a convex polygon (m, 3) [m] in space."""
+        """Return the sheet along a polyline (m, 2) [m] in 2-D, or in a convex flat polygon (m, 3) [m] in 3-D."""
         numbers, is_flat = np.arange(len(places)), places.shape[1] == 2
         around = [0 * numbers[2:], numbers[1:-1], numbers[2:]]
         return cls(places, np.stack([numbers[:-1], numbers[1:]] if is_flat else around, axis=1))
 
     @property
     def pieces(self) -> Points:
-        """Return the corners (k, d, d) of the sheet's edges or triangles [m]."""
+        """(k, d, d) [m]"""
         return self.vertices[self.corners]
 
     @property
     def normals(self) -> Points:
-        """Return a unit normal (k, d) of each edge or triangle."""
-        first, *others = np.moveaxis(self.pieces, 1, 0)
-        along = [other - first for other in others]
-        across = along[0][:, ::-1] * np.array([-1.0, 1.0]) if len(along) == 1 else np.cross(*along)
-        return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
+        """(k, d) unit vectors"""
+        return np.asarray(self._across / np.linalg.norm(self._across, axis=1, keepdims=True))
 
     def centroid(self) -> Points:
-        """Return the centroid (d,) of the sheet's length or area [m]."""
-        first, *others = np.moveaxis(self.pieces, 1, 0)
-        along = [other - first for other in others]
-        sizes = np.linalg.norm(along[0] if len(along) == 1 else np.cross(*along), axis=1)
+        sizes = np.linalg.norm(self._across, axis=1)
         return np.asarray(sizes @ self.pieces.mean(axis=1) / sizes.sum())
 
     @classmethod
     def joined(cls, sheets: Sequence["Sheet"]) -> "Sheet":
-        """Join at least one sheet to a single one."""
         starts = np.cumsum([0, *(len(one.vertices) for one in sheets[:-1])])
         corners = [one.corners + start for one, start in zip(sheets, starts, strict=True)]
         return cls(np.concatenate([one.vertices for one in sheets]), np.concatenate(corners))
@@ -71,18 +63,11 @@ class Sheet(Solid):
     def nearest(self, points: Points) -> Points:
         if points.shape[1] == 3:
             return self._tree.nearest(points)[0]
-        found, least = np.zeros_like(points), np.full(len(points), np.inf)
-        for start, end in self.pieces:
-            along = np.clip((points - start) @ (end - start) / ((end - start) @ (end - start)), 0.0, 1.0)
-            places = start + along[:, None] * (end - start)
-            squares = ((points - places) ** 2).sum(axis=1)
-            found = np.where((squares < least)[:, None], places, found)
-            least = np.minimum(squares, least)
-        return found
+        return nearest_on_edges(points, self.pieces)
 
     def aside(self, points: Points, distance: float) -> Points:
-        """Return, for points (n, d) [m], points (n, d) [m] at a distance [m] from the sheet on the same side; for
-        points on the sheet, on the side of its normals."""
+        """Return points (n, d) [m] at a distance [m] from the sheet, on the same side as given points (n, d) [m]; for
+        points on the sheet, on the side of the normals."""
         feet = self.nearest(points)
         away = points - feet
         length = np.linalg.norm(away, axis=1)
@@ -94,7 +79,6 @@ class Sheet(Solid):
         return np.asarray(feet + distance * away / length[:, None])
 
     def faces(self, fine: float) -> Faces:
-        """Return both sides of the sheet as a surface that encloses no volume."""
         return Faces(self.vertices, np.concatenate([self.corners, self.corners[:, ::-1]]))
 
     def crossed(self, starts: Points, ends: Points, spacing: float) -> Which:
@@ -115,13 +99,20 @@ class Sheet(Solid):
         return found
 
     @cached_property
+    def _across(self) -> Points:
+        """Return normal vectors (k, d) with a size proportional to the length or area of each edge or triangle."""
+        first, *others = np.moveaxis(self.pieces, 1, 0)
+        along = [other - first for other in others]
+        return along[0][:, ::-1] * np.array([-1.0, 1.0]) if len(along) == 1 else np.cross(*along)
+
+    @cached_property
     def _tree(self) -> TriangleTree:
         return TriangleTree.of(self.pieces)
 
 
 @dataclass(frozen=True, eq=False)
 class Thickened(Solid):
-    """The points within a depth of a sheet, as a solid."""
+    """Points within a depth of a sheet, as a solid."""
 
     sheet: Sheet
     depth: float
@@ -141,7 +132,7 @@ class Thickened(Solid):
         return np.asarray(feet + self.depth * away / np.maximum(length, 1e-300))
 
     def faces(self, fine: float) -> Faces:
-        """Return the solid's surface with sharp edges: the sheet shifted to both sides, and strips between the ends."""
+        """Return a surface with sharp edges: the sheet shifted to both sides, and strips between the ends."""
         sheet, count = self.sheet, len(self.sheet.vertices)
         aside = np.zeros_like(sheet.vertices)
         for corner in sheet.corners.T:
@@ -164,8 +155,7 @@ class Thickened(Solid):
 
 
 def sheet_points(sheet: Sheet, layers: WallLayers, lattice: RestLattice) -> WallPoints:
-    """Build the wall particles on both sides of a sheet and around its ends, in layers with the depths of a flat
-    wall's."""
+    """Build the wall particles on both sides of a sheet and around its ends, in the layers of a flat wall."""
     apart = DENSITY * lattice.spacing
     parts = [surface_points(Thickened(sheet, depth), apart, 0.0) for depth in layers.depths]
     positions = np.concatenate([one.points for one in parts])
@@ -177,9 +167,9 @@ def sheet_points(sheet: Sheet, layers: WallLayers, lattice: RestLattice) -> Wall
 def sheet_weights(
     sheet: Sheet, points: Sequence[Points], flat: Sequence[Points], room: Room, lattice: RestLattice, least: float
 ) -> Points:
-    """Compute the weights (b,) of the wall particles of a sheet as for other solids: from points beside the sheet, at
-    least ``least`` [m] from any surface. The lists have positions (b, d) [m] and weights (b,): first the sheet's, as in
-    a flat wall, then those of other walls in the room."""
+    """Compute the weights (b,) of a sheet's wall particles, fitted at points at least ``least`` [m] from any surface.
+    The lists have positions (b, d) [m] and flat-wall weights (b,), first of the sheet, then of other walls in the
+    room."""
     spacing, own = lattice.spacing, len(points[0])
     heights = spacing * (np.arange(int(np.ceil(lattice.support / spacing - 0.5))) + 0.5)
     found = np.concatenate([surface_points(Thickened(sheet, height), spacing, 0.0).points for height in heights])

@@ -1,15 +1,12 @@
-"""Smoothing kernels W(r; h) of compact support h and their gradients, in NumPy.
+"""Smoothing kernels W(r; h) with a support radius h and their gradients, in NumPy.
 
 With q = r / h, s = x / h and the normalisation sigma [1 / m^d]:
 
     W = sigma w(q),    grad W = (sigma / h) f(q) s,
 
-where f(q) = w'(q) / q is finite at q = 0 for every kernel here, so no direction is needed at r = 0. Cubic spline:
-Monaghan (1992). Wendland C2 and C4: Dehnen and Aly (2012). The Warp versions, with Hessians, are in
-`cortado.discretise.smoothing_functions`.
-
-Constants of a filled neighbourhood on the lattice of the rest spacing are functions of a smoothing kernel, the spacing
-[m] of the lattice, the support radius [m] and the dimension, 2 or 3.
+where f(q) = w'(q) / q is finite at q = 0. Cubic spline: Monaghan (1992). Wendland C2 and C4: Dehnen and Aly (2012). The
+Warp versions are in `cortado.discretise.smoothing_functions`. Constants of the rest lattice are functions of a
+smoothing kernel, the spacing [m], the support radius [m] and the dimension, 2 or 3.
 """
 
 import itertools
@@ -30,18 +27,17 @@ class SmoothingKernel:
 
     name: str
     normalisations: tuple[float, float]
-    """sigma h^d in two and in three dimensions."""
+    """sigma h^d in 2-D and 3-D."""
     value: Callable[[np.ndarray], np.ndarray]
-    """w(q)."""
+    """w(q)"""
     gradient_factor: Callable[[np.ndarray], np.ndarray]
-    """f(q) = w'(q) / q."""
+    """f(q) = w'(q) / q"""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the kernel by its name."""
         return smoothing_kernel, (self.name,)
 
     def normalisation(self, dimension: int, support: float) -> float:
-        """Return the normalisation sigma [1 / m^d] for a support radius [m]."""
+        """Return sigma [1 / m^d]."""
         return self.normalisations[dimension - 2] / support**dimension
 
     def weight(self, distance: np.ndarray, dimension: int, support: float) -> np.ndarray:
@@ -77,26 +73,23 @@ KERNELS = {kernel.name: kernel for kernel in (CUBIC_SPLINE, WENDLAND_C2, WENDLAN
 
 
 def smoothing_kernel(name: str) -> SmoothingKernel:
-    """Return the smoothing kernel with this name; raise `InputError` if there is no such kernel."""
+    """Return the smoothing kernel with this name; raise `InputError` for an unknown name."""
     if name not in KERNELS:
         raise InputError(f"kernel is {name!r}, but must be one of {', '.join(KERNELS)}.")
     return KERNELS[name]
 
 
 SKIN = 0.03
-"""Extra radius of neighbour lists, relative to the support radius: density is also computed at predicted positions."""
+"""Extra radius of neighbour lists, relative to the support radius, for densities at predicted positions."""
 SLACK = 1e-4
-"""Relative amount by which the lattice's density is below the rest density.
-
-At the rest density exactly, every particle of a block that starts as a lattice sits on the kink of the pressure clamp.
-Round-off would then choose the derivative of the pressure, and no finite difference could confirm it.
-"""
+"""Relative amount by which the lattice's density is below the rest density. At exactly the rest density every lattice
+particle would be on the kink of the pressure clamp, where round-off chooses the derivative."""
 RATE_LIMIT = 1.5
-"""Bound on `greatest_rate`: the iteration converges below 2, and the margin is for particles off the lattice."""
+"""Bound on `greatest_rate`, below the limit of convergence, 2, for particles off the lattice."""
 
 
 def lattice_offsets(spacing: float, support: float, dimension: int) -> np.ndarray:
-    """Return separations (m, d) [m] between a lattice point and all points within the support, itself included."""
+    """Return separations (m, d) [m] between a lattice point and all points within the support, including itself."""
     reach = range(-int(support / spacing) - 1, int(support / spacing) + 2)
     offsets = spacing * np.array(list(itertools.product(reach, repeat=dimension)), dtype=np.float64)
     return offsets[np.linalg.norm(offsets, axis=1) < support]
@@ -108,8 +101,8 @@ def _waves(spacing: float, dimension: int, count: int = 25) -> np.ndarray:
 
 
 def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return V_0 = (1 - SLACK) / sum_j W_ij [m^d]. With a mass rho_0 V_0 the lattice's density is the rest density
-    times 1 - SLACK."""
+    """Return V_0 = (1 - SLACK) / sum_j W_ij [m^d]: with the mass rho_0 V_0 the lattice has the density (1 - SLACK)
+    rho_0."""
     distances = np.linalg.norm(lattice_offsets(spacing, support, dimension), axis=1)
     return float((1.0 - SLACK) / kernel.weight(distances, dimension, support).sum())
 
@@ -118,7 +111,7 @@ def _filled(
     kernel: SmoothingKernel, spacing: float, support: float, dimension: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the `lattice_offsets` (m, d) [m], the gradients of W there (m, d) [1 / m^(d + 1)], and the volume V [m^d]
-    with which the lattice has the rest density exactly."""
+    with which the lattice has exactly the rest density."""
     offsets = lattice_offsets(spacing, support, dimension)
     volume = rest_volume(kernel, spacing, support, dimension) / (1.0 - SLACK)
     return offsets, kernel.gradient(offsets, support), volume
@@ -129,7 +122,7 @@ def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, 
 
     delta = 1 / (beta (S . S + sum_j G_ij . G_ij)), beta = 2 m^2 dt^2 / rho_0^2, S = sum_j G_ij,
 
-    reduced if the pressure iteration would diverge with this value: if the `greatest_rate` exceeds `RATE_LIMIT`.
+    reduced if the `greatest_rate` exceeds `RATE_LIMIT`.
     """
     gradients = kernel.gradient(lattice_offsets(spacing, support, dimension), support)
     total = gradients.sum(axis=0)
@@ -140,12 +133,11 @@ def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, 
 
 @cache
 def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the factor by which one pressure iteration with the delta of a filled neighbourhood overcorrects the worst
+    """Return the factor by which a pressure iteration with the delta of a filled neighbourhood overcorrects the worst
     pressure wave on the lattice [-].
 
-    A pressure wave exp(i k . x) moves the particles. Their density responds with the factor delta |S(k)|^2 / (2 sum_j
-    G_j . G_j), where S(k) = sum_j G_j sin(k . x_j). The iteration converges if the factor is below 2. It is 1.4 for the
-    cubic spline with a support of 2 spacings in 3-D, and 3.7 with 3 spacings.
+    A pressure wave exp(i k . x) changes the density by the factor delta |S(k)|^2 / (2 sum_j G_j . G_j), where S(k) =
+    sum_j G_j sin(k . x_j). The iteration converges if the factor is below 2.
     """
     offsets = lattice_offsets(spacing, support, dimension)
     gradients = kernel.gradient(offsets, support)
@@ -155,7 +147,7 @@ def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
 
 def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: float) -> np.ndarray:
     """Return F = x . G / (|x|^2 + 0.01 h^2) (m,) [1 / m^(d + 2)] at separations (m, d) [m], the factor of second
-    derivatives computed from differences."""
+    derivatives from differences."""
     squares = (separations**2).sum(axis=1)
     return (separations * kernel.gradient(separations, support)).sum(axis=1) / (squares + 0.01 * support**2)
 
@@ -167,10 +159,8 @@ def wall_response(kernel: SmoothingKernel, spacing: float, support: float, dimen
 
 @cache
 def lattice_laplacian_correction(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the factor [-] that makes the Laplacian 2 V sum_j (u_i - u_j) F_ij exact for a parabola on the lattice.
-
-    Without it second derivatives are 1 to 8 % too small at any resolution, mostly because of the 0.01 h^2 in F.
-    """
+    """Return the factor [-] that makes the Laplacian 2 V sum_j (u_i - u_j) F_ij exact for a parabola on the lattice;
+    second derivatives without the factor are 1 to 8 % too small."""
     offsets, _, volume = _filled(kernel, spacing, support, dimension)
     return float(-1.0 / (volume * (shear_factor(kernel, offsets, support) * offsets[:, 0] ** 2).sum()))
 
@@ -184,7 +174,7 @@ def circulation_factor(kernel: SmoothingKernel, spacing: float, support: float, 
 
 @cache
 def laplacian_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the size of the greatest eigenvalue [1 / m2] of the corrected Laplacian on the lattice."""
+    """Return the largest magnitude of an eigenvalue [1 / m2] of the corrected Laplacian on the lattice."""
     offsets, _, volume = _filled(kernel, spacing, support, dimension)
     correction = lattice_laplacian_correction(kernel, spacing, support, dimension)
     weights = -2.0 * volume * correction * shear_factor(kernel, offsets, support)
@@ -193,11 +183,9 @@ def laplacian_rate(kernel: SmoothingKernel, spacing: float, support: float, dime
 
 @cache
 def pairwise_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the greatest eigenvalue [1 / m2] on the lattice of the pairwise viscous force on velocities,
+    """Return the greatest eigenvalue [1 / m2] on the lattice of the pairwise viscous force,
 
     2 (d + 2) V sum_j F_ij x_ij x_ij^T / |x_ij|^2 (v_i - v_j).
-
-    For a compression wave it is about three times the Laplacian's eigenvalue.
     """
     offsets, _, volume = _filled(kernel, spacing, support, dimension)
     squares = (offsets**2).sum(axis=1)
@@ -217,9 +205,9 @@ def stress_control(kernel: SmoothingKernel, spacing: float, support: float, dime
 
 @cache
 def stress_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the greatest eigenvalue [1 / m2] on the lattice of viscosity as a stress (`cortado.sph.stress_kernels`),
-    reached by a compression wave. It is the maximum over wave vectors k of 2 |g|^2 + C (sum_j 2 s_j (1 - cos k . x_j) -
-    m_2 |g|^2), with g = sum_j s_j x_j sin(k . x_j) / m_2."""
+    """Return the greatest eigenvalue [1 / m2] on the lattice of viscosity as a stress (`cortado.sph.stress_kernels`):
+    the maximum over wave vectors k of 2 |g|^2 + C (sum_j 2 s_j (1 - cos k . x_j) - m_2 |g|^2), with g = sum_j s_j x_j
+    sin(k . x_j) / m_2."""
     offsets, gradients, volume = _filled(kernel, spacing, support, dimension)
     others = np.any(offsets != 0.0, axis=1)
     offsets, gradients = offsets[others], gradients[others]

@@ -2,11 +2,8 @@
 
     W = sigma w(q),    grad W = (sigma / h) f(q) s,    H u = (sigma / h^2) (f(q) u + (f'(q) / q) (s . u) s),
 
-with q = r / h, s = x / h and f(q) = w'(q) / q.
-
-A GPU has one instruction for the reciprocal root, but none for a root or a quotient. So q is computed as q^2 (1 / q),
-and divisions by q become products with 1 / q. Pieces are selected without branches, so that terms which two functions
-of a pair share are computed once.
+with q = r / h, s = x / h and f(q) = w'(q) / q. GPUs have an instruction only for the reciprocal root, so q is q^2 (1 /
+q), and products with 1 / q replace divisions. Without branches, two functions of a pair share terms.
 """
 
 from functools import cache
@@ -20,8 +17,7 @@ from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C2, WENDLAND_C4, SmoothingKernel
 
 Radial = tuple[Any, Any, Any]
-"""Warp functions of a kernel's dimensionless form: w, f = w' / q for the gradient, and f' / q for the Hessian. The
-arguments of the latter two are q and 1 / q."""
+"""Warp functions w(q), f(q, 1 / q) = w' / q for the gradient, and f' / q of the same arguments for the Hessian."""
 
 
 def _cubic_spline(precision: Precision) -> Radial:
@@ -95,17 +91,15 @@ RADIAL_FUNCTIONS = {
     WENDLAND_C2.name: _wendland_c2,
     WENDLAND_C4.name: _wendland_c4,
 }
-"""Makers of the `Radial` functions in a precision, by the kernel's name."""
 
 
 @cache
 def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bool = False) -> SimpleNamespace:
-    """Make Warp functions of a separation x [m]: ``weight`` (W), ``slope`` (a of grad W = a x), ``slope_change`` (the
+    """Build Warp functions of a separation x [m]: ``weight`` (W), ``slope`` (a of grad W = a x), ``slope_change`` (the
     derivative of a along a vector u, with which H u = a u + (grad a . u) x), ``slope_gradient`` (grad a) and
     ``gradient``.
 
-    Each takes 1 / h, h being the support radius [m], and the normalisation sigma [1 / m^d]. A tape can differentiate
-    ``taped`` ones.
+    Arguments are x, 1 / h [1/m] and the normalisation sigma [1 / m^d]. A tape can differentiate ``taped`` functions.
     """
     real, vector = precision.real, precision.vector
     value, gradient_factor, hessian_factor = RADIAL_FUNCTIONS[kernel.name](precision)
@@ -115,8 +109,7 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bo
 
     @wp.func
     def square(x: vector, per_h: real) -> real:
-        """Return q^2. tiny guards coincident particles: for them 1 / q is finite and s = 0, so that the second term of
-        the Hessian vanishes and H = W''(0) I, as it should be."""
+        """Return q^2. For coincident particles, tiny keeps 1 / q finite, so that H = W''(0) I."""
         return wp.dot(x, x) * (per_h * per_h) + tiny
 
     @wp.func
@@ -133,7 +126,7 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bo
     def slope_change(x: vector, u: vector, per_h: real, sigma: real) -> real:
         q_2 = square(x, per_h)
         per_q = inverse_root(q_2)
-        # of numbers of a size with q and W, as 1 / h^4 overflows where spacings are small
+        # the parentheses avoid 1 / h^4, which overflows for small spacings
         return sigma * (per_h * per_h) * hessian_factor(q_2 * per_q, per_q) * (per_h * per_h * wp.dot(x, u))
 
     @wp.func

@@ -1,4 +1,4 @@
-"""Solids as the discretisation uses them: signed distances, faces, volume and moments, in float64."""
+"""Solids with faces and moments, in float64. Points are (n, d) [m]; distances (n,) [m] are negative inside."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -12,16 +12,14 @@ from cortado.discretise.shapes import corners as corners_of
 
 @dataclass(frozen=True)
 class Faces:
-    """A closed surface of flat faces: edges in 2-D, with the inside on their left, and triangles in 3-D, with the
-    inside behind them."""
+    """A closed surface of flat faces: edges in 2-D, with the inside on their left; triangles in 3-D."""
 
     vertices: Points
     """(m, d) [m]"""
     corners: Numbers
-    """(k, d) indices of the vertices of each face, in 3-D counterclockwise as seen from outside"""
+    """(k, d) indices of the vertices of each face, in 3-D counterclockwise as seen from outside."""
 
     def moved(self, turn: Points, position: Points) -> "Faces":
-        """Return the faces rotated by a matrix (d, d) and then shifted by (d,) [m]."""
         return Faces(self.vertices @ turn.T + position, self.corners)
 
     def reversed(self) -> "Faces":
@@ -39,8 +37,8 @@ def box_faces(half: Points) -> Faces:
 
 
 def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -> Faces:
-    """Return the faces of the part of a box, between corners (d,) [m], below a plane. The plane has a unit normal (d,)
-    and a height along the normal [m]."""
+    """Return the faces of the part of a box, between corners (d,) [m], below a plane at ``height`` [m] along its normal
+    (d,)."""
     from scipy.spatial import ConvexHull
 
     ends = corners_of(lower, upper)
@@ -67,6 +65,19 @@ def polygon_faces(corners: Points) -> Faces:
     return Faces(ordered, np.stack([numbers, np.roll(numbers, -1)], axis=1))
 
 
+def nearest_on_edges(points: Points, edges: Points) -> Points:
+    """Return the nearest points (n, 2) of edges (k, 2, 2) to points (n, 2) [m]."""
+    best, found = np.full(len(points), np.inf), np.empty_like(points)
+    for first, last in edges:
+        side = last - first
+        along = np.clip((points - first) @ side / (side @ side), 0.0, 1.0)
+        places = first + along[:, None] * side
+        squares = ((points - places) ** 2).sum(axis=1)
+        nearer = squares < best
+        best, found[nearer] = np.minimum(best, squares), places[nearer]
+    return found
+
+
 def arc(centre: Points, radius: float, start: float, end: float, fine: float) -> Points:
     """Return points (m, 2) [m] of an arc from one angle to another [rad], about ``fine`` [m] apart."""
     count = max(int(np.ceil(abs(end - start) * radius / fine)), 4)
@@ -75,8 +86,8 @@ def arc(centre: Points, radius: float, start: float, end: float, fine: float) ->
 
 
 def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
-    """Return the faces, about ``fine`` [m] wide, of a solid of revolution about an axis of space. Its profile is its
-    cross-section in a plane through the axis, symmetric about the axis."""
+    """Return the faces, about ``fine`` [m] wide, of a solid of revolution about an axis of space. The profile is the
+    cross-section through the axis, symmetric about the axis."""
     count = max(int(np.ceil(2.0 * np.pi * profile.vertices[:, 0].max() / fine)), 12)
     angles = 2.0 * np.pi * np.arange(count) / count
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -104,7 +115,7 @@ def outer_edges(profile: Faces) -> Points:
 
 
 def _cut(start: Points, end: Points) -> Points:
-    """Return the start (2,) of an edge, or its intersection with the axis if it starts beyond the axis."""
+    """Return the start (2,) of an edge, or the edge's intersection with the axis if the start is beyond."""
     if start[0] >= 0.0:
         return start
     return np.array([0.0, start[1] + (end[1] - start[1]) * start[0] / (start[0] - end[0])])
@@ -117,20 +128,17 @@ WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
 @dataclass(frozen=True)
 class Moments:
-    """Volume, centroid and second moments of a solid in d dimensions."""
-
     volume: float
     """[m^d]"""
     centre: Points
-    """(d,) its centroid [m]"""
+    """(d,) centroid [m]"""
     second: Points
-    """(d, d) the integrals of products of coordinates about the centroid [m^(d + 2)]"""
+    """(d, d) integrals of products of coordinates about the centroid [m^(d + 2)]."""
 
 
 def enclosed_moments(corners: Points, weights: Points) -> Moments:
-    """Return the moments of a body enclosed by edges (k, 2, 2) or triangles (k, 3, 3) [m], by integrals over the
-    surface (Mirtich 1996). Faces are counterclockwise as seen from outside, each with a weight (k,). Each is the base
-    of a cone with its apex at a point nearby."""
+    """Return the moments of a body enclosed by edges (k, 2, 2) or triangles (k, 3, 3) [m] by surface integrals (Mirtich
+    1996). Faces are counterclockwise as seen from outside, with weights (k,)."""
     d = corners.shape[1]
     origin = whole_origin(corners.reshape(-1, d))
     about = corners - origin
@@ -144,8 +152,8 @@ def enclosed_moments(corners: Points, weights: Points) -> Moments:
 
 def revolved_moments(edges: Points, axis: int) -> Moments:
     """Return the moments of a solid of revolution about an axis of space, from the edges (k, 2, 2) [m] of its profile
-    on one side of it. Coordinates are radius and height; edges run counterclockwise, those on the axis may be left
-    out."""
+    on one side of the axis. Coordinates are radius and height; edges run counterclockwise, and edges on the axis may be
+    left out."""
     height = edges[..., 1].mean()
     start, end = edges[:, 0], edges[:, 1]
     x, y = np.moveaxis(start[:, None] + NODES[:, None] * (end - start)[:, None], 2, 0)
@@ -171,40 +179,39 @@ class Solid(ABC):
 
     @abstractmethod
     def extent(self) -> tuple[Points, Points]:
-        """Return the box around the solid: lower and upper corner, each (d,) [m]."""
+        """Return the lower and the upper corner of the box around the solid, each (d,) [m]."""
 
     @abstractmethod
     def distance(self, points: Points) -> Points:
-        """Return the distances (n,) of points (n, d) [m] from the surface, negative inside [m]."""
+        """Return the distances of points from the surface."""
 
     @abstractmethod
     def nearest(self, points: Points) -> Points:
-        """Return the nearest points (n, d) [m] of the surface to given points (n, d) [m]."""
+        """Return the nearest points of the surface to given points."""
 
     @abstractmethod
     def faces(self, fine: float) -> Faces:
-        """Return the solid's surface as flat faces, about ``fine`` [m] wide where it is curved."""
+        """Return the surface as flat faces, about ``fine`` [m] wide on curved parts."""
 
     def moments(self) -> Moments:
-        """Return volume, centroid and second moments, to round-off; available for solids that may move freely."""
+        """Return volume, centroid and second moments, to round-off, for solids that may move freely."""
         raise NotImplementedError(f"{type(self).__name__} has no moments")
 
     def shown_faces(self, fine: float) -> Faces:
-        """Return the `faces` for pictures; for an unbounded solid those inside its box."""
+        """Return the `faces` for pictures, for an unbounded solid only inside its box."""
         return self.faces(fine)
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
-        """Return the `distance` (n,) [m] of points (n, d) [m] up to a reach [m]; beyond, any number of the same sign
-        that is at least as large as the reach. For solids with many faces this is faster."""
+        """Return distances up to ``reach`` [m], beyond which only signs and lower bounds are exact."""
         return self.distance(points)
 
     def own_feet(self, fine: float) -> tuple[Points, Points] | None:
-        """Return points of the surface (n, d) [m], one for each area fine^(d - 1) [m^(d - 1)], and outward unit vectors
-        (n, d). Return None if a lattice around the solid is as quick a way to find such points."""
+        """Return points of the surface, one for each area fine^(d - 1) [m^(d - 1)], and outward unit vectors (n, d);
+        None if a lattice around the solid finds such points as fast."""
         return None
 
     def outward(self, points: Points) -> Points:
-        """Return unit vectors (n, d) pointing away from the solid at points (n, d) [m] off its surface."""
+        """Return unit vectors (n, d) away from the solid at points off its surface."""
         across = (points - self.nearest(points)) * np.sign(self.distance(points))[:, None]
         return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300))
 
@@ -215,9 +222,9 @@ class Placed(Solid):
 
     solid: Solid
     position: Points
-    """(d,) Position of the solid's origin [m]"""
+    """(d,) [m]"""
     turn: Points
-    """(d, d) the rotation matrix"""
+    """(d, d) rotation matrix"""
 
     @property
     def is_bounded(self) -> bool:
@@ -283,8 +290,6 @@ class Hollow(Solid):
 
 @dataclass(frozen=True)
 class Mass:
-    """Volume and inertia of a solid with a density of 1."""
-
     volume: float
     """[m^d]"""
     inertia: Points
@@ -292,7 +297,6 @@ class Mass:
 
     @classmethod
     def of(cls, solid: Solid) -> "Mass":
-        """Compute volume and inertia of a solid from its moments."""
         moments = solid.moments()
         about = np.trace(moments.second) * np.eye(3)
         if len(moments.centre) == 2:
@@ -300,5 +304,5 @@ class Mass:
         return cls(moments.volume, about - moments.second)
 
     def in_volumes(self, unit: float) -> "Mass":
-        """Return this mass with volume and inertia both divided by ``unit`` [m^d]."""
+        """Return volume and inertia divided by ``unit`` [m^d]."""
         return Mass(self.volume / unit, self.inertia / unit)

@@ -4,8 +4,8 @@ point, and which segments cross a sheet.
 Nodes are numbered as in a heap: the children of node n are 2 n and 2 n + 1. Nodes from ``leaves`` on are leaves; the
 first leaf contains triangles ``starts[0]`` to ``starts[1]``.
 
-A sheet is an open surface of edges in the plane or of triangles in space: its faces. A segment through the joint of two
-faces crosses the sheet, because faces extend slightly beyond their edges.
+A sheet is an open surface of faces: edges in 2-D, triangles in 3-D. Faces extend slightly beyond their edges, so that a
+segment through a joint of two faces crosses the sheet.
 """
 
 from collections.abc import Sequence
@@ -20,20 +20,16 @@ from cortado.device.precision import FLOAT64, Precision, TypesByName
 from cortado.discretise.shapes import Points, in_space
 
 DEPTH = 32
-"""Largest number of nodes on the search stack, more than a tree has levels."""
 real, vector = wp.float64, wp.vec3d
 box = wp.types.vector(length=6, dtype=wp.float64)
-"""The type of a box: its lower and upper corner."""
 waiting_nodes, waiting_squares = wp.types.vector(length=DEPTH, dtype=wp.int32), wp.types.vector(DEPTH, wp.float64)
 _module = kernel_module("triangle_tree")
 _kinds = {vector: "points nearest", box: "boxes", real: "squares", wp.vec3i: "names"}
 typed = TypesByName(wp.int32, {**_kinds, wp.array2d(dtype=vector): "corners"})
-"""Types of the kernels' arrays by name."""
 
 
 @wp.func
 def square_from_box(p: vector, b: box) -> real:
-    """Return the squared distance from a box, 0 inside."""
     square = real(0.0)
     for k in range(3):
         beyond = wp.max(wp.max(b[k] - p[k], p[k] - b[k + 3]), real(0.0))
@@ -74,8 +70,7 @@ def nearest_of_triangle(p: vector, a: vector, b: vector, c: vector) -> vector:
 @wp.kernel(module=_module, enable_backward=False)
 @typed.arrays
 def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach: real, nearest, squares):
-    """Find the nearest point of the triangles and its squared distance. Without a triangle within ``reach``, the result
-    is the point itself and ``reach`` squared."""
+    """Find the nearest point of the triangles, and its squared distance, up to ``reach``; else the point itself."""
     i = first + wp.tid()
     p = points[i]
     best = reach * reach
@@ -122,7 +117,7 @@ def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach:
 @wp.func
 def side_of_edge(p: vector, a: vector, b: vector) -> wp.int32:
     """Return 1 if an edge rising along the second axis is ahead of a point along the first axis, -1 if a falling edge
-    is, otherwise 0. Both triangles of an edge get the same value up to the sign, despite rounding."""
+    is, otherwise 0. Despite rounding, both triangles of an edge get the same value up to the sign."""
     upwards = int(1)
     low = a
     high = b
@@ -177,7 +172,7 @@ def find_windings(first: int, points, boxes, starts, corners, leaves: int, windi
 
 @wp.func
 def pierces(p: vector, q: vector, a: vector, b: vector, c: vector, tolerance: real) -> wp.bool:
-    """Test whether a segment passes through the interior of a triangle, by more than a tolerance on both sides."""
+    """Test whether a segment passes through the interior of a triangle, by more than ``tolerance`` on both sides."""
     normal = wp.cross(b - a, c - a)
     size = wp.length(normal)
     above = wp.dot(normal, p - a)
@@ -220,7 +215,7 @@ def find_crossings(
     first: int, points, boxes, starts, corners, leaves: int, names, tolerance: real, places, counts, others
 ):
     """Find the later triangles that cross a given one, and write them to ``others`` from ``places`` on while there is
-    room. Triangles have ``names`` of vertices; ``points`` are not used."""
+    room. Triangles have ``names`` of vertices; ``points`` are unused."""
     i = first + wp.tid()
     low = wp.min(corners[i, 0], wp.min(corners[i, 1], corners[i, 2]))
     high = wp.max(corners[i, 0], wp.max(corners[i, 1], corners[i, 2]))
@@ -252,32 +247,30 @@ def find_crossings(
 
 
 MARGIN = {"float64": 1e-6, "float32": 1e-3}
-"""In spacings: widening of faces, more than the round-off 1,000 spacings from the origin."""
+"""Widening of faces, more than the round-off 1,000 spacings from the origin [spacings]."""
 AROUND = 1e-3
-"""In spacings: distance around a segment within which faces are searched, in float32."""
+"""Distance around a segment within which faces are searched, in float32 [spacings]."""
 
 
 @cache
 def faces_type(precision: Precision) -> Any:
-    """Build the Warp struct with the faces of sheets, sheet after sheet, each in its sheet's frame."""
     real, vector = precision.real, precision.vector
 
     class Faces:
         trees: wp.array(dtype=wp.uint64)
         """Trees of the boxes around the faces, one for each sheet."""
         starts: wp.array(dtype=wp.int32)
-        """Number of the first face of each sheet."""
+        """Index of the first face of each sheet."""
         middles: wp.array(dtype=vector)
-        """Centre of each sheet, relative to which its faces are given [m]."""
+        """Centre of each sheet, the origin of its faces [m]."""
         normals: wp.array(dtype=vector)
         """(faces,) unit vectors"""
         places: wp.array2d(dtype=vector)
-        """(faces, 3) a point on each end or side of a face [m]"""
+        """(faces, 3) a point on each end or side of a face [m]."""
         inwards: wp.array2d(dtype=vector)
-        """(faces, 3) unit vectors from these points into the face; in the plane the third is 0"""
+        """(faces, 3) unit vectors from these points into the face; in 2-D the third is 0."""
         margin: real
         around: real
-        """Distance around a segment within which faces are searched [m]."""
 
     Faces.__name__ = Faces.__qualname__ = f"Faces_{precision.name}"
     return wp.struct(Faces)
@@ -325,12 +318,12 @@ def face_functions(precision: Precision) -> tuple[Any, Any, Any]:
 
 def faces_on(sheets: Sequence[tuple[Points, Points]], spacing: float, precision: Precision, device: Any) -> Any:
     """Return the struct of the faces of sheets, from corners (k, d, d) [m] and unit normals (k, d), for particles with
-    a spacing [m]. Also return the trees inside it, which the caller must keep alive."""
+    a spacing [m]. Also return its trees, which the caller must keep alive."""
     made, trees, middles, rows = faces_type(precision)(), [], [], []
     for corners, normals in sheets:
         middle = 0.5 * (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1)))
         pieces = corners - middle
-        following = np.roll(pieces, -1, axis=1) - pieces  # in the plane from either end to the other one
+        following = np.roll(pieces, -1, axis=1) - pieces  # in 2-D from either end to the other one
         inwards = np.cross(normals[:, None], following) if pieces.shape[1] == 3 else following
         inwards = inwards / np.linalg.norm(inwards, axis=2, keepdims=True)
         ends = (in_space(pieces.min(axis=1)), in_space(pieces.max(axis=1)))
@@ -350,13 +343,11 @@ def faces_on(sheets: Sequence[tuple[Points, Points]], spacing: float, precision:
 
 
 def _three(rows: Points) -> Points:
-    """Pad vectors (k, 2 or 3, 3) with rows of 0 to (k, 3, 3)."""
     return np.pad(rows, [(0, 0), (0, 3 - rows.shape[1]), (0, 0)])
 
 
 @cache
 def find_crossing(precision: Precision = FLOAT64) -> Any:
-    """Build the kernel that tests which segments cross a single sheet."""
     goes_through, vector = face_functions(precision)[2], precision.vector
     typed = TypesByName(wp.bool, {faces_type(precision): "faces", vector: "starts ends"})
 

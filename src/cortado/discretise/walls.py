@@ -21,11 +21,11 @@ def nearest_cells(length: float, spacing: float) -> int:
 
 
 def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, depth: float) -> Points:
-    """Return one layer (n, d) around a box, ``depth`` outside of it: faces, edges and corners, each point once.
+    """Return one layer (n, d) around a box, ``depth`` [m] outside: faces, edges and corners, each point once.
 
-    Along a face the points continue the lattice inside; if an axis is no multiple of the spacing, they are slightly
-    stretched along it. A periodic axis has no wall. The points are built axis by axis: outside along this axis, inside
-    along earlier axes, either along later ones.
+    Along a face the points continue the lattice inside, slightly stretched if a side is no multiple of the spacing.
+    Periodic axes have no wall. Points are built axis by axis: outside along this axis, inside along earlier axes,
+    either along later ones.
     """
     inside = [_cells(a, b, nearest_cells(b - a, spacing)) for a, b in zip(lower, upper, strict=True)]
     outside = [
@@ -37,8 +37,8 @@ def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: f
 
 
 def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: float) -> Points:
-    """Return the walls (n, 3) of an upright cup, with the centre of its base at the origin and its height along the
-    third axis.
+    """Return one layer (n, 3) of the walls of an upright cup, with the centre of its base at the origin and its height
+    along the third axis.
 
     The side consists of rings ``depth`` outside of the radius, about a spacing apart. Base and lid (if any) have the
     lattice of fluid in the cup, ``depth`` outside, and a ring that continues the side.
@@ -63,17 +63,16 @@ def _cells(lower: float, upper: float, count: int) -> Points:
 
 
 def stacked(flat: Points, levels: Points) -> Points:
-    """Repeat plane points (n, 2) at every level, and return them as (levels n, 3)."""
     return np.column_stack([np.tile(flat, (len(levels), 1)), np.repeat(levels, len(flat))])
 
 
 OVERLAP = 0.8
-"""Largest distance of resting, upright fluid from the side of a cup, as a fraction of the reach."""
+"""Largest distance of upright lattices from the side of a cup, as a fraction of the reach."""
 
 
 @dataclass(frozen=True)
 class Places(Rows):
-    """Positions beside walls where fluid may rest, each with the axes of the lattice on which it would rest."""
+    """Points beside walls for fluid at rest, each with the axes of its lattice."""
 
     points: Points
     """(n, d) [m]"""
@@ -82,17 +81,13 @@ class Places(Rows):
 
     @classmethod
     def upright(cls, points: Points) -> "Places":
-        """Return the points (n, d) [m] as places on lattices along the axes of space."""
         dimension = points.shape[1]
         return cls(points, np.broadcast_to(np.eye(dimension), (len(points), dimension, dimension)))
 
 
 def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, reach: float) -> Places:
-    """Return places less than ``reach`` [m] from a wall of a box, starting half a spacing from the wall.
-
-    They are built axis by axis: near a wall along this axis, far from walls along earlier axes, anywhere along later
-    ones.
-    """
+    """Return places less than ``reach`` [m] from a wall of a box, starting half a spacing from the wall. Places are
+    built axis by axis: near a wall along this axis, far from walls along earlier axes, anywhere along later ones."""
     every = [_between(a, b, open_axis, spacing) for a, b, open_axis in zip(lower, upper, periodic, strict=True)]
     beside = [
         np.zeros(len(x), dtype=bool) if open_axis else np.minimum(x - a, b - x) < reach
@@ -107,8 +102,8 @@ def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: f
     """Return places less than ``reach`` [m] from a wall of an upright cup, with the centre of its base at the origin
     and its height along the third axis.
 
-    Along the side, lattices are aligned with the side. On the base they are those of fluid in the cup, as far as the
-    side has little influence. The top of an open cup, which may overflow, has no places.
+    At the side, lattices are aligned with the side; on the base and the lid, further inside, they are lattices of fluid
+    in the cup. The top of an open cup, which may overflow, has no places.
     """
     levels = _between(0.0, height, False, spacing)
     closed = levels if lid else levels[levels < height - reach]
@@ -134,21 +129,18 @@ def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Poin
 
 
 ENDS = 6.0
-"""In supports: wall particles this far from an edge have the weight of further ones, to a relative 1e-6."""
+"""Distance from an edge beyond which weights of wall particles are constant, to a relative 1e-6 [supports]."""
 WHOLE = 1e-9
-"""In cells: tolerance within which a side counts as a whole number of cells."""
+"""Tolerance within which a side is an integer number of cells [cells]."""
 
 
 def short_box(
     lower: Points, upper: Points, spacing: float, support: float
 ) -> tuple[Points, Callable[[Points], Points]]:
-    """Shorten a box between corners (d,) [m] so that its wall particles have the same weights, which repeat far from
-    edges and corners. Returns its upper corner (d,) [m], and a function that maps points (n, d) [m] on the walls of the
-    long box to those of the shorter one.
-
-    Cells of a spacing [m] are removed from the middle of long sides that are a whole number of cells, for fluid with a
-    support [m].
-    """
+    """Shorten a box between corners (d,) [m], without changing the weights of its wall particles, which repeat far from
+    edges and corners. Cells of a spacing [m] are removed from the middle of long sides that are an integer number of
+    cells. Return the upper corner (d,) [m], and a function from points (n, d) [m] on the walls of the long box to those
+    of the short one."""
     ends, lengths = int(np.ceil(ENDS * support / spacing)), upper - lower
     cells = np.array([nearest_cells(length, spacing) for length in lengths])
     whole = np.abs(lengths / spacing - cells) < WHOLE * cells
@@ -165,27 +157,22 @@ def short_box(
 
 
 SHALLOW = 0.4
-"""Depth of the shallow layer, in spacings; it exists if the fluid's second lattice layer reaches the wall.
-
-With a shallow layer at half a spacing, the deep layer would have to be so steep that it lies at the kernel's edge.
-"""
+"""Depth of the shallow layer [spacings], which exists if the fluid's second lattice layer reaches the wall. With half a
+spacing the deep layer would lie at the kernel's edge."""
 
 
 @dataclass(frozen=True)
 class RestLattice:
-    """The lattice of the fluid at rest, and the smoothing kernel of sums over it."""
-
     kernel: SmoothingKernel
     spacing: float
     """[m]"""
     support: float
     """[m]"""
     dimension: int
-    """2 or 3."""
 
     @cached_property
     def offsets(self) -> Points:
-        """Return the `lattice_offsets` (m, d) [m]."""
+        """(m, d) [m]"""
         return lattice_offsets(self.spacing, self.support, self.dimension)
 
     def weights(self, separations: Points) -> Points:
@@ -193,8 +180,8 @@ class RestLattice:
         return self.kernel.weight(np.linalg.norm(separations, axis=1), self.dimension, self.support)
 
     def sums(self, separations: Points) -> Points:
-        """Return W, and the gradient of W times the spacing, (m, 1 + d), at separations (m, d) [m]; both divided by the
-        sum of W on the lattice [-]."""
+        """Return W, and the gradient of W times the spacing, (m, 1 + d) [-], relative to the sum of W on the
+        lattice."""
         gradients = self.kernel.gradient(separations, self.support)
         both = np.column_stack([self.weights(separations), self.spacing * gradients])
         return np.asarray(both / self.weights(self.offsets).sum())
@@ -209,18 +196,18 @@ class RestLattice:
         return float(self.weights(self._to_plane(distance)).sum())
 
     def plane_slope(self, distance: float) -> float:
-        """Return the derivative of `plane_weight` with respect to the distance [1 / m^(d + 1)]."""
+        """Return the derivative of `plane_weight` [1 / m^(d + 1)]."""
         return float(self.kernel.gradient(self._to_plane(distance), self.support)[:, 0].sum())
 
 
 @dataclass(frozen=True)
 class WallLayers:
-    """The layers of wall particles behind a flat wall, the deepest last."""
+    """Layers of wall particles behind a flat wall, the deepest last."""
 
     depths: tuple[float, ...]
     """Distances behind the surface of the container [m]."""
     weights: tuple[float, ...]
-    """Weight in the density of a particle of each layer, a fluid particle being 1."""
+    """Weight in the density of a particle of each layer, relative to a fluid particle."""
 
 
 def wall_layers(lattice: RestLattice) -> WallLayers:
@@ -260,25 +247,21 @@ def wall_layers(lattice: RestLattice) -> WallLayers:
 
 
 STIFFNESS = 3e-3
-"""Penalty on the relative change of a weight, compared with an error of the density. Where densities do not determine a
-weight, it stays that of a flat wall."""
+"""Penalty on relative changes of weights, compared with errors of the density, towards a flat wall's weights."""
 UNEVEN_STIFFNESS = 0.06
-"""The same penalty for particles off a lattice. With 0.003 some of them would get no weight, and fluid would leak
-there."""
+"""Penalty as `STIFFNESS` for particles off a lattice; with 0.003 some would have no weight, and fluid would leak."""
 LEAST, ROUNDS = 0.6, 4
-"""Least weight of particles off a lattice, relative to a flat wall's. Also the rounds in which smaller weights are set
-to it, and the others are computed again."""
+"""Smallest weight of particles off a lattice, relative to a flat wall's, and rounds that impose it."""
 BALANCE = 0.02
-"""Weight of the push of a uniform pressure, compared with an error of the density. Densities alone hardly determine the
-slopes of two layers: around a cup they would become so shallow that fluid leaks. At 0.1 corners would be too dense."""
+"""Weight of the push of a uniform pressure, compared with an error of the density. Without it the slopes of two layers
+around a cup become so shallow that fluid leaks; with 0.1 corners are too dense."""
 RAISED = 3.0
-"""In spacings: distance along the first axis of a place, away from a solid, over which free room is measured."""
+"""Distance along the first axis of a place, away from a solid, over which free room is measured [spacings]."""
 CHUNK = 4096
-"""Number of places processed at a time, to limit the memory."""
 
 
 Crossed = Callable[[Points, Points], Which]
-"""A test of which segments between points (n, d) [m] cross a sheet."""
+"""Test of which segments between points (n, d) [m] cross a sheet."""
 
 
 def _missing(lattice: RestLattice, places: Places, room: Room, crossed: Crossed | None) -> Points:
@@ -288,7 +271,7 @@ def _missing(lattice: RestLattice, places: Places, room: Room, crossed: Crossed 
     cells = places.points[:, None] + offsets @ places.axes
     raised = places.points + RAISED * lattice.spacing * places.axes[:, 0]
     furthest = (RAISED + 0.5) * lattice.spacing + lattice.support
-    empty = -room.distance(raised, furthest)  # the radius of a ball around each that nothing is in
+    empty = -room.distance(raised, furthest)  # the radius of an empty ball around each
     open_cells = np.linalg.norm(cells - raised[:, None], axis=2) <= empty[:, None] - 0.5 * lattice.spacing
     shares = np.ones(open_cells.shape)
     shares[~open_cells] = room.cell_shares(cells[~open_cells], lattice.spacing)
@@ -301,8 +284,7 @@ def _missing(lattice: RestLattice, places: Places, room: Room, crossed: Crossed 
 
 
 Fit = Callable[["csr_array", Points], Points]
-"""A function that finds relative changes (b,) of flat-wall weights, given a matrix (m, b) and the wanted product (m,)
-with them."""
+"""Function from a matrix (m, b) and the wanted product (m,) to relative changes (b,) of flat-wall weights."""
 
 
 def wall_weights(
@@ -316,12 +298,11 @@ def wall_weights(
     known: int = 0,
     crossed: Crossed | None = None,
 ) -> Points:
-    """Compute the weights (b,) of wall particles in the density [-], a fluid particle being 1.
+    """Compute the weights (b,) of wall particles in the density [-], relative to a fluid particle.
 
     With these weights the lattice has the rest density at all places, and a uniform pressure pushes no particle less
-    than a spacing from a wall. Both conditions are met in the least-squares sense: along faces, edges and corners, in a
-    cup, and across the seam of a period. To balance the push, as in `wall_layers`, the wall contributes twice the
-    gradient of the missing fluid.
+    than a spacing from a wall, both by least squares. To balance the push, as in `wall_layers`, the wall contributes
+    twice the gradient of the missing fluid.
 
     Args:
         walls: (b, d) wall particles [m].
@@ -391,8 +372,7 @@ def even_changes(sums: "csr_array", wanted: Points) -> Points:
 
 
 def uneven_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Find changes of weights, a `Fit`, for evenly spaced particles off a lattice; weights are at least `LEAST` of
-    those of a flat wall."""
+    """Find changes of weights, a `Fit`, for evenly spaced particles off a lattice; weights are at least `LEAST`."""
     from scipy.sparse.linalg import lsmr
 
     changes, free = np.zeros(sums.shape[1]), np.ones(sums.shape[1], dtype=bool)

@@ -1,7 +1,4 @@
-"""The looks of a scene in pictures: materials, lights, cameras, and the tables [picture] and [render].
-
-No simulation depends on the looks. Colours are linear, from 0 to 1.
-"""
+"""Materials, lights, cameras, and the tables [picture] and [render]. Colours are linear, from 0 to 1."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,23 +32,20 @@ Numbers = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Liquid:
-    """A fluid's look in pictures. Light on a path of length L in the fluid is dimmed by the Beer-Lambert law."""
+    """Optical properties of a fluid in pictures, for the Beer-Lambert law on a path of length L."""
 
     colour: Numbers
-    """Colour of scattered light, and of white light after a path of length 1 / absorption through the fluid."""
+    """Colour of scattered light, and of white light after a path of length 1 / absorption."""
     scattering: float
-    """[1/m]: the fraction exp(-scattering L) of the light is not scattered on a path of length L."""
+    """[1/m]; the fraction exp(-scattering L) of the light is not scattered."""
     absorption: float
-    """[1/m]: of the light that is not scattered, the fraction colour^(absorption L) is not absorbed."""
+    """[1/m]; the fraction colour^(absorption L) of the unscattered light is not absorbed."""
 
 
 @dataclass(frozen=True)
 class Finish:
-    """The look of the surface of a solid, or of the walls of a container."""
-
     colour: Numbers
     transparency: float = 0.0
-    """Fraction of the light that passes through."""
     reflectivity: float = 0.0
     """Fraction of the light that the surface reflects like a mirror, tinted with its colour."""
 
@@ -63,16 +57,14 @@ LIQUIDS = {
     "honey": Liquid(colour=(0.80, 0.36, 0.03), scattering=3.0, absorption=25.0),
     "oil": Liquid(colour=(0.80, 0.62, 0.08), scattering=1.0, absorption=15.0),
 }
-"""Materials of phases, by name."""
 FINISHES = {
     "glass": Finish(colour=(0.72, 0.86, 0.82), transparency=0.92),
     "steel": Finish(colour=(0.62, 0.61, 0.59), reflectivity=0.75),
 }
-"""Materials of solids and containers, by name."""
 
 
 class Coloured(Table):
-    """A table with a colour: the given one; if left out, that of its material; without a material, a plain one."""
+    """A table with a colour, by default that of its material, or ``plain`` without a material."""
 
     materials: ClassVar[Mapping[str, Any]]
     plain: ClassVar[Numbers]
@@ -87,30 +79,27 @@ class Coloured(Table):
 
     @field_serializer("colour", check_fields=False)
     def _given_colour(self, colour: Colour, info: SerializationInfo) -> Colour | None:
-        """Leave out (None) a colour not given, as the material has it; the context "colours" asks for every colour."""
+        """Return None for a default colour, which the material implies, unless the context is "colours"."""
         return colour if "colour" in self.model_fields_set or info.context == "colours" else None
 
 
 @dataclass(frozen=True)
 class Light:
-    """The light of a picture: a lamp (the sun), a sky, and a weak strip of light opposite. Colours are linear."""
+    """Light of a picture: a lamp (the sun), a sky, and a weak strip of light opposite the sun."""
 
     azimuth: float
-    """Azimuth of the sun, measured to the right from the direction of the camera at its starting place [degrees]."""
+    """Azimuth of the sun to the right of the initial direction of the camera [degrees]."""
     elevation: float
-    """Elevation of the sun above the floor [degrees]."""
+    """[degrees] above the floor"""
     lamp: Numbers
-    """Colour of the sun in reflections."""
     strip: Numbers
-    """Colour of the strip in reflections."""
     sunlight: Numbers
-    """Light that falls from the sun on a surface facing it; a white surface reflects 1."""
+    """Light from the sun on a surface that faces the sun; a white surface reflects 1."""
     shadow: float
     """Fraction of the light on the floor that comes from the sun."""
     background: Numbers
-    """Colour of the horizon, if a picture does not choose one."""
     zenith: Numbers
-    """Colour of the sky overhead, relative to that of the horizon."""
+    """Colour of the sky overhead, relative to the horizon."""
 
 
 LIGHTS = {
@@ -155,13 +144,10 @@ LIGHTS = {
         zenith=(1.15, 1.15, 1.15),
     ),
 }
-"""The lights by their names."""
 
 
 @dataclass(frozen=True)
 class View:
-    """The view of a camera: where the camera is, and the point at which it looks, in the scene's axes."""
-
     eye: Points
     """(3,) [m]"""
     look_at: Points
@@ -170,32 +156,32 @@ class View:
 
 @dataclass(frozen=True)
 class Moment:
-    """The moment of a film at which a picture is taken, with the state of the run at this moment."""
+    """A moment of a film, with the state of the run."""
 
     share: float
-    """Fraction of the film that is over, from 0 to 1."""
+    """Fraction of the film that is over."""
     time: float
-    """[s] in the run"""
+    """[s]"""
     up: Points
-    """(3,) unit vector against gravity"""
+    """(3,) unit vector against gravity."""
     solids: Mapping[str, NDArray]
-    """(3,) the current centre of each solid, by name [m]"""
+    """(3,) current centre of each solid by name [m]."""
 
 
 class CameraPath(Table):
     """A path on which a camera moves."""
 
     goes_around: ClassVar[bool] = False
-    """True if the camera looks from all sides, so that its home must be far enough away for all of them."""
+    """True if the camera looks from all sides, which needs a distance that suits all of them."""
     kind: str
     """Name of the path."""
 
     def view(self, home: View, moment: Moment) -> View:
-        """Return the camera's view at a moment; ``home`` is the view of a camera that does not move."""
+        """Return the view at a moment; ``home`` is the view of a camera at rest."""
         raise NotImplementedError
 
     def check_solids(self, names: Sequence[str], path: FieldPath = ()) -> None:
-        """Raise this table's error, at a path in the scene, if it names a solid that is not among these names."""
+        """Raise a `field_error` at ``path`` if the table names a solid that is not in ``names``."""
 
 
 @public
@@ -240,7 +226,7 @@ class Keyframes(CameraPath):
     cameras: tuple[tuple[Length, ...], ...]
     """(k, 3) Positions of the camera at these times [m]."""
     look_at: tuple[tuple[Length, ...], ...] | None = None
-    """(k, 3) Points at which the camera looks at these times [m]; if left out, the point at which it looks at home."""
+    """(k, 3) Points at which the camera looks at these times [m]; if left out, the usual point."""
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
@@ -272,7 +258,7 @@ class Follow(CameraPath):
     solid: Text
     """Name of the solid."""
     distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 1.0
-    """Distance of the camera from the solid, as a multiple of its distance at home."""
+    """Distance of the camera from the solid, as a multiple of its usual distance."""
 
     def view(self, home: View, moment: Moment) -> View:
         middle = np.asarray(moment.solids[self.solid])
@@ -288,9 +274,6 @@ AnyCameraPath = Annotated[Orbit | Dolly | Keyframes | Follow, Field(discriminato
 
 
 COLOURS = ("phase", *NAMES, "age")
-"""Values by which particles may be coloured."""
-SEARCHED_FRAMES = 121
-"""Number of frames in films of a search, if the scene does not choose another."""
 Place = Annotated[tuple[Length, ...], components("x", "y", "z")]
 
 
@@ -339,19 +322,16 @@ class Picture(Table):
 
     @property
     def sun_and_sky(self) -> Light:
-        """Return the numbers of the light, with the background that the picture shows."""
         light = LIGHTS[self.light]
         return light if self.background is None else replace(light, background=self.background)
 
     @property
     def for_films(self) -> "Picture":
-        """Return this table for films that a command draws by default: quick, unless the table sets a quality."""
         return self.model_copy(update={"quality": self.quality or "quick"})
 
     @property
     def searched_frames(self) -> int:
-        """Return the maximum number of states that a search records for its films."""
-        return SEARCHED_FRAMES if self.film_frames is None else self.film_frames
+        return 121 if self.film_frames is None else self.film_frames
 
     @field_validator("look_at")
     @classmethod
@@ -361,7 +341,6 @@ class Picture(Table):
         return value
 
     def in_scene(self, dimension: int, solids: Sequence[str], path: FieldPath = ()) -> "Picture":
-        """Return this table, at a path, for 2 or 3 dimensions and solids of these names."""
         for name in ("camera", "look_at", "camera_path"):
             value = getattr(self, name)
             if value is not None and dimension == 2:
@@ -381,15 +360,15 @@ class Render(Table):
     view: Literal["top", "volume", "plane"] = "top"
     """"top": from above; "volume": through a camera; "plane": the plane itself, in 2-D, where it is the default."""
     resolution: Pixels = (128, 128)
-    """"top": seen from above; "volume": seen through a camera; "plane": the plane itself, the default in 2-D."""
+    """(2,) Columns and rows of pixels."""
     background: Colour = (1.0, 1.0, 1.0)
-    """(3,) red, green and blue, each from 0 to 1"""
+    """(3,) red, green and blue, each from 0 to 1."""
     extinction: Annotated[float, quantity("1/m", gt=0.0)] | None = None
     """How quickly light fades in fluid [1/m]; if left out, the renderer chooses a value."""
     position: Place | None = Field(default=None, validate_default=True)
-    """(3,) Position of the camera [m]; needed for a view of the volume"""
+    """(3,) Position of the camera [m]; required for a view of the volume."""
     look_at: Place | None = Field(default=None, validate_default=True)
-    """(3,) Point in the middle of the picture [m]; needed for a view of the volume"""
+    """(3,) Point in the middle of the picture [m]; required for a view of the volume."""
     field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=170.0)] | None = Field(
         default=None, validate_default=True
     )
@@ -414,7 +393,6 @@ class Render(Table):
         return self
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """Return this table with the view for 2 or 3 dimensions; raise the error of a field that does not fit."""
         if dimension == 2 and "view" not in self.model_fields_set:
             return self.model_copy(update={"view": "plane"})
         if (self.view == "plane") != (dimension == 2):

@@ -1,4 +1,4 @@
-"""Checks of a scene as a whole: its names, its sizes, and where its fluid is. Each raises a `field_error`."""
+"""Checks of the names, the sizes and the fluid of a scene. Checks raise a `field_error`."""
 
 from itertools import product
 from typing import Any
@@ -10,10 +10,10 @@ from cortado.calls import point_in_words
 from cortado.device.threads import sampling_parts, shortage
 from cortado.discretise.mesh_files import read_mesh
 from cortado.discretise.room import TOLERANCE
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, corners
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.solid import Solid
-from cortado.errors import InputError, Words, shown
+from cortado.errors import Words, shown
 from cortado.scene.drain_tables import check_drains
 from cortado.scene.emitter_table import EmitterTable, check_columns, check_fed
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
@@ -29,20 +29,19 @@ from cortado.scene.sensor_tables import (
     SpringForceTable,
 )
 from cortado.scene.shape_tables import MeshShape, check_length
-from cortado.scene.solids import SolidTable
+from cortado.scene.solids import check_free_body
 from cortado.scene.springs import check_springs
 from cortado.scene.stability import chosen_limits
-from cortado.scene.tables import MISSING, FieldPath, field_error, field_name
+from cortado.scene.tables import MISSING, FieldPath, check_name, field_error, field_name, usable_file
 
 DEEPEST = 0.25
-"""In spacings: largest depth to which bodies may overlap walls and each other at the start."""
+"""Largest initial overlap of free bodies with walls and each other [spacings]."""
 FINE, MOST = 0.5, 40
-"""In spacings: distance between the points at which a body's overlap is tested; and the most such points along an
-axis."""
+"""Distance between the points at which overlaps are tested [spacings], and most points along an axis."""
 
 
-def check_free(scene: SceneTables) -> None:
-    """Check that free bodies start outside of walls and of each other, and that the solver is the projection."""
+def check_free_bodies(scene: SceneTables) -> None:
+    """Check that free bodies start outside of walls and each other, and that the solver can move them."""
     bodies = free(scene.solid)
     if not bodies:
         return
@@ -73,7 +72,6 @@ def check_free(scene: SceneTables) -> None:
 
 
 def check_sheets(scene: SceneTables) -> None:
-    """Check that a scene with sheets uses no feature that does not work with sheets."""
     name = next((table.name for table in scene.solid if table.is_sheet), None)
     if name is None:
         return
@@ -91,30 +89,29 @@ def check_sheets(scene: SceneTables) -> None:
 
 
 def _nearest_images(points: Points, middle: Points, lengths: Points) -> Points:
-    """Return the periodic images of points (n, d) nearest to a point (d,); the periods (d,) are 0 along other axes."""
+    """Return the periodic images of points (n, d) nearest to a point (d,); periods (d,) are 0 along other axes."""
     periods = np.where(lengths > 0.0, lengths, np.inf)
     return points - np.where(lengths > 0.0, lengths * np.round((points - middle) / periods), 0.0)
 
 
 def _points_within(solid: Solid, step: float) -> Points:
-    """Return the corners of a solid, and the lattice points inside the solid, (n, d)."""
+    """Return vertices of a solid's surface, and lattice points inside the solid, (n, d)."""
     sides = [np.linspace(a, b, min(int((b - a) / step) + 2, MOST)) for a, b in zip(*solid.extent(), strict=True)]
     points = np.stack([axis.ravel() for axis in np.meshgrid(*sides, indexing="ij")], axis=-1)
     return np.concatenate([solid.faces(step).vertices, points[solid.distance(points) < 0.0]])
 
 
 NEAREST = 0.5
-"""In spacings: two particles that start closer than this overlap."""
+"""Smallest initial distance between particles [spacings]."""
 OVERLAPPING = NEAREST * (1.0 - 1e-6)
 DENSEST = 0.9
-"""Fraction of the number density within a fluid. If another body has at least this density where a particle starts, the
-particle is inside it, however the lattices lie. In its corners, half a spacing outside, the fraction is at most 7/8."""
+"""Number density, relative to its value inside a fluid, above which a point is inside a body. Half a spacing outside a
+concave corner, the density is at most 7/8."""
 SUPPORT, NEIGHBOURS = 2.0, 40
-"""For number densities: the support [spacings], and a number that exceeds the count of particles within the support."""
+"""Support radius for number densities [spacings], and a number greater than that of neighbours."""
 
 
 def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
-    """Check that the points of a file do not overlap each other; the particles of a lattice cannot."""
     if not isinstance(fluid, PointsFluid) or fluid.count(spacing) < 2:
         return
     points = fluid.points()
@@ -129,7 +126,7 @@ def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
 
 
 def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, spacing: float) -> None:
-    """Check that no body overlaps another one or a periodic image of any; ``lengths`` (d,) are the periods [m]."""
+    """Check that bodies do not overlap each other or periodic images; ``lengths`` (d,) are the periods [m]."""
     paths, bodies = zip(*placed, strict=True)
     lower, upper = np.swapaxes([body.extent(spacing) for body in bodies], 0, 1)
     shifts = [np.array(s) * lengths for s in product(*[(0, -1, 1) if length else (0,) for length in lengths])]
@@ -143,7 +140,8 @@ def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, s
 
 
 def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float) -> Points | None:
-    """Return a point (d,) where a particle of one body is too near to the other, shifted; None without such a point."""
+    """Return a point (d,) of overlap between a body and another one shifted by ``shift`` (d,) [m]; None without
+    overlap."""
     from scipy.spatial import cKDTree
 
     one = _near(first.particles(spacing), np.array(second.extent(spacing)) + shift, spacing)
@@ -163,13 +161,13 @@ def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float)
 
 
 def _near(points: Points, extent: Any, spacing: float) -> Points:
-    """Return the points (n, d) that are inside a box, or within the support of a particle inside the box."""
+    """Return the points (n, d) inside a box and at most the support radius outside."""
     reach = SUPPORT * spacing
     return points[((points > extent[0] - reach) & (points < extent[1] + reach)).all(axis=1)]
 
 
 def _density(tree: Any, points: Points, spacing: float) -> np.ndarray:
-    """Return the number density (n,) of a tree's particles at points (n, d), relative to the density within a fluid."""
+    """Return the number density (n,) of a tree's particles at points (n, d), relative to the density inside a fluid."""
     dimension = points.shape[1]
     distances = tree.query(points, k=NEIGHBOURS, distance_upper_bound=SUPPORT * spacing)[0]
     return spacing**dimension * CUBIC_SPLINE.weight(distances, dimension, SUPPORT * spacing).sum(axis=1)
@@ -182,19 +180,10 @@ def _overlap(other: str, place: Points, spacing: float) -> tuple[Words, str]:
 
 MOST_PARTICLES = 2e8
 FURTHEST = 1e9
-"""In spacings from the origin; beyond, neighbouring particles would not have distinct positions in float64."""
-
-
-def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
-    """Check that a solid is thick enough for its wall particles."""
-    least = solid.least_thickness * spacing
-    if solid.side == "outside" and (thickness := solid.thinnest(spacing)) < least * (1.0 - 1e-6):
-        found, of = Words(f"only {thickness:g} m thick"), "one spacing" if least == spacing else "half a spacing"
-        raise field_error(path, found, f'at least {of}, {least:g} m, thick, or a solid of the shape "sheet"')
+"""Largest distance from the origin [spacings], where float64 still separates neighbouring particles."""
 
 
 def check_scene(scene: SceneTables) -> None:
-    """Run all checks of a scene. Checks on which others rely come first."""
     spacing = scene.discretisation.spacing
     if not (scene.fluid or scene.emitter):
         found = Words("empty") if "fluid" in scene.model_fields_set else MISSING
@@ -218,10 +207,14 @@ def check_scene(scene: SceneTables) -> None:
     for index, solid in enumerate(scene.solid):
         _check_near(("solid", index), solid.body().extent(), spacing)
     for index, solid in enumerate(scene.solid):
-        check_solid(("solid", index), solid, spacing)
+        least = solid.least_thickness * spacing
+        if solid.side == "outside" and (thickness := solid.thinnest(spacing)) < least * (1.0 - 1e-6):
+            found, of = Words(f"only {thickness:g} m thick"), "one spacing" if least == spacing else "half a spacing"
+            wanted = f'at least {of}, {least:g} m, thick, or a solid of the shape "sheet"'
+            raise field_error(("solid", index), found, wanted)
     check_hinges(scene.hinge, scene.solid, scene.dimension)
     check_springs(scene.spring, scene.hinge, scene.solid)
-    check_free(scene)
+    check_free_bodies(scene)
     check_drains(scene)
     check_fed(scene)
     check_sheets(scene)
@@ -231,7 +224,7 @@ def check_scene(scene: SceneTables) -> None:
     for index, fluid in enumerate(scene.fluid):
         _check_inside(scene, index, fluid)
         if isinstance(fluid, PointsFluid):
-            _check_free(scene, ("fluid", index), fluid.points())
+            _check_outside_solids(scene, ("fluid", index), fluid.points())
         check_distinct(("fluid", index), fluid, spacing)
     for index, emitter in enumerate(scene.emitter):
         _check_outlet(scene, ("emitter", index), emitter)
@@ -240,20 +233,18 @@ def check_scene(scene: SceneTables) -> None:
 
 
 def check_bounded(scene: SceneTables) -> None:
-    """Check that adaptive time steps have an upper bound where the fluid rests."""
     if not np.isfinite(min(chosen_limits(scene).values())):
         wanted = "given, as nothing else bounds the time step of this scene where the fluid rests"
         raise field_error(("solver", "greatest_time_step"), MISSING, wanted)
 
 
 def _bodies(scene: SceneTables) -> list[tuple[FieldPath, FluidBody]]:
-    """Return all bodies with particles, in order, each with its path in the scene."""
     fluids: list[tuple[FieldPath, FluidBody]] = [(("fluid", index), fluid) for index, fluid in enumerate(scene.fluid)]
     return [*fluids, *((("emitter", index), emitter) for index, emitter in enumerate(scene.emitter))]
 
 
 def _check_names(scene: SceneTables) -> None:
-    """Check that names are not file paths: arrays in files of runs have names that begin with them."""
+    """Check that names contain no "/", as they become names of arrays in files."""
     for key in ("solid", "emitter", "drain", "spring", "hinge", "sensor"):
         for index, table in enumerate(getattr(scene, key)):
             if "/" in (table.name or ""):
@@ -266,8 +257,7 @@ def _check_phases(scene: SceneTables) -> None:
         if name in names[:index]:
             raise field_error(("phase", index, "name"), name, f"different from that of phase[{names.index(name)}]")
     for path, body in _bodies(scene):
-        if body.phase not in names:
-            raise field_error((*path, "phase"), body.phase, f"the name of a phase, of {shown(names)}")
+        check_name((*path, "phase"), body.phase, names, "a phase")
     for index, phase in enumerate(scene.phase):
         if phase.rheology is not None and len(names) > 1:
             wanted = "left out where there are several phases"
@@ -285,56 +275,38 @@ def _check_phases(scene: SceneTables) -> None:
 def _check_sensors(scene: SceneTables) -> None:
     names, springs = ([one.name for one in tables] for tables in (scene.solid, scene.spring))
     moving = [solid.name for solid in scene.solid if solid.moves]
-    on_moving = f"the name of a solid that moves, of {shown(moving)}" if moving else "left out, as no solid moves"
     for index, sensor in enumerate(scene.sensor):
         path = "sensor", index
         if isinstance(sensor, SolidLoadTable):
-            if sensor.solid not in names:
-                wanted = f"the name of a solid, of {shown(names)}" if names else "of a scene with solids"
-                raise field_error((*path, "solid"), sensor.solid, wanted)
+            check_name((*path, "solid"), sensor.solid, names, "a solid", "of a scene with solids")
             if sensor.axes == "body" and sensor.solid not in moving:
                 raise field_error((*path, "axes"), sensor.axes, '"world", as the solid is at rest')
         elif isinstance(sensor, SpringForceTable):
-            if sensor.spring not in springs:
-                wanted = f"the name of a spring, of {shown(springs)}" if springs else "of a scene with springs"
-                raise field_error((*path, "spring"), sensor.spring, wanted)
+            check_name((*path, "spring"), sensor.spring, springs, "a spring", "of a scene with springs")
         elif isinstance(sensor, BodyMotionTable):
-            free = [solid.name for solid in scene.solid if solid.motion == "free"]
-            if sensor.solid not in free:
-                wanted = f"the name of a free body, of {shown(free)}" if free else 'of a solid whose motion is "free"'
-                raise field_error((*path, "solid"), sensor.solid, wanted)
+            check_free_body((*path, "solid"), sensor.solid, scene.solid)
         elif not isinstance(sensor, FlowRateTable):
-            if sensor.on is not None and sensor.on not in moving:
-                raise field_error((*path, "on"), sensor.on, on_moving)
+            if sensor.on is not None:
+                wanted = "left out, as no solid moves"
+                check_name((*path, "on"), sensor.on, moving, "a solid that moves", wanted)
             if not isinstance(sensor, PressureProbeTable) and sensor.axes == "body" and sensor.on is None:
                 raise field_error((*path, "axes"), sensor.axes, '"world", as the sensor is on no solid')
 
 
 def _check_files(scene: SceneTables) -> None:
-    support = scene.discretisation.support_radius
+    spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     for name, tables, reach in (("solid", scene.solid, support), ("fluid", scene.fluid, None)):
         for index, table in enumerate(tables):
             if isinstance(table, MeshShape):
-                _check_mesh(scene, (name, index, "file"), table, reach)
+                with usable_file((name, index, "file"), table.file, "a file of a mesh"):
+                    read_mesh(table.file, table.scale, spacing, reach, scene.container.extent())
     for index, fluid in enumerate(scene.fluid):
         if isinstance(fluid, PointsFluid):
-            try:
+            with usable_file(("fluid", index, "file"), fluid.file, "a file of positions"):
                 fluid.points()
-            except InputError as error:
-                sentence = f"cannot be used: {error}"
-                raise field_error(("fluid", index, "file"), fluid.file, "a file of positions", sentence) from None
-
-
-def _check_mesh(scene: SceneTables, path: FieldPath, table: MeshShape, reach: float | None) -> None:
-    """Check that a mesh can be read and fits the particles; ``reach`` is the support radius of a solid's walls [m]."""
-    try:
-        read_mesh(table.file, table.scale, scene.discretisation.spacing, reach, scene.container.extent())
-    except InputError as error:
-        raise field_error(path, table.file, "a file of a mesh", f"cannot be used: {error}") from None
 
 
 def _check_counts(scene: SceneTables) -> None:
-    """Check the number of particles before anything is allocated."""
     spacing = scene.discretisation.spacing
     fluid = sum(body.count(spacing) for _, body in _bodies(scene))
     walls = scene.container.wall_count(spacing) + sum(solid.wall_count(spacing) for solid in scene.solid)
@@ -349,7 +321,7 @@ def _check_counts(scene: SceneTables) -> None:
 
 
 def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
-    """Check that a box with these corners, each (d,) [m], is not too far from the origin."""
+    """Check the distance of a box with corners (2, d) [m] from the origin."""
     furthest = np.abs(ends).max()
     if furthest > FURTHEST * spacing:
         wanted = f"within {FURTHEST:g} spacings of {spacing:g} m"
@@ -357,10 +329,9 @@ def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
 
 
 def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
-    """Check that a body is inside the container. Containers are convex, so all particles are inside if the corners of a
-    box around them are. A body that is too long along an axis is refused before any particles are made."""
+    """Check that a body is inside the container, first with its bounding box, as its particles may be too many."""
     spacing = scene.discretisation.spacing
-    if scene.container.contains(fluid.box_corners(spacing), 1e-6 * spacing).all():
+    if scene.container.contains(corners(*fluid.extent(spacing)), 1e-6 * spacing).all():
         return
     region, (lower, upper) = scene.container.region(scene.dimension), fluid.extent(spacing)
     for ends, beyond in ((lower, region.lower - lower), (upper, upper - region.upper)):
@@ -375,8 +346,7 @@ def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
         raise _outside(index, witnesses[outside][0])
 
 
-def _check_free(scene: SceneTables, path: FieldPath, points: Points) -> None:
-    """Check that points (n, d) [m] are outside of all solids."""
+def _check_outside_solids(scene: SceneTables, path: FieldPath, points: Points) -> None:
     tolerance, room = TOLERANCE * scene.discretisation.spacing, scene.room
     within = room.from_solids(points) < -tolerance
     if within.any():
@@ -390,17 +360,15 @@ def _outside(index: int, place: Points) -> PydanticCustomError:
 
 
 def _check_outlet(scene: SceneTables, path: FieldPath, emitter: EmitterTable) -> None:
-    """Check that an emitter's opening is inside the container, also along its path, and that fluid enters through it.
-    The column upstream may be outside, but not along a periodic axis, where it would come in on the other side.
-
-    Containers are convex, so an opening that is inside at two times is inside between them.
-    """
+    """Check that an emitter's opening is inside the container, also along its path, and that fluid flows into the
+    container. The column upstream may be outside except along periodic axes. Containers are convex, so testing the
+    path's knots suffices."""
     spacing, lengths = scene.discretisation.spacing, scene.periods[1]
     tolerance, outlet, opening = 1e-6 * spacing, np.array(emitter.outlet), emitter.opening(spacing)
     if not scene.container.contains(outlet[None], tolerance).all():
         raise field_error((*path, "outlet"), emitter.outlet, "inside the container")
     outside = ~scene.container.contains(opening, tolerance)
-    _check_free(scene, path, np.concatenate([opening, emitter.particles(spacing)]))
+    _check_outside_solids(scene, path, np.concatenate([opening, emitter.particles(spacing)]))
     if outside.any():
         wanted = f"so small that the opening is inside the container, also at {point_in_words(opening[outside][0])}"
         size = "radius" if emitter.sides is None else "sides"
@@ -428,7 +396,6 @@ def _check_outlet(scene: SceneTables, path: FieldPath, emitter: EmitterTable) ->
 
 
 def _check_schedule(scene: SceneTables) -> None:
-    """Check that the scene has each parameter that the schedule changes, and that the first gravity agrees."""
     courses = scene.schedule.courses
     for name in courses:
         if not BY_NAME[name].present(scene):

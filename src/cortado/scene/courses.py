@@ -1,5 +1,4 @@
-"""Values over time: at a steady rate, or interpolated between values that a scene or a CSV file gives. Also the checks
-that the keys of a solid's motion fit together."""
+"""Quantities over time, from constants, lists or CSV files, and checks of a solid's motion keys."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,20 +11,16 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError, Words, shown
 from cortado.files.disk import name_and_unit, read_columns, reason, regular_file
-from cortado.scene.tables import GREATEST, MISSING, FieldPath, field_error, quantity
+from cortado.scene.tables import GREATEST, MISSING, FieldPath, field_error, quantity, usable_file
 
 Interpolation = Literal["linear", "spline"]
 Ramp = Annotated[float, quantity("s", gt=0.0)]
 WITHIN = np.minimum(np.arange(9) / 8.0, 1.0 - 1e-9)
-"""Fractions of the interval between two times at which a curve is sampled."""
 RAMP_PARTS = 16
-"""Number of parts into which a ramp is cut for sampling."""
 
 
 @dataclass(frozen=True, eq=False)
 class Steady:
-    """A quantity that is 0 at time 0 and grows at a constant rate."""
-
     rate: NDArray[np.float64]
     """() or (components,), change per second"""
 
@@ -34,38 +29,35 @@ class Steady:
         return np.multiply.outer(times, self.rate)
 
     def greatest(self) -> float:
-        """Return the size of the rate."""
         return float(np.linalg.norm(self.rate))
 
     def rates(self, times: NDArray) -> NDArray:
-        """Return the derivatives with respect to time, (n,) or (n, components), at times (n,) [s]."""
+        """Return time derivatives, (n,) or (n, components), at times (n,) [s]."""
         return np.broadcast_to(self.rate, (*np.shape(times), *self.rate.shape))
 
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """A quantity interpolated between values at given times, and constant before the first and after the last. The
-    curve is piecewise linear, or a cubic spline (C2) with zero slope at both ends. A ramp multiplies the difference
-    from ``begun`` by 10 s^3 - 15 s^4 + 6 s^5, where s grows from 0 to 1 with time."""
+    """Values interpolated between times, linearly or by a cubic spline with zero slope at both ends, and constant
+    outside. A ramp multiplies the difference from ``begun`` by 10 s³ - 15 s⁴ + 6 s⁵, where s = t / ramp is at most
+    1."""
 
     times: NDArray[np.float64]
     """(k,) [s]"""
     values: NDArray[np.float64]
     """(k,) or (k, components)"""
     interpolation: Interpolation = "linear"
-    """How values are found between the times."""
     ramp: float = 0.0
     """Duration of the ramp, from time 0 on [s]; 0 means no ramp."""
     begun: Any = 0.0
     """Value at the start of the ramp."""
 
     def at(self, times: NDArray) -> NDArray:
-        """Return values (n,) or (n, components) at times (n,) [s]."""
         found = self._curve(times)
         return found if not self.ramp else self.begun + self._weights(times)[0] * (found - self.begun)
 
     def rates(self, times: NDArray) -> NDArray:
-        """Return the time derivatives, (n,) or (n, components), at times (n,) [s]; at a knot, just after it."""
+        """Return time derivatives, (n,) or (n, components), at times (n,) [s], just after a knot."""
         found = self._slopes(times)
         if not self.ramp:
             return found
@@ -73,19 +65,18 @@ class Knots:
         return weights * found + growth * (self._curve(times) - self.begun)
 
     def greatest(self) -> float:
-        """Return the greatest size of the rate of change."""
         return float(fastest([(1.0, self)], self.breaks).max())
 
     @cached_property
     def breaks(self) -> NDArray[np.float64]:
-        """Return times (m,) [s] between which the curve has no corner: its knots, and some times along a ramp."""
+        """Return times (m,) [s] between which the curve is smooth: the knots, and `RAMP_PARTS` parts of a ramp."""
         along = np.linspace(0.0, self.ramp, RAMP_PARTS + 1) if self.ramp else self.times[:1]
         return np.unique(np.concatenate([self.times, along]))
 
     @property
     def seen(self) -> NDArray[np.float64]:
-        """Return values (m,) or (m, components) that cover the curve's range: the table's own for straight lines
-        without a ramp, otherwise many samples of the curve."""
+        """Return values (m,) or (m, components) that cover the curve's range: the knots of a piecewise linear curve
+        without a ramp, otherwise samples."""
         straight = self.interpolation == "linear" and not self.ramp
         return self.values if straight else self.at(np.append(_within(self.breaks).ravel(), self.breaks[-1]))
 
@@ -96,7 +87,6 @@ class Knots:
         return CubicSpline(self.times, self.values, bc_type="clamped")
 
     def _curve(self, times: NDArray) -> NDArray:
-        """Return the values, without the ramp."""
         if self.interpolation == "spline" and len(self.times) > 1:
             return np.asarray(self._spline(np.clip(times, self.times[0], self.times[-1])))
         columns = self.values.reshape(len(self.times), -1).T
@@ -104,7 +94,6 @@ class Knots:
         return found.reshape(len(times), *self.values.shape[1:])
 
     def _slopes(self, times: NDArray) -> NDArray:
-        """Return the time derivatives, without the ramp."""
         if self.interpolation == "spline" and len(self.times) > 1:
             found = np.asarray(self._spline(times, 1)).T
             return np.where((times >= self.times[0]) & (times < self.times[-1]), found, 0.0).T
@@ -113,14 +102,14 @@ class Knots:
         return slopes[np.searchsorted(self.times, times, side="right") - 1]
 
     def _weights(self, times: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the factor of the ramp and its time derivative [1/s], each (n,) for numbers or (n, 1) for vectors."""
+        """Return the ramp's factor and its time derivative [1/s], each (n,) for numbers or (n, 1) for vectors."""
         s = np.clip(np.asarray(times) / self.ramp, 0.0, 1.0).reshape(-1, *(1,) * (self.values.ndim - 1))
         return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * (s * (1.0 - s)) ** 2 / self.ramp
 
 
 def fastest(moved: Iterable[tuple[float, Knots]], times: NDArray) -> NDArray[np.float64]:
-    """Return for each of the times (k,) [s] the greatest speed until the next time; 0 for the last. The speed is the
-    sum of the sizes of several rates, each multiplied by a factor."""
+    """Return the greatest sum of rates times factors between each of the times (k,) [s] and the next; 0 for the
+    last."""
     inner = _within(times).ravel()
     sizes = [factor * np.linalg.norm(one.rates(inner).reshape(len(inner), -1), axis=1) for factor, one in moved]
     most = sum(sizes, np.zeros(len(inner))).reshape(-1, len(WITHIN)).max(axis=1)
@@ -128,7 +117,6 @@ def fastest(moved: Iterable[tuple[float, Knots]], times: NDArray) -> NDArray[np.
 
 
 def _within(times: NDArray) -> NDArray[np.float64]:
-    """Return sample times (k - 1, parts) [s] in the intervals between times (k,) [s]."""
     return np.asarray(times[:-1, None] + np.diff(times)[:, None] * WITHIN)
 
 
@@ -143,34 +131,36 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0},
     "m/s2": {"m/s^2": 1.0, "m/s2": 1.0, "m/s²": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3, "g": 9.80665},
 }
-"""Factors of the units that columns of a file may use, by the unit that scenes use for the quantity."""
+"""Factors that convert a file's unit to the scene's unit, by the scene's unit."""
 MOST_BYTES = 2**25
-"""Largest size of a file [byte]: room for half a million to a million lines."""
+"""Largest size of a file [byte]."""
 Columns = tuple[tuple[str, str], ...]
-"""Names of columns, each with the unit that scenes use for it."""
+"""Names of columns, each with its unit in scenes."""
 
 
-def values_in_file(file: str, columns: Columns, needed: bool) -> tuple[NDArray, dict[str, NDArray]]:
-    """Return the times (k,) [s] of a CSV file and its columns, each (k,), in the units of a scene.
+def values_in_file(file: str, columns: Columns, needs_all: bool) -> tuple[NDArray, dict[str, NDArray]]:
+    """Return the times (k,) [s] of a CSV file and its columns (k,) in the units of a scene.
 
-    Raises `InputError`, a sentence that names the file and the column, what was found there, and what was expected.
+    Raises `InputError` with the file, the column, the value found and the values allowed.
 
     Args:
         file: a header of names with units, such as ``time [s],x [mm],rotation [deg]``, then rows of numbers at
             increasing times.
-        columns: columns that the file may have besides the time.
-        needed: whether the file must have all of these columns, not just one.
+        columns: allowed columns besides the time.
+        needs_all: True if the file must have all of these columns, False for at least one.
     """
     try:
         stat = regular_file(file, MOST_BYTES)
     except OSError as problem:
         raise InputError(f"{file} cannot be read: {reason(problem)}.") from None
-    return _values(file, columns, needed, stat.st_mtime_ns, stat.st_size)
+    return _values(file, columns, needs_all, stat.st_mtime_ns, stat.st_size)
 
 
 @lru_cache(maxsize=8)
-def _values(file: str, columns: Columns, needed: bool, changed: int, size: int) -> tuple[NDArray, dict[str, NDArray]]:
-    """Read one version of a file, identified by its time of change and its size, only once."""
+def _values(
+    file: str, columns: Columns, needs_all: bool, changed: int, size: int
+) -> tuple[NDArray, dict[str, NDArray]]:
+    """Read a file; its modification time and size make the cache notice a new version."""
     known, found = dict((("time", "s"), *columns)), dict[str, NDArray]()
     listed = ", ".join(f"{name} [{next(iter(UNITS[unit]))}]" for name, unit in known.items())
     for head, values in read_columns(file).items():
@@ -189,8 +179,8 @@ def _values(file: str, columns: Columns, needed: bool, changed: int, size: int) 
         found[name] = values * units[unit]
         found[name].flags.writeable = False
     missing = [name for name in known if name not in found]
-    if "time" in missing or len(found) < 2 or (needed and missing):
-        what = f"all of {listed}" if needed else f"time [s] and one or more of {listed.partition(', ')[2]}"
+    if "time" in missing or len(found) < 2 or (needs_all and missing):
+        what = f"all of {listed}" if needs_all else f"time [s] and one or more of {listed.partition(', ')[2]}"
         raise InputError(f"{file} has no column {missing[0]!r}, but must have {what}.")
     times = found.pop("time")
     later = np.flatnonzero(np.diff(times, prepend=np.nextafter(min(0.0, times[0]), -1.0)) <= 0.0)
@@ -203,12 +193,6 @@ def _values(file: str, columns: Columns, needed: bool, changed: int, size: int) 
 
 
 WAYS = {2: ("x", "y", "rotation"), 3: ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")}
-"""Names of the coordinates of a body's motion, by the dimension of the scene: first displacements, then rotations."""
-
-
-def path_columns(dimension: int) -> Columns:
-    """Return the columns that a file with a solid's path may have."""
-    return tuple((way, "m" if k < dimension else "rad") for k, way in enumerate(WAYS[dimension]))
 
 
 Rows = NDArray[np.float64]
@@ -216,13 +200,14 @@ Rows = NDArray[np.float64]
 
 def path_of(solid: Any, dimension: int) -> tuple[Rows, Rows | None, Rows | None] | None:
     """Return the times (k,) [s] of a solid's path, with displacements (k, d) [m] and rotations (k, 1) or (k, 3) [rad]
-    since the first time. Return None for a solid without a path. Raises `InputError` if the file cannot be used."""
+    since the first time; None for a solid without a path. Raises `InputError` for an unusable file."""
     if solid.path is None:
         if solid.times is None:
             return None
         return np.array(solid.times), _since_first(solid.positions), _since_first(solid.rotations)
-    times, found = values_in_file(solid.path, path_columns(dimension), False)
-    names = [name for name, _ in path_columns(dimension)]
+    columns = tuple((way, "m" if k < dimension else "rad") for k, way in enumerate(WAYS[dimension]))
+    times, found = values_in_file(solid.path, columns, False)
+    names = WAYS[dimension]
     shifts, turns = (_stacked(found, some, len(times)) for some in (names[:dimension], names[dimension:]))
     if turns is not None and np.count_nonzero(turns.any(axis=0)) > 1 and turns[0].any():
         raise InputError(f"{solid.path} begins with a rotation of {turns[0].tolist()} rad, but must begin with 0.")
@@ -234,14 +219,13 @@ def _since_first(rows: Any) -> Rows | None:
 
 
 def _stacked(found: Mapping[str, NDArray], names: Sequence[str], count: int) -> Rows | None:
-    """Return columns, given by name, as rows (count, names), with 0 for missing columns; None if all are missing."""
+    """Stack the named columns to rows (count, names), with 0 for missing columns; None if all are missing."""
     if found.keys().isdisjoint(names):
         return None
     return np.stack([found.get(name, np.zeros(count)) for name in names], axis=1)
 
 
 def check_motion(solid: Any, dimension: int, path: FieldPath) -> None:
-    """Raise a `field_error` where the keys of a motion do not fit together."""
     rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
     given = [name for name in ("path", "times", *rows, *steady, "ramp") if getattr(solid, name) is not None]
     if solid.interpolation != "linear":
@@ -261,7 +245,8 @@ def check_motion(solid: Any, dimension: int, path: FieldPath) -> None:
         _check_freedom(solid, dimension, path)
         return
     if solid.path is not None:
-        _check_file(solid, dimension, path)
+        with usable_file((*path, "path"), solid.path, "the file of a path"):
+            path_of(solid, dimension)
         refused, reason = ["times", *rows, *steady], "the file of its path says where it is"
     elif solid.times is None:
         if wrong := [name for name in rows if name in given]:
@@ -278,15 +263,7 @@ def check_motion(solid: Any, dimension: int, path: FieldPath) -> None:
         raise field_error((*path, wrong[0]), Words("given"), f"left out, as {reason}")
 
 
-def _check_file(solid: Any, dimension: int, path: FieldPath) -> None:
-    try:
-        path_of(solid, dimension)
-    except InputError as error:
-        raise field_error((*path, "path"), solid.path, "the file of a path", f"cannot be used: {error}") from None
-
-
 def _check_free(solid: Any, given: Sequence[str], path: FieldPath) -> None:
-    """Check the mass of a free body, and that no key prescribes its motion."""
     if solid.mass is None and solid.density is None:
         raise field_error((*path, "density"), MISSING, 'a density in kg/m3, or a mass, as motion is "free"')
     if None not in (solid.mass, solid.density):
@@ -303,7 +280,6 @@ def _check_free(solid: Any, given: Sequence[str], path: FieldPath) -> None:
 
 
 def _check_inertia(solid: Any, dimension: int, path: FieldPath) -> None:
-    """Check that an inertia, if given, is physically possible for a body."""
     numbers = solid.inertia
     if numbers is None:
         return
@@ -322,7 +298,6 @@ def _check_inertia(solid: Any, dimension: int, path: FieldPath) -> None:
 
 
 def _check_freedom(solid: Any, dimension: int, path: FieldPath) -> None:
-    """Check how a free body is held, and that its initial motion is along directions in which the body is free."""
     if solid.freedom is None:
         return
     ways, found = WAYS[dimension], Words(f"a list of {', '.join(map(repr, solid.freedom)) or 'nothing'}")
@@ -336,8 +311,7 @@ def _check_freedom(solid: Any, dimension: int, path: FieldPath) -> None:
 
 def _check_knots(solid: Any, dimension: int, path: FieldPath) -> None:
     times: Sequence[float] = solid.times or ()
-    if len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
-        raise field_error((*path, "times"), times, "at least two times, from 0 on, each greater than the one before")
+    _check_times(path, times)
     for name, size in (("positions", dimension), ("rotations", 2 * dimension - 3)):
         values = getattr(solid, name)
         if values is None:
@@ -355,14 +329,17 @@ def _check_knots(solid: Any, dimension: int, path: FieldPath) -> None:
         raise field_error((*path, "rotations", 0), solid.rotations[0], "0, as it is not turned yet")
 
 
+def _check_times(path: FieldPath, times: Sequence[float] | None) -> None:
+    if times is None or len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
+        wanted = "at least two times, from 0 on, each greater than the one before"
+        raise field_error((*path, "times"), MISSING if times is None else times, wanted)
+
+
 def check_over_time(path: FieldPath, table: Any, values: str, constant: str) -> None:
-    """Check that a table has increasing ``times`` from 0 on and equally many ``values``, in place of the ``constant``.
-    All three arguments are names of keys of the table."""
+    """Check a table's increasing ``times`` from 0 on, with as many ``values`` and no ``constant``, given by keys."""
     times: Sequence[float] = table.times or ()
     given = getattr(table, values)
-    if len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
-        wanted = "at least two times, from 0 on, each greater than the one before"
-        raise field_error((*path, "times"), MISSING if table.times is None else times, wanted)
+    _check_times(path, table.times)
     if given is None or len(given) != len(times):
         found = MISSING if given is None else Words(f"a list of {len(given)}")
         raise field_error((*path, values), found, f"a list of {len(times)}, as are times")

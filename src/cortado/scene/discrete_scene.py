@@ -1,7 +1,4 @@
-"""The discretisation of a scene: first particles, walls, and the constants of the lattice. NumPy in float64 throughout.
-
-It is the same for every device, every precision and every engine.
-"""
+"""Discretisation of a scene: initial particles, walls, and constants of the lattice, with NumPy in float64."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -48,42 +45,39 @@ if TYPE_CHECKING:
     from cortado.device.precision import Precision
 
 WHOLE = 1e-6
-"""Relative length by which a solid may fall short of a period and still count as filling it."""
+"""Largest relative length by which a solid that fills a period may be shorter than the period."""
 OFF_SHEETS = 0.25
-"""In spacings: least distance between a sheet and fluid at the start. Closer particles on its two sides would push each
-other away."""
+"""Smallest initial distance of fluid from a sheet [spacings], below which particles on both sides repel each other."""
 NEAREST_PLACE = 0.4
-"""In spacings: least distance from any surface of the points at which weights of walls are fitted."""
+"""Smallest distance from surfaces of the points where weights of walls are fitted [spacings]."""
 
 
 @dataclass(frozen=True)
 class Walls(Rows):
-    """The wall particles of a scene, those at rest first."""
-
     positions: Points
-    """(b, d) [m], at the start"""
+    """(b, d) at the start [m]."""
     weights: Points
-    """(b, d) vector from each particle to the nearest point of its surface [m]."""
+    """(b,) weights in the density, relative to a fluid particle [-]."""
     feet: Points
-    """(b, d) from each to the nearest point of its surface [m]."""
+    """(b, d) vectors to the nearest point of the surface [m]."""
     sticks: NDArray[np.bool_]
-    """(b,) True for a wall particle along which fluid has no slip."""
+    """(b,) True without slip."""
     slides: Points
-    """(b, d) velocity with which the surface slides along the solid, in the solid's own frame [m/s]"""
+    """(b, d) velocity of the surface along the solid, in the solid's frame [m/s]."""
     solid: NDArray[np.int64]
-    """(b,) number of each particle's solid, from `wall_numbers`; -1 for the container."""
+    """(b,) number of the solid, from `wall_numbers`; -1 for the container."""
 
     @classmethod
     def of(cls, points: WallPoints, weights: Points, sticks: bool | NDArray[np.bool_]) -> "Walls":
-        """Build the container's wall particles from points and weights; ``sticks`` is one flag for all or (b,)
-        flags."""
         grips, solid = np.full(len(points), sticks), np.full(len(points), -1)
         return cls(points.positions, weights, points.feet, grips, 0.0 * points.feet, solid)
 
 
 def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     """Build the wall particles of a scene; raise `InputError` for a solid that no fluid can touch."""
-    container = _container(scene, layers, lattice)
+    even = _even_points(scene.container, scene.dimension, layers, lattice.spacing)
+    solids = scene.container.solids(scene.dimension, lattice.support)
+    container = ContainerWalls(even, solids, scene.resting_room, lattice.spacing, lattice.support)
     still = [_kept(scene, container, layers, lattice)]
     if container.room.solids:
         still.append(_around(scene, container, still[0], layers, lattice))
@@ -97,13 +91,6 @@ def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
         else:
             still.append(_alone(table, k, periods, layers, lattice))
     return Walls.joined(still)
-
-
-def _container(scene: Scene, layers: WallLayers, lattice: RestLattice) -> ContainerWalls:
-    """Build the container's walls as they would be without solids, in evenly spaced layers."""
-    points = _even_points(scene.container, scene.dimension, layers, lattice.spacing)
-    solids = scene.container.solids(scene.dimension, lattice.support)
-    return ContainerWalls(points, solids, scene.resting_room, lattice.spacing, lattice.support)
 
 
 def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: RestLattice) -> Walls:
@@ -124,7 +111,6 @@ def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: 
 
 
 def _even_points(container: Container, dimension: int, layers: WallLayers, spacing: float) -> WallPoints:
-    """Return the wall particles of a container, in evenly spaced layers."""
     particles = [container.walls(dimension, spacing, depth) for depth in layers.depths]
     positions = np.concatenate(particles)
     flat = np.repeat(layers.weights, [len(layer) for layer in particles])
@@ -133,7 +119,7 @@ def _even_points(container: Container, dimension: int, layers: WallLayers, spaci
 
 
 def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Build the wall particles of all solids at rest, and of the container near them, where fluid can touch them."""
+    """Build the wall particles of solids at rest, and of the container near them, where fluid can touch them."""
     room, (lower, _) = container.room, scene.periods
     resting = [solid for solid in thick(scene.solid) if not solid.moves]
     images = [room.images(solid) for solid in room.solids]
@@ -154,12 +140,8 @@ def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLa
 
 
 def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Build the wall particles of one moving solid as if it were alone; one that fills a period also has its own
-    images.
-
-    The particles are found in the solid's own frame. So they do not depend on where it starts, nor on how it is turned,
-    unless it fills a period.
-    """
+    """Build the wall particles of a moving solid alone, with periodic images if it fills a period. Other solids'
+    particles are created in the solid's frame, independent of its initial pose."""
     dimension, turn = len(periods), table.turn(len(periods))
     lower, upper = table.solid().extent()
     filled = np.where(upper - lower > periods * (1.0 - WHOLE), periods, 0.0)
@@ -185,8 +167,8 @@ def _beside_sheets(
     layers: WallLayers,
     lattice: RestLattice,
 ) -> list[Walls]:
-    """Build the wall particles on both sides of sheets in a room with other walls. Their layers have the depths of a
-    flat wall's layers. Fluid interacts only with those on the other side of the sheet (`cortado.particles.sheets`)."""
+    """Build the wall particles on both sides of sheets in a room with other walls, in the layers of a flat wall. Fluid
+    interacts only with those behind the sheet (`cortado.particles.sheets`)."""
     if not tables:
         return []
     sheets, found = list[Sheet](), list[Walls]()
@@ -208,8 +190,8 @@ def _beside_sheets(
 def _weighed(
     surface: ExposedSurface, beside: Places, kept: Walls, layers: WallLayers, lattice: RestLattice
 ) -> tuple[WallPoints, Points]:
-    """Return wall particles beneath a surface, with weights fitted next to the ``kept`` walls, at the points ``beside``
-    and at points around the solids."""
+    """Return wall particles beneath a surface, with weights fitted at the points ``beside`` and at points around the
+    solids, in the presence of the walls ``kept``."""
     room, spacing, reach = surface.room, lattice.spacing, lattice.support
     points = surface.walls(layers, lattice)
     about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
@@ -220,8 +202,8 @@ def _weighed(
 
 
 def mirrors_of(scene: Scene) -> tuple[Points, Points]:
-    """Return the coordinates of flat walls that mirror the fluid, (3,) at the lower and at the upper ends [m]. They are
-    infinite where no wall mirrors the fluid, as with solvers without images."""
+    """Return the coordinates of flat walls that mirror the fluid, (3,) at the lower and at the upper ends [m]; else
+    infinite."""
     nowhere = np.full(3, np.inf)
     if not isinstance(scene.solver, ProjectionSolver):
         return -nowhere, nowhere
@@ -232,30 +214,26 @@ def mirrors_of(scene: Scene) -> tuple[Points, Points]:
 
 @dataclass(frozen=True)
 class Lattice:
-    """Constants of the rest lattice and of the kernel on it."""
-
     support: float
-    """Support radius h [m]."""
+    """h [m]"""
     normalisation: float
     """sigma [1 / m^d]."""
     self_weight: float
     """W(0) [1 / m^d]."""
     volume: float
-    """V_0 [m^d], with which the kernel sums over the lattice give the rest density; used only in sums of kernels."""
+    """V_0 [m^d], for which kernel sums over the lattice give the rest density."""
     cell: float
-    """Volume of a particle [m^d], that of a lattice cell; a particle's mass is this volume times the rest density."""
+    """Volume of a lattice cell [m^d]: a particle's mass over its rest density."""
     stiffness: float
-    """k [m2]: delta = k / dt^2 [Pa m3 / kg] (Solenthaler and Pajarola 2009) for a filled neighbourhood."""
+    """k [m2] of delta = k / dt² [Pa m3 / kg] for a filled neighbourhood (Solenthaler and Pajarola 2009)."""
     response: float
-    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.solver`."""
+    """sum_j G_j · G_j [1 / m^(2 d + 2)], for `cortado.solvers.pcisph.solver`."""
     laplacian_correction: float
-    """[-], see `cortado.discretise.smoothing.lattice_laplacian_correction`."""
+    """[-]"""
     domain: Domain
-    """The axes along which the scene is periodic, with their periods."""
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int, domain: Domain) -> "Lattice":
-        """Compute the constants of a kernel with a support radius [m] on a lattice with a spacing [m]."""
         return cls(
             support=support,
             normalisation=kernel.normalisation(dimension, support),
@@ -271,33 +249,24 @@ class Lattice:
 
 @dataclass(frozen=True)
 class DiscreteScene:
-    """The particles, walls and constants from which a solver starts, besides the scene itself."""
-
     kernel: SmoothingKernel
-    """The smoothing kernel W."""
     lattice: Lattice
-    """Constants of the rest lattice."""
     fluid: FluidSample
-    """The first fluid particles."""
     masses: FluidMasses
-    """Masses of the first particles, and the masses that the scene asked for."""
     wall_layers: WallLayers
-    """Layers and drag of the walls; present also for a scene without walls."""
     walls: Walls
-    """The wall particles; empty without a container and solids."""
     periods: Points
-    """(d,) lengths of the periods [m], 0 along an axis that is not periodic."""
+    """(d,) [m]; 0 along other axes"""
 
     @cached_property
     def near(self) -> Region:
-        """Return a box around all first particles and walls."""
         everything = np.concatenate([self.fluid.positions, self.walls.positions])
         return Region.between(everything.min(axis=0), everything.max(axis=0))
 
 
 def discretise(scene: Scene) -> DiscreteScene:
-    """Discretise a scene into particles. Raises `InputError` if a file with points has vanished since the scene was
-    read, or if points are packed too densely. Warns if the mass of the fluid differs from the mass asked for."""
+    """Discretise a scene into particles. Raises `InputError` if a file with points has vanished, or if points are too
+    dense; warns if the fluid's mass differs from the prescribed mass."""
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     at_rest = RestLattice(kernel, spacing, support, dimension)
@@ -307,7 +276,8 @@ def discretise(scene: Scene) -> DiscreteScene:
     walls = walls_of(scene, layers, at_rest)
     own = wall_numbers(scene.solid)
     beside = ~np.isin(walls.solid, [own[table.name] for table in scene.solid if table.is_sheet])
-    fluid = _packed(fluid, walls.some(beside), at_rest, *scene.periods)  # which would see walls on both sides
+    # Packing would see the wall particles on both sides of a sheet.
+    fluid = _packed(fluid, walls.some(beside), at_rest, *scene.periods)
     fluid = replace(fluid, positions=_off_sheets(scene, fluid))
     masses = FluidMasses.of(scene, fluid)
     for sentence in (*thin_sentences(scene), *standing_sentences(scene)):
@@ -326,7 +296,6 @@ def discretise(scene: Scene) -> DiscreteScene:
 
 
 def _velocities(scene: Scene, fluid: FluidSample) -> Points:
-    """Return first velocities (n, d) [m/s]; in a spinning body they depend on the positions of the particles."""
     found, ends = fluid.velocities.copy(), np.cumsum(fluid.sizes)
     for body, end, size in zip(scene.fluid, ends, fluid.sizes, strict=True):
         found[end - size : end] = body.velocities(fluid.positions[end - size : end])
@@ -334,7 +303,8 @@ def _velocities(scene: Scene, fluid: FluidSample) -> Points:
 
 
 def _off_sheets(scene: Scene, fluid: FluidSample) -> Points:
-    """Return first positions (n, d) [m]. Lattice particles that a sheet cuts are moved `OFF_SHEETS` away from it."""
+    """Return initial positions (n, d) [m], with lattice particles that a sheet cuts `OFF_SHEETS` away from the
+    sheet."""
     found, least = fluid.positions.copy(), OFF_SHEETS * scene.discretisation.spacing
     for table in scene.solid:
         about = table.own_solid()
@@ -346,7 +316,6 @@ def _off_sheets(scene: Scene, fluid: FluidSample) -> Points:
 
 
 def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Points, lengths: Points) -> FluidSample:
-    """Pack the particles of round bodies until they fill the bodies at the rest density, and return the fluid."""
     if not fluid.bodies:
         return fluid
     stays = ~fluid.is_packed

@@ -8,14 +8,14 @@ from pydantic import Field, model_validator
 
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points
-from cortado.errors import InputError, Words
+from cortado.errors import Words
 from cortado.scene.courses import Knots, check_over_time, values_in_file
-from cortado.scene.parameters import Axis, Parameter, Range
+from cortado.scene.parameters import Axis, Parameter, Range, ending
 from cortado.scene.shape_tables import File, check_order
-from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity
+from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity, usable_file
 
 PRESCRIBED, BLENDED = 3.0, 3.0
-"""In spacings: thickness of the shell around a sink where the sink sets the flow, and of the transition beyond it."""
+"""Thickness of the shell around a sink with prescribed flow, and of the transition outside the shell [spacings]."""
 
 
 class BoxDrain(Table):
@@ -46,22 +46,22 @@ class BoxDrain(Table):
         return np.array([-none if self.lower is None else self.lower, none if self.upper is None else self.upper])
 
     def middle(self, dimension: int) -> Points:
-        """Return the middle (d,) of the box [m]: along an axis with one end that end, without ends 0."""
+        """Return the middle (d,) of the box [m]; along an axis with one end, this end; without ends, 0."""
         ends = self.ends(dimension)
         return np.where(np.isfinite(ends), ends, np.where(np.isfinite(ends[::-1]), ends[::-1], 0.0)).mean(axis=0)
 
 
 class PlaneDrain(Table):
-    """A plane that takes every particle which crosses it in its direction; one that points upwards sets a level."""
+    """A plane that takes every particle which crosses it along `direction`; if upward, it limits the fluid level."""
 
     shape: Literal["plane"]
     """Kind of the drain."""
     name: Text
     """Name of the drain."""
     position: Vector[Length]
-    """(d,) a point of the plane [m]."""
+    """(d,) A point of the plane [m]."""
     direction: Vector[Annotated[float, quantity()]]
-    """(d,) where beyond is; its length does not matter."""
+    """(d,) Direction in which particles cross the plane; its length has no effect."""
 
     @model_validator(mode="after")
     def _check_direction(self) -> Self:
@@ -70,18 +70,13 @@ class PlaneDrain(Table):
         return self
 
     def middle(self, dimension: int) -> Points:
-        """Return the position (d,) [m]."""
         return np.array(self.position)
 
 
-def flow_name(name: str) -> str:
-    """Return the name of the parameter of the flow rate of an emitter or a sink."""
-    return f"{name}.flow_rate"
-
-
-def count_name(drain: str) -> str:
-    """Return the name of the state field with the number of particles that a drain has taken."""
-    return f"{drain}.count"
+flow_name = ending("flow_rate")
+"""Parameter: flow rate of an emitter or a sink."""
+count_name = ending("count")
+"""Field: number of particles that a drain has taken."""
 
 
 class FlowTable(Table):
@@ -94,7 +89,7 @@ class FlowTable(Table):
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of `flow_rates`, increasing from 0 on [s]; between them flow rates are interpolated linearly."""
     flow_rates: tuple[Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)], ...] | None = None
-    """(k,) Flow rates at these times, in place of `flow_rate` [m3/s (m2/s in 2-D)]."""
+    """(k,) Flow rates at `times`, in place of `flow_rate` [m3/s (m2/s in 2-D)]."""
     file: File | None = None
     """CSV file in place of `times` and `flow_rates`, with the columns `time` and `flow_rate` and units in its header. A
     relative path starts at the scene file's folder."""
@@ -109,17 +104,12 @@ class FlowTable(Table):
         return super().in_dimension(dimension, path)
 
     def _read(self, dimension: int, path: FieldPath) -> Self:
-        """Return this table with the times and flow rates of its file, read once; later changes have no effect."""
         for key in ("flow_rate", "times", "flow_rates"):
             if (found := getattr(self, key)) is not None:
                 raise field_error((*path, key), found, "left out, as there is a file")
-        assert self.file is not None
-        unit = "m3/s" if dimension == 3 else "m2/s"
-        try:
-            times, found = values_in_file(self.file, (("flow_rate", unit),), True)
-        except InputError as error:
-            wanted = "the file of a flow rate"
-            raise field_error((*path, "file"), self.file, wanted, f"cannot be used: {error}") from None
+        with usable_file((*path, "file"), self.file, "the file of a flow rate"):
+            assert self.file is not None
+            times, found = values_in_file(self.file, (("flow_rate", "m3/s" if dimension == 3 else "m2/s"),), True)
         rates = found["flow_rate"]
         if times[0] != 0.0 or (rates < 0.0).any():
             wanted = "a file with times from 0 on and flow rates of at least 0"
@@ -129,17 +119,17 @@ class FlowTable(Table):
 
     @property
     def course(self) -> Knots | None:
-        """Return the flow rate over time; None if it is steady."""
+        """Return the flow rate over time; None if constant."""
         return None if self.times is None else Knots(np.array(self.times), np.array(self.flow_rates))
 
     @property
     def begun(self) -> float:
-        """Return the flow rate at the start [m3/s (m2/s in 2-D)]."""
+        """[m3/s (m2/s in 2-D)]"""
         return (self.flow_rates or (self.flow_rate or 0.0,))[0]
 
     @property
     def greatest(self) -> float:
-        """Return the greatest flow rate [m3/s (m2/s in 2-D)]."""
+        """[m3/s (m2/s in 2-D)]"""
         return max(self.flow_rates or (self.flow_rate or 0.0,))
 
     def _at(self, times: Points) -> Points:
@@ -151,7 +141,7 @@ class FlowTable(Table):
         return float(np.trapezoid(self._at(times), times))
 
     def time_for(self, volume: float) -> float:
-        """Return the time [s] at which a volume, in 2-D area, has flowed; infinite if this never happens."""
+        """Return the time [s] when a volume, in 2-D area, has flowed; infinite if never."""
         last = float((self.times or (0.0,))[-1])
         times = np.union1d(self.times or 0.0, np.linspace(0.0, last, 1025))
         flows = self._at(times)
@@ -161,7 +151,6 @@ class FlowTable(Table):
         return float(np.interp(volume, volumes, times))
 
     def flow_parameter(self, dimension: int) -> Parameter:
-        """Return the parameter of the flow rate."""
         return Parameter(
             flow_name(self.name),
             "m³/s" if dimension == 3 else "m²/s",
@@ -188,11 +177,9 @@ class SinkDrain(FlowTable):
     three spacings around this sphere the sink prescribes the flow; in another three spacings the flow adapts to it."""
 
     def middle(self, dimension: int) -> Points:
-        """Return the position (d,) [m]."""
         return np.array(self.position)
 
     def inner(self, spacing: float) -> float:
-        """Return the distance at which particles are taken [m]."""
         return 2.5 * spacing if self.radius is None else self.radius
 
 
@@ -200,7 +187,6 @@ AnyDrain = Annotated[BoxDrain | PlaneDrain | SinkDrain, Field(discriminator="sha
 
 
 def check_drains(scene: Any) -> None:
-    """Check that fluid can come to each drain, and that the solver supports sinks if the scene has any."""
     (ends, lengths), spacing = (scene.container.extent(), scene.periods[1]), scene.discretisation.spacing
     if scene.drain and (lengths > 0.0).all():
         wanted = "left out, as no axis is without a period, along which what it takes could be put aside"
@@ -228,7 +214,7 @@ def check_drains(scene: Any) -> None:
 
 
 def _is_open(scene: Any, drain: BoxDrain, ends: Points) -> bool:
-    """Test whether some part of a drain inside a container with corners (2, d) [m] is outside of solids at rest."""
+    """Test whether a part of a drain inside a container with corners (2, d) [m] is outside of solids at rest."""
     lower, upper = np.clip(drain.ends(scene.dimension), *ends)
     most = 512 if scene.dimension == 2 else 64
     cells = np.clip(np.ceil((upper - lower) / (0.5 * scene.discretisation.spacing)), 1, most).astype(int)
@@ -238,15 +224,14 @@ def _is_open(scene: Any, drain: BoxDrain, ends: Points) -> bool:
 
 
 def _check_reached(drain: BoxDrain | PlaneDrain, ends: Points, path: FieldPath) -> None:
-    """Check that a part of a drain is inside a container with corners (2, d) [m]."""
-    key, found = ("position", drain.position) if isinstance(drain, PlaneDrain) else ("lower", drain.lower)
+    found: tuple[float, ...] | None
     if isinstance(drain, PlaneDrain):
-        way = np.array(drain.direction)
+        key, found, way = "position", drain.position, np.array(drain.direction)
         reached = (np.where(way > 0.0, ends[1], ends[0]) - drain.position) @ way > 0.0
     else:
         lower, upper = drain.ends(ends.shape[1])
         reached = ((lower < ends[1]) & (upper > ends[0])).all()
-        key, found = ("lower", found) if (lower >= ends[1]).any() else ("upper", drain.upper)
+        key, found = ("lower", drain.lower) if (lower >= ends[1]).any() else ("upper", drain.upper)
     if not reached:
         raise field_error((*path, key), found, "where a part of the drain is in the container")
 
@@ -265,15 +250,14 @@ def sink_limit(scene: Any, values: Any) -> float:
 
 
 def drain_parameters(scene: Any) -> list[Parameter]:
-    """Return the parameters of a scene's sinks."""
     found = []
     for drain in scene.drain:
         if isinstance(drain, SinkDrain):
-            found += [drain.flow_parameter(scene.dimension), _place(drain, scene.discretisation.spacing)]
+            found += [drain.flow_parameter(scene.dimension), _position(drain, scene.discretisation.spacing)]
     return found
 
 
-def _place(sink: SinkDrain, spacing: float) -> Parameter:
+def _position(sink: SinkDrain, spacing: float) -> Parameter:
     return Parameter(
         f"{sink.name}.position",
         "m",
@@ -286,14 +270,13 @@ def _place(sink: SinkDrain, spacing: float) -> Parameter:
 
 
 DIRECTIONS = 1024
-"""Number of directions in which walls around a sink are searched."""
 PARTS = 16
-"""Number of points tested along each of these directions, a third of a spacing apart."""
+"""Number of directions around a sink, and of points along each, at which walls are searched."""
 
 
 def open_sphere(room: Room, place: Points, radius: float) -> float:
-    """Return the open part of the sphere, in 2-D of the circle, around a place (d,) [m], as an angle [sr] or [rad]. A
-    direction is open if no wall lies on it up to a radius [m]: space beyond a thin floor does not count."""
+    """Return the open solid angle [sr], in 2-D angle [rad], without walls closer than ``radius`` [m] to a place (d,)
+    [m]."""
     k = np.arange(DIRECTIONS) + 0.5
     if len(place) == 2:
         turn = 2.0 * np.pi * k / DIRECTIONS

@@ -1,9 +1,7 @@
-"""Emitters: columns of particles that wait upstream of an opening and leave it at one speed. This module has their
-tables and parameters."""
+"""Emitters, columns of particles that leave at one speed: their tables and parameters."""
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -16,7 +14,7 @@ from cortado.errors import Words, shown
 from cortado.scene.drain_tables import FlowTable
 from cortado.scene.fluids import FluidBody
 from cortado.scene.motions import course_table
-from cortado.scene.parameters import Axis, Parameter
+from cortado.scene.parameters import Axis, Parameter, ending
 from cortado.scene.tables import GREATEST, MISSING, FieldPath, Length, Text, Vector, field_error, quantity
 
 
@@ -25,9 +23,9 @@ class EmitterSample:
     """The m particles of an emitter, layer by layer from the outlet upstream."""
 
     offsets: Points
-    """(m, d) offsets from the axis, perpendicular to it [m]"""
+    """(m, d) offsets from the axis [m]."""
     upstream: Points
-    """(m,) distance from the opening, against the direction of the flow [m]"""
+    """(m,) [m]"""
     positions: Points
     """(m, d) [m]"""
     velocities: Points
@@ -35,14 +33,14 @@ class EmitterSample:
     speed: float
     """Speed at the start [m/s]."""
     layer: int
-    """Number of particles in a layer; m is a multiple of it."""
+    """Number of particles in a layer; m is a multiple."""
     column: float
-    """Length of the waiting column [m]; particles further upstream are in reserve."""
+    """Length of the waiting column [m]; particles further upstream are the reserve."""
 
     def in_line(self, name: str, first: int, others: Any, particles: int) -> Points:
-        """Return the distance [m] of particles upstream of the opening at the start of the run. For a particle emitted
-        again it is the distance it would have had. It is 0 for particles outside this emitter, whose own begin at
-        ``first``. The distances are read from further fields of a state."""
+        """Return the distances (particles,) upstream of the opening at the start [m]: for re-emitted particles, as if
+        they had waited; for particles of others, 0. The emitter's particles begin at index ``first``, and ``others``
+        are fields of a state."""
         found = np.zeros(particles)
         found[first : first + len(self.upstream)] = self.upstream
         if (again := others.get(again_name(name))) is None:
@@ -51,38 +49,25 @@ class EmitterSample:
         return np.where(np.ravel(again) > 0.0, joined, found)
 
     def waits(self, name: str, first: int, others: Any, particles: int) -> NDArray[np.bool_]:
-        """Return a mask (n,) of the particles that wait in the emitter, from further fields of a state."""
+        """Return a mask (particles,) of the particles that wait in the emitter; ``others`` are fields of a state."""
         emitted = float(np.ravel(others[emitted_name(name)])[0])
         return self.in_line(name, first, others, particles) > emitted
 
 
 OF_OPENINGS = ("emitted", "again", "drained", ".count")
-"""Endings of the names of state fields that say which particles are in the fluid, and how many drains took."""
+"""Suffixes of state fields about emitters and drains."""
 COLUMN = 6.0
-"""Default length of the column, in spacings: fluid at the opening has neighbours upstream, which have some too."""
+"""Default length of the column [spacings], which gives fluid at the opening a full neighbourhood."""
 
 
-def path_name(emitter: str) -> str:
-    """Return the name of the parameter where the opening of an emitter is [m]."""
-    return f"{emitter}.path"
-
-
-def outlet_name(emitter: str) -> str:
-    """Return the name of the state field with the position of an emitter's opening [m]."""
-    return f"{emitter}.outlet"
-
-
-def emitted_name(emitter: str) -> str:
-    """Return the name of the state field with the length of the column that has left an emitter [m]."""
-    return f"{emitter}.emitted"
-
-
-def again_name(emitter: str) -> str:
-    """Return the name of the state field with each particle's place in an emitter's line, from 1 on. The field is 0 for
-    particles that this emitter does not emit again."""
-    return f"{emitter}.again"
-
-
+path_name = ending("path")
+"""Parameter: position of an emitter's opening over time [m]."""
+outlet_name = ending("outlet")
+"""Field: position of an emitter's opening [m]."""
+emitted_name = ending("emitted")
+"""Field: length of the column that has left an emitter [m]."""
+again_name = ending("again")
+"""Field: number of each re-emitted particle in the emitter's line, from 1 on; 0 for other particles."""
 _PATH = Parameter(
     "emitter_path",
     "m",
@@ -94,7 +79,6 @@ _PATH = Parameter(
     moment=1.0,
 )
 OutletPath: Any = course_table(_PATH)
-"""The table of an emitter's opening positions over time."""
 
 
 class EmitterTable(FluidBody, FlowTable):
@@ -105,32 +89,32 @@ class EmitterTable(FluidBody, FlowTable):
     outlet: Vector[Length]
     """(d,) Middle of the opening [m]."""
     direction: Vector[Annotated[float, quantity()]] = (0.0, -1.0, 0.0)
-    """(d,) Direction of the flow; its length does not matter."""
+    """(d,) Direction of the flow; its length has no effect."""
     radius: Annotated[float, quantity("m", gt=0.0)] | None = None
     """Radius of a round opening, in 2-D half its width [m]. Fluid passes through the lattice cells inside the opening.
-    Its speed is the flow rate divided by their area; `describe` prints the speed."""
+    The speed of the flow, which `describe` prints, is the flow rate divided by the area of these cells."""
     sides: tuple[Annotated[float, quantity("m", gt=0.0)], ...] | None = None
-    """(d - 1,) Widths of a rectangular opening, in place of `radius` [m]. In 3-D they are along the two axes, in order,
-    to which the direction is most nearly perpendicular."""
+    """(d - 1,) Widths of a rectangular opening, in place of `radius` [m]. In 3-D the widths are along the two axes, in
+    order, that are most nearly perpendicular to the direction."""
     length: Annotated[float, quantity("m", gt=0.0)] | None = None
     """Length of the column that waits upstream of the opening [m]; six spacings if left out."""
     volume: Annotated[float, quantity("m3 (m2 in 2-D)", gt=0.0)] | None = None
-    """Volume, in 2-D area, that the emitter gives in all [m3 (m2 in 2-D)]. If left out, commands such as `cortado run`
-    provide enough for the run, and `Simulation` provides only the column (`Scene.lasting`)."""
+    """Volume, in 2-D area, that the emitter emits in total [m3 (m2 in 2-D)]. If left out, commands such as `cortado
+    run` provide enough for the run, and `Simulation` provides only the column (`Scene.lasting`)."""
     fed_by: tuple[Text, ...] = ()
-    """Names of drains whose particles this emitter emits again. Then its only other particles are those of the column,
-    and of a `volume` if given. A drain can feed only one emitter."""
+    """Names of drains whose particles this emitter emits again. The emitter then has no other particles than the
+    column, and a `volume` if given. A drain can feed only one emitter."""
     path: OutletPath | None = None
     """Middle of the opening over time; if left out, the opening stays at `outlet`."""
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """Largest offset of a particle from its lattice place in its layer, along each axis of the opening and in spacings;
-    the same in every run. With the solver "projection" it is 0.05 if left out, because a stream on an exact lattice is
-    too wide."""
+    """Largest offset of a particle from its lattice position in its layer, along each axis of the opening [spacings];
+    equal in all runs. With the solver "projection" the default is 0.05, because a stream on an exact lattice is too
+    wide."""
 
     @field_validator("direction")
     @classmethod
     def _normalise(cls, direction: tuple[float, ...]) -> tuple[float, ...]:
-        """Normalise a direction; one already normalised to round-off is kept, so that JSON gives the same scene."""
+        """Normalise a direction that is not normalised to round-off, so that JSON gives the same scene."""
         size = math.hypot(*direction)
         if size < 1.0 / GREATEST:
             raise field_error((), direction, "a vector that is not zero")
@@ -150,34 +134,31 @@ class EmitterTable(FluidBody, FlowTable):
         return placed.model_copy(update={"path": self.path.in_dimension(dimension, (*path, "path"))})
 
     def layers(self, spacing: float) -> float:
-        """Return the number of layers whose middles lie within the column's length, or of all layers if fewer. The
-        whole number returned may be larger than any array."""
+        """Return the number of layers in the column, which may exceed the largest array."""
         length = COLUMN * spacing if self.length is None else self.length
         within = float(max(math.ceil(length / spacing - 0.5 - ROUND_OFF), 0))
         return within if self.volume is None or self.fed_by else min(within, self.supply(spacing))
 
     def supply(self, spacing: float) -> float:
-        """Return the number of layers, including the reserve."""
         given = 0.0 if self.volume is None else self.volume / (self.area(spacing) * spacing)
         if self.volume is None or self.fed_by:
             given += self.layers(spacing)
         return float(max(math.ceil(given - ROUND_OFF), 1))
 
     def dry_after(self, spacing: float) -> float:
-        """Return the time at which the emitter runs out of fluid [s]; it may be infinite."""
+        """Return the time [s] when the emitter runs out of fluid; infinite if never."""
         return math.inf if self.fed_by else self.time_for(self.supply(spacing) * spacing * self.area(spacing))
 
     def lasting(self, time: float, spacing: float) -> Self:
-        """Return this table with a volume if it has none and its column would run out before a time [s]. The column is
-        then complete."""
+        """Return the table with a volume that lasts until a time [s]; unchanged with a volume or a long enough
+        column."""
         if self.volume is not None or self.dry_after(spacing) >= time:
             return self
         column = self.layers(spacing) * spacing * self.area(spacing)
         return self.model_copy(update={"volume": self.passed(time) + column})
 
     def speed(self, spacing: float) -> float:
-        """Return the greatest speed of the flow [m/s]. At this speed the particles carry the volume that the flow rate
-        prescribes."""
+        """Return the greatest speed of the flow [m/s]: the flow rate over the area of a layer's cells."""
         return self.greatest / self.area(spacing)
 
     def area(self, spacing: float) -> float:
@@ -185,22 +166,20 @@ class EmitterTable(FluidBody, FlowTable):
         return float(len(self._cross_section(spacing)) * spacing ** (len(self.outlet) - 1))
 
     def asked_area(self) -> float:
-        """Return the area of the opening as the table gives it [m2], in 2-D its width [m]."""
+        """Return the area of the opening from the keys [m2], in 2-D its width [m]."""
         if self.radius is None:
             return math.prod(self.sides or ())
         return 2.0 * self.radius if len(self.outlet) == 2 else float(np.pi * self.radius**2)
 
     @property
     def width(self) -> float:
-        """Return the greatest width of the opening [m]."""
         return max(self.sides or (2.0 * (self.radius or 0.0),))
 
     def opening(self, spacing: float) -> Points:
-        """Return a layer of particles, moved into the opening, (n, d) [m]."""
+        """Return positions (n, d) of a layer of particles in the opening [m]."""
         return np.array(self.outlet) + self._cross_section(spacing)
 
     def sample(self, spacing: float) -> EmitterSample:
-        """Return the particles on a lattice of this spacing [m], with the reserve in line behind the column."""
         cross_section = self._cross_section(spacing)
         layers, speed = int(self.supply(spacing)), self.begun / self.area(spacing)
         upstream = np.repeat((np.arange(layers) + 0.5) * spacing, len(cross_section))
@@ -227,7 +206,6 @@ class EmitterTable(FluidBody, FlowTable):
         return lower - np.maximum(first, last), upper - np.minimum(first, last)
 
     def particles(self, spacing: float) -> Points:
-        """Return the particles of the column, (n, d) [m]."""
         sample = self.sample(spacing)
         return sample.positions[sample.upstream < sample.column]
 
@@ -244,23 +222,16 @@ class EmitterTable(FluidBody, FlowTable):
 
 
 def emitter_parameters(scene: Any) -> list[Parameter]:
-    """Return the parameters of a scene's emitters."""
-    found = []
-    for emitter in scene.emitter:
-        outlet, course = np.array(emitter.outlet), None if emitter.path is None else emitter.path.knots
-        meaning = f"where the opening of the emitter {emitter.name} is after each step"
-        value = partial(_constant, outlet)
-        found.append(replace(_PATH, name=path_name(emitter.name), meaning=meaning, value=value, course=course))
-        found.append(emitter.flow_parameter(scene.dimension))
-    return found
+    return [one for e in scene.emitter for one in (_path_parameter(e), e.flow_parameter(scene.dimension))]
 
 
-def _constant(value: Any, source: Any) -> Any:
-    return value
+def _path_parameter(emitter: EmitterTable) -> Parameter:
+    outlet, course = np.array(emitter.outlet), None if emitter.path is None else emitter.path.knots
+    meaning = f"where the opening of the emitter {emitter.name} is after each step"
+    return replace(_PATH, name=path_name(emitter.name), meaning=meaning, value=lambda source: outlet, course=course)
 
 
 def check_fed(scene: Any) -> None:
-    """Check that the drains which feed emitters exist, and that such a scene has only one phase."""
     names, fed = [drain.name for drain in scene.drain], list[str]()
     for index, emitter in enumerate(scene.emitter):
         path = "emitter", index, "fed_by"
@@ -273,7 +244,7 @@ def check_fed(scene: Any) -> None:
 
 
 def check_columns(scene: Any) -> None:
-    """Check that at the start no sheet crosses an emitter's column or is closer than a spacing to its opening."""
+    """Check that no sheet crosses an emitter's column or is closer than a spacing to its opening at the start."""
     spacing = scene.discretisation.spacing
     for index, emitter in enumerate(scene.emitter):
         opening, ahead = emitter.opening(spacing), spacing * np.array(emitter.direction)
@@ -287,8 +258,7 @@ def check_columns(scene: Any) -> None:
 
 
 def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:
-    """Return for each emitter of a scene its name, the number of its first particle among ``count`` particles, and its
-    particles."""
+    """Return for each emitter its name, the index of its first of ``count`` particles, and its particles."""
     made = [emitter.sample(scene.discretisation.spacing) for emitter in scene.emitter]
     ends = count - np.cumsum([0, *(len(sample.upstream) for sample in made[::-1])])[::-1]
     names = [emitter.name for emitter in scene.emitter]
@@ -296,7 +266,7 @@ def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:
 
 
 def waits(scene: Any, others: Any, particles: int) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles that wait in emitters, from further fields of a state."""
+    """Return a mask (particles,) of the particles that wait in emitters; ``others`` are fields of a state."""
     found = np.zeros(particles, dtype=bool)
     for name, first, sample in samples(scene, particles):
         if emitted_name(name) in others:

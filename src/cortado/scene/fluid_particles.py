@@ -1,8 +1,5 @@
-"""Fluid particles of a scene, in float64.
-
-Bodies whose surface cuts through cells of a lattice start with as many particles as fit their volume. These are then
-moved until the fluid is at rest everywhere: `cortado.discretise.packing`.
-"""
+"""Fluid particles of a scene, in float64. A body whose surface cuts lattice cells starts with as many particles as fit
+its volume, which are then packed (`cortado.discretise.packing`)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -20,22 +17,21 @@ from cortado.scene.fluids import ALIGNED, Fluid, PointsFluid, RegionFluid
 from cortado.scene.scene import Scene
 
 FINER = 4
-"""Number of parts along each axis into which cells at a surface are divided to measure a volume."""
+"""Parts along each axis into which cells at a surface are divided to measure a volume."""
 LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
-"""Fraction of particles that a round body has too few: of those in its outermost spacing near cut cells, and at most of
-all of its own. Particles off the lattice see a density higher than on it, by 4 % with Wendland kernels and a support of
-2 spacings."""
+"""Largest fractions of missing particles in a packed body: of particles in the outermost spacing near cut cells, and of
+all. Off the lattice, the density is up to 4 % higher than on the lattice."""
 BESIDE = 2
-"""In cells: greatest distance along each axis from a cut cell at which particles may be left out."""
+"""Largest distance along each axis from a cut cell at which particles may be left out [cells]."""
 FAR = 4.0
-"""In spacings: depths in a body are computed up to this depth only."""
+"""Depth in a body up to which depths are computed [spacings]."""
 DIGITS = 6
-"""Decimals of distances [spacings] by which particles are sorted, so that round-off does not change their order."""
+"""Decimals of depths [spacings] by which particles are sorted, so that round-off does not change the order."""
 
 
 def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGuard[RegionFluid]:
-    """Test whether a body's particles may be off the lattice: its own surface cuts cells, or it comes within ``reach``
-    [m] of a solid."""
+    """Test whether a body's particles may be off the lattice: its surface cuts cells, or a solid is within ``reach``
+    [m]."""
     if not isinstance(fluid, RegionFluid) or fluid.cuts_cells(spacing):
         return isinstance(fluid, RegionFluid)
     return bool(len(room.solids) and (room.from_solids(fluid.particles(spacing), reach) < reach).any())
@@ -43,25 +39,23 @@ def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGua
 
 @dataclass(frozen=True)
 class CutBody:
-    """A body of fluid, cut by the container and by solids so that only a part of it has room."""
-
     fluid: RegionFluid
     room: Room
     spacing: float
     """[m]"""
 
     def distance(self, points: Points, reach: float) -> Points:
-        """Return the distances (n,) [m] of points (n, d) [m] from the body, negative inside. ``reach`` is as in
+        """Return the distances (n,) [m] of points (n, d) [m] from the body, negative inside, as in
         `Room.from_solids`."""
         return np.maximum(self.fluid.distance(points, self.spacing, reach), self.room.distance(points, reach))
 
     def shares(self, points: Points) -> Points:
-        """Return the fraction (n,) of the cell around each point (n, d) [m] that lies within the body."""
+        """Return the fraction (n,) of the cell around each point (n, d) [m] inside the body."""
         return np.clip(0.5 - self.distance(points, 0.5 * self.spacing) / self.spacing, 0.0, 1.0)
 
     def volume(self, depth: float = 0.0, beside_cuts: bool = False) -> float:
-        """Return the volume [m^d] of the part deeper than a depth [m] below the surface, in all cells or only in those
-        beside cut cells."""
+        """Return the volume [m^d] deeper than ``depth`` [m] below the surface, in all cells or only beside cut
+        cells."""
         dimension, fine = self.room.dimension, self.spacing / FINER
         cells, reach = self.fluid.block(self.spacing).grown(1).points(), depth + self.spacing
         cells = cells[self._beside_cuts(cells)] if beside_cuts else cells
@@ -75,25 +69,22 @@ class CutBody:
 
     @cached_property
     def asked(self) -> float:
-        """Return the volume [m^d] that it is to hold: the fluid shape's, times the part of it that walls leave."""
+        """Return the prescribed volume [m^d]: the shape's exact volume times the fraction outside of walls."""
         everywhere = Room(Region.everywhere(self.room.dimension), (), self.room.periods)
         return self.fluid.volume(self.spacing) * self._held / replace(self, room=everywhere)._held
 
     @cached_property
     def _held(self) -> float:
-        """Return the volume [m^d] that the particles should have: the shape's, times the fraction that walls leave."""
         return self.volume()
 
     @cached_property
     def count(self) -> int:
-        """Return the number of the body's particles."""
         volume, outermost = self._held, self.volume(0.0, True) - self.volume(self.spacing, True)
         lacking = min(LOOSENESS * outermost, MOST_LOOSENESS * volume)
         return round((volume - lacking) / self.spacing**self.room.dimension)
 
     def particles(self) -> Points:
-        """Return the first positions (n, d) [m] of the `count` particles: lattice points, and near cells that surfaces
-        cut the deepest ones."""
+        """Return initial positions (n, d) [m]: lattice points, near cells that surfaces cut only the deepest ones."""
         if not self._cuts_cells():
             return self.fluid.particles_in(self.room, self.spacing)
         points = self.fluid.lattice(self.spacing, self.spacing)
@@ -102,14 +93,12 @@ class CutBody:
         return points[np.sort(np.argsort(depths, kind="stable")[: self.count])]
 
     def _beside_cuts(self, points: Points) -> Which:
-        """Test (n,) which points (n, d) [m] are within `BESIDE` cells of a cell that a surface cuts. Flat faces between
-        cells cut no cell, so that layers along such faces stay whole."""
+        """Test (n,) which points (n, d) [m] are within `BESIDE` cells of a cell that a surface cuts."""
         reach = (BESIDE + 0.5) * self.fluid.block(self.spacing).spacings.max()
         return np.asarray(self._cut.query(points, p=np.inf, distance_upper_bound=reach)[0] < reach)
 
     @cached_property
     def _cut(self) -> Any:
-        """Build a tree of the centres of cells that a surface cuts."""
         from scipy.spatial import cKDTree
 
         lattice = self.fluid.block(self.spacing)
@@ -117,7 +106,6 @@ class CutBody:
         return cKDTree(cells[np.abs(self.distance(cells, self.spacing)) < (0.5 - ALIGNED) * lattice.spacings.min()])
 
     def _cuts_cells(self) -> bool:
-        """Return True if the surface of the body, or of a solid, cuts through cells."""
         if self.fluid.cuts_cells(self.spacing):
             return True
         from_solids = self.room.from_solids(self.fluid.particles(self.spacing), self.spacing)
@@ -126,15 +114,13 @@ class CutBody:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The surroundings of cut bodies: particles that stay in place, air, and walls."""
-
     bodies: tuple[CutBody, ...]
     staying: Points
-    """(m, d) particles of other fluid [m]"""
+    """(m, d) particles of other fluid [m]."""
     lower: Points
-    """(d,) where the period begins [m]"""
+    """(d,) [m]"""
     lengths: Points
-    """(d,) the lengths of the period [m], 0 for axes without one"""
+    """(d,) [m]; 0 without period"""
 
     def air(self, reach: float) -> tuple[Points, Points]:
         """Return lattice points (m, d) [m] around the bodies, up to ``reach`` [m] from their surfaces, and the fraction
@@ -144,7 +130,7 @@ class Surroundings:
         return points[shares > 0.0], shares[shares > 0.0]
 
     def _air_around(self, body: CutBody, reach: float) -> tuple[Points, Points]:
-        """Return the points of air closer to one body than to the others, and within half a period of it."""
+        """Return the air of one body: points nearer to this body than to others, within half a period of it."""
         points = body.fluid.lattice(body.spacing, reach + body.spacing)
         middle = 0.5 * np.sum(body.fluid.extent(body.spacing), axis=0)
         within = ((self.lengths == 0.0) | (np.abs(points - middle) < 0.5 * self.lengths)).all(axis=1)
@@ -160,7 +146,6 @@ class Surroundings:
         return np.min([body.distance(points + shift, reach) for shift in body.room.shifts()], axis=0)
 
     def _shares(self, points: Points, spacing: float) -> Points:
-        """Return the fraction (n,) of the cell around each point that is fluid."""
         found = sum(body.shares(points + shift) for body in self.bodies for shift in body.room.shifts())
         reach = spacing * np.sqrt(points.shape[1])
         point, particle, _ = pairs_within(points, self.staying, reach, self.lower, self.lengths)
@@ -171,36 +156,33 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class FluidSample:
-    """Fluid particles, in the order in which the scene lists its fluids; those of emitters come last."""
-
     positions: Points
     """(n, d) [m]"""
     velocities: Points
     """(n, d) [m/s]"""
     phase: NDArray[np.int64]
-    """(n,) index into the scene's phases"""
+    """(n,) index"""
     sizes: tuple[int, ...]
-    """Number of particles of each body of fluid, without those of emitters."""
+    """Number of particles of each body of fluid, without emitters."""
     asked: tuple[float, ...]
-    """Volume [m^d] that each body should have, without the walls' part; for points the volume of their particles."""
+    """Prescribed volume [m^d] of each body outside of walls; for points, the volume of the particles."""
     bodies: tuple[CutBody, ...]
-    """Bodies whose particles are still to be packed, in the order of the particles."""
     is_packed: NDArray[np.bool_]
-    """(n,) true for a particle of one of these bodies."""
+    """(n,) True for particles of `bodies`."""
     is_placed: NDArray[np.bool_]
-    """(n,) true for a particle with a prescribed position: a point of a file, or a particle in an emitter."""
+    """(n,) True for a particle with a prescribed position: a point of a file, or a particle in an emitter."""
     emitters: tuple[tuple[str, int, EmitterSample], ...]
-    """For each emitter its name, the number of its first particle, and its particles with their places in line."""
+    """For each emitter, its name, the index of its first particle, and its particles."""
     places: Points
-    """(n, d) where particles rest that are in reserve or were taken by a drain [m]"""
+    """(n, d) positions of particles in reserve or taken by drains [m]."""
 
     def jittered(self, most: float) -> Points:
-        """Return positions (n, d) [m] with coordinates changed by up to ``most`` [m], except placed ones."""
+        """Return positions (n, d) [m] with random offsets of up to ``most`` [m], except for prescribed positions."""
         moves = np.random.default_rng(0).uniform(-most, most, self.positions.shape)
         return np.where(self.is_placed[:, None], self.positions, self.positions + moves)
 
     def some(self, kept: NDArray[np.int64]) -> "FluidSample":
-        """Return a sample of the particles numbered (m,), in rising order, which must include all of emitters."""
+        """Return the sample of the particles with sorted indices (m,), which must include all particles of emitters."""
         names = "positions", "velocities", "phase", "is_packed", "is_placed", "places"
         arrays = {name: getattr(self, name)[kept] for name in names}
         ends = np.searchsorted(kept, np.cumsum(self.sizes))
@@ -217,14 +199,13 @@ class FluidSample:
 
     @property
     def emitted(self) -> slice:
-        """Return the slice of the emitters' particles."""
         count = len(self.positions)
         return slice(self.emitters[0][1] if self.emitters else count, count)
 
 
 def fluid_particles(scene: Scene) -> FluidSample:
-    """Build the fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with
-    points has vanished since the scene was read, or if walls leave no room for any particle of a fluid."""
+    """Build the fluid of a scene before packing. Raises `InputError` if a file with points has vanished, or if walls
+    leave no room for any particle of a fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
     room, reach = scene.room, scene.discretisation.support_radius
     bodies = [CutBody(body, room, spacing) if is_packed(body, room, reach, spacing) else None for body in scene.fluid]
@@ -265,8 +246,8 @@ def fluid_particles(scene: Scene) -> FluidSample:
 
 
 def resting_places(scene: Scene, count: int) -> Points:
-    """Return positions (count, d) [m] for particles in reserve or taken by drains: outside of everything, and too far
-    apart to touch. A periodic axis has as many as fit its period; positions are NaN if all axes are periodic."""
+    """Return positions (count, d) [m] for particles in reserve or taken by drains, outside of everything and without
+    neighbours. Along periodic axes only as many as fit; NaN if all axes are periodic."""
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     boxes = [body.extent(spacing) for body in (*scene.fluid, *scene.emitter)]
     boxes += [solid.body().extent() for solid in scene.solid]
@@ -283,7 +264,6 @@ def resting_places(scene: Scene, count: int) -> Points:
 
 
 def _why_none(body: CutBody | None, spacing: float) -> str:
-    """Explain why a body of fluid has no particles and what to do, as the end of a sentence."""
     if body is None:
         return (
             f" that is half a spacing, {0.5 * spacing:g} m, or more from all walls: it must be larger, or further "
@@ -295,16 +275,15 @@ def _why_none(body: CutBody | None, spacing: float) -> str:
 
 @dataclass(frozen=True)
 class FluidMasses:
-    """Masses of fluid by phase [kg]; in 2-D of a layer one metre thick."""
+    """Masses of fluid by phase [kg]; in 2-D per metre of depth."""
 
     given: Mapping[str, float]
-    """Mass of the particles at the start, including those that wait in an emitter."""
+    """Mass of the particles at the start, including particles that wait in emitters."""
     asked: Mapping[str, float]
-    """Mass of the bodies' volumes, without the part that walls take, plus the mass of the emitters' fluid."""
+    """Prescribed mass: of the bodies' volumes outside of walls, plus the emitters' fluid."""
 
     @classmethod
     def of(cls, scene: Scene, fluid: FluidSample) -> Self:
-        """Compute the masses of the first particles of a scene."""
         names, cell = [phase.name for phase in scene.phase], scene.discretisation.spacing**scene.dimension
         densities = np.array([phase.rest_density for phase in scene.phase])
         held = cell * np.bincount(fluid.phase, minlength=len(names))
@@ -316,7 +295,7 @@ class FluidMasses:
 
     @property
     def off(self) -> dict[str, str]:
-        """Return, by phase, words about each phase whose mass differs from the requested mass by more than `EXCESS`."""
+        """Return, by phase, words about each mass that differs from the prescribed mass by more than `EXCESS`."""
         return {
             name: f"{given:.4g} kg of {name}, where {self.asked[name]:.4g} kg were asked for"
             for name, given in self.given.items()
@@ -325,7 +304,6 @@ class FluidMasses:
 
     @property
     def warning(self) -> str | None:
-        """Return a warning to print before a scene runs; None if all phases have the requested mass."""
         if not self.off:
             return None
         return (

@@ -1,4 +1,4 @@
-"""The shapes of bodies of fluid, each with its particles."""
+"""Shapes of bodies of fluid, with their particles."""
 
 from abc import abstractmethod
 from dataclasses import replace
@@ -35,7 +35,7 @@ from cortado.scene.tables import (
 )
 
 ALIGNED = 1e-3
-"""In spacings: largest distance of a surface from the faces of cells at which it counts as not cutting them."""
+"""Largest distance of a surface from faces of lattice cells [spacings] for which the surface cuts no cell."""
 
 
 class FluidBody(Table):
@@ -46,7 +46,7 @@ class FluidBody(Table):
 
     @abstractmethod
     def count(self, spacing: float) -> float:
-        """Return the number of particles, or a slightly larger number, without creating any."""
+        """Return an upper bound of the number of particles, without creating them."""
 
     @abstractmethod
     def extent(self, spacing: float) -> tuple[Points, Points]:
@@ -54,7 +54,7 @@ class FluidBody(Table):
 
     @abstractmethod
     def particles(self, spacing: float) -> Points:
-        """Return the positions of the particles (n, d) [m]."""
+        """(n, d) [m]"""
 
 
 class Fluid(FluidBody):
@@ -71,7 +71,8 @@ class Fluid(FluidBody):
         return super().in_dimension(dimension, path)
 
     def velocities(self, points: Points) -> Points:
-        """Return first velocities (n, d) [m/s] of the particles at points (n, d) [m], whose mean is the middle."""
+        """Return initial velocities (n, d) [m/s] for all particles' positions (n, d) [m], with spin about their
+        mean."""
         found = np.tile(np.array(self.velocity, dtype=np.float64), (len(points), 1))
         if self.angular_velocity is None:
             return found
@@ -81,34 +82,28 @@ class Fluid(FluidBody):
         return found + np.cross(self.angular_velocity, arms)
 
     def greatest_speed(self, spacing: float) -> float:
-        """Return the greatest speed of the particles at the start, or a slightly larger speed [m/s]."""
         spin = np.linalg.norm(self.angular_velocity or 0.0)
         lower, upper = self.extent(spacing) if spin else (np.zeros(1), np.zeros(1))
         return float(np.linalg.norm(self.velocity) + 0.5 * spin * np.linalg.norm(upper - lower))
 
-    def box_corners(self, spacing: float) -> Points:
-        """Return the corners of the extent (2^d, d) [m]."""
-        return corners(*self.extent(spacing))
-
     def witnesses(self, spacing: float) -> Points:
-        """Return test particles (n, d) [m]: a convex region that contains these contains all particles."""
+        """Return points (n, d) [m] such that a convex region with these points contains all particles."""
         return self.particles(spacing)
 
     def particles_in(self, room: Room, spacing: float) -> Points:
-        """Return the particles (n, d) [m] for which a container and solids leave room."""
+        """Return the particles (n, d) [m] that walls do not displace."""
         return self.particles(spacing)
 
     @abstractmethod
     def volume(self, spacing: float) -> float:
-        """Return the volume [m^d] of the whole shape, even if walls cut it; for points that of their particles."""
+        """Return the volume [m^d] of the uncut shape; for points, the volume of the particles."""
 
 
 class RegionFluid(Fluid):
-    """Fluid that fills a shape. Its particles lie on a lattice, or start from one and are packed before a run."""
+    """Fluid that fills a shape, with particles on a lattice or packed."""
 
     @abstractmethod
-    def block(self, spacing: float) -> Block:
-        """Return the lattice in the box around the shape."""
+    def block(self, spacing: float) -> Block: ...
 
     def count(self, spacing: float) -> float:
         return self.block(spacing).size
@@ -120,27 +115,27 @@ class RegionFluid(Fluid):
         return self.block(spacing).points()
 
     def particles_in(self, room: Room, spacing: float) -> Points:
-        """Return the particles (n, d) [m] at least half a spacing from all walls; nearer ones would be compressed."""
+        """Return the particles (n, d) [m] at least half a spacing from all walls."""
         everything = self.particles(spacing)
         return everything[room.contains(everything, (ROUND_OFF - 0.5) * self.block(spacing).spacings.min())]
 
     @abstractmethod
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
-        """Return distances (n,) [m] of points (n, d) [m] from the filled region, negative inside; for a box from its
-        whole cells. Beyond a reach [m] only the sign and a size of at least the reach are sure."""
+        """Return distances (n,) [m] of points (n, d) [m] from the fluid, negative inside. Beyond ``reach`` [m] only
+        their signs and lower bounds are exact."""
 
     def cuts_cells(self, spacing: float) -> bool:
-        """Return True if the surface of the body cuts through cells of the lattice."""
+        """Return True if the surface cuts cells of the lattice."""
         return False
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Return lattice points (n, d) [m] in the box around the shape, extended by ``reach`` [m]. Each stands for a
-        cell of the spacing's volume, and between flat faces layers are whole."""
+        """Return lattice points (n, d) [m] in the box around the shape, extended by ``reach`` [m]; cells fit between
+        flat faces."""
         return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
 
 
 class Turnable(RegionFluid):
-    """A body that may be rotated. A rotated body cuts cells of the lattice, see `cortado.scene.fluids`."""
+    """A body that may be rotated; its particles are then packed."""
 
     rotation: Rotation | None = None
     """Rotation about its middle [rad]; not rotated if left out. In 3-D a rotation vector, in 2-D one number,
@@ -152,9 +147,9 @@ class Turnable(RegionFluid):
 
 
 class BoxFluid(BoxShape, Turnable):
-    """A box, filled with particles at ``lower + (i + 1/2) spacing``, or packed if rotated. If a side is no whole
-    multiple of the spacing, particles are up to 3 % further apart along some axes and closer along others. The mass is
-    then right within 0.3 %. Where no lattice fits that well, the particles are packed, and the mass is up to 0.8 % too
+    """A box, filled with particles at ``lower + (i + 1/2) spacing``, or packed if rotated. If a side is no integer
+    multiple of the spacing, particles are up to 3 % further apart along some axes and closer along others, and the mass
+    is right within 0.3 %. If no lattice fits that well, the particles are packed, and the mass is up to 0.8 % too
     small; `describe` and a run then print both masses."""
 
     def block(self, spacing: float) -> Block:
@@ -175,12 +170,12 @@ class BoxFluid(BoxShape, Turnable):
         return Region.between(first - half, last + half).distance(points)
 
     def witnesses(self, spacing: float) -> Points:
-        return self.box_corners(spacing)
+        return corners(*self.extent(spacing))
 
 
 class RoundFluid(RegionFluid):
-    """A body of fluid whose surface cuts cells of the lattice. Its particles are packed before a run
-    (`cortado.discretise.packing`); ``particles`` returns whole cells, which show only roughly where the fluid is."""
+    """A body of fluid whose surface cuts cells of the lattice. The particles are packed before a run, and ``particles``
+    returns the cells from which packing starts."""
 
     def particles(self, spacing: float) -> Points:
         points = self.block(spacing).points()
@@ -224,7 +219,7 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
         return Region.cylinder(np.array(self.base), self.radius, self.height, axis).distance(points)
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Return a lattice stretched along the axis so that whole layers fill the height, and narrowed across it."""
+        """Return a lattice stretched along the axis so that layers fill the height, and narrowed across."""
         layers = max(round(self.height / spacing), 1)
         along = self.height / layers
         across = np.sqrt(spacing**3 / along)
@@ -261,15 +256,14 @@ class PointsFluid(Fluid):
 
 
 class Filled(Turnable):
-    """A body of fluid that fills a solid shape. Its particles are packed, unless its surface follows cells of the
-    lattice that starts at the lower corner of the box around it."""
+    """A body of fluid that fills a solid shape. The particles are packed, unless the surface follows cells of the
+    lattice that starts at the lower corner of the body's box."""
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the shape, unrotated and centred at the origin, and the middle that its own keys give, (d,) [m]."""
+        """Return the unrotated shape with its centroid at the origin, and the centroid (d,) that its keys imply [m]."""
 
     def body(self) -> Placed:
-        """Return the shape at its position, with its rotation."""
         shape, middle = self.shape_about()
         return Placed(shape, middle, rotation_matrix(self.rotation or (0.0,) * (2 * len(middle) - 3)))
 
@@ -297,7 +291,7 @@ class Filled(Turnable):
 
 
 class FilledShape(Filled):
-    """A body of fluid that fills a shape, and that may have a given position."""
+    """A body of fluid with a shape and an optional position."""
 
     position: tuple[Length, ...] | None = None
     """(d,) Position of the centroid of its volume [m]; if left out, the other keys of the shape determine it."""
@@ -312,19 +306,19 @@ class FilledShape(Filled):
 
 
 class TurnedBox(Filled, BoxFluid):
-    """A box of fluid with a rotation."""
+    """A rotated box of fluid."""
 
     shape_about = BoxShape.shape_about
 
 
 class TurnedCylinder(Filled, CylinderFluid):
-    """A cylinder of fluid with a rotation."""
+    """A rotated cylinder of fluid."""
 
     shape_about = CylinderShape.shape_about
 
 
 def turned(fluid: Fluid) -> Fluid:
-    """Return a body of fluid unchanged or, if its kind is usually on a lattice and it is rotated, a packed body."""
+    """Return a rotated box or cylinder as a packed body, and any other body of fluid unchanged."""
     kinds: dict[type[Fluid], type[Filled]] = {BoxFluid: TurnedBox, CylinderFluid: TurnedCylinder}
     kind = kinds.get(type(fluid))
     if kind is None or not isinstance(fluid, Turnable) or fluid.rotation is None:

@@ -1,6 +1,4 @@
-"""How free bodies are held: which ways they may go and turn, and on which hinges, to the world or to each other. These
-have tables and parameters.
-"""
+"""Degrees of freedom of free bodies, and hinges between bodies, with their tables and parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,56 +10,56 @@ from numpy.typing import NDArray
 from cortado.arrays import unit
 from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Mass
-from cortado.errors import InputError, Words, shown
+from cortado.errors import Words, shown
 from cortado.scene.courses import WAYS, Knots, check_over_time, values_in_file
 from cortado.scene.parameters import Axis, Parameter, Range, Source
 from cortado.scene.shape_tables import File
-from cortado.scene.solids import SolidTable
-from cortado.scene.tables import FieldPath, Length, Table, Text, Vector, field_error, quantity
+from cortado.scene.solids import SolidTable, check_free_body
+from cortado.scene.tables import FieldPath, Length, Table, Text, Vector, check_name, field_error, quantity, usable_file
 
 Three = tuple[float, float, float]
 COLUMNS = (("torque", "N m"), ("speed", "rad/s"))
-"""Columns of a motor's file."""
 
 
 class HingeTable(Table):
-    """A hinge, about which a free body turns: one point of the body stays where it is, or stays with another solid."""
+    """A hinge about which a free body turns. At the hinge, one point of the body stays fixed in space, or stays on a
+    point of another solid."""
 
     name: Text
     """Name of the hinge."""
     solid: Text
-    """Name of the body."""
+    """Name of the free body."""
     to: Text | None = None
-    """Name of another solid that moves, to a point of which the body is hinged; if left out, to the world."""
+    """Name of a moving solid to which the hinge joins the body; if left out, the hinge is fixed in space."""
     position: Vector[Length]
-    """(d,) Where the hinge is at the start [m]."""
+    """(d,) Position of the hinge at the start [m]."""
     axis: tuple[Annotated[float, quantity()], ...] | None = None
-    """(3,) Direction of its axis at the start in 3-D, of any length; left out, the body turns about it in every way. In
-    2-D there is none."""
+    """(3,) Direction of the hinge's axis at the start, in 3-D only; its length has no effect. If left out, the body can
+    turn about every axis through the hinge."""
     stiffness: Annotated[float, quantity("N m/rad", ge=0.0)] | None = None
-    """Torque against each radian from the angle at rest [N m/rad]; in 2-D that of a metre across."""
+    """Torque per radian of turn away from `rest_angle` [N m/rad]; in 2-D per metre of depth."""
     rest_angle: Annotated[float, quantity("rad", ge=-3.0, le=3.0)] = 0.0
-    """Turn from how the scene begins at which that torque is 0 [rad]."""
+    """Turn since the start at which the torque of the stiffness is 0 [rad]."""
     damping: Annotated[float, quantity("N m s/rad", ge=0.0)] | None = None
-    """Torque against each radian a second of the turn, or of its difference from the motor's speed [N m s/rad]."""
+    """Damping torque per angular velocity relative to `speed` [N m s/rad]."""
     torque: Annotated[float, quantity("N m")] | None = None
-    """Torque with which a motor turns the body [N m]."""
+    """Constant torque of a motor on the body [N m]."""
     speed: Annotated[float, quantity("rad/s")] | None = None
-    """Angular velocity to which the damping brings the body, as a motor does [rad/s]."""
+    """Angular velocity towards which the damping drives the body, as a motor does [rad/s]."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
-    """(k,) Times of `torques` or `speeds`, from 0 on, each greater than the one before [s]; between them values go in
-    straight lines."""
+    """(k,) Times of `torques` or `speeds`, increasing from 0 on [s]; between times the motor's values are interpolated
+    linearly."""
     torques: tuple[Annotated[float, quantity("N m")], ...] | None = None
-    """(k,) Torques of a motor at these times, in place of `torque` [N m]."""
+    """(k,) Torques of a motor at `times`, in place of `torque` [N m]."""
     speeds: tuple[Annotated[float, quantity("rad/s")], ...] | None = None
-    """(k,) Speeds of a motor at these times, in place of `speed` [rad/s]."""
+    """(k,) Angular velocities of a motor at `times`, in place of `speed` [rad/s]."""
     file: File | None = None
-    """CSV file in place of `times`, `torques` and `speeds`, with the column `time` and one or both of `torque` and
-    `speed`, and units in its head. A relative name begins at the scene file."""
+    """CSV file in place of `times`, `torques` and `speeds`, with a column `time` and one or both of `torque` and
+    `speed`, each with its unit in the header. A relative path starts at the scene file's folder."""
 
     @property
     def turns(self) -> bool:
-        """Return True where something turns the body about the hinge."""
+        """Return True if a spring, a damper or a motor turns the body about the hinge."""
         return any(getattr(self, key) is not None for key in ("stiffness", "damping", "torque", "speed", "times"))
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
@@ -86,43 +84,39 @@ class HingeTable(Table):
         return super().in_dimension(dimension, path)
 
     def _read(self, path: FieldPath) -> Self:
-        """Return this table with the times and values of its file, which is read once and stays as it was."""
         for key in ("torque", "speed", "times", "torques", "speeds"):
             if (found := getattr(self, key)) is not None:
                 raise field_error((*path, key), found, "left out, as there is a file")
         assert self.file is not None
-        try:
+        with usable_file((*path, "file"), self.file, "the file of a motor"):
             times, columns = values_in_file(self.file, COLUMNS, False)
-        except InputError as error:
-            wanted = "the file of a motor"
-            raise field_error((*path, "file"), self.file, wanted, f"cannot be used: {error}") from None
         if times[0] != 0.0:
             raise field_error((*path, "file"), self.file, "a file with times from 0 on")
         lists = {f"{name}s": tuple(values.tolist()) for name, values in columns.items()}
         return self.model_copy(update={"file": None, "times": tuple(times.tolist()), **lists})
 
     def course(self, name: str) -> Knots | None:
-        """Return the motor's torque or speed over time; None where it is steady."""
+        """Return the motor's torque or speed over time; None if constant."""
         values = getattr(self, f"{name}s")
         return None if values is None else Knots(np.array(self.times), np.array(values))
 
 
 @dataclass(frozen=True)
 class Hold:
-    """How a free body is held. See `cortado.sph.moving_solids`."""
+    """Degrees of freedom of a free body, for `cortado.sph.moving_solids`."""
 
     moving: Three = (1.0, 1.0, 1.0)
-    """1 along axes of space along which its middle may go, else 0."""
+    """For each axis of space, 1 if the body's centre may move along the axis, else 0."""
     turning: int = 3
-    """Number of axes of space about which it may turn; 3 also in the plane where it turns."""
+    """Number of axes of space about which the body may turn; 3 for a turning body in 2-D."""
     axis: Three = (0.0, 0.0, 0.0)
-    """Unit vector along the one axis about which it may turn, or along that about which it may not, if they are two."""
+    """Unit vector: the axis of rotation if `turning` is 1, the blocked axis if `turning` is 2."""
     arm: Three = (0.0, 0.0, 0.0)
-    """From its centre of mass to its hinge, in its own frame [m]; 0 without a hinge."""
+    """Vector from the centre of mass to the hinge in the body's frame [m]; 0 without a hinge."""
 
     @classmethod
     def of(cls, table: SolidTable, dimension: int, hinges: Sequence[HingeTable] = ()) -> Self:
-        """Return how the table of a free body, or its hinge to the world among others, holds it."""
+        """Return the degrees of freedom of a free body, from its hinge to space or else from its key `freedom`."""
         for hinge in hinges:
             if hinge.solid == table.name and hinge.to is None:
                 arm = in_frame(table, hinge.position)
@@ -138,34 +132,29 @@ class Hold:
 
 
 def _three(vector: Any) -> Three:
-    """Return a vector (d,) as three numbers."""
     x, y, z = (*map(float, vector), 0.0)[:3]
     return x, y, z
 
 
 def inertia_about(hold: Hold, mass: Mass) -> np.ndarray:
-    """Return the inertia (3, 3) of a mass about the hinge, or about its centre without one, in the body's frame."""
+    """Return the inertia (3, 3) about the hinge, or about the centre of mass without a hinge, in the body's frame."""
     arm = np.array(hold.arm)
     return np.asarray(mass.inertia + mass.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm)))
 
 
 def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dimension: int) -> None:
-    """Check that hinges are of free bodies, one to the world of each, which nothing else holds and which begin to turn
-    about it, and that those between bodies make no ring."""
-    free = [solid.name for solid in solids if solid.motion == "free"]
+    """Check that hinges hold free bodies, at most one to space each, fit the initial motion, and form no closed
+    chains."""
     joined = {solid.name: {solid.name} for solid in solids}
     for index, hinge in enumerate(hinges):
         path = ("hinge", index)
-        if hinge.solid not in free:
-            wanted = f"the name of a free body, of {shown(free)}" if free else 'of a solid whose motion is "free"'
-            raise field_error((*path, "solid"), hinge.solid, wanted)
-        number = next(k for k, solid in enumerate(solids) if solid.name == hinge.solid)
+        check_free_body((*path, "solid"), hinge.solid, solids)
         if hinge.to is not None:
             _check_joint(hinge, solids, joined, path)
             continue
         if hinge.solid in [other.solid for other in hinges[:index] if other.to is None]:
             raise field_error((*path, "solid"), hinge.solid, "another one, as this one is on a hinge already")
-        solid = solids[number]
+        number, solid = next((k, solid) for k, solid in enumerate(solids) if solid.name == hinge.solid)
         for key in ("freedom", "velocity"):
             if getattr(solid, key) is not None:
                 wanted = f"left out, as the solid is on the hinge {hinge.name!r}"
@@ -178,12 +167,11 @@ def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dim
 
 
 def _check_joint(hinge: HingeTable, solids: Sequence[SolidTable], joined: dict[str, set[str]], path: FieldPath) -> None:
-    """Check a hinge between two solids, given by name which ones those before it have joined, and add to these."""
+    """Check a hinge between two solids and merge their groups in ``joined``, sets of connected solids by name."""
+    assert hinge.to is not None
     ends = [hinge.solid, hinge.to]
     others = [solid.name for solid in solids if solid.moves and solid.name != hinge.solid]
-    if hinge.to not in others:
-        wanted = f"the name of another solid that moves, of {shown(others)}" if others else "left out, for the world"
-        raise field_error((*path, "to"), hinge.to, wanted)
+    check_name((*path, "to"), hinge.to, others, "another solid that moves", "left out, for the world")
     for number, solid in enumerate(solids):
         if solid.name in ends and solid.motion == "free" and solid.sticks:
             wanted = f'"free", as the body is on the hinge {hinge.name!r} to another solid'
@@ -195,11 +183,10 @@ def _check_joint(hinge: HingeTable, solids: Sequence[SolidTable], joined: dict[s
 
 
 def hinge_parameters(hinge: HingeTable, dimension: int) -> list[Parameter]:
-    """Return the parameters of a hinge: what turns the body, and where one to another solid is."""
     turn, of, found = "N m" if dimension == 3 else "N", (hinge.name, f"of the hinge {hinge.name}"), list[Parameter]()
     if hinge.to is not None:
         place = np.array(hinge.position)
-        where, size = f"where in its solids the hinge {hinge.name} is, as they are in the scene", 0.1
+        where = f"where in its solids the hinge {hinge.name} is, as they are in the scene"
         found.append(
             Parameter(
                 f"{hinge.name}.position",
@@ -208,7 +195,7 @@ def hinge_parameters(hinge: HingeTable, dimension: int) -> list[Parameter]:
                 Axis.SCALAR,
                 lambda source: place,
                 components=lambda dimension, phases: dimension,
-                change=lambda source, value: np.full(np.shape(value), size),
+                change=lambda source, value: np.full(np.shape(value), 0.1),
             )
         )
     if hinge.turns:
@@ -230,7 +217,7 @@ def hinge_parameters(hinge: HingeTable, dimension: int) -> list[Parameter]:
 def number_of(
     name: str, of: str, end: str, unit: str, what: str, value: float, values: Range, change: float
 ) -> Parameter:
-    """Return the parameter of one number of a spring or a hinge; where it is 0, or may be less, ``change`` is large."""
+    """Create a scalar parameter, whose typical change is ``change`` if the value is 0 or may be negative."""
     own = np.asarray(value, dtype=np.float64)
 
     def changed(source: Source, at: NDArray[Any]) -> NDArray[np.float64]:
@@ -242,22 +229,21 @@ def number_of(
 
 
 def in_frame(table: SolidTable, place: Any) -> Points:
-    """Return a place (d,) of a solid at the start in its own frame [m]."""
+    """Convert a point (d,) of a solid at the start from the scene to the solid's frame [m]."""
     return np.asarray((np.array(place) - table.middle()) @ table.turn(len(place)))
 
 
 @dataclass(frozen=True)
 class Begun:
-    """Where a solid is when the scene begins; the world is at the origin."""
+    """Pose of a solid at the start; space itself is at the origin."""
 
     middle: Points
     """(3,) [m]"""
     turn: Points
-    """(3, 3) the rotation from its own frame."""
+    """(3, 3) rotation matrix from the solid's frame."""
 
     @classmethod
     def of(cls, table: SolidTable | None, dimension: int) -> Self:
-        """Return where the solid of a table begins; None stands for the world."""
         middle, turn = np.zeros(3), np.eye(3)
         if table is not None:
             middle[:dimension], turn[:dimension, :dimension] = table.middle(), table.turn(dimension)
@@ -265,32 +251,39 @@ class Begun:
 
 
 @dataclass(frozen=True)
-class Joint:
-    """A hinge between a free body and another solid, or the world, by their numbers."""
+class Link:
+    """A spring or hinge between a free body and another solid or space, with solids as indices."""
 
     name: str
     body: int
-    """Number of its body among the free bodies."""
+    """Index among the free bodies."""
     against: int
-    """Number of the other solid among the solids that move; -1 for the world."""
+    """Index of the other solid among the moving solids; -1 for a solid at rest and for space."""
     other: int
-    """Number of the other solid among the free bodies; -1 for one that is not free."""
+    """Index of the other solid among the free bodies; -1 if not free."""
+
+
+@dataclass(frozen=True)
+class Joint(Link):
     begun: tuple[Begun, Begun]
-    """Where both begin."""
     axis: Points | None
-    """(3,) unit vector; None for one that turns in every way."""
+    """(3,) unit vector; None for a hinge that turns about every axis."""
     turns: bool
-    """True where a spring, a damper or a motor turns the body."""
+
+
+def linked(link: Any, moved: Sequence[SolidTable]) -> tuple[SolidTable, SolidTable | None, tuple[str, int, int, int]]:
+    """Return the two solids of a spring or hinge, and the fields of its `Link`; ``moved`` has all moving solids."""
+    names, bodies = [one.name for one in moved], [one.name for one in moved if one.motion == "free"]
+    against = names.index(link.to) if link.to in names else -1
+    other = bodies.index(link.to) if link.to in bodies else -1
+    body, solid = moved[names.index(link.solid)], None if against < 0 else moved[against]
+    return body, solid, (link.name, bodies.index(link.solid), against, other)
 
 
 def joints_of(hinges: Sequence[HingeTable], moved: Sequence[SolidTable]) -> list[Joint]:
-    """Return the hinges of solids that move, which are all ``moved``."""
-    numbers = {table.name: number for number, table in enumerate(moved)}
-    bodies, found = [table.name for table in moved if table.motion == "free"], []
+    found = []
     for hinge in hinges:
-        d, against = len(hinge.position), numbers.get(hinge.to or "", -1)
+        d, (body, solid, fields) = len(hinge.position), linked(hinge, moved)
         axis = unit(np.array(hinge.axis)) if hinge.axis is not None else np.array([0.0, 0.0, 1.0]) if d == 2 else None
-        other = bodies.index(hinge.to) if hinge.to in bodies else -1
-        begun = Begun.of(moved[numbers[hinge.solid]], d), Begun.of(None if against < 0 else moved[against], d)
-        found.append(Joint(hinge.name, bodies.index(hinge.solid), against, other, begun, axis, hinge.turns))
+        found.append(Joint(*fields, (Begun.of(body, d), Begun.of(solid, d)), axis, hinge.turns))
     return found

@@ -1,7 +1,4 @@
-"""The tables of a scene together, and the tables that no other module defines. SI units.
-
-Vectors have as many components as the scene has dimensions. Any wrong value raises a `SceneError`, one sentence.
-"""
+"""The tables of a scene, and those tables that no other module defines, in SI units."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -39,9 +36,8 @@ from cortado.scene.tables import (
 )
 
 SHORTEST = 40.0
-"""Least default regularisation [s] of a fluid with a yield stress: unyielded fluid then creeps at most 2.5 % of its
-depth per second. With larger values the edge of a plug is too sharp for 40 particles across: the speed between plates
-is wrong by 0.8 % with 40 s, by 2.7 % with 100 s."""
+"""Smallest default regularisation of a yield stress [s]: unyielded fluid creeps at most 2.5 % of its depth per second.
+Longer ones are too sharp for 40 particles across a plug: the speed errs by 2.7 % with 100 s, 0.8 % with 40 s."""
 
 
 class RheologyTable(Table):
@@ -51,29 +47,29 @@ class RheologyTable(Table):
     """Name of the law."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
-        """Return the parameters of the law for a phase of this viscosity [Pa s]."""
+        """Return the law's numbers by name, for a phase with this viscosity [Pa s]."""
         return {name: value for name, value in self.model_dump().items() if name != "kind"}
 
     def thickest(self, viscosity: float) -> float:
-        """Return the greatest viscosity of the fluid [Pa s] for a phase of this viscosity."""
+        """Return the greatest viscosity [Pa s], for a phase with this viscosity [Pa s]."""
         return viscosity
 
 
 class Thinning(RheologyTable):
-    """The base of laws of viscosity with a power of the shear rate."""
+    """Base of the laws of viscosity with a power of the shear rate."""
 
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
-    """n [-]: with n < 1 the fluid gets thinner where it is sheared, with n > 1 thicker."""
+    """n [-]: with n < 1 the fluid is shear-thinning, with n > 1 shear-thickening."""
     least_shear_rate: Annotated[float, quantity("1/s", gt=0.0)] = 0.01
-    """Shear rate [1/s] that is added to the actual one in squares, so that the viscosity at rest is finite."""
+    """Regularisation at rest [1/s]: the law uses sqrt(shear_rate² + least_shear_rate²) as shear rate."""
 
     def thickest(self, viscosity: float) -> float:
         return viscosity * max(self.least_shear_rate ** (self.flow_index - 1.0), 1.0)
 
 
 class PowerLaw(Thinning):
-    """The power law of Ostwald and de Waele, eta = viscosity (shear rate)^(flow_index - 1). Here viscosity is the
-    consistency: the viscosity at a shear rate of 1/s."""
+    """The power law of Ostwald and de Waele, eta = viscosity (shear rate)^(flow_index - 1). The key `viscosity` of the
+    phase is the consistency: the viscosity at a shear rate of 1/s."""
 
     kind: Literal["power_law"] = "power_law"
     """Name of the law."""
@@ -81,7 +77,7 @@ class PowerLaw(Thinning):
 
 class Carreau(RheologyTable):
     """The law of Carreau (1972), eta = infinite_viscosity + (viscosity - infinite_viscosity) (1 + (relaxation_time
-    shear rate)^2)^((flow_index - 1) / 2). Here viscosity is the value at rest."""
+    shear rate)^2)^((flow_index - 1) / 2). The key `viscosity` of the phase is the viscosity at rest."""
 
     kind: Literal["carreau"] = "carreau"
     """Name of the law."""
@@ -90,19 +86,19 @@ class Carreau(RheologyTable):
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
     """n [-], the exponent: thinner under shear for n < 1."""
     infinite_viscosity: Annotated[float, quantity("Pa s", ge=0.0)] = 0.0
-    """The viscosity at a large shear rate [Pa s]."""
+    """Viscosity at a large shear rate [Pa s]."""
 
     def thickest(self, viscosity: float) -> float:
         return max(viscosity, self.infinite_viscosity)
 
 
 class Yielding(RheologyTable):
-    """The base of laws of viscosity with a yield stress."""
+    """Base of the laws of viscosity with a yield stress."""
 
     yield_stress: Annotated[float, quantity("Pa", ge=0.0)]
     """Stress below which the fluid hardly flows [Pa]."""
     regularisation: Annotated[float, quantity("s", gt=0.0)] | None = None
-    """m of Papanastasiou (1987) [s]: it makes the viscosity at rest finite, larger by yield_stress m. Unyielded fluid
+    """m of Papanastasiou (1987) [s], which limits the viscosity at rest to viscosity + yield_stress m. Unyielded fluid
     creeps at a speed of at most its depth / m. If left out: the longer of 40 s and 100 viscosity / yield_stress."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
@@ -117,7 +113,7 @@ class Yielding(RheologyTable):
 
 class Bingham(Yielding):
     """The law of Bingham, smoothed as by Papanastasiou (1987): eta = viscosity + yield_stress (1 - exp(-m shear rate))
-    / shear rate. Here viscosity is the value once the fluid flows."""
+    / shear rate. The key `viscosity` of the phase is the plastic viscosity, of fluid that flows."""
 
     kind: Literal["bingham"] = "bingham"
     """Name of the law."""
@@ -131,7 +127,6 @@ class HerschelBulkley(Yielding, Thinning):
 
 
 AnyRheology = Annotated[PowerLaw | Carreau | Bingham | HerschelBulkley, Field(discriminator="kind")]
-"""A law of viscosity by its ``kind``."""
 
 
 class MixtureTable(Table):
@@ -150,7 +145,6 @@ class MixtureTable(Table):
     epsilon / sqrt(alpha)."""
 
     def width(self, spacing: float) -> float:
-        """Return the interface width [m] in a scene with this spacing [m]."""
         return spacing if self.interface_width is None else self.interface_width
 
 
@@ -159,25 +153,24 @@ OTHER_TABLES = ("problem", "optimise", "fit", "dataset")
 
 
 class DiscretisationTable(Table):
-    """The spacing, the kernel and the lattice with which the fluid is divided into particles."""
+    """Spacing, kernel and lattice of the fluid's particles."""
 
     spacing: Annotated[float, quantity("m", gt=0.0)]
     """Distance between particles at rest [m]."""
     support: Annotated[float, quantity(ge=1.2, le=4.0)] = 2.0
-    """Distance within which particles interact, as support radius / spacing. With the solver "projection" it is 2.6 if
-    neither it nor the kernel is given."""
+    """Support radius / spacing: particles interact within the support radius. With the solver "projection" the default
+    is 2.6 if the kernel is left out, too."""
     kernel: Literal["cubic_spline", "wendland_c2", "wendland_c4"] = "cubic_spline"
-    """Name of the smoothing kernel. With the solver "projection" it is "wendland_c2" if neither it nor the support is
-    given."""
+    """Name of the smoothing kernel. With the solver "projection" the default is "wendland_c2" if the support is left
+    out, too."""
 
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """Largest offset of a particle from its first position, along each axis and in spacings; the same in every run.
-    With the solver "projection" and all axes periodic it is 0.05 if left out, because fluid on an exact lattice is too
-    stiff. Points of files are not moved."""
+    """Largest offset of a particle from its initial position, along each axis [spacings]; equal in all runs. With the
+    solver "projection" and all axes periodic the default is 0.05, because fluid on an exact lattice is too stiff.
+    Points of files are not moved."""
 
     @property
     def support_radius(self) -> float:
-        """Return the distance at which the smoothing kernel ends [m]."""
         return self.support * self.spacing
 
 
@@ -196,7 +189,7 @@ class Phase(Coloured):
     rheology: AnyRheology | None = None
     """Dependence of the viscosity on the shear rate; constant if left out."""
     material: Annotated[str, OneOf(tuple(LIQUIDS))] | None = None
-    """Look of the phase in pictures: its colour, and how far one sees into it. No simulation depends on it."""
+    """Look of the phase in pictures: its colour and its transparency. Simulations do not depend on it."""
     colour: Colour | None = None
     """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light: half as bright is 0.5. If left
     out, the colour of the material, or [0.1, 0.3, 0.8] without a material."""
@@ -209,8 +202,8 @@ class FixedForces(Table):
     """(d,) Acceleration of all fluid by gravity [m/s2]. With schedule.gravity, it must equal the first row there."""
     viscosity: Literal["stress", "pairwise", "none"] = "stress"
     """Form of the viscous force. "stress" matches the given viscosity within 1 %, with 40 particles across a shear
-    wave, and exerts no force on fluid in rigid rotation. "pairwise", for the solver "pcisph" only, is that of Monaghan
-    (2005): 0.6 to 1.4 times the given viscosity, depending on the direction of the shear."""
+    wave, and exerts no force on fluid in rigid rotation. "pairwise" (Monaghan 2005), for the solver "pcisph" only, has
+    0.6 to 1.4 times the given viscosity, depending on the direction of the shear."""
     viscous_solve: Literal["automatic", "explicit", "implicit"] = "automatic"
     """When the viscous stress is computed. "explicit": at the start of a step, which limits the time step. "implicit":
     at the end of a step, by a system of equations, for any time step. "automatic": implicit if the time step is too
@@ -225,18 +218,17 @@ _OPTIONAL: dict[str, Any] = {
     if p.is_optional
 }
 Forces: Any = create_model("Forces", __base__=FixedForces, __module__=__name__, **_OPTIONAL)
-"""The forces of a scene: `FixedForces`, and the optional ones of the registry of parameters."""
 
 
 def _with(given: Any, chosen: Mapping[str, Any]) -> Any:
-    """Return a table with the chosen values filled in, if it sets none of these keys."""
+    """Return a table with the chosen values, or unchanged if it sets any of their keys."""
     if isinstance(given, Table) and not given.model_fields_set & set(chosen):
         return given.model_copy(update=chosen)
     return {**given, **chosen} if isinstance(given, Mapping) and not set(given) & set(chosen) else given
 
 
 class SceneTables(Table):
-    """Everything that a simulation starts from; each table is valid by itself."""
+    """All tables of a scene, each valid without the others."""
 
     beside: ClassVar = OTHER_TABLES
     name: Text = "scene"
@@ -272,7 +264,7 @@ class SceneTables(Table):
     schedule: Schedule = Schedule()
     """What changes while the scene runs."""
     sensor: tuple[AnySensor, ...] = ()
-    """Quantities of the fluid that are recorded in every step. They do not influence the simulation."""
+    """Quantities of the fluid that are recorded in every step. Sensors do not influence the simulation."""
     render: Render | None = None
     """Settings of differentiable pictures."""
     picture: Picture | None = None
@@ -280,32 +272,30 @@ class SceneTables(Table):
 
     @property
     def sticks(self) -> bool:
-        """Return True if some walls have no slip."""
         return self.container.sticks or any(solid.sticks for solid in self.solid)
 
     @property
     def periods(self) -> tuple[Points, Points]:
-        """Return the start and the length of the period, each (d,) [m]; the length is 0 for other axes."""
+        """Return the start and the length of the period, each (d,) [m]; the length is 0 along other axes."""
         return self.container.periods(self.dimension)
 
     @property
     def domain(self) -> Domain:
-        """Return the periods as a domain, with the quantities that follow from them."""
         return self.container.domain(self.dimension)
 
     @property
     def region(self) -> Region:
-        """Return the region inside the container, which is open along periodic axes."""
+        """Return the region inside the container, unbounded along periodic axes."""
         return self.container.region(self.dimension).opened(self.periods[1])
 
     @property
     def room(self) -> Room:
-        """Return the room for fluid at the start: inside the container and outside of solids."""
+        """Return the initial room for fluid: inside the container and outside of solids."""
         return Room(self.region, solids_of(thick(self.solid)), self.periods[1])
 
     @property
     def resting_room(self) -> Room:
-        """Return the room for fluid if only solids at rest were present."""
+        """Return the room for fluid without the moving solids."""
         return replace(self.room, solids=solids_of(tuple(solid for solid in thick(self.solid) if not solid.moves)))
 
     @model_validator(mode="before")

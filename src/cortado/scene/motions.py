@@ -1,5 +1,4 @@
-"""Changes while a scene runs: parameters with given values at some times, and solids that move, rotate and change their
-size. The names of solids' state fields are defined here."""
+"""Parameters over time, moving solids, and the names of solids' state fields and parameters."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,28 +11,28 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, create_model, model_validator
 
 from cortado.discretise.solid import Mass
-from cortado.errors import InputError, Words
+from cortado.errors import Words
 from cortado.scene.courses import Columns, Interpolation, Knots, Ramp, Steady, path_of, values_in_file
-from cortado.scene.parameters import PARAMETERS, Axis, Parameter, Range, Role, Source
+from cortado.scene.parameters import PARAMETERS, Axis, Parameter, Range, Role, ending
 from cortado.scene.shape_tables import File
 from cortado.scene.solids import SolidTable
-from cortado.scene.tables import MISSING, FieldPath, Several, Table, field_error, quantity
+from cortado.scene.tables import MISSING, FieldPath, Several, Table, field_error, quantity, usable_file
 
 
 class Course(Table):
-    """The course of one parameter over time, constant before the first and after the last of the given times."""
+    """One parameter over time, constant before the first and after the last of the given times."""
 
     columns: ClassVar[Callable[[int], Columns]]
-    """Columns of the parameter's file, by the number of dimensions."""
+    """Function from the number of dimensions to the columns of the parameter's file."""
     grows_from: ClassVar[float | None] = 0.0
-    """Value at the start of a ramp; None for the first value."""
+    """Value at the start of a ramp; None means the first value."""
     times: Several[Annotated[float, quantity("s", ge=0.0)]] | None = None
-    """(k,) Times since the first state of the run, increasing [s]"""
+    """(k,) Times since the first state of the run, increasing [s]."""
     values: Any = None
     """(k, components) in the parameter's unit"""
     file: File | None = None
-    """A CSV file in place of `times` and `values`. It has a column time [s] and a column with a unit for each
-    component: x, y and z; tilt, in 3-D tilt_x and tilt_z. A relative path starts at the scene file's folder."""
+    """A CSV file in place of `times` and `values`, with a column time [s] and a column with a unit for each component:
+    x, y and z; tilt, in 3-D tilt_x and tilt_z. A relative path starts at the scene file's folder."""
     interpolation: Interpolation = "linear"
     """Curve between the times: straight lines, or a cubic spline with zero slope at both ends."""
     ramp: Ramp | None = None
@@ -61,7 +60,7 @@ class Course(Table):
 
     @property
     def knots(self) -> Knots:
-        """Return the values (k, components) at the times; raise `InputError` for a file that cannot be used."""
+        """Return the values (k, components) at the times; raise `InputError` for an unusable file."""
         if self.file is None:
             times, values = np.array(self.times), np.array(self.values, dtype=np.float64)
         else:
@@ -73,10 +72,8 @@ class Course(Table):
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         placed = self.model_copy()
         object.__setattr__(placed, "__pydantic_private__", {"_dimension": dimension})
-        try:
+        with usable_file((*path, "file"), self.file, "a table over time"):
             rows = placed.knots.values if self.values is None else self.values
-        except InputError as error:
-            raise field_error((*path, "file"), self.file, "a table over time", f"cannot be used: {error}") from None
         size = len(type(self).columns(dimension))
         for index, row in enumerate(rows):
             if len(row) != size:
@@ -86,7 +83,6 @@ class Course(Table):
 
 
 def course_table(parameter: Parameter) -> type[Course]:
-    """Build the table of one parameter over time; its values have the parameter's unit."""
     unit = parameter.unit.replace("²", "2").replace("°", "degrees")
     row = Annotated[tuple[Annotated[float, quantity(unit)], ...], Field(min_length=1, max_length=3, fail_fast=True)]
     values: Any = (Several[row] | None, Field(None, description="(k, components) one row for each of the times"))
@@ -97,7 +93,6 @@ def course_table(parameter: Parameter) -> type[Course]:
 
 
 def _columns(parameter: Parameter, unit: str, dimension: int) -> Columns:
-    """Return the columns of a file with a parameter over time: x, y and z for a vector in space, or its own name."""
     size = 1 if parameter.components is None else parameter.components(dimension, 1)
     if size == dimension:
         return tuple((axis, unit) for axis in "xyz"[:size])
@@ -115,7 +110,6 @@ class _Schedule(Table):
 
     @property
     def courses(self) -> dict[str, Knots]:
-        """Return the courses that are given, by the names of their parameters."""
         return {name: course.knots for name, course in self._tables.items()}
 
     @property
@@ -125,11 +119,9 @@ class _Schedule(Table):
 
     @property
     def leads_gravity(self) -> bool:
-        """Return True if gravity changes, either directly or by a tilt."""
         return not self._tables.keys().isdisjoint(("gravity", "tilt"))
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """Return this table for 2 or 3 dimensions, with rows checked to have the components of their parameters."""
         placed = {name: course.in_dimension(dimension, (*path, name)) for name, course in self._tables.items()}
         return self.model_copy(update=placed)
 
@@ -137,50 +129,41 @@ class _Schedule(Table):
 Schedule: Any = create_model(
     "Schedule", __base__=_Schedule, __module__=__name__, __doc__=vars(_Schedule)["__doc__"], **_COURSES
 )
-"""A course for each parameter over time that changes, made from the registry of parameters."""
 
 AXES = ("turn_x", "turn_y", "turn_z")
-"""Endings of state fields' names for a free body's rotation: displacements of the ends of its unit axes [-]."""
+"""Suffixes of a free body's rotation fields: displacements of the tips of its unit axes since the start [-]."""
 RESTITUTION = 0.6
-"""Default restitution of a free body."""
-RADIAN = 1.0
-"""Typical large rotation for an optimiser [rad]."""
-STRETCH = 0.2
-"""Typical large relative change of a scale for an optimiser."""
 
 
 def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
-    """Return the solids that move, in order."""
     return [solid for solid in solids if solid.moves]
 
 
 def wall_numbers(solids: Sequence[SolidTable]) -> dict[str, int]:
-    """Return the numbers of solids in wall particles, by name: 0, 1, ... for moving solids, and -2, -3, ... for solids
-    at rest, because -1 is the container."""
+    """Return the number of each solid in wall particles: 0, 1, ... if it moves, -2, -3, ... at rest (-1: container)."""
     resting = [solid for solid in solids if not solid.moves]
     numbers = {solid.name: number for number, solid in enumerate(moving(solids))}
     return numbers | {solid.name: -2 - number for number, solid in enumerate(resting)}
 
 
 def told(solids: Sequence[SolidTable]) -> list[SolidTable]:
-    """Return the solids whose motion is prescribed."""
+    """Return the solids with prescribed motion."""
     return [solid for solid in moving(solids) if solid.motion != "free"]
 
 
 def free(solids: Sequence[SolidTable]) -> list[SolidTable]:
-    """Return the solids that fluid moves."""
     return [solid for solid in solids if solid.motion == "free"]
 
 
 def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the first middles (k, d) [m] and rotation matrices (k, d, d) of a scene's moving solids."""
+    """Return the initial middles (k, d) [m] and rotation matrices (k, d, d) of the moving solids."""
     tables, d = moving(scene.solid), scene.dimension
     middles = np.array([table.middle() for table in tables]).reshape(-1, d)
     return middles, np.array([table.turn(d) for table in tables]).reshape(-1, d, d)
 
 
 def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> float:
-    """Return the greatest speed of any point of a solid [m/s]; ``values`` of parameters replace the scene's."""
+    """Return the greatest speed of any point of a solid [m/s]; parameters in ``values`` replace the scene's."""
     found = [0.0]
     for solid in moving(solids):
         shifts, turns = courses(solid)
@@ -193,37 +176,31 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
 
 
 def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
-    """Return a bound of the distance from a solid's middle to its furthest point [m]; ``values`` of parameters replace
-    the scene's."""
+    """Return a bound of the distance [m] from a solid's middle to its furthest point, for parameters ``values``."""
     furthest = np.abs(solid.own_solid().extent()).max(axis=0)
     return float(np.linalg.norm(furthest) * values.get(scale_name(solid.name), 1.0))
 
 
-def _name(end: str) -> Callable[[str], str]:
-    """Build the function that returns the name of a solid's parameter or state field, from the solid's name."""
-    return lambda solid: f"{solid}.{end}"
-
-
-position_name = _name("position")
-"""Parameter: position of the middle at the start [m]; field: current position."""
-rotation_name = _name("rotation")
-"""Parameter and field: rotation at the start [rad]."""
-scale_name = _name("scale")
-"""Parameter and field: size relative to that in the scene."""
-displacement_name = _name("displacement")
+position_name = ending("position")
+"""Parameter: initial position of the middle [m]; field: current position."""
+rotation_name = ending("rotation")
+"""Parameter and field: initial rotation [rad]."""
+scale_name = ending("scale")
+"""Parameter and field: size relative to the scene's."""
+displacement_name = ending("displacement")
 """Parameter: displacement of the middle since the start [m]."""
-turn_name = _name("turn")
+turn_name = ending("turn")
 """Parameter and field: rotation since the start [rad]."""
-velocity_name = _name("velocity")
-"""Parameter: velocity of the middle, for a free body the one at the start [m/s]; field: a free body's velocity."""
-angular_velocity_name = _name("angular_velocity")
-"""Parameter: angular velocity, for a free body the one at the start [rad/s]; field: that of a free body."""
-density_name = _name("density")
-mass_name = _name("mass")
-friction_name = _name("friction")
+velocity_name = ending("velocity")
+"""Parameter: velocity of the middle, for a free body at the start [m/s]; field: a free body's velocity."""
+angular_velocity_name = ending("angular_velocity")
+"""Parameter: angular velocity, for a free body at the start [rad/s]; field: a free body's angular velocity."""
+density_name = ending("density")
+mass_name = ending("mass")
+friction_name = ending("friction")
 """Parameter: coefficient of friction of a free body [-]."""
-restitution_name = _name("restitution")
-"""Parameter: coefficient of restitution of a free body [-], its speed after a hit over that before."""
+restitution_name = ending("restitution")
+"""Parameter: coefficient of restitution of a free body [-]."""
 
 
 def weight_name(solid: SolidTable) -> str:
@@ -232,8 +209,7 @@ def weight_name(solid: SolidTable) -> str:
 
 
 def mass_of_one(solid: SolidTable) -> Mass:
-    """Return the mass of a free body, and its inertia about its centre of mass, for a density or a mass of 1, whichever
-    its table gives."""
+    """Return a free body's mass and inertia for a density of 1 or a mass of 1, whichever its table gives."""
     even = Mass.of(solid.shape_about()[0])
     size = even.volume if solid.mass is None else 1.0
     if solid.inertia is not None:
@@ -248,14 +224,13 @@ def mass_of_one(solid: SolidTable) -> Mass:
 
 
 def solids_in(fields: Iterable[str]) -> list[str]:
-    """Return the names of the solids for which a state has fields."""
     end = position_name("")
     return [field.removesuffix(end) for field in fields if field.endswith(end)]
 
 
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
-    """Return the parameters of moving solids. Prescribed ones have a first position and size, and a displacement at the
-    end of each step or, in steady motion, a speed. Free bodies have a first motion and a density."""
+    """Return the parameters of moving solids: pose, size and motion of prescribed solids; initial motion, density or
+    mass, friction and restitution of free bodies."""
     known = {parameter.name: parameter for solid in moving(solids) for parameter in _parameters(solid)}
     names = (position_name, rotation_name, scale_name, displacement_name, turn_name)
     found = [known[name(solid.name)] for solid in told(solids) for name in names]
@@ -272,13 +247,12 @@ def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
 
 
 def _parameters(solid: SolidTable) -> list[Parameter]:
-    """Return all parameters that a moving solid may have."""
     name, middle, still = solid.name, solid.middle(), np.zeros(len(solid.middle()))
     unturned = np.zeros(_shape_of(2 * len(middle) - 3))
     when, (shifts, turns) = " at the start" if solid.motion == "free" else "", courses(solid)
     place = {"change": lambda source, value: np.full(np.shape(value), 10.0 * source.scene.discretisation.spacing)}
-    turn, rate = {"change": _constant(RADIAN)}, {"change": _constant(1.0)}
-    size = {"role": Role.STATE, "range": Range.POSITIVE, "change": lambda source, value: STRETCH * np.abs(value)}
+    turn = rate = {"change": lambda source, value: np.full(np.shape(value), 1.0)}
+    size = {"role": Role.STATE, "range": Range.POSITIVE, "change": lambda source, value: 0.2 * np.abs(value)}
     steps: dict[str, Any] = {"axis": Axis.STEP, "moment": 1.0, "grows": True}
 
     def made(of: Callable[[str], str], unit: str, meaning: str, value: Any, **more: Any) -> Parameter:
@@ -311,16 +285,12 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
     ]
 
 
-def _constant(size: float) -> Callable[[Source, NDArray], NDArray[np.float64]]:
-    return lambda source, value: np.full(np.shape(value), size)
-
-
 def _shape_of(components: int) -> tuple[int, ...]:
     return () if components == 1 else (components,)
 
 
 def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
-    """Return displacement [m] and rotation [rad] over time, since the start, of a solid with prescribed motion."""
+    """Return the displacement [m] and rotation [rad] over time of a solid with prescribed motion, since the start."""
     d = len(solid.middle())
     times, shifts, turns = path_of(solid, d) or (None, None, None)
 
@@ -336,26 +306,25 @@ def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Position and rotation of a moving solid in a state: R = Q R(w), as 3 x 3 matrices also in the plane."""
+    """Pose of a moving solid in a state, with the rotation matrix R = Q R(w), which is (3, 3) also in 2-D."""
 
     name: str
-    """Name of the solid."""
     is_free: bool
-    """True for a free body: states store the columns of Q for free bodies, and a rotation vector for other solids."""
+    """True for a free body, whose state contains the columns of Q; other solids' states contain a rotation vector."""
     position: NDArray[Any]
     """(d,) [m]"""
     scale: float
-    """Scale of the solid, relative to the scene's."""
+    """Size relative to the scene."""
     begun: NDArray[Any]
-    """w, (3,), rotation vector of the solid at the start [rad]"""
+    """w, (3,) rotation vector of the initial rotation [rad]."""
     turn: NDArray[Any]
-    """(3,) rotation vector since the start [rad]; 0 for a free body"""
+    """(3,) rotation vector since the start [rad]; 0 for a free body."""
     turned: NDArray[Any]
-    """Q, (3, 3), rotation since the start"""
+    """Q, (3, 3) rotation matrix since the start."""
 
     @classmethod
     def of(cls, name: str, is_free: bool, at: Any) -> Self:
-        """Read the pose of a solid from a state, ``at``, whose fields have a first axis of length 1."""
+        """Read the pose of a solid from the fields ``at`` of a state, which have a first axis of length 1."""
         position, begun, turn, scale = at[position_name(name)][0], at[rotation_name(name)][0], np.zeros(3), 1.0
         if is_free:
             turned = np.eye(3) + np.array([_in_space(at[f"{name}.{axis}"][0]) for axis in AXES]).T
@@ -366,12 +335,11 @@ class Pose:
 
     @property
     def rotation(self) -> NDArray[Any]:
-        """Return the rotation matrix R (3, 3)."""
         return np.asarray(self.turned @ matrix(self.begun))
 
     @property
     def angles(self) -> NDArray[np.float64]:
-        """Return the rotation vector (3,) of R, in the plane its angle (1,), of at most half a turn [rad]."""
+        """Return the rotation vector (3,) of R, in 2-D its angle (1,), from -pi to pi [rad]."""
         from scipy.spatial.transform import Rotation
 
         return np.asarray(_angles(Rotation.from_matrix(self.rotation).as_rotvec(), len(self.position)).ravel())
@@ -381,7 +349,7 @@ class Pose:
         return self.turning_bars(np.linalg.solve(_jacobian(_in_space(self.angles)).T, _in_space(bar)))
 
     def turning_bars(self, t: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Convert ``t`` (3,), the derivative with respect to a further turn of R, into those of fields, by name."""
+        """Convert the derivative ``t`` (3,) with respect to a further rotation of R into those of fields, by name."""
         name, dimension = self.name, len(self.position)
         bars = {rotation_name(name): _angles(_jacobian(self.begun).T @ self.turned.T @ t, dimension)}
         if not self.is_free:
@@ -391,14 +359,14 @@ class Pose:
 
 
 def matrix(rotation: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the matrix (3, 3) of a rotation vector (3,), or of an angle (1,) in the plane [rad]."""
+    """Return the matrix (3, 3) of a rotation vector (3,), or of an angle (1,) in 2-D [rad]."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_rotvec(_in_space(rotation)).as_matrix())
 
 
 def _in_space(vector: NDArray[Any]) -> NDArray[np.float64]:
-    """Return a vector as (3,); an angle becomes a rotation vector."""
+    """Pad a vector to (3,); an angle becomes a rotation vector about z."""
     found = np.zeros(3)
     if np.ndim(vector) == 0 or len(vector) == 1:
         found[2] = np.reshape(vector, ())
@@ -408,12 +376,12 @@ def _in_space(vector: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _angles(w: NDArray[Any], dimension: int) -> NDArray[np.float64]:
-    """Return a rotation vector w (3,) in the form of a state field, (1, 1) or (1, 3)."""
+    """Convert a rotation vector w (3,) to the form of a state field, (1, 1) in 2-D or (1, 3)."""
     return np.asarray(w[2:] if dimension == 2 else w[None])
 
 
 def _jacobian(w: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the matrix J of `cortado.sph.moving_solids` for a rotation vector."""
+    """Return the Jacobian J (3, 3) of a rotation vector w (3,): R(w + dw) is R(w) followed by the rotation J dw."""
     size, cross = float(np.linalg.norm(w)), np.cross(np.eye(3), w)
     if size < 1e-4:
         return np.asarray(np.eye(3) + 0.5 * cross + cross @ cross / 6.0)

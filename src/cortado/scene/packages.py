@@ -1,8 +1,5 @@
-"""Solvers and forces that installed packages register by entry points, and that scene files can name.
-
-Entry points are read only if a scene names a kind that is not Cortado's own. An error in a package's part, wherever it
-occurs, becomes a sentence that names the package.
-"""
+"""Solvers and forces that installed packages register by entry points, for scene files to name. Entry points are read
+only for a kind that is not Cortado's. An error in a package becomes a sentence that names the package."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -34,14 +31,12 @@ from cortado.scene.tables import (
 )
 
 GUARDED = "_guarded_by_cortado"
-"""The attribute that marks guarded classes."""
 ABSENT = object()
 OTHERS = ("builtins", "cortado", "numpy", "types", "warp")
-"""Top-level modules whose functions and classes never belong to a package of a user."""
+"""Top-level modules whose functions and classes do not belong to a user's package."""
 
 
 def _in_words(problem: BaseException, package: str) -> str:
-    """Describe an error that a package raised, and the line where it occurred, in words without the full stop."""
     try:
         text = " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".: ")
     except Exception:  # words of its own that cannot be made
@@ -55,8 +50,8 @@ def _in_words(problem: BaseException, package: str) -> str:
 def guarded(
     what: str, package: str, error: type[CortadoError] = InputError, expected: tuple[type[BaseException], ...] = ()
 ) -> Iterator[None]:
-    """Turn an error that a package raises into an ``error`` whose text begins with ``what``. Cortado's own errors,
-    interruptions and ``expected`` errors pass unchanged; an attempt to end the process becomes an ``error``, too."""
+    """Convert an error in a package to an ``error`` whose text begins with ``what``. Cortado's errors, interruptions
+    and ``expected`` errors pass unchanged; attempts to end the process become an ``error``."""
     kept: tuple[type[BaseException], ...] = (CortadoError, KeyboardInterrupt, *expected)
     try:
         yield
@@ -67,10 +62,10 @@ def guarded(
 
 
 class PackageMaker:
-    """A wrapper around a solver or force from an installed package; errors raised in it name the package."""
+    """A solver or force from an installed package, with errors that name the package."""
 
     def __init__(self, part: Any, kind: str, package: str):
-        """Guard a part: ``kind`` is the package's name for it, ``package`` the package's name in messages."""
+        """Guard a part: ``kind`` is its name in scene files, ``package`` the package's name in messages."""
         self._part, self._kind, self._package = part, kind, package
 
     def __getattr__(self, name: str) -> Any:
@@ -84,7 +79,6 @@ class PackageMaker:
 
     @cached_property
     def parameters(self) -> Any:
-        """Return the parameters of the part, with guarded functions."""
         found = self.__getattr__("parameters")
         return [self._judged(one) for one in found] if isinstance(found, (list, tuple)) else found
 
@@ -109,7 +103,7 @@ class PackageMaker:
 
 
 def _at_work(made: Any, kind: str, package: str) -> Any:
-    """Guard the methods of an object that a package made, such as a solver, so that errors name the package."""
+    """Guard the methods of an object that a package created, such as a solver."""
     cls: Any = type(made)
     if cls.__module__.partition(".")[0] not in OTHERS and not isinstance(made, type):
         with suppress(TypeError):  # of a class that is not Python's
@@ -151,12 +145,12 @@ def _is_ours(function: Any) -> bool:
 
 MOST = 1_000_000_000
 TYPES = {float: Annotated[float, quantity()], int: Annotated[int, count(-MOST, MOST)], bool: Flag, str: Text}
-"""Checks of keys whose argument is annotated with a plain type."""
+"""Checks of keys by the type of their argument."""
 
 
 def registered(group: str, kind: str, own: Collection[str], advice: str) -> EntryPoint:
-    """Return the entry point with this name in a group, such as "cortado.forces"; raise a `SceneError` about ``kind``.
-    Names that are Cortado's ``own`` are refused."""
+    """Return the entry point with this name in a group, such as "cortado.forces". Raise a `SceneError` about ``kind``,
+    also for names in ``own``, which Cortado reserves."""
     if kind in own:
         raise SceneError(None, "kind", kind, f"another name, as {kind} is a force of Cortado's own, in [forces]")
     found = entry_points(group=group)
@@ -178,7 +172,6 @@ def registered(group: str, kind: str, own: Collection[str], advice: str) -> Entr
 
 
 def _package_of(entry: EntryPoint) -> str:
-    """Return the name of a package in messages."""
     return f"the package {entry.dist.name}" if entry.dist is not None else f"the package of {entry.value}"
 
 
@@ -195,7 +188,7 @@ def loaded(entry: EntryPoint) -> Callable[..., Any]:
 
 @contextmanager
 def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
-    """Turn any error that a package raises, also an error of Cortado's, into a `SceneError` about a field."""
+    """Convert any error in a package, including Cortado's errors, to a `SceneError` about a field."""
     try:
         with guarded(what, _package_of(entry)):
             yield
@@ -208,8 +201,7 @@ def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
 
 
 def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved: Collection[str]) -> dict[str, Any]:
-    """Check the keys of a table by the annotations of a factory's arguments, and return them as its arguments. Raise a
-    `SceneError` about the first key that does not fit."""
+    """Return the arguments of a factory, checked by annotations; raise a `SceneError` about the first wrong key."""
     arguments = _arguments(factory)
     if arguments is None:
         return dict(keys)
@@ -229,7 +221,7 @@ def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved:
 
 
 def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
-    """Return a function's named arguments, and ``**others`` if it takes them; None if Python cannot find out."""
+    """Return a function's named arguments, and ``**others`` if present; None if its signature is unknown."""
     for evaluated in (True, False):
         try:
             found = signature(factory, eval_str=evaluated).parameters
@@ -243,8 +235,7 @@ def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
 
 
 def _adapter(argument: Argument) -> tuple[TypeAdapter | None, str]:
-    """Return the check of a value, and a description of valid values. Only plain types and scene field types are
-    checked here; values with other annotations are left to the part itself."""
+    """Return the check of a plain type or scene field type, else None, and a description of valid values."""
     annotation: Any = TYPES.get(argument.annotation) if isinstance(argument.annotation, type) else argument.annotation
     if annotation is None or get_origin(annotation) is not Annotated:
         return None, "given"
@@ -266,8 +257,7 @@ def _checked(name: str, value: Any, argument: Argument | None) -> Any:
 
 
 def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any], method: str) -> Any:
-    """Build a part by a factory from the keys of a table, and check that the part has the named method; raise a
-    `SceneError`."""
+    """Build a part from the keys of a table, and check that it has the named method; raise a `SceneError`."""
     called = f'of the kind "{entry.name}"'
     with _told("", entry, f"{called} cannot be made:"):
         found = factory(**keys)
@@ -279,19 +269,16 @@ def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any]
 
 
 class PackageTable(Table):
-    """A table whose kind an installed package registers. Its other keys are the arguments of the registered factory."""
+    """A table whose kind an installed package registers. Other keys than `kind` are arguments of its factory."""
 
     model_config = ConfigDict(extra="allow")
     group: ClassVar[str]
-    """Group of entry points."""
     method: ClassVar[str]
-    """Name of a method that the made part must have."""
     own: ClassVar[Collection[str]] = ()
     """Names that no package can use."""
     advice: ClassVar[str] = ""
-    """Words about alternatives to ``kind``, for error messages."""
     kind: Text
-    """The package's name for the part."""
+    """Name of the part in the package."""
 
     @model_validator(mode="before")
     @classmethod
@@ -302,23 +289,17 @@ class PackageTable(Table):
         common = {name: value for name, value in given.items() if name in cls.model_fields}
         others = {name: value for name, value in given.items() if name not in cls.model_fields}
         try:
-            return {**common, **cls._judged(data["kind"], others)}
+            entry = registered(cls.group, data["kind"], cls.own, cls.advice)
+            factory = loaded(entry)
+            checked = checked_keys(factory, others, tuple(cls.model_fields))
+            made(entry, factory, checked, cls.method)
+            return {**common, **checked}
         except SceneError as error:
             sentence = None if error.wanted and error.sentence.startswith("is ") else error.sentence
             path = () if not error.field else (error.field,)
             raise field_error(path, error.found, error.wanted, sentence) from error
 
-    @classmethod
-    def _judged(cls, kind: str, keys: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the keys as arguments of the part; raise a `SceneError` about a key that does not fit."""
-        entry = registered(cls.group, kind, cls.own, cls.advice)
-        factory = loaded(entry)
-        checked = checked_keys(factory, keys, tuple(cls.model_fields))
-        made(entry, factory, checked, cls.method)
-        return checked
-
     def make(self) -> Any:
-        """Build the part by the package's factory from the keys; raise a `SceneError`."""
         entry = registered(self.group, self.kind, self.own, self.advice)
         return made(entry, loaded(entry), self.model_extra or {}, self.method)
 
@@ -327,14 +308,14 @@ class PackageTable(Table):
 
 
 class Inline:
-    """A mark that inlines the JSON schema of a table, instead of listing it among the tables with known keys."""
+    """Mark that inlines the JSON schema of a table."""
 
     def __get_pydantic_json_schema__(self, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         return {"allOf": [handler.resolve_ref_schema(handler(core_schema))]}
 
 
 class PackageForce(PackageTable):
-    """A force that an installed package registers; there may be several."""
+    """A force that an installed package registers."""
 
     group = "cortado.forces"
     method = "force"

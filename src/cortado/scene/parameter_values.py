@@ -1,10 +1,9 @@
-"""Checks of the parameter values that users give, each error in one sentence; and functions of these values with which
-a run starts. Without Warp, in float64.
+"""Checks of parameter values, and functions of parameter values at the start of a run. NumPy in float64.
 
-n is the number of fluid particles, in the order in which the scene lists them; d is the scene's dimension.
+n is the number of fluid particles, in the order of the scene; d is the scene's dimension.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,15 +16,14 @@ from cortado.scene.parameters import BY_NAME, Axis, Parameter, Range, Role, Sour
 
 
 def reference_density(fractions: np.ndarray, rest_density: np.ndarray) -> np.ndarray:
-    """Return the mixtures' rest densities m (n,) [kg / m3] from fractions (n, phases) and rest densities (phases,) [kg
-    / m3]."""
+    """Return the mixtures' rest densities m (n,) from mass fractions (n, phases) and rest densities (phases,)
+    [kg/m3]."""
     return 1.0 / (fractions / rest_density).sum(axis=1)
 
 
 def reference_density_tangent(
     fractions: np.ndarray, rest_density: np.ndarray, fractions_dot: np.ndarray, rest_density_dot: np.ndarray
 ) -> np.ndarray:
-    """Return the derivative of the mixtures' rest density m (n,) in a direction."""
     change = (fractions_dot - fractions * rest_density_dot / rest_density) / rest_density
     return -(reference_density(fractions, rest_density) ** 2) * change.sum(axis=1)
 
@@ -33,27 +31,27 @@ def reference_density_tangent(
 def reference_density_adjoint(
     fractions: np.ndarray, rest_density: np.ndarray, reference_density_bar: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the adjoints of fractions (n, phases) and of rest densities (phases,), given the adjoint of m (n,)."""
+    """Return the adjoints of mass fractions (n, phases) and of rest densities (phases,) from the adjoint of m (n,)."""
     by_volume = (reference_density_bar * reference_density(fractions, rest_density) ** 2)[:, None] / rest_density
     return -by_volume, (by_volume * fractions / rest_density).sum(axis=0)
 
 
 SMALL = 1e-2
-"""Angles [rad] below which a series replaces a division by the angle; the error of the series is below round-off."""
+"""Angles [rad] below which a series replaces a division by the angle."""
 
 
 @dataclass(frozen=True)
 class Tilt:
-    """A map from angles a (d - 1,) [degrees] to gravity g(a) = |g| (cos|a| e_0 + sin|a| / |a| sum_k a_k e_k), where e_0
-    is gravity's direction at rest.
+    """Gravity as a function of angles a (d - 1,) [degrees]: g(a) = |g| (cos|a| e_0 + sin|a| / |a| sum_k a_k e_k), where
+    e_0 is gravity's direction without tilt.
 
-    The unit vectors e_k come from the axes other than the one nearest to gravity at rest, in order, made orthogonal to
-    gravity and to each other. If gravity at rest is along -y, it leans towards x by a_1 and towards z by a_2. The map
-    is the exponential map of the sphere: smooth also at rest, and invertible for |a| < 180.
+    The unit vectors e_k are the axes except the one nearest to e_0, in order, made orthogonal to e_0 and to each other.
+    Gravity along -y leans towards x by a_1 and towards z by a_2. The map is the exponential map of the sphere, smooth
+    also at a = 0, and invertible for |a| < 180.
     """
 
     rest: tuple[float, ...]
-    """(d,) gravity without a tilt [m/s2], not 0."""
+    """(d,) gravity without tilt [m/s2], not 0."""
 
     def gravity(self, angles: np.ndarray) -> np.ndarray:
         """Return gravity (d,) or (steps, d) [m/s2] for angles (d - 1,) or (steps, d - 1) [degrees]."""
@@ -62,7 +60,7 @@ class Tilt:
         return self._size * np.concatenate([np.cos(size), np.sinc(size / np.pi) * a], axis=-1) @ self._axes
 
     def tangent(self, angles: np.ndarray, dot: np.ndarray) -> np.ndarray:
-        """Return the derivative of `gravity` in the direction ``dot``, of the shape of the angles [m/s2]."""
+        """Return the tangent of `gravity` along ``dot``, of the shape of the angles [m/s2]."""
         a, a_dot = np.radians(angles), np.radians(dot)
         sine, sine_derivative = self._factors(a)
         along = (a * a_dot).sum(axis=-1, keepdims=True)
@@ -73,7 +71,7 @@ class Tilt:
         )
 
     def adjoint(self, angles: np.ndarray, bar: np.ndarray) -> np.ndarray:
-        """Return the derivative with respect to the angles [1/degree], given that with respect to gravity."""
+        """Return the adjoint of the angles [1/degree] from the adjoint of gravity."""
         a, bars = np.radians(angles), self._size * bar @ self._axes.T
         sine, sine_derivative = self._factors(a)
         rest_bar, lean_bar = bars[..., :1], bars[..., 1:]
@@ -107,15 +105,15 @@ class Tilt:
         return sine, np.where(size < SMALL, -1.0 / 3.0 + size**2 / 30.0 - size**4 / 840.0, derivative)
 
 
-class Known(Mapping[str, Parameter]):
-    """A table of parameters by name, beginning with those of the registry. A table is equal only to itself."""
+class Known(dict[str, Parameter]):
+    """Parameters by name: the registry's, and those of forces and a solver. Two tables are equal only if identical."""
 
-    __eq__, __hash__ = object.__eq__, object.__hash__
+    __eq__, __hash__ = object.__eq__, object.__hash__  # type: ignore[assignment]
 
     def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
-        """Add the parameters ``own`` of forces and of a solver, each with its owner in words; `TIME` may occur several
+        """Add the parameters ``own`` of forces and a solver, each with its owner in words; `TIME` may occur several
         times. Raises `InputError` if two parameters share a name, or a name of kernel arguments."""
-        self._by_name = dict(BY_NAME)
+        super().__init__(BY_NAME)
         arguments = {argument(name): name for name in BY_NAME}
         for parameter, whose in dict(own).items():
             name = parameter.name
@@ -125,40 +123,26 @@ class Known(Mapping[str, Parameter]):
                     f"have its own: give {whose.replace('a ', 'the ')} another name."
                 )
             arguments[argument(name)] = name
-            self._by_name[name] = parameter
-        self.own = tuple(p for p in self._by_name.values() if p.name not in BY_NAME)
-        """Parameters of forces and of a solver."""
+            self[name] = parameter
+        self.own = tuple(p for p in self.values() if p.name not in BY_NAME)
         self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
         """Names of the parameters on which steps depend."""
         self.state = tuple(name for name, p in self.items() if p.role is Role.STATE)
-        """Names of the parameters that describe the first state; later states have values of their own."""
+        """Names of the parameters of the initial state."""
         self.over_time = tuple(name for name, p in self.items() if p.axis is Axis.STEP)
         """Names of the parameters that may have a row for each step."""
         self.vectors = tuple(name for name in self.run if self[name].components is not None)
-        """Names of the vector parameters on which steps depend."""
         self.views = {p.name: p.in_place_of for p in self.values() if p.in_place_of is not None}
-        """Alternative forms of parameters: the name of each, with the name of the parameter that it replaces."""
+        """Alternative parameters, each with the name of the parameter that it replaces."""
         self.courses = {p.name: p.course for p in self.own if p.course is not None}
-        """Courses over time of parameters of forces and of a solver."""
 
     def has_rows(self, name: str, value: Any) -> bool:
-        """Test whether a value has rows in time: one for each step, or one for each of some knots."""
+        """Test whether a value has an axis of time: one row for each step or knot."""
         parameter = self[name]
         return parameter.axis is Axis.STEP and np.ndim(value) == parameter.rank + 1
 
-    def __getitem__(self, name: str) -> Parameter:
-        return self._by_name[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._by_name)
-
-    def __len__(self) -> int:
-        return len(self._by_name)
-
 
 class _Passing:
-    """The course of the parameter `TIME`: time itself."""
-
     def at(self, times: NDArray) -> NDArray:
         return times
 
@@ -176,8 +160,8 @@ TIME = Parameter(
     moment=0.0,
     course=_Passing(),
 )
-"""The parameter for forces that depend on time; kernels read it from an array (members, steps). Derivatives with
-respect to the time step include it, and a resumed run continues it."""
+"""Parameter for forces that depend on time; kernels read it from an array (members, steps). Derivatives with respect to
+the time step include it, and a resumed run continues it."""
 
 
 def argument(name: str) -> str:
@@ -186,25 +170,20 @@ def argument(name: str) -> str:
 
 
 REGISTRY = Known()
-"""The parameters of a simulation without user-defined forces."""
 
 
 Values = Mapping[str, Any]
 Arrays = dict[str, np.ndarray]
 
 NAMES = names()
-"""Names of all parameters."""
 UNITS = {name: parameter.unit for name, parameter in BY_NAME.items()}
-"""Units of all parameters by name."""
 OVER_TIME = names(axis=Axis.STEP)
-"""Parameters that may have a row for each step; a tilt replaces gravity."""
 SUM_TOLERANCE = 0.01
-"""Allowed deviation from 1 of the sum of a particle's mass fractions; finite differences need some room."""
+"""Allowed deviation from 1 of the sum of a particle's mass fractions, with room for finite differences."""
 
 
 def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
-    """Return the scene's value of every ``known`` parameter that it has, in the shape that a user would write. A tilt,
-    another form of gravity, is left out."""
+    """Return the scene's values of ``known`` parameters, as users write them, without alternatives such as a tilt."""
     phases, positions = len(source.scene.phase), source.positions.shape
     found = {}
     for name, parameter in known.items():
@@ -229,7 +208,6 @@ def check_known(name: str, scene: Any, what: str = "parameter", known: Known = R
 
 
 def require_points(points: object) -> None:
-    """Raise `InputError` unless the argument maps names of parameters to values, for at least one parameter."""
     if not isinstance(points, Sequence) or isinstance(points, (str, bytes)) or not points:
         raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")
     for point in points:
@@ -237,7 +215,6 @@ def require_points(points: object) -> None:
 
 
 def is_too_small(array: np.ndarray, allowed: Range) -> bool:
-    """Test whether a number is too small for a range that begins at 0."""
     if allowed is Range.POSITIVE:
         return bool((array <= 0.0).any())
     return allowed is Range.NOT_NEGATIVE and bool((array < 0.0).any())
@@ -271,10 +248,8 @@ def _check_range(name: str, array: np.ndarray, allowed: Range, what: str) -> Non
 
 
 def stacked(tables: Sequence[Arrays]) -> Arrays:
-    """Stack the arrays of equal name in several tables along a new first axis."""
     return {name: np.stack([one[name] for one in tables]) for name in tables[0]}
 
 
 def entry(arrays: Arrays, number: int) -> Arrays:
-    """Return one entry along the first axis of each array."""
     return {name: array[number] for name, array in arrays.items()}

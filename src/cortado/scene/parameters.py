@@ -1,10 +1,4 @@
-"""The registry of parameters: name, unit, shape, range, value in a scene, and typical change of each. Without Warp.
-
-Array shapes on a device, checks of user input, scales of the certificate and tables of the documents are derived from
-it.
-
-The quantities of particles are listed here, too, with names, units and meanings.
-"""
+"""Registry of parameters, with units, shapes, ranges and values in a scene, and of the quantities of particles."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -19,7 +13,7 @@ from cortado.errors import InputError, shown
 
 
 class Axis(Enum):
-    """What the entries of a parameter belong to: phases, steps, particles, or nothing (a single entry)."""
+    """Owner of each entry of a parameter: a phase, step or particle, or the whole run."""
 
     SCALAR = "one number"
     PHASE = "each phase"
@@ -29,8 +23,6 @@ class Axis(Enum):
 
 
 class Role(Enum):
-    """The part that a parameter plays in a run."""
-
     RUN = "what steps depend on"
     STATE = "part of the first state"
     VIEW = "another way to write a parameter"
@@ -39,8 +31,6 @@ class Role(Enum):
 
 
 class Range(Enum):
-    """The range of valid numbers of a parameter."""
-
     ANY = "any"
     POSITIVE = "greater than 0"
     NOT_NEGATIVE = "at least 0"
@@ -48,8 +38,6 @@ class Range(Enum):
 
 
 class Source(Protocol):
-    """A simulation as the registry needs it: a scene, discretised into particles."""
-
     scene: Any
     positions: NDArray
     velocities: NDArray
@@ -57,59 +45,50 @@ class Source(Protocol):
 
 
 class Changing(Protocol):
-    """The course of a parameter during a run, at times (n,) [s]."""
-
     def at(self, times: NDArray) -> NDArray:
         """Return numbers (n,) or (n, components) at times (n,) [s]."""
 
-    def rates(self, times: NDArray) -> NDArray:
-        """Return the derivatives with respect to time at times (n,) [s], in the shape of the values."""
+    def rates(self, times: NDArray) -> NDArray: ...
 
 
 Limit = Callable[[Any, Mapping[str, Any]], float]
-"""A time step [s] of a scene, given values of parameters that replace the scene's (possibly none)."""
+"""Function from a scene, and values of parameters that replace the scene's, to a time step [s]."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """An input of a run, or of its loss, with its unit, shape and range: one entry of the registry."""
+    """An input of a run, or of its loss."""
 
     name: str
     unit: str
-    """SI unit; empty for a plain number."""
     meaning: str
-    """Meaning in words, for the documents."""
     axis: Axis
     value: Callable[[Source], Any]
-    """Returns the value in a scene that has the parameter."""
     components: Callable[[int, int], int] | None = None
-    """Returns the number of components of a vector, from the numbers of dimensions and phases; None for a number."""
+    """Function from the numbers of dimensions and phases to the number of components; None for a scalar."""
     role: Role = Role.RUN
     range: Range = Range.ANY
     change: Callable[[Source, NDArray], Any] = lambda source, value: np.abs(value)
-    """Returns a typical large change for an optimiser, at a value; the default is the value itself."""
+    """Function from a scene and a value to a typical large change for an optimiser; the default is the value."""
     acts: Callable[[Source, Mapping[str, NDArray]], bool] = lambda source, values: True
-    """Returns whether the parameter can have any effect in a scene, with values of parameters by name."""
+    """Function that tests whether the parameter has any effect in a scene, with values of parameters by name."""
     present: Callable[[Any], bool] = lambda scene: True
-    """Returns whether a scene has the parameter."""
     absent: str = ""
     """Words about a scene without the parameter, such as "has only one phase"."""
     force: str | None = None
-    """Module whose ``force`` builds the force that uses the parameter, in scenes with it: see `cortado.sph.parts`."""
+    """Module whose ``force`` builds the force that uses the parameter: see `cortado.sph.parts`."""
     is_optional: bool = False
-    """True for a key of [forces] that scenes may leave out; its force is then left out, too."""
+    """True for a key of [forces] that may be left out, together with its force."""
     longest_step: Limit = lambda scene, values: inf
-    """The longest time step at which an optional force is likely to be stable."""
     moment: float = 0.5
     """Time within a step, from 0 (start) to 1 (end), at which a schedule is evaluated for the step's row."""
     grows: bool = False
-    """True for a parameter over time that is 0 at the start of a run, so that a steady change of it grows."""
+    """True if a parameter over time is 0 at the start of a run, and a steady change of it grows."""
     in_place_of: str | None = None
-    """Name of the parameter that this one replaces when it is given."""
+    """Name of the parameter that this one replaces if given."""
     course: Changing | None = None
-    """Default course over time, for a parameter of a user-defined force."""
+    """Default values over time."""
     shape: tuple[int, ...] = ()
-    """Shape of a parameter that is an array."""
 
     @property
     def rank(self) -> int:
@@ -117,7 +96,7 @@ class Parameter:
         return 0 if self.components is None else 1
 
     def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
-        """Return the shapes that a value may have, () for a number; positions have shape (n, d)."""
+        """Return the allowed shapes of a value, () for a scalar; ``positions`` is the shape (n, d) of positions."""
         if self.axis is Axis.ARRAY:
             return [self.shape]
         particles, dimension = positions
@@ -160,9 +139,9 @@ def _of_phases(name: str) -> Callable[[Source], list[Any]]:
 
 
 def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
-    """Return C sqrt(rho s^3 / sigma) for the lightest phase and the spacing s, the longest time step with surface
-    tension (Brackbill et al. 1992). C is 0.08, because from 0.1 on PCISPH needs many more iterations for drops in
-    space; for the curvature form C is 0.2."""
+    """Return C sqrt(rho s³ / sigma) for the lightest phase and the spacing s, the longest stable time step with surface
+    tension (Brackbill et al. 1992). C is 0.08 for PCISPH, which needs many more iterations from 0.1 on, and else
+    0.2."""
     tension = float(values.get("surface_tension", scene.forces.surface_tension))
     density = float(np.min(values.get("rest_density", [phase.rest_density for phase in scene.phase])))
     part = 0.08 if scene.solver.kind == "pcisph" else 0.2
@@ -172,8 +151,7 @@ def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
 def _optional(
     name: str, unit: str, meaning: str, force: str, longest_step: Limit = lambda scene, values: inf
 ) -> Parameter:
-    """Build the parameter of a number >= 0 in the table [forces] of a scene, which switches a force on. ``force`` is
-    the module that builds the force, ``longest_step`` the longest time step at which it is likely to be stable."""
+    """Build the parameter of a number >= 0 in [forces], which switches on the force of the module ``force``."""
     return Parameter(
         name,
         unit,
@@ -313,7 +291,6 @@ BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 
 
 def names(role: Role | None = None, axis: Axis | None = None) -> tuple[str, ...]:
-    """Return the names of parameters with a role and an axis, or with any if not given, in the list's order."""
     return tuple(p.name for p in PARAMETERS if role in (None, p.role) and axis in (None, p.axis))
 
 
@@ -324,8 +301,6 @@ def offered(scene: Any) -> tuple[str, ...]:
 
 
 class Kind(Enum):
-    """The shape of a quantity at one particle."""
-
     NUMBER = "a number"
     VECTOR = "a vector"
     TURNING = "in the plane a number, which is positive counter-clockwise, in space a vector"
@@ -333,16 +308,14 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity of each particle, computed from a state and the parameters of the step after it."""
+    """A quantity of each particle, computed from a state and the parameters of the next step."""
 
     name: str
     unit: str
     meaning: str
-    """Meaning, one sentence."""
     kind: Kind = Kind.NUMBER
 
     def shape(self, particles: int, dimension: int) -> tuple[int, ...]:
-        """Return the shape of the quantity's values for a number of particles and dimensions."""
         is_vector = self.kind is Kind.VECTOR or (self.kind is Kind.TURNING and dimension == 3)
         return (particles, dimension) if is_vector else (particles,)
 
@@ -357,40 +330,41 @@ QUANTITIES = {
         Quantity("wall_force", "N", "What a particle pushes the walls with; in the plane N/m.", Kind.VECTOR),
     )
 }
-"""Every quantity by its name."""
 NAMES = tuple(QUANTITIES)
 
 
 def sizes(name: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Return sizes (..., n) of the values of a quantity, or of one frame of a state field: absolute values of numbers,
-    or lengths of vectors (..., n, k)."""
+    """Return the values (..., n) of a scalar quantity or state field, or the norms of vectors (..., n, k)."""
     known = QUANTITIES.get(name)
     is_vector = values.ndim == 2 if known is None else len(known.shape(1, dimension)) == 2
     return np.linalg.norm(values, axis=-1) if is_vector else values
 
 
+def ending(end: str) -> Callable[[str], str]:
+    """Return the function that appends an ending to a name, for the names of parameters and state fields."""
+    return lambda name: f"{name}.{end}"
+
+
 LOAD = ".load"
-"""Ending of the names of loads on solids."""
 
 
 def load_name(solid: str) -> str:
-    """Return the name of the load of the fluid on a solid: force [N], then torque [N m]; in the plane [N/m] and [N]."""
+    """Return the name of the fluid's load on a solid: force [N], then torque [N m]; in 2-D [N/m] and [N]."""
     return f"{solid}{LOAD}"
 
 
 def is_load(name: object) -> bool:
-    """Test whether a name has the form of a load's; whether such a solid exists is checked when it is computed."""
+    """Test whether a name has the form of a load's name; the solid may not exist."""
     return isinstance(name, str) and name.endswith(LOAD)
 
 
 def check_readable(name: object, what: str, fields: tuple[str, ...]) -> str:
-    """Return the name if it is that of a quantity, of one of the ``fields`` of a state, or of a load on a solid;
-    otherwise raise `InputError`."""
+    """Return the name of a quantity, of one of the ``fields``, or of a load on a solid; else raise `InputError`."""
     return str(name) if is_load(name) else check_quantity(name, what, fields)
 
 
 def check_quantity(name: object, what: str = "quantity", others: tuple[str, ...] = ()) -> str:
-    """Return the name if it is that of a quantity or one of ``others``; otherwise raise `InputError`."""
+    """Return the name of a quantity or one of ``others``; raise `InputError` for any other."""
     if not isinstance(name, str) or name not in (*others, *NAMES):
         raise InputError(f"{what} is {shown(name)}, but must be one of {', '.join((*others, *NAMES))}.")
     return name

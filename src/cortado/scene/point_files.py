@@ -1,9 +1,9 @@
 """Points from files: NumPy arrays, and the formats that VTK reads.
 
-VTK and HDF5 trust the contents of a file: a damaged file may make them print pages, wait, use all memory or end the
-process. So a process of its own, ``python -m cortado.scene.point_files FILE``, reads such files within limits, and its
-messages are discarded. It writes the points (n, 3) or (n, 2) in NumPy's format to standard output. If it refuses the
-file, it writes the reason and exits with the code `REFUSED`.
+VTK and HDF5 trust the contents of a file: a damaged file may make them hang, use all memory or crash. A separate
+process, ``python -m cortado.scene.point_files FILE``, therefore reads such files within limits. The process writes the
+points (n, 3) or (n, 2) in NumPy's format to standard output, or the reason for refusing the file with the exit code
+`REFUSED`.
 """
 
 import io
@@ -25,32 +25,22 @@ from cortado.errors import InputError, Words, shown
 from cortado.files.disk import reason, regular_file
 
 MOST_POINTS = 10_000_000
-"""Largest number of points in a file."""
 REFUSED = 3
 ROOM = 2**30
-"""Memory allowed for any file [byte]; large files are allowed more."""
+"""Memory that the process may use beyond 20 times the file's size [byte]."""
 
 
 class Refused(Exception):
     """The reason why a file with points cannot be used, as a clause."""
 
 
-def _poly_data(path: str) -> Any:
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
-
-    return _read_by_vtk(vtkXMLPolyDataReader(), path)
-
-
-def _legacy(path: str) -> Any:
-    from vtkmodules.vtkIOLegacy import vtkDataSetReader
-
-    return _read_by_vtk(vtkDataSetReader(), path)
-
-
-def _read_by_vtk(reader: Any, path: str) -> Any:
+def _by_vtk(path: str) -> Any:
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
+    from vtkmodules.vtkIOLegacy import vtkDataSetReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
+    reader = vtkXMLPolyDataReader() if path.endswith(".vtp") else vtkDataSetReader()
     messages = vtkStringOutputWindow()
     vtkOutputWindow.SetInstance(messages)  # VTK has no exceptions
     reader.SetFileName(path)
@@ -65,7 +55,7 @@ def _read_by_vtk(reader: Any, path: str) -> Any:
 
 
 def _hdf5(path: str) -> Any:
-    """Read the points of all parts of the first time step; a file that Cortado wrote must have valid checksums."""
+    """Read the points of all parts of the first time step; files from Cortado must have valid checksums."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -88,7 +78,6 @@ def _hdf5(path: str) -> Any:
 
 
 def _trajectory(path: str) -> Any:
-    from cortado.errors import InputError
     from cortado.files import vtkhdf
 
     try:
@@ -101,8 +90,7 @@ def _trajectory(path: str) -> Any:
     return positions[0]
 
 
-READERS: dict[str, Callable[[str], Any]] = {".vtk": _legacy, ".vtp": _poly_data, ".vtkhdf": _hdf5}
-"""Readers by file name suffix."""
+READERS: dict[str, Callable[[str], Any]] = {".vtk": _by_vtk, ".vtp": _by_vtk, ".vtkhdf": _hdf5}
 
 
 def _check_count(count: int) -> None:
@@ -111,7 +99,6 @@ def _check_count(count: int) -> None:
 
 
 def _limit_memory(size: int) -> None:
-    """Limit the process's memory for a file of a size [byte]: several times the file's size for VTK, plus an array."""
     try:
         import resource
     except ImportError:  # on Windows
@@ -142,13 +129,12 @@ def main(path: str) -> int:
 
 SUFFIXES = (".npy", *READERS)
 MOST_POINT_BYTES = 2**30
-"""Largest size of a file of points [byte]."""
 SECONDS, BYTES_PER_SECOND = 15.0, 5e6
-"""Time limit for reading a file [s]: the first number, plus the file's size over the second [byte/s]."""
+"""Time limit for reading a file: the first number [s], plus the file's size over the second [byte/s]."""
 
 
 def read_points(path: str, dimension: int) -> Points:
-    """Read points (n, d) [m] from a file, read-only. Raises `InputError`, a sentence that names the file."""
+    """Read points (n, d) [m] from a file, read-only; raise `InputError` with the file's name."""
     if Path(path).suffix not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}.")
     try:
@@ -160,7 +146,7 @@ def read_points(path: str, dimension: int) -> Points:
 
 @lru_cache(maxsize=4)
 def _read(path: str, dimension: int, changed: int, size: int) -> Points:
-    """Read each version of a file, identified by its time of change and its size, only once."""
+    """Read a file; its modification time and size make the cache notice a new version."""
     array = _read_npy(path, size, dimension) if Path(path).suffix == ".npy" else _read_apart(path, size)
     if array.ndim == 2 and array.shape[1] == 3 and dimension == 2 and Path(path).suffix in READERS:
         array = array[:, :2]  # VTK knows no plane
@@ -199,7 +185,6 @@ def _read_npy(path: str, size: int, dimension: int) -> Any:
 
 
 def _read_apart(path: str, size: int) -> Any:
-    """Return the points of a file, read by another process: see `cortado.scene.point_files`."""
     limit = SECONDS + size / BYTES_PER_SECOND
     command = [sys.executable, "-P", "-m", "cortado.scene.point_files", path]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # each would reserve memory

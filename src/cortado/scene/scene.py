@@ -1,8 +1,4 @@
-"""A scene as users write it, in a TOML file or in Python, checked and frozen. Also overrides such as
-``solver.time_step=0.002``, and warnings about numbers that may be in another unit.
-
-Any wrong value raises a `SceneError`, one sentence.
-"""
+"""Scenes, overrides of their values, and warnings about numbers that may be in another unit."""
 
 import json
 import os
@@ -29,25 +25,14 @@ from cortado.scene.shape_tables import BoxContainer, CylinderContainer
 from cortado.scene.stability import broken_limits, longest_step
 from cortado.scene.tables import sentences
 
-LIGHTEST = 50.0
-"""Rest density below which a scene warns [kg/m3]: liquid hydrogen has 71, and mercury in g/cm3 is 13.5."""
-THICKEST = 1e4
-"""Viscosity above which a scene warns [Pa s]; honey has 10."""
-HEAVIEST = {2: 3e5, 3: 3e6}
-"""Mass of fluid above which a scene warns [kg], by dimension: the mass of water 30 m x 10 m, in space 10 m deep."""
-
-
-EMPTY = ("force", "solid", "hinge", "spring", "emitter", "drain")
-"""Lists of tables that are left out of `Scene.computed_json` if empty."""
-
 
 @public
 class Scene(SceneTables):
     """A scene, from which a simulation starts.
 
-    Its keys are those of a scene file. A table such as [discretisation] is a dict, and tables such as [[phase]] are a
-    list of dicts. A missing or wrong value raises a `SceneError`, one sentence. Scenes are immutable: `replaced`
-    returns another scene, with all checks. Pydantic's ``model_copy(update=...)`` would skip the checks.
+    Arguments are the keys of a scene file. A table such as [discretisation] is a dict, and tables such as [[phase]] are
+    a list of dicts. A missing or wrong value raises a `SceneError`. Scenes are immutable: `replaced` returns another
+    scene, with all checks. Pydantic's ``model_copy(update=...)`` would skip the checks.
 
     Example::
 
@@ -79,7 +64,7 @@ class Scene(SceneTables):
         return self
 
     def replaced(self, *overrides: str) -> "Scene":
-        """Return this scene with other values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
+        """Return the scene with other values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
 
         Overrides are written as for `load_scene`; a relative file name in an override starts at the current folder.
         Raises `SceneError` as `load_scene` does.
@@ -87,7 +72,7 @@ class Scene(SceneTables):
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
     def lasting(self, time: float | None = None, steps: int | None = None) -> "Scene":
-        """Return this scene with emitters that have enough fluid for a time [s], or for ``steps`` steps.
+        """Return the scene with emitters that have enough fluid for a time [s], or for ``steps`` steps.
 
         An emitter is unchanged if it has a volume, is fed by drains, or has a long enough column. If all axes are
         periodic the scene is unchanged, because there is no place for a reserve. Raises `InputError` if the particles
@@ -108,7 +93,7 @@ class Scene(SceneTables):
         return self.model_copy(update={"emitter": lasting})
 
     def going_on(self, state: RestartState) -> "Scene":
-        """Return this scene with emitters that have as many particles as in the run that a state comes from."""
+        """Return the scene with as many particles in emitters as the run from which a state comes."""
         origin, spacing, made = state.origin, self.discretisation.spacing, list(self.emitter)
         if origin is None or len(origin.waiting) != len(made):
             return self
@@ -118,16 +103,16 @@ class Scene(SceneTables):
         return self.model_copy(update={"emitter": tuple(made)})
 
     def to_json(self) -> str:
-        """Return the scene as JSON with all defaults, except colours that follow from materials; `from_json` reads
-        it."""
+        """Return the scene as JSON, for `from_json`, with all defaults except colours that follow from materials."""
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """Return as JSON the part of the scene on which results depend: no [picture], [[sensor]] or materials. Also
-        left out: empty lists of [[force]], [[solid]], [[hinge]], [[spring]], [[emitter]] and [[drain]]; a jitter of 0;
+        """Return the part of the scene on which results depend as JSON. Left out are [picture], [[sensor]] and
+        materials; empty lists of [[force]], [[solid]], [[hinge]], [[spring]], [[emitter]] and [[drain]]; a jitter of 0;
         keys of adaptive time steps if steps are fixed; and options of the projection that are off."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
-        aside |= {name: True for name in EMPTY if not getattr(self, name)}
+        lists = ("force", "solid", "hinge", "spring", "emitter", "drain")
+        aside |= {name: True for name in lists if not getattr(self, name)}
         aside |= {} if self.discretisation.jitter else {"discretisation": {"jitter"}}
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
         off = set() if getattr(self.solver, "velocities_follow", True) else {"velocities_follow"}
@@ -139,7 +124,8 @@ class Scene(SceneTables):
 
     @classmethod
     def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
-        """Read a scene that `to_json` wrote, with overrides as for `load_scene`."""
+        """Read a scene from the JSON ``text`` of `to_json`, with overrides as for `load_scene`; ``file`` is its name in
+        errors."""
         if not isinstance(text, (str, bytes)):
             raise InputError(f"text is {shown(text)}, but must be the text that Scene.to_json gives.")
         try:
@@ -153,12 +139,11 @@ class Scene(SceneTables):
 
 
 def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
-    """Yield sentences about numbers that look as if they were in another unit."""
     for phase in scene.phase:
-        if phase.rest_density < LIGHTEST:
+        if phase.rest_density < 50.0:  # liquid hydrogen has 71 kg/m3, and mercury in g/cm3 would have 13.5
             found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
             yield f"{found}, less than any liquid has: is it in g/cm3?"
-        if phase.viscosity > THICKEST:
+        if phase.viscosity > 1e4:
             yield f"the viscosity of {phase.name} is {phase.viscosity:g} Pa s, more than tar has: is it in mPa s?"
     for name, bodies in (("fluid", scene.fluid), ("solid", scene.solid)):
         for index, body in enumerate(bodies):
@@ -169,19 +154,19 @@ def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
 
 
 def _millimetres(scene: SceneTables) -> str | None:
-    """Return the warning that the scene's lengths may be in millimetres, as its fluid is very heavy; None if the mass
-    is plausible, or if gravity is not the Earth's in metres."""
+    """Return a warning about lengths in millimetres if the fluid is very heavy and gravity the Earth's in metres; else
+    None."""
     densities, spacing = {phase.name: phase.rest_density for phase in scene.phase}, scene.discretisation.spacing
     cells = sum(fluid.count(spacing) * densities[fluid.phase] for fluid in scene.fluid)
     mass, strength = cells * spacing**scene.dimension, np.linalg.norm(scene.forces.gravity)
-    if mass < HEAVIEST[scene.dimension] or not 0.1 < strength / 9.81 < 10.0:
+    heaviest = {2: 3e5, 3: 3e6}[scene.dimension]  # kg: water of 30 m x 10 m, in space 10 m deep
+    if mass < heaviest or not 0.1 < strength / 9.81 < 10.0:
         return None
     layer = " in a layer of 1 m" if scene.dimension == 2 else ""
     return f"the fluid weighs about {mass:.2g} kg{layer}: are its lengths in millimetres? A scene has metres."
 
 
 def _given(value: Any) -> Any:
-    """Return tables without the entries that are left out (null in JSON)."""
     if isinstance(value, dict):
         return {name: _given(entry) for name, entry in value.items() if entry is not None}
     return [_given(entry) for entry in value] if isinstance(value, list) else value
@@ -192,7 +177,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
     """Read a scene from a TOML file.
 
     Args:
-        path: the file. Its tables [problem], [optimise] and [fit] are for other modules and are ignored.
+        path: the file, whose tables [problem], [optimise] and [fit] are ignored.
         overrides: replacements such as ``solver.time_step=0.002`` or ``fluid[0].upper=[1,1,1]``.
 
     Raises:
@@ -204,7 +189,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
 
 
 def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
-    """Return the argument itself if it is a scene, or the scene in the file at a path; raise `InputError` otherwise."""
+    """Return a scene unchanged, or the scene in the file at a path; raise `InputError` otherwise."""
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, (str, os.PathLike)):
@@ -213,7 +198,7 @@ def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
 
 
 def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
-    """Build a scene from the contents of its file; other files are looked for in the scene file's folder."""
+    """Build a scene from the contents of its file, in whose folder other files are."""
     if isinstance(data, Mapping):
         data = {key: value for key, value in data.items() if key not in OTHER_TABLES}
     folder = Path(file).parent if file else Path()
@@ -225,14 +210,13 @@ def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
 
 
 def files_named(tables: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """Return, from what `Scene.to_json` wrote, the tables that name a file, each with the key of the file."""
+    """Return the tables of `Scene.to_json` that name a file, each with the key of the file."""
     found = [*(tables.get("solid") or ()), *(tables.get("fluid") or ()), *(tables.get("schedule") or {}).values()]
     found += [one["path"] for one in tables.get("emitter") or ()]
     return [(table, key) for table in found if table for key in ("file", "path") if table.get(key)]
 
 
 def scene_in_words(scene: Scene, particles: int) -> str:
-    """Describe a scene with this number of particles in one sentence: its contents, its container, and its forces."""
     phases = " and ".join(
         f"{phase.name} ({phase.rest_density:g} kg/m³, {phase.viscosity:g} Pa s)" for phase in scene.phase
     )
@@ -263,16 +247,16 @@ def _held(scene: Scene) -> str:
 
 
 MOST_BYTES = 1_000_000
-"""Largest size of a file [byte]: even the worst TOML of this size takes only a few seconds and some hundred MB."""
+"""Largest size of a file [byte]; the worst TOML of this size takes a few seconds and some hundred MB."""
 MOST_PARTS = 10
-"""Most parts of a dotted key: the time and memory to parse a key grow with the square of their number."""
+"""Most parts of a dotted key; the time to parse a key grows with the square."""
 
 _ASIDE = re.compile(
     r'''#[^\n]*|"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5}|\Z)|"(?:[^"\\\n]|\\.)*+"?'''
     r"""|'{3}(?:[^']|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?""",
     re.DOTALL,
 )
-"""Finds comments and quoted texts, including unfinished ones."""
+"""Comments and quoted texts, including unfinished ones."""
 _TOO_DEEP = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_PARTS}}}[\w-]++")
 _TWICE = re.compile(r"Cannot declare \('(fluid|phase)',\) twice")
 _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
@@ -281,12 +265,12 @@ _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
 def read_toml(
     path: str | os.PathLike[str], overrides: Sequence[str] = (), unread: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Read a TOML file and return its contents with overrides applied. Overrides of ``unread`` tables are refused.
-    Raises `SceneError`.
+    """Read a TOML file and return its contents with overrides applied. Raises `SceneError`, also for an override of a
+    table in ``unread``.
 
-    An override is ``key=value``: ``forces.gravity=[0,-5,0]``, ``fluid.0.upper=[1,1,1]`` or ``fluid[0].upper=[1,1,1]``;
-    an entry with a name may be addressed by its name, ``phase.oil.viscosity=0.1``. A value that is not TOML is taken as
-    text.
+    An override is ``key=value``, such as ``forces.gravity=[0,-5,0]``, ``fluid.0.upper=[1,1,1]`` or
+    ``fluid[0].upper=[1,1,1]``. A list entry can have its name in place of its index, ``phase.oil.viscosity=0.1``. A
+    value that is not TOML becomes text.
     """
     file = as_path("path", path)
     try:
@@ -310,7 +294,6 @@ def read_toml(
 
 
 def overrides_of(overrides: Sequence[str], tables: Sequence[str]) -> list[str]:
-    """Return those overrides that replace something in the given tables."""
     return [one for one in overrides if isinstance(one, str) and _table_of(one) in tables]
 
 
@@ -319,7 +302,7 @@ def _table_of(override: str) -> str:
 
 
 def _beside(file: str) -> str | None:
-    """Return a scene file in the same folder whose name nearly equals that of a missing file."""
+    """Return a scene file in the folder of a missing file with nearly the same name; None without one."""
     folder, name = os.path.split(file)
     try:
         names = [one for one in os.listdir(folder or ".") if one.endswith(".toml")]
@@ -330,7 +313,7 @@ def _beside(file: str) -> str | None:
 
 
 def put_in(data: dict[str, Any], overrides: Sequence[str], file: str, unread: Sequence[str] = ()) -> dict[str, Any]:
-    """Apply overrides to the contents of a file; raise `SceneError`, also for overrides of ``unread`` tables."""
+    """Apply overrides to the contents of a file; raise `SceneError`, also for an override of a table in ``unread``."""
     if isinstance(overrides, str):
         sentence = f"must be in a list, as [{shown(overrides)}], as there may be several overrides."
         raise SceneError(file, shown(overrides), sentence=sentence)
@@ -352,7 +335,7 @@ def _unreadable(file: str, sentence: str) -> SceneError:
 
 
 def _require_shallow(text: str, file: str) -> None:
-    """Raise `SceneError` for a dotted key with very many parts, anywhere in the text, before the text is parsed."""
+    """Raise `SceneError` for a dotted key with too many parts, before the text is parsed."""
     plain = _ASIDE.sub(lambda found: "" if found[0].startswith("#") else "text", text)
     deep = _TOO_DEEP.search(plain)
     if deep:
@@ -364,7 +347,6 @@ def _too_deep(file: str, key: str) -> SceneError:
 
 
 def _apply(data: dict[str, Any], override: str, file: str) -> None:
-    """Apply one override to the contents of a file."""
     if len(override) > MOST_BYTES:
         sentence = f"is the beginning of {len(override)} characters, but an override must have at most {MOST_BYTES}."
         raise SceneError(file, shown(override), sentence=sentence)
@@ -400,14 +382,13 @@ def _apply(data: dict[str, Any], override: str, file: str) -> None:
 
 
 def _entry(tables: list[Any], part: str) -> int | None:
-    """Return the index of an entry in a list, given its index or its name; None if there is none."""
+    """Return the index of a list entry from its index or its name as text; None for an unknown entry."""
     if part.isdecimal():
         return int(part) if len(part) <= 9 and int(part) < len(tables) else None
     return next((k for k, table in enumerate(tables) if part in _names([table])), None)
 
 
 def _entries(tables: list[Any]) -> str:
-    """Explain in words how entries of a list are addressed."""
     if not tables:
         return "left out, as the list is empty"
     names = _names(tables)
@@ -416,13 +397,12 @@ def _entries(tables: list[Any]) -> str:
 
 
 def _names(tables: list[Any]) -> list[str]:
-    """Return the names of entries; a force without a name is named by its kind."""
     found = (table.get("name", table.get("kind")) for table in tables if isinstance(table, dict))
     return [str(name) for name in found if name is not None]
 
 
 def _value(text: str) -> Any:
-    """Parse a text as a TOML value, or return the text itself."""
+    """Parse a text as a TOML value; return the text if it is not TOML."""
     try:
         parsed = tomllib.loads(f"value = {text}")
     except (ValueError, RecursionError):

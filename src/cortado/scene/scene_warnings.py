@@ -29,7 +29,7 @@ OF_SPACE = ("surface", "field_of_view", "transparency", "floor")
 
 
 def given(table: Table, *names: str) -> Iterator[str]:
-    """Yield those of the names whose fields in a table differ from their defaults."""
+    """Yield the names of fields whose values differ from their defaults, out of ``names``."""
     for name in names:
         field = type(table).model_fields.get(name)
         if field is not None and getattr(table, name) != field.default:
@@ -37,7 +37,7 @@ def given(table: Table, *names: str) -> Iterator[str]:
 
 
 def check_idle(scene: SceneTables) -> None:
-    """Raise a `field_error` for the first key that has no effect because of the choice made in another key."""
+    """Raise a `field_error` for the first key that has no effect because of another key."""
     for path, table, names, reason in _idle(scene):
         for name in given(table, *names):
             raise field_error((*path, name), getattr(table, name), f"left out, as {reason}")
@@ -51,7 +51,7 @@ def idle_sentences(scene: SceneTables) -> Iterator[str]:
 
 
 Idle = tuple[FieldPath, Table, tuple[str, ...], str]
-"""A table's path, the table, those of its keys that have no effect, and the reason."""
+"""Path of a table, the table, the names of its keys without effect, and the reason."""
 
 
 def _idle(scene: SceneTables) -> Iterator[Idle]:
@@ -123,11 +123,10 @@ def _turned_off(scene: SceneTables) -> Iterator[Idle]:
 
 
 def creep_sentence(scene: SceneTables) -> str | None:
-    """Return a sentence about creeping fluid with a yield stress; None without one, or without fluid at the start.
+    """Return a sentence about creeping fluid with a yield stress; None without yield stress or initial fluid.
 
-    Consider a film of depth H whose wall stress is a fraction r <= 1 of the yield stress. The surface speed is (H / m)
-    (1 + (1 - r) ln(1 - r) / r), with the ``regularisation`` m. The shear rate at each height is -ln(1 - stress / yield
-    stress) / m. The speed is at most H / m.
+    A film of depth H with the ``regularisation`` m has the surface speed (H / m) (1 + (1 - r) ln(1 - r) / r) <= H / m,
+    where r <= 1 is the wall stress over the yield stress.
     """
     phase, law = scene.phase[0], scene.phase[0].rheology
     if not isinstance(law, Yielding) or law.yield_stress == 0.0 or not scene.fluid:
@@ -142,23 +141,18 @@ def creep_sentence(scene: SceneTables) -> str | None:
     )
 
 
-FAULT = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear"
-"""The error of the pairwise viscosity, as measured in shear waves (`docs/records/validation_viscosity.md`)."""
-
-
 def viscosity_sentence(scene: SceneTables, where: str) -> str | None:
     """Return a sentence about the inaccurate viscosity form, ``where`` it matters; None for other forms."""
     if scene.forces.viscosity != "pairwise":
         return None
-    return f'{where} and forces.viscosity is "pairwise", {FAULT}: viscosity = "stress" has it within 1 %.'
+    fault = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear"
+    return f'{where} and forces.viscosity is "pairwise", {fault}: viscosity = "stress" has it within 1 %.'
 
 
 THROUGH = 1.5
-"""In spacings: how far a solid must extend through a wall for fluid in the corner between them to rest. Water 15 deep
-moves at 0.13 m/s beside a solid that ends on the floor; at 0.10 if it extends by 0.5 spacings, and at 0.05 if by 1 to
-5."""
+"""Smallest length by which a solid must extend through a wall so that fluid in the corner rests [spacings]."""
 FACING = 0.9
-"""Least component of a face's normal along an axis at which the face counts as perpendicular to the axis."""
+"""Smallest component of a face's unit normal along an axis to which the face counts as perpendicular."""
 
 
 def standing_sentences(scene: SceneTables) -> Iterator[str]:
@@ -185,7 +179,7 @@ def standing_sentences(scene: SceneTables) -> Iterator[str]:
 
 
 def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
-    """Test whether a path does not rotate a solid and keeps its distance from a wall across an axis."""
+    """Test whether a solid is not rotated by its path and keeps its distance from a wall across an axis."""
     shifts, turns = courses(table)
     if turns.greatest() > 0.0:
         return False
@@ -195,13 +189,11 @@ def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
 
 
 ONE_LAYER, TWO_LAYERS = 1.1, 1.5
-"""In spacings: least thickness of walls that hold fluid, with one layer of wall particles, and with two (supports
-beyond two spacings). Water at rest 25 to 120 spacings deep, on shelves or in cups, leaked through 0.75 (in space 1.0),
-and with two layers through 1.0 to 1.25. It took 10 to 90 steps, with either solver, however short."""
+"""Smallest thickness of walls without leaks [spacings], with one and with two layers of wall particles."""
 DEPTHS = np.arange(1, 9) / 8.0
-"""Fractions of that thickness: the solid must reach at least so deep below its surface."""
+"""Fractions of this thickness at which the solid is tested below its surface."""
 MARGIN = 1e-3
-"""Fraction of that thickness by which a wall may be too thin."""
+"""Fraction of this thickness by which a wall may be too thin."""
 SHARE = 0.01
 """Fraction of the surface that may be too thin without a warning."""
 

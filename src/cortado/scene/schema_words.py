@@ -1,5 +1,4 @@
-"""Words from the JSON schema of files' tables: descriptions of valid values, units of keys, and help of tables, which
-lists their keys."""
+"""Words from the JSON schema of tables: valid values, units of keys, and the list of keys in the help of a table."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,12 +18,11 @@ else:
     ModelMetaclass = type(BaseModel)
 
 GREATEST = 1e50
-"""Largest number in a scene, so that its cube fits into a float64. No positive number is smaller than the inverse."""
+"""Largest number in a scene, whose cube fits into a float64; its inverse is the smallest positive number."""
 Schema = Mapping[str, Any]
 
 
 def wanted(schema: Schema, name: str = "") -> str:
-    """Describe a valid value in words, from its part of a JSON schema; ``name`` is that of its field."""
     match schema:
         case {"enum": names}:
             return any_of(names)
@@ -62,7 +60,6 @@ def any_of(names: Iterable[str]) -> str:
 
 
 def _limits(schema: Schema) -> str:
-    """Describe the range of a number in words."""
     unit = "" if schema["unit"] == "-" else f" {schema['unit']}"
     least, most = schema["minimum"], schema["maximum"]
     limits = [f"greater than {schema['exclusiveMinimum']:g}{unit}"] if "exclusiveMinimum" in schema else []
@@ -72,8 +69,8 @@ def _limits(schema: Schema) -> str:
 
 
 def unit_of(key: str) -> str:
-    """Return the unit of a scene's value with a dotted key, such as "Pa s" for ``phase.0.viscosity``. Return an empty
-    text for a value without unit, or if shapes of a body give the key different units."""
+    """Return the unit of a scene's value with a dotted key, such as "Pa s" for ``phase.0.viscosity``; empty without a
+    unit, or if the key has different units in different shapes."""
     found = list(_choices(_schema()))
     for part in key.split("."):
         found = [choice for one in found for choice in _choices(_part(one, part))]
@@ -83,19 +80,16 @@ def unit_of(key: str) -> str:
 
 @cache
 def _schema() -> Schema:
-    """Read the JSON schema that Cortado ships; tests compare it with `Scene`."""
     read: Schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
     return read
 
 
 def _part(schema: Schema, part: str) -> Schema:
-    """Return the schema of a list's entry, given its index, or of a table's field, given its name."""
     found: Schema = schema.get("items", {}) if part.isdigit() else schema.get("properties", {}).get(part, {})
     return found
 
 
 def _choices(schema: Schema) -> Iterator[Schema]:
-    """Yield a schema, and the schemas that it combines or chooses among."""
     yield schema
     if "$ref" in schema:
         yield from _choices(_schema()["$defs"][schema["$ref"].rpartition("/")[2]])
@@ -104,13 +98,11 @@ def _choices(schema: Schema) -> Iterator[Schema]:
             yield from _choices(one)
 
 
-_HOMES: dict[str, str] = {}
-"""The module of each table, by the table's name."""
+_HOMES: dict[str, str] = {}  # modules of tables by name
 
 
 class Documented(ModelMetaclass):
-    """The metaclass of tables. It gives their help a line for each key from the shipped schema, without the types that
-    only pydantic needs."""
+    """Metaclass of tables, whose help lists the keys from the shipped schema."""
 
     def __init__(cls, name: str, *arguments: Any, **named: Any):
         super().__init__(name, *arguments, **named)
@@ -118,7 +110,6 @@ class Documented(ModelMetaclass):
 
     @property
     def __doc__(cls) -> str | None:  # type: ignore[override]
-        """Return the docstring of a table, followed by its keys."""
         own: str | None = cls.__dict__.get("__doc__")
         schema = _schema() if cls.__name__ == "Scene" else _schema()["$defs"].get(cls.__name__, {})
         known, needed = cls.__dict__.get("__pydantic_fields__", {}), schema.get("required", ())
@@ -127,7 +118,7 @@ class Documented(ModelMetaclass):
 
     @property
     def __signature__(cls) -> Signature:
-        """Return the keys with their defaults; a table that may be left out has an empty one as default."""
+        """Return the keys with their defaults; an optional table has the default {}."""
         found = []
         for name, field in vars(cls)["__pydantic_fields__"].items():
             default = Parameter.empty if field.is_required() else field.get_default(call_default_factory=True)
@@ -137,11 +128,10 @@ class Documented(ModelMetaclass):
 
     @__signature__.setter
     def __signature__(cls, value: Any) -> None:
-        """Leave out pydantic's own signature, which has annotations."""
+        """Ignore pydantic's signature, which has annotations."""
 
 
 def _line(key: str, schema: Schema, is_needed: bool) -> str:
-    """Describe a key in one line: its name, its default and its meaning."""
     given, *others = schema.get("anyOf", (schema,))
     words = [{"word": one["const"]} for one in others if "const" in one]
     what = _tables(given, "a table") or _tables(given.get("items", {}), "a list of tables")
@@ -153,7 +143,7 @@ def _line(key: str, schema: Schema, is_needed: bool) -> str:
 
 
 def _tables(schema: Schema, what: str) -> str:
-    """Name the tables that a key accepts, with their module; return an empty text if it accepts no table."""
+    """Name the tables that a key accepts, with their module; return an empty text for a key without tables."""
     names = [one["$ref"].rpartition("/")[2] for one in (schema, *schema.get("oneOf", ())) if "$ref" in one]
     there = [name for name in names if hasattr(modules.get(_HOMES.get(name, "")), name)]
     return f"{what}, {_HOMES[there[0]]}.{' or '.join(there)}" if there else what if names else ""

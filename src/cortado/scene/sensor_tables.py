@@ -1,4 +1,4 @@
-"""The tables of sensors, which record numbers of a run in every step."""
+"""Tables of sensors, which record numbers of a run in every step."""
 
 import unicodedata
 from typing import Annotated, Literal, Self
@@ -17,12 +17,12 @@ class SensorTable(Table):
     """A sensor that records numbers of the fluid in every step."""
 
     name: Text
-    """Name with which the names of its columns in sensors.csv begin."""
+    """Name of the sensor; the names of its columns in sensors.csv begin with it."""
 
     @field_validator("name")
     @classmethod
     def _check_name(cls, name: str) -> str:
-        """Refuse a name that begins with a sign, also a full-width one: a spreadsheet would take it for a formula."""
+        """Refuse a name that a spreadsheet takes for a formula, also with a full-width sign."""
         plain = unicodedata.normalize("NFKC", name).strip()
         if plain[:1] in tuple("=+-@") or not name.isprintable():
             wanted = "one line of text that begins with none of = + - @, as it heads a column of a table"
@@ -48,8 +48,8 @@ class PressureProbeTable(SensorTable):
 
 
 class WaveGaugeTable(SensorTable):
-    """A sensor of the height of the fluid's surface at a place. It is the level at which the fluid in a vertical column
-    would fill the space that solids leave free there."""
+    """A sensor of the height of the fluid's surface: the level to which the fluid in a vertical column would fill the
+    space that solids leave free."""
 
     kind: Literal["wave_gauge"]
     """Kind of the sensor."""
@@ -62,8 +62,8 @@ class WaveGaugeTable(SensorTable):
     on: Text | None = None
     """Name of a moving solid that carries the column along, from its position at the start of the scene."""
     axes: Axes = "world"
-    """Axes of a column carried by a solid. "body": the column turns with the solid, and heights are those in the solid
-    at the start. "world": the column stays upright, and heights are those in the scene."""
+    """Axes of a column carried by a solid. "body": the column turns with the solid, and heights are heights in the
+    solid at the start. "world": the column stays upright, and heights are heights in the scene."""
 
 
 class FlowRateTable(SensorTable):
@@ -76,8 +76,8 @@ class FlowRateTable(SensorTable):
     normal: Vector[Annotated[float, quantity()]]
     """(d,) Direction in which the flow counts as positive."""
     reach: Reach = None
-    """Half the thickness of the layer of fluid that is measured [m]; if left out, two support radii, but at least five
-    spacings."""
+    """Half the thickness of the measured layer of fluid [m]; two support radii, but at least five spacings, if left
+    out."""
 
     @field_validator("normal")
     @classmethod
@@ -99,8 +99,7 @@ class WallForceTable(SensorTable):
     about: Corner = None
     """(d,) Reference point of the torque [m]; the origin if left out."""
     on: Text | None = None
-    """Name of a moving solid that carries and turns the region and the reference point, from their positions at the
-    start of the scene."""
+    """Name of a moving solid that carries and turns the region and the reference point from their initial positions."""
     axes: Axes = "world"
     """Axes of force and torque for a region on a solid: "world", or "body" for axes that turn with the solid."""
 

@@ -1,5 +1,4 @@
-"""The tables of shapes that both solids and bodies of fluid may have, and the tables of containers, with their
-walls."""
+"""Tables of shapes that solids and bodies of fluid share, and tables of containers with their walls."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -25,17 +24,17 @@ from cortado.scene.tables import Colour, FieldPath, Flag, Length, OneOf, Table, 
 
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 THIN = 2.5
-"""In spacings: parts of meshes thicker than this do not count as sheets."""
+"""Thickness of parts of meshes that do not count as sheets [spacings]."""
 
 
 def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:
-    """Check that each component of upper is greater than that of lower."""
+    """Check that each component of ``upper`` is greater than that of ``lower``."""
     if len(lower) == len(upper) and any(b <= a for a, b in zip(lower, upper, strict=True)):
         raise field_error(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
 
 
 def _beside_scene(file: str, info: ValidationInfo) -> str:
-    """Return the absolute path of a file named in a scene; relative paths start at the scene file's folder."""
+    """Return the absolute path of a file; relative paths start at the scene file's folder."""
     folder = Path((info.context or {}).get("folder", "."))
     try:
         return str((folder / file).absolute())
@@ -44,7 +43,6 @@ def _beside_scene(file: str, info: ValidationInfo) -> str:
 
 
 File = Annotated[Text, AfterValidator(_beside_scene)]
-"""The path of a file, relative to the scene file's folder."""
 
 
 class BoxShape(Table):
@@ -62,7 +60,6 @@ class BoxShape(Table):
         return self
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the box centred at the origin, unrotated, and its middle (d,) [m]."""
         return Box(0.5 * np.subtract(self.upper, self.lower)), 0.5 * np.add(self.lower, self.upper)
 
 
@@ -73,10 +70,9 @@ class SphereShape(Table):
     centre: Vector[Length]
     """(d,) Middle [m]."""
     radius: Annotated[float, quantity("m", gt=0.0)]
-    """From the middle to the surface [m]."""
+    """Distance from the middle to the surface [m]."""
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the sphere centred at the origin, and its middle (d,) [m]."""
         return Round(np.zeros(len(self.centre)), self.radius), np.array(self.centre)
 
 
@@ -84,7 +80,7 @@ class CylinderShape(Table):
     """A cylinder, in 3-D."""
 
     instead: ClassVar[str]
-    """Words that name the corresponding shapes in 2-D."""
+    """Names of corresponding shapes in 2-D."""
     shape: Literal["cylinder"] = "cylinder"
     base: Vector[Length]
     """(3,) Centre of the bottom [m]."""
@@ -101,7 +97,6 @@ class CylinderShape(Table):
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the cylinder centred at the origin, unrotated, and its middle (3,) [m]."""
         along = INDEX_OF_AXIS[self.axis]
         middle = np.array(self.base) + 0.5 * self.height * np.eye(3)[along]
         return Revolved(Box(np.array([self.radius, 0.5 * self.height])), along), middle
@@ -114,7 +109,7 @@ class PolygonShape(Table):
     corners: Annotated[
         tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)], ...], Field(min_length=3)
     ]
-    """(m, 2) The corners in order along the boundary, clockwise or counterclockwise [m]."""
+    """(m, 2) Corners in order along the boundary, clockwise or counterclockwise [m]."""
 
     @model_validator(mode="after")
     def _check_sides(self) -> Self:
@@ -131,7 +126,6 @@ class PolygonShape(Table):
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the polygon with its centroid at the origin, and the centroid (2,) [m]."""
         corners = np.array(self.corners)
         middle = Polygon(corners).moments().centre
         return Polygon(corners - middle), middle
@@ -152,7 +146,6 @@ class MeshShape(Table):
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the mesh with its centroid at the origin, and the centroid (3,) [m]."""
         return _about_middle(mesh_in_file(self.file), self.scale)
 
     def thinnest_sheet(self, spacing: float) -> float:
@@ -160,22 +153,25 @@ class MeshShape(Table):
         return _thinnest_sheet(mesh_in_file(self.file), self.scale, THIN * spacing)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=8)  # as a mesh builds a tree
 def _about_middle(found: FoundMesh, scale: float) -> tuple[Mesh, Points]:
-    """Return a mesh, scaled and centred at the origin, and its middle (3,) [m]; cached, because it needs a tree."""
     middle = found.mesh.moments().centre
     return found.mesh.moved(scale, -scale * middle), scale * (found.origin + middle)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=8)  # as this takes thousands of points
 def _thinnest_sheet(found: FoundMesh, scale: float, reach: float) -> float:
-    """Return the thickness of the thinnest sheet of a scaled mesh [m]; infinite if all are thicker than a reach [m].
-    The result is cached, because it needs thousands of points."""
     return thickness_of(_about_middle(found, scale)[0], reach).thinnest
 
 
+def surface_cells(lower: Points, upper: Points, spacing: float) -> float:
+    """Return the number of cells with this spacing [m] on the surface of a box with corners (d,) [m]."""
+    cells = np.maximum((upper - lower) / spacing, 1.0)
+    return float(2.0 * np.sum(np.prod(cells) / cells))
+
+
 def _crossing(corners: Points) -> tuple[int, int] | None:
-    """Return the indices of two sides of a polygon that cross away from its corners, or of a side without length."""
+    """Return the indices of two sides of a polygon that cross or overlap, or twice that of a side without length."""
     count, sides = len(corners), np.roll(corners, -1, axis=0) - corners
 
     def turned(a: Points, b: Points) -> float:
@@ -201,20 +197,19 @@ class Container(Table):
     """A container of the fluid, of any shape."""
 
     sticks: ClassVar[Any] = False
-    """True if the walls have no slip."""
     finish: ClassVar[Any] = None
-    """`Finish` of the walls; None if the scene sets no finish."""
+    """`Finish` of the walls; None without a material or colour."""
 
     @abstractmethod
     def extent(self) -> tuple[Points, Points] | None:
-        """Return the box around the container: lower and upper corner, each (d,) [m]; None without a container."""
+        """Return the lower and the upper corner (d,) [m] of the box around the container; None without a container."""
 
     @abstractmethod
     def region(self, dimension: int) -> Region:
-        """Return the region where fluid may be, within one period."""
+        """Return the region for fluid, within one period."""
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """Return a mask (n,) of the points (n, d) [m] that are inside, or outside by at most the tolerance [m]."""
+        """Return a mask (n,) of the points (n, d) [m] that are at most ``tolerance`` [m] outside."""
         return self.region(points.shape[1]).contains(points, tolerance)
 
     @abstractmethod
@@ -223,11 +218,11 @@ class Container(Table):
 
     @abstractmethod
     def places(self, dimension: int, spacing: float, reach: float) -> Places:
-        """Return positions, less than ``reach`` [m] from a wall, where fluid may rest."""
+        """Return places for fluid less than ``reach`` [m] from a wall."""
 
     def shortened(self, spacing: float, support: float) -> "tuple[Container, Callable[[Points], Points]]":
-        """Return a shorter container whose walls have this one's weights, for a spacing and a support [m], and a
-        function. It maps points (b, d) [m] on this one's walls to points of equal weight on the shorter one's."""
+        """Return a shorter container with equal weights of walls, for a spacing and a support [m]. Also return a
+        function from points (b, d) [m] on these walls to points of equal weight on the shorter walls."""
         return self, lambda points: points
 
     @abstractmethod
@@ -235,24 +230,19 @@ class Container(Table):
         """Return the solids that form the container's walls, extended by ``reach`` [m] beyond the ends of a period."""
 
     def wall_count(self, spacing: float) -> float:
-        """Estimate the number of wall particles in one layer, without creating any."""
         ends = self.extent()
-        if ends is None:
-            return 0.0
-        cells = np.maximum((ends[1] - ends[0]) / spacing, 1.0)
-        return float(2.0 * np.sum(np.prod(cells) / cells))
+        return 0.0 if ends is None else surface_cells(*ends, spacing)
 
     def periods(self, dimension: int) -> tuple[Points, Points]:
-        """Return the start and the length of the period, each (d,) [m]; the length is 0 for other axes."""
+        """Return the start and the length of the period, each (d,) [m]; the length is 0 along other axes."""
         return np.zeros(dimension), np.zeros(dimension)
 
     def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
         """Return the coordinates of flat walls that mirror the fluid, for a support [m]: at the lower and the upper end
-        of each axis, each (d,) [m]; -inf or inf without such a wall."""
+        of each axis, each (d,) [m]; -inf or inf without a mirroring wall."""
         return np.full(dimension, -np.inf), np.full(dimension, np.inf)
 
     def domain(self, dimension: int) -> Domain:
-        """Return the container's region and its periods as one object."""
         return Domain.of(*self.periods(dimension))
 
 
@@ -278,7 +268,7 @@ class NoContainer(Container):
 
 
 class Walled(Table):
-    """The walls of a container."""
+    """Keys of a container's walls."""
 
     slip: Literal["free", "no"] = "free"
     """"no": the viscous force acts between fluid and wall; "free": it does not."""
@@ -330,8 +320,8 @@ class BoxContainer(Walled, BoxShape, Container):
         return box_places(*self.extent(), self.periodic, spacing, reach)
 
     def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
-        """Return the walls that mirror the fluid. Walls without slip do not, because mirrored fluid would distort the
-        shear. Walls of a very narrow box do not, because images would have images."""
+        """Return the walls that mirror the fluid: not walls without slip, where mirrored fluid would distort the shear,
+        nor walls of a very narrow box, where images would have images."""
         (lower, upper), periodic = self.extent(), np.array(self.periodic)
         if self.sticks or (upper - lower < support)[~periodic].any():
             return super().mirrors(dimension, support)
@@ -382,10 +372,8 @@ AnyContainer = Annotated[BoxContainer | CylinderContainer | NoContainer, Field(d
 
 
 def check_length(container: Container, spacing: float, support_radius: float) -> None:
-    """Check that a container is at least one spacing wide, and a period longer than two support radii.
-
-    The neighbour search considers only the nearest periodic image; in a shorter period a pair would interact twice.
-    """
+    """Check that a container is at least one spacing wide, and a period longer than two support radii, as the neighbour
+    search considers only the nearest periodic image."""
     ends = container.extent()
     if ends is None:
         return
@@ -398,5 +386,4 @@ def check_length(container: Container, spacing: float, support_radius: float) ->
     if short.any():
         axis = int(np.argmax(short))
         reason = f"the {periods[axis]:g} m of this axis are not more than two support radii, {2.0 * support_radius:g} m"
-        wanted = f"false, as {reason}"
-        raise field_error(("container", "periodic", axis), True, wanted)
+        raise field_error(("container", "periodic", axis), True, f"false, as {reason}")

@@ -1,4 +1,4 @@
-"""The shapes that solids of a scene may have."""
+"""Shapes of solids."""
 
 from functools import lru_cache
 from typing import Annotated, ClassVar, Literal, Self
@@ -24,15 +24,14 @@ from cortado.scene.shape_tables import (
     SphereShape,
 )
 from cortado.scene.solids import SolidTable
-from cortado.scene.tables import MISSING, FieldPath, Length, Vector, field_error, quantity
+from cortado.scene.tables import MISSING, FieldPath, Length, Vector, field_error, quantity, usable_file
 
 ALONG = 1e-9
-"""Largest component along a period of a normal that counts as perpendicular to the period."""
 
 
 class PlaneSolid(SolidTable):
-    """The half space behind a plane, such as a slope or a wall, at rest; `normal` points from it into the fluid. It is
-    unbounded, and so needs a container, which it cuts."""
+    """The half space behind a plane, such as a slope or a wall, at rest; `normal` points from it into the fluid. A
+    plane needs a container, which cuts it."""
 
     shape: Literal["plane"] = "plane"
     position: Vector[Length]
@@ -174,7 +173,7 @@ class CupSolid(SolidTable):
         return self.thickness
 
     def _middle(self) -> float:
-        """Return the height of the cup's centroid above the base [m]."""
+        """Return the height of the centroid above the base [m]."""
         power = len(self.base) - 1
         solid, hollow = (self.radius + self.thickness) ** power, self.radius**power
         whole, cavity = solid * self.height, hollow * (self.height - self.thickness)
@@ -203,12 +202,12 @@ class MeshSolid(MeshShape, SolidTable):
 
 
 FLAT = 1e-6
-"""Largest distance from a common plane of a sheet's corners in space, relative to the sheet's size."""
+"""Largest distance of a flat sheet's corners from a common plane, relative to the size of the sheet."""
 
 
 class SheetSolid(SolidTable):
-    """A wall of no thickness. Fluid on one side does not interact with fluid on the other. In 2-D it is a line of
-    straight parts, in 3-D a flat convex polygon or the open mesh of a file."""
+    """A wall of no thickness that separates the fluids on its two sides. In 2-D it is a line of straight parts, in 3-D
+    a flat convex polygon or the open mesh of a file."""
 
     measures: ClassVar = ("scale",)
     least_thickness: ClassVar = 0.0
@@ -237,10 +236,13 @@ class SheetSolid(SolidTable):
         if (self.corners is None) == (self.file is None):
             found = MISSING if self.file is None else Words("given")
             raise field_error((*path, "corners"), found, "a list of corners, or a file in its place")
-        if self.file is not None:
-            self._check_file(dimension, path)
-        else:
+        if self.file is None:
             self._check_corners(dimension, path)
+            return turned
+        if dimension == 2:
+            raise field_error((*path, "file"), self.file, "left out in 2-D, where corners say where a sheet is")
+        with usable_file((*path, "file"), self.file, "a file of a mesh"):
+            _sheet_in(self.file)
         return turned
 
     def shape_about(self) -> tuple[Solid, Points]:
@@ -251,19 +253,10 @@ class SheetSolid(SolidTable):
     def shown_shape(self, spacing: float) -> Solid:
         about = self.shape_about()[0]
         assert isinstance(about, Sheet)
-        return Thickened(about, SHOWN * spacing)
+        return Thickened(about, 0.1 * spacing)
 
     def thinnest(self, spacing: float) -> float:
         return np.inf
-
-    def _check_file(self, dimension: int, path: FieldPath) -> None:
-        if dimension == 2:
-            raise field_error((*path, "file"), self.file, "left out in 2-D, where corners say where a sheet is")
-        assert self.file is not None
-        try:
-            _sheet_in(self.file)
-        except InputError as error:
-            raise field_error((*path, "file"), self.file, "a file of a mesh", f"cannot be used: {error}") from None
 
     def _check_corners(self, dimension: int, path: FieldPath) -> None:
         assert self.corners is not None
@@ -285,10 +278,6 @@ class SheetSolid(SolidTable):
             if not is_flat or (turns @ normal <= 0.0).any() or around > 1.5:
                 wanted = "the corners of a flat convex polygon, once around, none on a straight edge"
                 raise field_error((*path, "corners"), self.corners, wanted)
-
-
-SHOWN = 0.1
-"""In spacings: half the thickness with which pictures show a sheet."""
 
 
 @lru_cache(maxsize=8)

@@ -1,4 +1,4 @@
-"""Solids, obstacles in the fluid or vessels around it: the keys that all of them have."""
+"""Keys that all solids of a scene have."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Hollow, Placed, Solid
 from cortado.scene.appearance import FINISHES, Coloured, Finish
 from cortado.scene.courses import WAYS, Interpolation, Ramp, check_motion
-from cortado.scene.shape_tables import Container, File
+from cortado.scene.shape_tables import Container, File, surface_cells
 from cortado.scene.tables import (
     Colour,
     FieldPath,
@@ -24,6 +24,7 @@ from cortado.scene.tables import (
     Rotation,
     Text,
     Turning,
+    check_name,
     check_turn,
     quantity,
     rotation_matrix,
@@ -34,11 +35,8 @@ class SolidTable(Coloured):
     """A solid of any shape, which fluid cannot enter."""
 
     measures: ClassVar[tuple[str, ...]] = ()
-    """Fields that scale with the size of the shape."""
     least_thickness: ClassVar = 1.0
-    """Smallest allowed thickness, in spacings."""
     is_sheet: ClassVar = False
-    """True for a wall of no thickness."""
     materials: ClassVar = FINISHES
     plain: ClassVar = (0.55, 0.55, 0.58)
 
@@ -47,33 +45,34 @@ class SolidTable(Coloured):
     position: tuple[Length, ...] | None = None
     """(d,) Position of the centroid of its volume [m]; if left out, the other keys of the shape determine it."""
     rotation: Rotation | None = None
-    """Rotation about its middle [rad]; not rotated if left out. In 3-D a rotation vector, in 2-D one number,
+    """Initial rotation about its middle [rad]; not rotated if left out. In 3-D a rotation vector, in 2-D one number,
     counterclockwise."""
     motion: Literal["fixed", "path", "free"] = "fixed"
-    """How the solid moves. "fixed": not at all. "path": as `times` with `positions` or `rotations`, the file `path`, or
-    a steady `velocity` or `angular_velocity` prescribe. "free": as a rigid body moved by fluid and gravity."""
+    """How the solid moves. "fixed": not at all. "path": along `times` with `positions` or `rotations`, along the file
+    `path`, or at a steady `velocity` or `angular_velocity`. "free": as a rigid body moved by fluid and gravity."""
     density: Annotated[float, quantity("kg/m3", gt=0.0)] | None = None
     """Density of a free body: its mass divided by its volume [kg/m³]."""
     mass: Annotated[float, quantity("kg", gt=0.0)] | None = None
     """Mass of a free body, in place of its density [kg]; in 2-D the mass per metre of depth."""
     centre_of_mass: tuple[Length, ...] | None = None
-    """(d,) Vector from the centroid of a free body's volume to its centre of mass, along the body's own axes [m]; 0 if
-    left out."""
+    """(d,) Vector from the centroid of a free body's volume to its centre of mass, in the body's frame [m]; 0 if left
+    out."""
     gyration_radius: Radii | None = None
-    """(3,) Radii of gyration of a free body about its own axes through its centre of mass, in 2-D one number [m]:
-    square roots of moment of inertia over mass. If left out, those of its shape."""
+    """(3,) Radii of gyration of a free body about the axes of its frame through its centre of mass, in 2-D one number
+    [m]: square roots of moment of inertia over mass. If left out, those of a homogeneous body."""
     inertia: Inertia | None = None
     """Moments of inertia of a free body about its centre of mass [kg m²], in place of its radii of gyration. In 2-D one
-    number, per metre of depth. In 3-D three numbers, about its own axes, or the nine of a matrix, row by row."""
+    number, per metre of depth. In 3-D three numbers, about the axes of its frame, or the nine of a matrix, row by
+    row."""
     freedom: tuple[Annotated[str, OneOf(sorted({*WAYS[2], *WAYS[3]}))], ...] | None = None
-    """Directions in which a free body can move; all if left out. They are some of "x", "y" and "rotation", in 3-D of
-    "x", "y", "z", "rotation_x", "rotation_y" and "rotation_z", along the axes of space."""
+    """Directions in which a free body can move, along the axes of space; all if left out. The names are "x", "y" and
+    "rotation", in 3-D "x", "y", "z", "rotation_x", "rotation_y" and "rotation_z"."""
     friction: Annotated[float, quantity(ge=0.0)] | None = None
     """Coefficient of Coulomb friction of a free body where it touches something; 0 if left out. Between two free bodies
-    the mean of both acts."""
+    the mean of both coefficients acts."""
     restitution: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
-    """Coefficient of restitution of a free body: its speed after a hit over that before; 0.6 if left out. Between two
-    free bodies the mean of both acts."""
+    """Coefficient of restitution of a free body: its speed after a hit over its speed before; 0.6 if left out. Between
+    two free bodies the mean of both coefficients acts."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of the path, increasing from 0 on [s]; after the last time the solid rests."""
     positions: tuple[tuple[Length, ...], ...] | None = None
@@ -88,16 +87,16 @@ class SolidTable(Coloured):
     """Curve between the times: straight lines, or a cubic spline. The spline has continuous velocity and acceleration,
     and zero velocity at both ends."""
     ramp: Ramp | None = None
-    """Duration of the ramp [s]. Until its end the path is multiplied by a factor that grows smoothly (C2) from 0 to
-    1."""
+    """Duration of the ramp [s]: from 0 to this time, the path is multiplied by a factor that grows smoothly (C2) from 0
+    to 1."""
     velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
-    """(d,) Velocity of the middle [m/s]: steady, or for a free body the one at the start."""
+    """(d,) Velocity of the middle [m/s], constant; for a free body, the velocity at the start."""
     angular_velocity: Turning | None = None
-    """Angular velocity about the middle [rad/s]: steady, or for a free body the one at the start. In 3-D a vector, in
-    2-D one number, counterclockwise."""
+    """Angular velocity about the middle [rad/s], constant; for a free body, the angular velocity at the start. In 3-D a
+    vector, in 2-D one number, counterclockwise."""
     surface_velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
-    """(d,) Velocity with which the surface slides although the shape stays in place, as of a conveyor belt, in the
-    solid's own frame [m/s]."""
+    """(d,) Velocity of a surface that slides along a shape at rest, such as a conveyor belt, in the solid's frame
+    [m/s]."""
     side: Literal["outside", "inside"] = "outside"
     """Side on which fluid may be: outside of the shape, or inside, as in a tank."""
     slip: Literal["free", "no"] = "free"
@@ -108,12 +107,11 @@ class SolidTable(Coloured):
     """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light. If left out, the colour of the
     material, or [0.55, 0.55, 0.58] without a material."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
-    """Fraction of the light that passes through the solid in pictures, from 0 to 1. If left out, that of the material;
-    without a material it is 0, or 1 if fluid is inside."""
+    """Fraction of the light that passes through the solid in pictures, from 0 to 1. If left out, the transparency of
+    the material; without a material 0, or 1 if fluid is inside."""
 
     @property
     def finish(self) -> Finish:
-        """Return the finish of the solid's surface in pictures."""
         plain = Finish(self.plain, transparency=float(self.side == "inside"))
         own = plain if self.material is None else FINISHES[self.material]
         clear = own.transparency if self.transparency is None else self.transparency
@@ -121,17 +119,15 @@ class SolidTable(Coloured):
 
     @property
     def sticks(self) -> bool:
-        """Return True if fluid has no slip along the solid."""
         return self.slip == "no"
 
     @property
     def is_steady(self) -> bool:
-        """Return True if no table prescribes the solid's position over time."""
+        """Return True if the solid's position is not a table over time."""
         return self.times is None and self.path is None
 
     @property
     def moves(self) -> bool:
-        """Return True if the solid or its surface moves."""
         return self.motion != "fixed" or self.surface_velocity is not None
 
     def centroid(self) -> Points:
@@ -139,29 +135,27 @@ class SolidTable(Coloured):
         return self.shape_about()[1] if self.position is None else np.array(self.position)
 
     def middle(self) -> Points:
-        """Return the middle (d,) of the solid at the start [m]: its centroid, or its centre of mass if it has one."""
+        """Return the middle (d,) of the solid at the start [m]: its centre of mass if given, else its centroid."""
         return self.centroid() + self._arm()
 
     def moved(self, middle: Points, rotation: tuple[float, ...]) -> Self:
-        """Return the solid with its middle (d,) at a position [m], rotated by a rotation matrix."""
+        """Return the solid with its middle (d,) at a position [m] and a rotation [rad] as in `rotation`."""
         turned = self.model_copy(update={"rotation": rotation})
         return turned.model_copy(update={"position": tuple((middle - turned._arm()).tolist())})
 
     def _arm(self) -> Points:
-        """Return the vector (d,) from the centroid to the middle at the start [m]; zero (1,) if they are the same."""
+        """Return the vector (d,) from the centroid to the middle at the start [m]; zero (1,) if they are equal."""
         arm = self.centre_of_mass
         return np.zeros(1) if arm is None else np.asarray(self.turn(len(arm)) @ np.array(arm))
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the shape, unrotated with its centroid at the origin, and the centroid in its own keys, (d,) [m]."""
+        """Return the unrotated shape with its centroid at the origin, and the centroid (d,) that its keys imply [m]."""
 
     def shown_shape(self, spacing: float) -> Solid:
-        """Return the shape, unrotated with its centroid at the origin, as pictures show it for a spacing [m]."""
         return self.shape_about()[0]
 
     def stretched(self, scale: float) -> Self:
-        """Return the solid enlarged ``scale`` times about its middle."""
         if scale == 1.0:
             return self
         grown = {name: _times(scale, getattr(self, name)) for name in self.measures}
@@ -169,37 +163,32 @@ class SolidTable(Coloured):
 
     @abstractmethod
     def thinnest(self, spacing: float) -> float:
-        """Return the thickness of the solid's thinnest part [m]. It is infinite if unknown, as for a mesh whose sheets
-        are all thicker than a few spacings [m]."""
+        """Return the thickness of the thinnest part [m]; infinite for a mesh without sheets thinner than a few
+        spacings."""
 
     def in_container(self, container: Container, path: FieldPath) -> Self:
-        """Return this table, at a path, adapted to a container, which unbounded shapes need."""
+        """Return the table, found at ``path``, with unbounded shapes cut to the container."""
         return self
 
     def wall_count(self, spacing: float) -> float:
-        """Estimate the number of wall particles in one layer, without creating any."""
-        lower, upper = self.shape_about()[0].extent()
-        cells = np.maximum((upper - lower) / spacing, 1.0)
-        return float(2.0 * np.sum(np.prod(cells) / cells))
+        return surface_cells(*self.shape_about()[0].extent(), spacing)
 
     def solid(self) -> Solid:
-        """Return the solid that fluid cannot enter: the shape, or for a tank everything outside of it."""
+        """Return the region without fluid: the body, or for a tank the outside of the body."""
         return Hollow(self.body()) if self.side == "inside" else self.body()
 
     def own_solid(self) -> Solid:
-        """Return the solid that fluid cannot enter, unrotated with its middle at the origin."""
+        """Return the region without fluid, unrotated with the middle at the origin."""
         shape = self.shape_about()[0]
         if self.centre_of_mass is not None:
             return Placed(shape, -np.array(self.centre_of_mass), np.eye(len(self.centre_of_mass)))
         return Hollow(shape) if self.side == "inside" else shape
 
     def body(self) -> Solid:
-        """Return the shape at its position, with its rotation."""
         centroid = self.centroid()
         return Placed(self.shape_about()[0], centroid, self.turn(len(centroid)))
 
     def turn(self, dimension: int) -> NDArray[np.float64]:
-        """Return the rotation matrix (d, d) at the start."""
         return rotation_matrix(self.rotation or (0.0,) * (2 * dimension - 3))
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
@@ -211,16 +200,18 @@ class SolidTable(Coloured):
 
 
 def thick(tables: Sequence[SolidTable]) -> tuple[SolidTable, ...]:
-    """Return the solids that are not sheets."""
     return tuple(table for table in tables if not table.is_sheet)
+
+
+def check_free_body(path: FieldPath, name: str, tables: Sequence[SolidTable]) -> None:
+    free = [table.name for table in tables if table.motion == "free"]
+    check_name(path, name, free, "a free body", 'of a solid whose motion is "free"')
 
 
 @lru_cache(maxsize=8)
 def solids_of(tables: tuple[SolidTable, ...]) -> tuple[Solid, ...]:
-    """Return the solids that tables describe, in order."""
     return tuple(table.solid() for table in tables)
 
 
 def _times(scale: float, value: Any) -> Any:
-    """Multiply a number, or each number of a tuple, by a scale."""
     return tuple(_times(scale, part) for part in value) if isinstance(value, tuple) else scale * value

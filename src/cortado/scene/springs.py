@@ -1,4 +1,4 @@
-"""Springs that pull free bodies: their tables and parameters, and the time step that they and hinges allow."""
+"""Springs between free bodies, other solids and space, and the time step that springs and hinges allow."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,38 +9,37 @@ import numpy as np
 from pydantic import model_validator
 
 from cortado.discretise.shapes import Points
-from cortado.errors import shown
-from cortado.scene.hinges import HingeTable, Hold, hinge_parameters, in_frame, inertia_about, number_of
+from cortado.scene.hinges import HingeTable, Hold, Link, hinge_parameters, in_frame, inertia_about, linked, number_of
 from cortado.scene.motions import mass_of_one, weight_name
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.parameters import Parameter, Range
-from cortado.scene.solids import SolidTable
-from cortado.scene.tables import Flag, Length, Table, Text, Vector, field_error, quantity
+from cortado.scene.solids import SolidTable, check_free_body
+from cortado.scene.tables import Flag, Length, Table, Text, Vector, check_name, field_error, quantity
 
 
 class SpringTable(Table):
-    """A spring with a damper, from a point of a free body to a point of another solid or to a place of the world."""
+    """A spring with a damper between a point of a free body and a point of another solid or of space."""
 
     name: Text
-    """Name of the spring, with which those of its parameters begin."""
+    """Name of the spring; the names of its parameters begin with it."""
     solid: Text
-    """Name of the free body that it pulls."""
+    """Name of the free body."""
     point: Vector[Length]
-    """(d,) Where it holds the body at the start, in the scene [m]."""
+    """(d,) Position of the spring's end on the free body at the start [m]."""
     to: Text | None = None
-    """Name of the solid at its other end; if left out that is a place of the world."""
+    """Name of the solid at the other end; if left out, the other end is fixed in space."""
     anchor: Vector[Length]
-    """(d,) Where its other end is at the start, in the scene [m]."""
+    """(d,) Position of the other end at the start [m]."""
     stiffness: Annotated[float, quantity("N/m", gt=0.0)]
-    """Force for each metre by which it is longer than at rest [N/m]; in 2-D that of a metre across."""
+    """Force per metre of extension [N/m]; in 2-D per metre of depth."""
     rest_length: Annotated[float, quantity("m", ge=0.0)] | None = None
-    """Length at which it pulls with no force [m]; as long as at the start if left out."""
+    """Length without force [m]; if left out, the length at the start."""
     preload: Annotated[float, quantity("N")] | None = None
-    """Force with which it pulls at the start [N], in place of a length at rest."""
+    """Tension of the spring at the start [N], in place of `rest_length`."""
     damping: Annotated[float, quantity("N s/m", ge=0.0)] = 0.0
-    """Force for each metre a second by which it gets longer [N s/m]."""
+    """Force per rate of extension [N s/m]."""
     slack: Flag = False
-    """Whether it only pulls, and is slack where it is shorter than at rest, as a mooring line is."""
+    """If true, the spring has no force while shorter than its rest length, like a mooring line."""
 
     @model_validator(mode="after")
     def _check_length(self) -> Self:
@@ -55,42 +54,35 @@ class SpringTable(Table):
 
     @property
     def length(self) -> float:
-        """Return its length at the start [m]."""
-        return (
-            float(np.linalg.norm(np.subtract(self.anchor, self.point))) if len(self.anchor) == len(self.point) else 0.0
-        )
+        """Return the length at the start [m]; 0 if the two ends have different dimensions."""
+        fits = len(self.anchor) == len(self.point)
+        return float(np.linalg.norm(np.subtract(self.anchor, self.point))) if fits else 0.0
 
     @property
     def length_at_rest(self) -> float:
-        """Return its length at rest [m]."""
         if self.rest_length is not None:
             return self.rest_length
         return self.length - (self.preload or 0.0) / self.stiffness
 
 
 def check_springs(springs: Sequence[SpringTable], hinges: Sequence[HingeTable], solids: Sequence[SolidTable]) -> None:
-    """Check that springs are between a free body and another solid, or the world, and have names of their own, as
-    hinges have."""
+    """Check the solids that springs name, and that no two solids, hinges or springs have the same name."""
     names = [solid.name for solid in solids]
     for index, hinge in enumerate(hinges):
         if hinge.name in names:
             raise field_error(("hinge", index, "name"), hinge.name, "another name than those of the solids")
-    free = [solid.name for solid in solids if solid.motion == "free"]
     for index, spring in enumerate(springs):
         path = ("spring", index)
         if spring.name in [*names, *(hinge.name for hinge in hinges)]:
             raise field_error((*path, "name"), spring.name, "another name than those of the solids and hinges")
-        if spring.solid not in free:
-            wanted = f"the name of a free body, of {shown(free)}" if free else 'of a solid whose motion is "free"'
-            raise field_error((*path, "solid"), spring.solid, wanted)
+        check_free_body((*path, "solid"), spring.solid, solids)
         if spring.to == spring.solid:
             raise field_error((*path, "to"), spring.to, "another solid than that of the other end")
-        if spring.to is not None and spring.to not in names:
-            raise field_error((*path, "to"), spring.to, f"the name of a solid, of {shown(names)}")
+        if spring.to is not None:
+            check_name((*path, "to"), spring.to, names, "a solid")
 
 
 def spring_parameters(scene: Any) -> list[Parameter]:
-    """Return the parameters of a scene's springs and hinges."""
     pull = "N/m" if scene.dimension == 3 else "N/m²"
     positive, not_negative, found = Range.POSITIVE, Range.NOT_NEGATIVE, list[Parameter]()
     for spring in scene.spring:
@@ -107,27 +99,21 @@ def spring_parameters(scene: Any) -> list[Parameter]:
 
 @dataclass(frozen=True)
 class _Yielding:
-    """A free body as springs find it."""
-
     table: SolidTable
     mass: float
     """[kg]"""
     lightest: float
-    """The greatest eigenvalue of the inverse of its inertia [1/(kg m2)]."""
+    """Greatest eigenvalue of the inverse inertia [1/(kg m2)]."""
 
     def at(self, point: Any) -> float:
-        """Return the greatest inverse of the mass that a force at a point (d,) of it at the start sees [1/kg]."""
+        """Return a bound of the inverse effective mass for a force at a point (d,) of the body [1/kg]."""
         arm = np.subtract(point, self.table.middle())
         return float(1.0 / self.mass + self.lightest * (arm @ arm))
 
 
-NUMBERS = ("stiffness", "damping")
-"""Keys of springs and hinges that bound the steps."""
-
-
 def spring_limit(scene: Any, values: Arrays) -> float:
-    """Return the longest step [s] that is stable with the scene's springs, 4 / (c + sqrt(c^2 + 4 w^2)). Their greatest
-    frequency w and rate of damping c are both bounds, without the water that goes along with bodies."""
+    """Return the longest stable time step [s] with the scene's springs, 4 / (c + sqrt(c² + 4 w²)). The frequency w and
+    the damping rate c are upper bounds, without the added mass of water."""
     bodies = {}
     for table in scene.solid:
         if table.motion == "free":
@@ -145,16 +131,16 @@ def spring_limit(scene: Any, values: Arrays) -> float:
             ends.append((hinge.name, [(str(name), bodies[str(name)].lightest) for name in on]))
     known = dict(values)
     for one in (*scene.spring, *scene.hinge):
-        for end in NUMBERS:
+        for end in ("stiffness", "damping"):
             known.setdefault(f"{one.name}.{end}", np.array(getattr(one, end) or 0.0))
-    square, rate = (_greatest(ends, known, end) for end in NUMBERS)
+    square, rate = (_greatest(ends, known, end) for end in ("stiffness", "damping"))
     fastest = rate + sqrt(rate * rate + 4.0 * square)
     return 4.0 / fastest if fastest > 0.0 else inf
 
 
 def _greatest(ends: Sequence[tuple[str, list[tuple[str, float]]]], values: Arrays, key: str) -> float:
-    """Return a bound of the greatest eigenvalue of J^T M^-1 J K: the sum over both bodies of a spring of the traces of
-    all springs at them."""
+    """Return a bound of the greatest eigenvalue of Jᵀ M⁻¹ J K: for a spring, the sum over its bodies of the traces of
+    all springs at the body; the greatest over all springs."""
     traces: dict[str, float] = {}
     for name, bodies in ends:
         for body, inverse in bodies:
@@ -163,32 +149,18 @@ def _greatest(ends: Sequence[tuple[str, list[tuple[str, float]]]], values: Array
 
 
 @dataclass(frozen=True)
-class Ends:
-    """A spring between solids by their numbers."""
-
-    name: str
-    body: int
-    """Number of its body among the free bodies."""
-    against: int
-    """Number of the other solid among the solids that move; -1 for one at rest and for the world."""
-    other: int
-    """Number of the other solid among the free bodies; -1 for one that is not free."""
+class Ends(Link):
     point: Points
-    """(d,) of its body, in the body's frame [m]."""
+    """(d,) position of the end on the body, in the body's frame [m]."""
     anchor: Points
-    """(d,) of the other solid, in its frame [m]; of the world if that does not move."""
+    """(d,) position of the other end [m], in the other solid's frame, or in space if that solid does not move."""
     slack: bool
 
 
 def ends_of(springs: Sequence[SpringTable], moved: Sequence[SolidTable]) -> list[Ends]:
-    """Return the ends of springs between solids that move, which are all ``moved``, and the world."""
-    numbers = {table.name: number for number, table in enumerate(moved)}
-    bodies = [table.name for table in moved if table.motion == "free"]
     found = []
     for spring in springs:
-        own, against = moved[numbers[spring.solid]], numbers.get(spring.to or "", -1)
-        other = bodies.index(spring.to) if spring.to in bodies else -1
-        anchor = np.array(spring.anchor) if against < 0 else in_frame(moved[against], spring.anchor)
-        point = in_frame(own, spring.point)
-        found.append(Ends(spring.name, bodies.index(own.name), against, other, point, anchor, spring.slack))
+        body, solid, fields = linked(spring, moved)
+        anchor = np.array(spring.anchor) if solid is None else in_frame(solid, spring.anchor)
+        found.append(Ends(*fields, in_frame(body, spring.point), anchor, spring.slack))
     return found

@@ -1,4 +1,4 @@
-"""The largest time step at which an explicit simulation of a scene is likely to be stable."""
+"""Estimates of the largest stable time step of a scene."""
 
 from collections.abc import Sequence
 from math import inf, sqrt
@@ -18,17 +18,19 @@ from cortado.scene.springs import spring_limit
 
 
 def greatest_fall(scene: SceneTables, gravity: Points) -> float:
-    """Return the greatest energy per mass [J/kg] of fluid after a fall through the room, with gravity (k, d) [m/s2]."""
+    """Return the greatest energy per mass [J/kg] of fluid that falls through the room, with gravity (k, d) [m/s2]."""
     lower, upper = _extent(scene)
     return float((np.abs(gravity) @ (upper - lower)).max())
 
 
 def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arrays) -> float:
-    """Return the greatest energy per mass [J/kg] that gravity (k, d) [m/s2] gives to fluid which falls to the foot of a
-    solid. It falls from the highest place at the start of any fluid, free body or outlet; ``values`` of parameters
-    replace the scene's. If something else can raise fluid or lower the solid, return the `greatest_fall`. This is so if
-    gravity changes or acts along a period, if the solid is free, or if solids follow paths, convey, or start elsewhere.
-    Rows of ``values`` for the steps of a path are ignored."""
+    """Return the greatest energy per mass [J/kg] of fluid that falls to the lowest point of a solid, with gravity (k,
+    d) [m/s2] and ``values`` of parameters that replace the scene's.
+
+    The fall begins at the highest point of initial fluid, free bodies and outlets. The result is `greatest_fall` if
+    something else can raise fluid or lower the solid: gravity that changes or acts along a period, or solids that are
+    free, follow paths, convey, or start elsewhere. Rows of ``values`` for the steps of a path are ignored.
+    """
     whole = greatest_fall(scene, gravity)
     around = scene.periods[1] > 0.0
     stirred = greatest_speed(told(scene.solid), values) > 0.0 or any(one.surface_velocity for one in scene.solid)
@@ -55,15 +57,14 @@ def _begins(scene: SceneTables, values: Arrays) -> list[tuple[Points, Points]]:
 
 
 def _extent(scene: SceneTables) -> tuple[Points, Points]:
-    """Return the box through which fluid may fall: lower and upper corner, each (d,) [m]."""
     lower, upper = _room(scene)
     outlets = np.array([lower, upper, *(emitter.outlet for emitter in scene.emitter)])
     return outlets.min(axis=0), outlets.max(axis=0)
 
 
 def _room(scene: SceneTables) -> tuple[Points, Points]:
-    """Return the box of the container: lower and upper corner, each (d,) [m]. Without a container it is the box around
-    the fluids and the solids, or around the outlets if there are only emitters."""
+    """Return the corners, each (d,) [m], of the container's box, or else of the box around fluids, solids or
+    outlets."""
     ends = scene.container.extent()
     if ends is not None:
         return ends
@@ -78,44 +79,33 @@ def _room(scene: SceneTables) -> tuple[Points, Points]:
 
 
 VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65)}
-"""By the form of the viscous force: a function of its greatest rate on a lattice, and the fraction used of a lattice's
-longest step. The margin is for fluid off the lattice and beside walls. Drops, colliding jets and dams, in the plane and
-in space, with every kernel, were stable at these steps, and unstable at steps a quarter to a half longer."""
+"""Function for the greatest rate on a lattice, and fraction of a lattice's longest step for fluid off the lattice and
+beside walls, by the form of the viscous force."""
 
 
 DEPTH_FACTORS = {"cubic_spline": 1.8, "wendland_c2": 1.6, "wendland_c4": 1.2}
-"""By the kernel, C in the limit C s^(3/2) / (H sqrt(g)) of fluid that rests H deep with a support of 2 spacings s.
-
-The bottom is compressed until pressure has built up, and the more so the deeper the fluid. Water at rest, 20 to 80
-spacings deep in the plane and up to 32 in space, was stable at the limit and diverged at 1.1 to 1.4 times it. A step
-took 5 to 200 pressure iterations; just 5 were too few at 20 spacings.
-"""
+"""C by the kernel in the limit C s^(3/2) / (H sqrt(g)) for resting fluid of depth H, with a support of 2 spacings s."""
 
 
 RESTING, RUNNING = 0.63, 0.4
-"""C in the limit C s / sqrt(H |g|) for fluid H deep, with a coarse grid, which passes pressure down within one step.
-The first value is for fluid that covers the floor of its container, the second for fluid with room to run out. Water at
-rest sinks at C = 0.8. Dams, whose fronts move at 2 sqrt(H |g|), are compressed by a quarter more at 0.5. At 0.6
-particles reach 2.7 times their density; before repairs were bounded, dams diverged at 0.5."""
+"""C in the limit C s / sqrt(H |g|) for fluid of depth H with a coarse grid. RESTING is for fluid that covers the floor
+of its container, RUNNING for fluid with room to run out, such as a dam."""
 
 
 SOLID_STEP = 0.2
-"""In spacings: largest motion of a solid in a step."""
+"""Largest motion of a solid in a step [spacings]."""
 FRICTION_STEP = 0.25
-"""nu dt / s^2 up to which free bodies without slip move correctly. A disc that settles between walls is 2 % too fast at
-0.25, and 3, 7 and 12 % at 0.36, 0.72 and 1.44, with 12 particles across; with 24 it is 2, 2, 3 and 4 %."""
+"""nu dt / s² up to which free bodies without slip move correctly, within 2 % for a disc that settles between walls."""
 
 BESIDE, THROUGH = 0.4, 0.25
-"""Largest motion of fluid in a step that keeps it out of a solid, in spacings and as a fraction of the solid's
-thickness. In funnels with walls 3 to 10 spacings thick steps of 0.5 spacings failed with PCISPH, steps of 0.8 with the
-projection. With walls 1.25 to 2 spacings thick steps of 0.4 to 0.65 of the thickness failed."""
+"""Largest motion of fluid in a step beside a solid, in spacings and as a fraction of the solid's thickness."""
 
 
 def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
-    """Return by name the bounds [s] of adaptive time steps that hold at any speed of the fluid: the `standing_limits`
-    and the key ``greatest_time_step``. Gravity in ``values`` bounds each step separately (`gravity_limits`), so here
-    the scene's gravity is used, or the weakest of a schedule. Paths of solids are treated likewise. If nothing else
-    bounds the steps, the strongest gravity and the fastest part of a path bound all of them."""
+    """Return by name the bounds [s] of adaptive time steps that hold at any speed of the fluid: `standing_limits` and
+    the key ``greatest_time_step``. Gravity in ``values`` and paths of solids bound each step separately
+    (`gravity_limits`), so the scene's gravity is used, or the weakest of a schedule. If nothing else bounds the steps,
+    the strongest gravity and the fastest part of a path bound all steps."""
     own = {name: value for name, value in (values or {}).items() if name != "gravity"}
     found = standing_limits(scene, own, [solid for solid in scene.solid if solid.is_steady])
     if scene.schedule.leads_gravity:
@@ -127,20 +117,18 @@ def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str,
 
 
 def longest_step(scene: SceneTables) -> float:
-    """Return the time step [s]; in a scene with adaptive steps, their upper bound."""
     size = scene.solver.time_step
     return min(chosen_limits(scene).values()) if size == "auto" else size
 
 
 def broken_limits(scene: SceneTables, values: Arrays, time_step: float) -> list[tuple[str, float]]:
-    """Return the `stability_limits` that a time step exceeds, smallest first: each with its name and the limit [s]."""
+    """Return the names and values [s] of the `stability_limits` that a time step exceeds, smallest first."""
     limits = sorted(stability_limits(scene, values).items(), key=lambda item: item[1])
     return [(name, limit) for name, limit in limits if time_step > limit * (1.0 + 1e-9)]
 
 
 def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> str:
-    """Return advice for a run that diverged, with ``values`` of parameters that replace the scene's. It names the limit
-    that the time step [s] exceeds, if any; adaptive steps exceed no limit."""
+    """Return advice for a run that diverged with a time step [s]; ``values`` of parameters replace the scene's."""
     if scene.solver.chooses:
         return "try a smaller solver.courant or solver.greatest_time_step, or more pressure iterations"
     broken = broken_limits(scene, values, time_step)
@@ -158,23 +146,23 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     its fluid falls from the outlet.
 
     Solids: beside a solid, fluid moves at most 0.4 spacings in a step, and at most a quarter of the solid's thickness.
-    The fluid's speed is taken as that of a fall from where fluid is highest at the start to the foot of the solid;
-    exceptions are in `fall_to`.
+    The fluid's speed is the initial speed plus that of the fall in `fall_to`.
 
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: a fraction of 2 rho / (mu l), the longest stable explicit step
     on a lattice, where l is the greatest rate of the viscous force's form, see `VISCOUS_RATES`. mu is that of the most
     viscous and rho that of the lightest phase in use, as they may meet. For the pairwise form with the cubic spline it
     is about 0.023 h^2 rho / mu.
 
-    Depth: C s^(3/2) / (H sqrt(|g|)) for fluid H deep and the spacing s, see `DEPTH_FACTORS`; the limit is proportional
-    to the support. With a coarse grid it is C s / sqrt(H |g|), see `RESTING`. In a container that leans, H is the depth
-    in the lowest corner once the surface is level: the height of the fluid and half its width, each along gravity.
+    Depth: C s^(3/2) / (H sqrt(|g|)) for fluid of depth H and the spacing s, see `DEPTH_FACTORS`; the limit is
+    proportional to the support. With a coarse grid it is C s / sqrt(H |g|), see `RESTING`. In a container that leans, H
+    is the depth in the lowest corner once the surface is level: the height of the fluid and half its width, each along
+    gravity.
 
-    Friction: 0.25 s^2 / nu if free bodies have no slip. With longer steps they move too fast, because pressure and
-    friction act one after the other. nu is the greatest viscosity over the smallest density.
+    Friction: 0.25 s^2 / nu if free bodies have no slip, with the greatest viscosity over the smallest density as nu.
+    Longer steps make free bodies too fast, because pressure and friction act one after the other.
 
     Moving solids move at most a fifth of a spacing in a step, and fluid near a sink at most 0.4 spacings. Optional
-    forces have limits of their own, in the registry of parameters.
+    forces have limits in the registry of parameters.
 
     ``values``: parameters by name that replace the scene's and its schedule's; of a changing gravity the strongest is
     used.
@@ -188,7 +176,7 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
 
 
 def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTable]) -> dict[str, float]:
-    """Return the `stability_limits` [s] that do not depend on the fluid's speed, given the speed of moving solids."""
+    """Return the `stability_limits` [s] that do not depend on the fluid's speed, with these moving solids."""
     viscous = inf if is_implicit(scene) else viscous_limit(scene, values)
     own = {**_other_limits(scene, values), "viscosity": viscous}
     if (fastest := greatest_speed(solids, values)) > 0.0:
@@ -211,7 +199,6 @@ def gravity_limits(scene: SceneTables, gravity: Points) -> dict[str, Points]:
 
 
 def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
-    """Return the `standing_limits` [s] except that of viscosity."""
     gravity = np.atleast_2d(values.get("gravity", _gravity(scene)))
     of_gravity = {name: float(limits.min()) for name, limits in gravity_limits(scene, gravity).items()}
     optional = {
@@ -223,8 +210,7 @@ def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
 
 
 def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
-    """Test whether the viscous force is computed implicitly, at the end of a step; ``values`` of parameters replace the
-    scene's."""
+    """Test whether the viscous force is computed implicitly; ``values`` of parameters replace the scene's."""
     values = values or {}
     if scene.forces.viscosity != "stress" or scene.forces.viscous_solve == "explicit":
         return False
@@ -236,7 +222,7 @@ def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
 
 
 def _gravity(scene: SceneTables) -> Points:
-    """Return the scene's gravity (d,) [m/s2], or (k, d) at the times of its schedule if that changes gravity."""
+    """Return the scene's gravity (d,) [m/s2], or (k, d) at the times of a schedule that changes gravity."""
     courses = scene.schedule.courses
     if "tilt" in courses:
         return Tilt(scene.forces.gravity).gravity(courses["tilt"].seen)
@@ -244,7 +230,7 @@ def _gravity(scene: SceneTables) -> Points:
 
 
 def _first_speed(scene: SceneTables, values: Arrays) -> float:
-    """Return the greatest initial speed of fluid, or speed at which fluid leaves an emitter [m/s]."""
+    """Return the greatest speed of fluid at the start and at outlets of emitters [m/s]."""
     if "initial_velocities" in values:
         speed = float(np.linalg.norm(values["initial_velocities"], axis=1).max())
     else:
@@ -257,7 +243,6 @@ def _first_speed(scene: SceneTables, values: Arrays) -> float:
 
 
 def viscous_limit(scene: SceneTables, values: Arrays) -> float:
-    """Return the longest step at which explicit viscosity is likely to be stable [s]."""
     kinematic = _kinematic(scene, values)
     if kinematic <= 0.0:
         return inf
@@ -268,8 +253,8 @@ def viscous_limit(scene: SceneTables, values: Arrays) -> float:
 
 
 def _kinematic(scene: SceneTables, values: Arrays) -> float:
-    """Return the greatest kinematic viscosity [m2/s], that of the most viscous phase over the density of the lightest
-    in use, as they may meet; 0 without viscosity."""
+    """Return the greatest kinematic viscosity [m2/s]: the viscosity of the most viscous phase over the density of the
+    lightest, as they may meet; 0 without viscosity."""
     if scene.forces.viscosity == "none":
         return 0.0
     names = {body.phase for body in (*scene.fluid, *scene.emitter)}
@@ -282,8 +267,7 @@ def _kinematic(scene: SceneTables, values: Arrays) -> float:
 
 
 def _beside_solids(scene: SceneTables, first: float, gravity: Points, values: Arrays) -> float:
-    """Return the longest step [s] for fluid of a first speed [m/s] beside solids. Solids that fluid is inside of, or
-    never comes to, set no limit (infinite)."""
+    """Return the longest step [s] for fluid with an initial speed ``first`` [m/s] beside solids; may be infinite."""
     spacing, found = scene.discretisation.spacing, [inf]
     for solid in scene.solid:
         speed = first + sqrt(2.0 * fall_to(scene, solid, gravity, values))
@@ -313,7 +297,7 @@ def _depth_limits(scene: SceneTables, gravity: Points) -> Points:
 
 
 def _covers_floor(scene: SceneTables, upright: Points) -> Points:
-    """Return a mask (k,): the fluid is as wide as the container, to a spacing, along all axes but ``upright`` (k,)."""
+    """Return a mask (k,): True if the fluid is as wide as the container along all axes but ``upright`` (k,)."""
     ends = scene.container.extent()
     if ends is None:
         return np.zeros(len(upright), dtype=bool)
@@ -322,7 +306,7 @@ def _covers_floor(scene: SceneTables, upright: Points) -> Points:
 
 
 def fluid_lengths(scene: SceneTables) -> Points:
-    """Return the lengths (d,) [m] of the fluid along each axis at the start, without the gaps between bodies."""
+    """Return the lengths (d,) [m] of the initial fluid along each axis, without the gaps between bodies."""
     spacing = scene.discretisation.spacing
     extents = np.array([fluid.extent(spacing) for fluid in scene.fluid])
     return np.array([_covered(extents[:, :, axis], spacing) for axis in range(scene.dimension)])

@@ -1,11 +1,9 @@
-"""Tables of a scene: the types of their fields, for pydantic, their base class, and the sentences of errors, with words
-from the JSON schemas of the tables.
+"""Base class of the tables of a scene, types of their fields for pydantic, and the sentences of errors.
 
-A field is ``Annotated[float, quantity("kg/m3", gt=0.0)]``. Pydantic checks its value, and describes it in the JSON
-schema of its table. Error sentences are built from this schema, so that checks, sentences and the help of an editor
-always agree. A wrong value raises a `SceneError`, whether the scene comes from a file or is built in Python. In
-schemas, the docstrings below fields become descriptions. They are read from the source only when a schema is requested,
-because reading them while models are built would delay every process by a third of a second.
+A field is ``Annotated[float, quantity("kg/m3", gt=0.0)]``. Pydantic checks the value of a field, and describes the
+field in the JSON schema of its table. Error sentences come from this schema. A wrong value raises a `SceneError`. The
+docstrings below fields become descriptions in schemas. Python reads these docstrings from the source only when a schema
+is requested, because that takes a third of a second.
 """
 
 import ast
@@ -43,11 +41,7 @@ FieldPath = Sequence[str | int]
 
 @dataclass(frozen=True, repr=False)
 class FieldError:
-    """An error in a field: its path, what was found, and what was expected.
-
-    Its ``repr`` hides the value that was found: pydantic would put the value, which may be of any length, into
-    messages.
-    """
+    """An error in a field; ``repr`` hides the value found, which may be of any length, from pydantic's messages."""
 
     path: tuple[str | int, ...]
     found: Any
@@ -56,8 +50,14 @@ class FieldError:
 
 
 def field_error(path: FieldPath, found: Any, wanted: str, sentence: str | None = None) -> PydanticCustomError:
-    """Build the exception that a check raises; the path (names and indices) starts at the model under check."""
+    """Build the exception that a check raises; ``path`` starts at the model under check."""
     return PydanticCustomError("scene", "wrong value", {"error": FieldError(tuple(path), found, wanted, sentence)})
+
+
+def check_name(path: FieldPath, name: str | None, names: Sequence[str], kind: str, otherwise: str = "") -> None:
+    """Raise a `field_error` if a name is not in ``names``; ``otherwise`` is the advice if ``names`` is empty."""
+    if name not in names:
+        raise field_error(path, name, f"the name of {kind}, of {shown(names)}" if names else otherwise)
 
 
 def quantity(unit: str = "-", *, gt: float | None = None, ge: float = -GREATEST, le: float = GREATEST) -> Any:
@@ -67,19 +67,19 @@ def quantity(unit: str = "-", *, gt: float | None = None, ge: float = -GREATEST,
 
 
 def count(least: int, most: int) -> Any:
-    """Describe a field with a whole number between two ends."""
+    """Describe a field with an integer from ``least`` to ``most``."""
     return Field(strict=True, ge=least, le=most)
 
 
 def components(*names: str) -> Any:
-    """Describe a field with a list of named components, the same number in 2-D and 3-D, such as a colour."""
+    """Describe a field with a list of named components, equal in 2-D and 3-D, such as a colour."""
     extra: Any = {"components": list(names)}
     return Field(min_length=len(names), max_length=len(names), fail_fast=True, json_schema_extra=extra)
 
 
 @dataclass(frozen=True)
 class OneOf:
-    """A mark of a field whose value must be one of the names of a registry."""
+    """Mark of a field whose value must be a name in a registry."""
 
     names: Collection[str]
 
@@ -89,7 +89,7 @@ class OneOf:
 
 @dataclass(frozen=True)
 class OrWord:
-    """A mark of a field whose value is a number, or a word for a way to choose the number."""
+    """Mark of a field whose value is a number or a certain word."""
 
     number: Any
     """The number's `quantity`."""
@@ -109,21 +109,17 @@ class OrWord:
 
 Item = TypeVar("Item")
 PER_AXIS = "per axis"
-"""Mark of the fields with one component for each axis of the scene."""
 Vector = Annotated[tuple[Item, ...], PER_AXIS, Field(min_length=2, max_length=3, fail_fast=True)]
-"""One component for each axis: a vector, or flags. The default in 2-D is the first two components of that in 3-D."""
+"""A vector or flags, one for each axis. The 2-D default is the first two components of the 3-D default."""
 Several = Annotated[tuple[Item, ...], Field(min_length=1, fail_fast=True)]
-"""A list of at least one entry."""
 Text = Annotated[str, Field(strict=True, pattern=r"\S")]
-"""A text with at least one visible character."""
 Flag = Annotated[bool, Field(strict=True)]
-"""Yes or no."""
 Length = Annotated[float, quantity("m")]
 Colour = Annotated[tuple[Annotated[float, quantity(ge=0.0, le=1.0)], ...], components("red", "green", "blue")]
 
 
 def without_numpy(value: Any) -> Any:
-    """Return a value with NumPy's arrays and numbers, also inside a list, converted to Python's lists and numbers."""
+    """Convert NumPy's arrays and numbers, also inside a list, to Python's lists and numbers."""
     if isinstance(value, (list, tuple)):
         return [entry.tolist() if isinstance(entry, (np.ndarray, np.generic)) else entry for entry in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
@@ -136,18 +132,11 @@ def _in_a_list(value: Any) -> Any:
     return [value] if isinstance(value, (int, float)) else value
 
 
-Rotation = Annotated[tuple[Angle, ...], Field(min_length=1, max_length=3, fail_fast=True), BeforeValidator(_in_a_list)]
-Turning = Annotated[
-    tuple[Annotated[float, quantity("rad/s")], ...],
-    Field(min_length=1, max_length=3, fail_fast=True),
-    BeforeValidator(_in_a_list),
-]
-Radii = Annotated[
-    tuple[Annotated[float, quantity("m", gt=0.0)], ...],
-    Field(min_length=1, max_length=3, fail_fast=True),
-    BeforeValidator(_in_a_list),
-]
-
+Few = Annotated[tuple[Item, ...], Field(min_length=1, max_length=3, fail_fast=True), BeforeValidator(_in_a_list)]
+"""One number in 2-D, or a list of three in 3-D."""
+Rotation = Few[Angle]
+Turning = Few[Annotated[float, quantity("rad/s")]]
+Radii = Few[Annotated[float, quantity("m", gt=0.0)]]
 Inertia = Annotated[
     tuple[Annotated[float, quantity("kg m2")], ...],
     Field(min_length=1, max_length=9, fail_fast=True),
@@ -156,14 +145,14 @@ Inertia = Annotated[
 
 
 def check_turn(path: FieldPath, value: tuple[float, ...] | None, dimension: int) -> None:
-    """Check that a rotation or an angular velocity, if given, is a number in 2-D and a vector in 3-D."""
+    """Check that a rotation or an angular velocity has 1 component in 2-D and 3 in 3-D; None is allowed."""
     if value is not None and len(value) != 2 * dimension - 3:
         wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
         raise field_error(path, value, wanted)
 
 
 def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return the matrix (d, d) of a rotation vector [rad], in 2-D of an angle."""
+    """Return the matrix (d, d) of a rotation vector (3,) in 3-D or an angle (1,) in 2-D [rad]."""
     from scipy.spatial.transform import Rotation as Turn
 
     if len(rotation) == 1:
@@ -172,7 +161,7 @@ def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
 
 
 def field_docstrings(cls: type) -> dict[str, str]:
-    """Return the docstrings of fields by name, including those of parent classes; empty for a class without source."""
+    """Return the docstrings of fields by name, including those of parent classes; empty without source code."""
     found: dict[str, str] = {}
     for one in reversed(cls.__mro__):
         found |= _of_module(one.__module__).get(one.__qualname__, {})
@@ -181,7 +170,6 @@ def field_docstrings(cls: type) -> dict[str, str]:
 
 @cache
 def _of_module(name: str) -> dict[str, dict[str, str]]:
-    """Return the docstrings of the fields of a module's top-level classes."""
     try:
         source = inspect.getsource(modules[name])
     except (KeyError, OSError, TypeError):
@@ -199,22 +187,29 @@ def _in_body(node: ast.ClassDef) -> dict[str, str]:
 
 
 MOST_HOMES = 2
-"""Most tables that an error names as having a key which was given in the wrong table."""
 UNKNOWN = Words("unknown")
-"""The value reported for a key that its table does not have."""
 
 
 @contextmanager
 def sentences(model: type[BaseModel]) -> Iterator[None]:
-    """Convert the first error that pydantic reports about a model into a `SceneError`."""
+    """Convert pydantic's first error about a model into a `SceneError`."""
     try:
         yield
     except ValidationError as error:
         raise _scene_error(error, model) from None
 
 
+@contextmanager
+def usable_file(path: FieldPath, file: str | None, wanted: str) -> Iterator[None]:
+    """Convert an `InputError` about a file into a `field_error` of the field that names the file."""
+    try:
+        yield
+    except InputError as error:
+        raise field_error(path, file, wanted, f"cannot be used: {error}") from None
+
+
 def field_name(path: FieldPath) -> str:
-    """Write a path such as ``("fluid", 0, "upper")`` as ``fluid[0].upper``."""
+    """Convert a path such as ``("fluid", 0, "upper")`` to ``fluid[0].upper``."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -251,8 +246,7 @@ def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
 
 
 def _homes(whole: Schema, path: FieldPath) -> list[str]:
-    """Return the other places in a JSON schema that have the key at the end of a path, such as ``forces.gravity``;
-    empty if no other table, or too many, have it."""
+    """Return the other paths in a JSON schema with the same last key; empty if there are more than `MOST_HOMES`."""
     key, own = path[-1], tuple(part for part in path if not isinstance(part, int))
     found = [home for home in dict.fromkeys(_fields(whole, whole, ())) if home[-1] == key and home != own]
     words = [field_name(home) if len(home) > 1 else f"{key} at the top of the file" for home in found]
@@ -260,7 +254,6 @@ def _homes(whole: Schema, path: FieldPath) -> list[str]:
 
 
 def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]:
-    """Yield the paths of all keys in a part of a JSON schema that is itself at a path, also inside lists and unions."""
     if "$ref" in part:
         part = whole["$defs"][part["$ref"].rpartition("/")[2]]
     for name, field in part.get("properties", {}).items():
@@ -278,8 +271,7 @@ def _is_out_of_size(number: float, schema: Schema) -> bool:
 
 
 def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | int]]:
-    """Return the part of a JSON schema at a pydantic location, and the path to it. A location also names the member of
-    a union; a path does not."""
+    """Return the part of a JSON schema at a location from pydantic, and its path without names of union members."""
     part, path = whole, list[str | int]()
     for step in location:
         if "discriminator" in part:
@@ -300,7 +292,6 @@ def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | i
 
 
 def _whole(part: Schema) -> Schema:
-    """Return the schema of a table that is written inline, and not among the named ones."""
     return part["allOf"][0] if "allOf" in part else part
 
 
@@ -322,15 +313,14 @@ ALSO_CALLED = {
     **{"type": ("kind", "shape"), "n": ("flow_index",), "cfl": ("courant",), "omega": ("angular_velocity",)},
     **{"angle": ("rotation",), "csv": ("path", "file"), "file": ("path",), "path": ("file",), "fps": ("frame_rate",)},
 }
-"""Keys of Cortado, by the names that other programs use for them."""
 
 
 class Table(BaseModel, metaclass=Documented):
-    """A table of the scene: immutable, without unknown keys; any wrong value raises a `SceneError`."""
+    """A table of a scene: immutable, without unknown keys. A wrong value raises a `SceneError`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     beside: ClassVar[tuple[str, ...]] = ()
-    """Tables of other modules that a file may contain besides these keys; used only for advice."""
+    """Other tables that a file may contain, for advice about unknown keys."""
 
     def __init__(self, /, **data: Any):
         with sentences(type(self)):
@@ -357,7 +347,6 @@ class Table(BaseModel, metaclass=Documented):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Return the JSON schema with the docstrings of the table and of its fields as their descriptions."""
         schema = handler(core_schema)
         own = handler.resolve_ref_schema(schema)
         properties = own.get("properties", {})
@@ -370,28 +359,20 @@ class Table(BaseModel, metaclass=Documented):
         return schema
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """Return this table, at a path, for 2 or 3 dimensions: vectors are checked, and missing ones filled in."""
-        filled = {}
-        for name, field in type(self).model_fields.items():
-            if PER_AXIS in field.metadata:
-                value = getattr(self, name)
-                filled[name] = value if name in self.model_fields_set else value[:dimension]
-                if len(filled[name]) != dimension:
-                    raise components_error((*path, name), value, dimension)
-        return self.model_copy(update=filled)
+        """Return the table for 2 or 3 dimensions, with checked vectors, of which defaults are cut to ``dimension``."""
+        vectors = [name for name, field in type(self).model_fields.items() if PER_AXIS in field.metadata]
+        defaults = {name: getattr(self, name)[:dimension] for name in vectors if name not in self.model_fields_set}
+        placed = self.model_copy(update=defaults)
+        placed.check_components(vectors, dimension, path)
+        return placed
 
     def check_components(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
-        """Raise a `field_error` for each of these fields that does not have one component for each dimension."""
+        """Raise a `field_error` if one of these fields does not have ``dimension`` components."""
         for name in names:
             value = getattr(self, name, None)
             if value is not None and len(value) != dimension:
-                raise components_error((*path, name), value, dimension)
-
-
-def components_error(path: FieldPath, value: Any, dimension: int) -> PydanticCustomError:
-    """Build the error for a vector whose number of components differs from the number of dimensions."""
-    wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
-    return field_error(path, value, wanted)
+                wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
+                raise field_error((*path, name), value, wanted)
 
 
 def _unknown_key(key: str, known: list[str]) -> PydanticCustomError:
