@@ -107,7 +107,7 @@ class EmitterTable(FluidBody, FlowTable):
     path: OutletPath | None = None
     """Middle of the opening over time; if left out, the opening stays at `outlet`."""
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """Largest offset of a particle from its lattice position in its layer, along each axis of the opening [spacings];
+    """Largest offset of a particle from its lattice position in its layer, along each axis of the opening, in spacings;
     equal in all runs. With the solver "projection" the default is 0.05, because a stream on an exact lattice is too
     wide."""
 

@@ -165,7 +165,7 @@ class DiscretisationTable(Table):
     out, too."""
 
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """Largest offset of a particle from its initial position, along each axis [spacings]; equal in all runs. With the
+    """Largest offset of a particle from its initial position, along each axis, in spacings; equal in all runs. With the
     solver "projection" and all axes periodic the default is 0.05, because fluid on an exact lattice is too stiff.
     Points of files are not moved."""
 
