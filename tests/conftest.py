@@ -9,10 +9,9 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-import warp as wp
 from matplotlib.image import imsave
 
-from compiling_notice import FLAGS, without_compiling
+from compiling_notice import FLAGS, compile_fast, without_compiling
 from cortado.cli import main
 from cortado.cli.subcommands import CORTADO
 from cortado.device.threads import CORES, usable_cores
@@ -24,7 +23,7 @@ collect_ignore = ["test_reference.py", "test_reference_projection.py", "test_stu
 collect_ignore += ["test_study_figures.py", "test_study_growth.py"]
 collect_ignore = collect_ignore if WITHOUT_ENGINE else []
 
-wp.config.cpu_compiler_flags = FLAGS
+compile_fast(FLAGS)
 gc.set_threshold(100_000, 20, 20)
 """Launches make so many small objects that looking for those in circles takes a tenth of the tests' time otherwise."""
 

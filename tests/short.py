@@ -63,7 +63,6 @@ KEPT = {
     "test_projection": {
         "test_a_step_is_that_of_the_twin[space]",
     },
-    "test_ranges": {"test_any_number_of_ranges_gives_the_same_bits[the projection]"},
     "test_reference_projection": {
         "test_it_is_the_projection_of_the_warp_engine[plane]",
         "test_steps_are_those_of_the_twin[scene-wendland_c2]",

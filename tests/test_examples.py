@@ -19,7 +19,7 @@ import cortado.cli.optimise
 import cortado.cli.run
 import cortado.cli.subcommands
 import cortado.cli.sweep
-from compiling_notice import SAME_FLAGS, without_compiling
+from compiling_notice import SAME_KERNELS, without_compiling
 from cortado import CortadoWarning, load_scene
 from cortado.cli import main
 from cortado.cli.subcommands import new_scene, templates
@@ -72,7 +72,7 @@ def test_there_are_eleven_short_ones():
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_an_example_ends_well(name, tmp_path):
-    (tmp_path / name).write_text(SAME_FLAGS + source_of(name))
+    (tmp_path / name).write_text(SAME_KERNELS + source_of(name))
     done = run(tmp_path / name, tmp_path)
     assert done.returncode == 0, done.stderr
     written = sorted(path.name for path in tmp_path.iterdir() if path.name != name)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import cortado
-from compiling_notice import SAME_FLAGS
+from compiling_notice import SAME_KERNELS
 from conftest import COLLECTED, VALIDATION, tier
 from cortado.lazy import FUNCTIONS, on_top
 from module_graph import all_before, loaded_before, sources
@@ -136,7 +136,7 @@ assert cortado.optimise(problem, {"gravity": [0.1, -9.0]}, cortado.optimisers.Gr
 def test_the_core_stands_alone():
     """All of it is imported, and used, where nothing that lies on top of it can be."""
     core = [name for name in MODULES if not is_on_top(name) and name != "reference"]
-    program = SAME_FLAGS + STANDING_ALONE.replace("{on_top}", repr(ON_TOP)).replace("{core}", repr(core))
+    program = SAME_KERNELS + STANDING_ALONE.replace("{on_top}", repr(ON_TOP)).replace("{core}", repr(core))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT.parent), str(Path(__file__).parent)])}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr

@@ -14,7 +14,7 @@ import pytest
 
 import cortado
 from bad_scenes import one_sentence
-from compiling_notice import SAME_FLAGS
+from compiling_notice import SAME_KERNELS
 from cortado import ComputationError, InputError, Scene, SceneError, Simulation, load_scene, reference
 from cortado.scene.packages import guarded
 from own_forces import Breeze
@@ -126,7 +126,7 @@ def test_they_are_there_in_processes_of_their_own(tmp_path):
     paths = [str(tmp_path), str(Path(__file__).parent)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     out = ["--steps", "2", "--out", str(tmp_path / "out"), "--no-pictures"]
-    program = SAME_FLAGS + "import runpy; runpy.run_module('cortado', run_name='__main__')"
+    program = SAME_KERNELS + "import runpy; runpy.run_module('cortado', run_name='__main__')"
     run = [sys.executable, "-c", program, "run", str(scene), *out]
     done = subprocess.run(run, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr

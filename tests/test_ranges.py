@@ -12,7 +12,7 @@ import cortado
 from cortado import Problem, Simulation, forces, gradients
 from cortado.device import launching
 from cortado.device.launching import KernelLauncher
-from scenes import MIXING, Weighed, box, jet, plane_of_three, scene, splash, two_layers
+from scenes import MIXING, Weighed, box, jet, plane, plane_of_three, scene, splash, two_layers
 from test_faces import flume
 
 ROOT = Path(cortado.__file__).parent
@@ -44,7 +44,8 @@ CASES = {
         container=NO_SLIP,
     ),
     "forces of one's own": splash,
-    "the projection": lambda: two_layers(solver=PROJECTION),
+    "the projection": lambda: plane(solver=PROJECTION),
+    "the projection of two layers": lambda: two_layers(solver=PROJECTION),
     "velocities that follow": lambda: two_layers(solver=PROJECTION | {"velocities_follow": True}),
     "a solid that moves": lambda: scene(solid=[BALL | ALONG], solver=PROJECTION),
     "a solid that moves, PCISPH, stress": lambda: scene(forces=STRESS, solid=[BALL | ALONG]),
