@@ -203,10 +203,10 @@ def at_the_line_of_another():
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: either, "either has 'a or b', which is one of its numbers in Python and a truth in Warp"),
+        (lambda: either, "either has 'a or b', which is an operand in Python but True or False in Warp"),
         (lambda: digits, "digits rounds to digits"),
-        (lambda: numpy_sign, "numpy_sign cannot be compiled: it calls np.sign, which is no function of Warp"),
-        (lambda: shadowed, "shadowed cannot be compiled: it calls clamp, which is no function of Warp"),
+        (lambda: numpy_sign, "numpy_sign cannot be compiled: it calls np.sign, but may only call functions of Warp"),
+        (lambda: shadowed, "shadowed cannot be compiled: it calls clamp, but may only call functions of Warp"),
         (lambda: summed, "summed cannot be compiled: it calls sum, which is no"),
         (lambda: elsewhere, r"elsewhere has the index int\(b\), but must have whole numbers there"),
         (lambda: twice_named, "twice_named gives k, which a loop counts with, another value too"),
@@ -214,7 +214,7 @@ def at_the_line_of_another():
         (lambda: helped_remainder, "calls a function of Warp with 'r % wp.float64"),
         (lambda: helped_round, "calls a function of Warp with 'round"),
         (lambda: doubled(plain), "plain is one that a decorator has put around another"),
-        (lambda: doubled_bare(plain), "call cannot be compiled: it calls function, which is no function of Warp"),
+        (lambda: doubled_bare(plain), "it calls function, but may only call functions of Warp"),
         (lambda: helped_doubled, "doubled_helper that .* calls is one that a decorator has put around another"),
         (lambda: functools.lru_cache(plain), "Rheology has <functools"),
         (lambda: functools.partial(plain), "Rheology has functools.partial"),

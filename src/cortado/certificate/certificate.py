@@ -47,8 +47,8 @@ from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
 BESIDE = 0.1 * PERTURBATION
-"""Distance, relative to the spacing, and velocity, relative to the speed of a fall, by which particles are moved off a
-corner of the loss."""
+"""Size of random changes of the first positions, in spacings, and of the first velocities, relative to the speed of a
+fall. They take fluid at rest off kinks of the loss, such as that of |v| at 0."""
 ROUGHLY = 0.1
 """Greatest accepted relative difference between the adjoint of a float32 loss and finite differences of its values."""
 

@@ -33,8 +33,8 @@ from cortado.simulation import Simulation
 
 
 def up_to(problem: Problem, steps: int) -> Problem | None:
-    """Return a problem shortened to ``steps`` steps, with its loss at the new end or its frames up to there; None if no
-    step or frame is left."""
+    """Return the problem of the first ``steps`` steps; None if no step or frame is left. A loss of the end is taken at
+    the new end, and of a `Frames` loss the frames up to the new end are kept."""
     loss: Any = problem.loss
     if isinstance(loss, Frames):
         kept = {step: one for step, one in loss.losses.items() if step <= steps}

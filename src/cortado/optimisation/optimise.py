@@ -206,7 +206,7 @@ def evaluate(
     require_function("on_result", on_result, "the number of a point", "its Estimate")
     require_methods("problem", problem, ("value",), "a cortado.Problem")
     if not isinstance(points, Iterable) or isinstance(points, (str, bytes, Mapping)):
-        raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")
+        raise InputError(f"points is {shown(points)}, but must be a list with a table of parameters for each point.")
     if loss_if_diverged is not None:
         loss_if_diverged = as_one_number("loss_if_diverged", loss_if_diverged)
     chosen = checked_executor(InProcess() if executor is None else executor)

@@ -9,8 +9,8 @@ Lists of neighbours are first made without sheets. Once in each step these hidde
 
 The sheet's wall particles fill the part of the support that the sheet hides, also at tips and holes. Positions, also of
 sheets, are those before the step: a particle ends a step on the side where it begins
-(`cortado.solvers.projection.sides`). Lists are symmetric, because a segment begins at the particle with the lower
-number. Visibility has no derivative.
+(`cortado.solvers.projection.sides`). Lists of fluid neighbours are symmetric:
+for both particles of a pair the segment from the one with the lower number is tested. Visibility has no derivative.
 """
 
 from collections.abc import Callable, Sequence

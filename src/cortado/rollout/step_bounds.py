@@ -125,7 +125,7 @@ class Pull:
     scene: Scene
     course: Knots
     upright: Callable[[NDArray], NDArray]
-    """Function from values of the course to gravity (k, d) [m/s2]."""
+    """Function that turns k values of the scheduled gravity or tilt into vectors of gravity, (k, d) [m/s2]."""
     greatest: float
     """Greatest length of a step [s]."""
 

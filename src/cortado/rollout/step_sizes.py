@@ -361,7 +361,8 @@ class ChosenSteps(StepSizes):
 
 @cache
 def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return two kernels without derivatives that choose a time step, ``speeds`` and ``choose``."""
+    """Return two kernels without derivatives: ``speeds`` computes squared speeds of particles, ``choose`` the time step
+    of each scene."""
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"step_sizes_{precision.name}")
     typed = TypesByName(real, {pair: "greatest squares", vector: "v", wp.int32: "step"})

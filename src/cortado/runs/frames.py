@@ -268,7 +268,8 @@ def _whole(times: Sequence[float] | NDArray, rate: float) -> int:
 
 
 def _speed(span: float, count: int, easy: float) -> float:
-    """Return the speed of a film of at most ``count`` frames and ``span`` [s]: ``easy`` if there are enough frames."""
+    """Return the speed of a film of at most ``count`` frames over ``span`` [s]: ``easy`` if there are enough frames for
+    it, otherwise a higher speed for which they suffice."""
     if span <= 0.0:
         return 1.0
     room = max((count - 1) / USUAL, min(FEW, count / SLOWEST))

@@ -41,8 +41,8 @@ class EverySteps:
         return {"record_every": self.steps}
 
     def is_due(self, step: int, before: float, now: float) -> bool:
-        """Test if the state after ``step`` steps is a frame, at time ``now`` after a state at ``before`` [s since the
-        start]."""
+        """Test whether the state after ``step`` steps is recorded as a frame. ``now`` is its time, ``before`` the time
+        of the state one step earlier [s since the start]."""
         return step % self.steps == 0
 
     def announced(self, rollout: Rollout) -> NDArray[Any]:

@@ -217,7 +217,7 @@ class Lattice:
     support: float
     """h [m]"""
     normalisation: float
-    """sigma [1 / m^d]."""
+    """Normalisation sigma of the smoothing kernel [1 / m^d]."""
     self_weight: float
     """W(0) [1 / m^d]."""
     volume: float

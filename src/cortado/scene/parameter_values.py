@@ -209,7 +209,7 @@ def check_known(name: str, scene: Any, what: str = "parameter", known: Known = R
 
 def require_points(points: object) -> None:
     if not isinstance(points, Sequence) or isinstance(points, (str, bytes)) or not points:
-        raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")
+        raise InputError(f"points is {shown(points)}, but must be a list with a table of parameters for each point.")
     for point in points:
         require_table("a point", point, "{'gravity': value}")
 

@@ -302,7 +302,7 @@ def _table_of(override: str) -> str:
 
 
 def _beside(file: str) -> str | None:
-    """Return a scene file in the folder of a missing file with nearly the same name; None without one."""
+    """Return the scene file whose name is closest to that of a missing file beside it; None if none is close."""
     folder, name = os.path.split(file)
     try:
         names = [one for one in os.listdir(folder or ".") if one.endswith(".toml")]

@@ -189,8 +189,9 @@ def lost_kernel(precision: Precision) -> Any:
 
         A particle is lost if it is not finite, too far away, a mixture without volume, or went through a wall: it was
         inside before the step and is outside or in a solid after it. Fluid may cross the rim of an open cup. Particles
-        from ``first_waiting`` on, in scene order, may pass walls if a nozzle or a drain moves them. ``x`` is the new
-        state in scene order; ``x_free`` and ``v_free`` are sorted and have no effect of nozzles and drains.
+        from ``first_waiting`` on, in scene order, may pass walls if a nozzle or a drain moves them. ``x``:
+        positions after the step, in scene order. ``x_free`` and ``v_free``: sorted positions and velocities after the
+        step, before nozzles and drains change them.
         """
         i = wp.tid()
         member = i // particles

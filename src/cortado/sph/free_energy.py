@@ -228,7 +228,8 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
     @fluid_sum(discretisation)
     @typed
     def spread_adjoint(x_ij, n_i, n_j, w_i, w_j, u_ij, y_i, y_ij, s) -> tuple[vector, real, real, fractions, real]:
-        """Return a pair's adjoints of x_i, n_i, w_i and u_i for an adjoint y of the sums, and y_i times the sum."""
+        """Return, for adjoints y of the sums, a pair's terms in the adjoints of x_i, n_i, w_i and u_i, and in the
+        product of y_i with the sum of i."""
         f = factor(x_ij, s)
         weight = w_i / n_j + w_j / n_i
         work = wp.dot(u_ij, y_ij)

@@ -252,8 +252,8 @@ def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
                 raise InputError(f"{what} rounds to digits, but must have round of one number alone.")
         elif not _is_of_warp(called):
             raise InputError(
-                f"{what} cannot be compiled: it calls {name}, which is no function of Warp; it must call functions of "
-                f"Warp alone, of its own under @wp.func, {', '.join(BUILTINS)}, or those of math that Warp has."
+                f"{what} cannot be compiled: it calls {name}, but may only call functions of Warp, functions under "
+                f"@wp.func, {', '.join(BUILTINS)}, and functions of math that Warp has too."
             )
 
 
@@ -270,8 +270,8 @@ def check_truths(what: str, function: ast.FunctionDef) -> None:
     truths = {name for name, values in _assigned(function).items() if all(_is_truth(v, set()) for v in values)}
     for node in ast.walk(function):
         if isinstance(node, ast.BoolOp) and node not in tests and not _is_truth(node, truths):
-            found = f"{what} has {ast.unparse(node)!r}, which is one of its numbers in Python and a truth in Warp"
-            raise InputError(f"{found}, but must have comparisons there, or x if x != 0.0 else y.")
+            found = f"{what} has {ast.unparse(node)!r}, which is an operand in Python but True or False in Warp"
+            raise InputError(f"{found}: compare the operands, or write x if x != 0.0 else y in place of x or y.")
 
 
 def check_helper(what: str, function: ast.FunctionDef) -> None:

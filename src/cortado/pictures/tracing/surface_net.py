@@ -164,8 +164,8 @@ def find_levels(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks,
 def level_blocks(
     s: Any, ends: tuple[np.ndarray, np.ndarray], cube: float, reach: float, launch: BandLauncher
 ) -> tuple[Any, wp.array]:
-    """Make `Blocks` around particles s between ``ends``, (3,) each [m], and the numbers of those that the surface may
-    pass."""
+    """Make `Blocks` over the box between the corners ``ends``, (3,) each [m], extended by ``reach`` [m], with the level
+    of particles ``s``. Return them and the indices of the blocks that the surface may cross."""
     device, wide = launch.device, WIDTH * cube
     low, high = np.floor((ends[0] - reach) / wide), np.ceil((ends[1] + reach) / wide)
     b, shape = Blocks(), (high - low).astype(int)

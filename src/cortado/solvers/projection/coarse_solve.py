@@ -31,8 +31,9 @@ ON_A_CPU = """
         return T(total);
     };
 """
-"""Functions for `SOLVE`: the scenes of a thread, `each` and `sum` over nodes, and the barrier `meet`, after which each
-thread sees the values that other threads wrote."""
+"""The names that `SOLVE` uses, on a CPU. A thread solves the scenes ``first``, ``first + teams`` and so on; the thread
+with ``lead`` writes the count; ``each`` and ``sum`` loop over nodes. After the barrier ``meet`` a thread sees what
+others wrote."""
 ON_A_GPU = """
     __shared__ T room[BLOCK];
     const int first = blockIdx.x / system.team, teams = gridDim.x / system.team, rank = blockIdx.x % system.team;

@@ -34,10 +34,10 @@ class JointArrays:
         self.whole = zeros(
             {f"{name}{suffix}": ((count, layout.members), kind) for name, (count, kind) in many.items()}, layout.device
         )
-        """K, b and lambda of all rows."""
+        """K, b and lambda of all rows (`cortado.solvers.projection.joint_kernels`)."""
         blocks, wanted, pushes = self.whole.values()
         self.entries = [{f"wanted{suffix}": wanted[k], f"push{suffix}": pushes[k]} for k in range(rows)]
-        """b and lambda of each row."""
+        """For each row its b, ``wanted``, and its lambda, ``push``."""
         self.blocks = {(k, n): {f"block{suffix}": blocks[k * rows + n]} for k in range(rows) for n in range(rows)}
 
     def side(self, k: int, other: bool) -> Arrays:

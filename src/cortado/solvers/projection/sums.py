@@ -29,10 +29,15 @@ a light one."""
 def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
     """Make the sums over neighbours; a symmetric matrix is its diagonal and its entries yz, xz and xy.
 
-    - ``moments``: M = -sum g_ij x_ij^T; Q = sum h_ij g_ij g_ij^T / m_j with h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2;
-      g = sum g_ij; the crowding sum (1 + R q / (1 + q / 4)) g_ij with q = (W_ij / W(s))^4; sum p_ij with
-      p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij; and sum V W_ij. ``per_nearest`` is 1 / (V W(s)), ``per_apart``
-      1 / (0.65 s)^2.
+    - ``moments``: six sums, with the spacing l. ``per_nearest`` is 1 / (V W(l)), ``per_apart`` 1 / (0.65 l)^2.
+
+          M = -sum g_ij x_ij^T
+          Q = sum h_ij g_ij g_ij^T / m_j,  h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2
+          g = sum g_ij
+          sum (1 + R q / (1 + q / 4)) g_ij,  q = (W_ij / W(l))^4
+          sum p_ij,  p_ij = max(1 - |x_ij|^2 / (0.65 l)^2, 0)^2 x_ij
+          sum V W_ij
+
     - ``force``: sum_j T_j g_ij with T = k L. The adjoint turns adjoints f into the symmetric part of sum f_ij g_ij^T.
     - ``velocity_gradient``: the rows of A = sum v_ij g_ij^T; the velocity gradient is A M^-1. The adjoint of v
       lacks the term A_bar_i g_i.

@@ -53,8 +53,9 @@ from cortado.sph.moment_functions import moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 EDGED = (0.1, 0.4)
-"""Squared part of a wall's push across normals, below which e is 0 and above which e is 1. It is below 0.02 along flat
-walls and in corners of a box, 0.3 at 1.5 spacings from an edge, and 0.75 diagonally in front of an edge."""
+"""Two limits of the part of |whole|^2 that is not along normals: e is 0 below the first limit and 1 above the second.
+This part is below 0.02 along flat walls and in corners of a box, 0.3 at 1.5 spacings from an edge, and 0.75 diagonally
+in front of an edge."""
 DIRECTION = 0.01
 """gamma^2 below which the direction of a wall is unknown, in parts of 0.05 a_0."""
 
