@@ -111,7 +111,7 @@ def test_what_is_hidden_is_seen_where_it_was_found(tmp_path):
 @pytest.mark.parametrize("count", [1, 3, 6])
 def test_images_are_shown_in_srgb(tmp_path, count):
     shades = [(0.05 + 0.15 * k) * np.ones((16, 24, 3)) for k in range(count)]
-    image = pixels(plots.images(shades, [f"step {k}" for k in range(count)], tmp_path / "a.png", "moments"))
+    image = pixels(plots.images(shades, [f"step {k}" for k in range(count)], tmp_path / "a.png"))
     places = []
     for shade in shades:
         level = int(to_srgb(shade)[0, 0, 0])

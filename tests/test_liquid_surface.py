@@ -13,7 +13,7 @@ from cortado.errors import ComputationError
 from cortado.pictures.exported import contained_liquid, enclosed, with_volume
 from cortado.pictures.painter import stage_of
 from cortado.pictures.tracing import liquid_surface as liquid_module
-from cortado.pictures.tracing.liquid_surface import Surface, liquid_surface
+from cortado.pictures.tracing.liquid_surface import Mesh, liquid_surface
 from cortado.pictures.tracing.near_particles import Particles
 from cortado.pictures.tracing.surface_net import Neighbours, smoothed
 from scenes import box, scene
@@ -34,7 +34,7 @@ def surface_of(positions, colours=None):
     found = liquid_surface(Particles.on(launch.device, positions, colours), SPACING, launch)
     each = (found.points, found.triangles, found.normals, found.colours)
     points, corners, normals, colours = (one.numpy() for one in each)
-    return Surface(points, corners.reshape(-1, 3), normals, colours)
+    return Mesh(points, corners.reshape(-1, 3), normals, colours)
 
 
 def mesh_of(surface):

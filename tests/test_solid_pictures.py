@@ -1,5 +1,7 @@
 """Solids in pictures: seen where they are, in front of what is behind them, without changing scenes that have none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -264,7 +266,7 @@ def test_solids_cast_a_shadow_on_the_floor():
     light = shadow_of(stage, stage.solids)
     assert 0.1 < light.min() < 0.5 and light[0, 0].min() == 1.0
     (ball,) = stage.solids
-    moved = shadow_of(stage, [ball.moved(ball.position - (0.2, 0.0, 0.0), ball.turn)])
+    moved = shadow_of(stage, [replace(ball, position=ball.position - (0.2, 0.0, 0.0))])
     places = [np.array(np.nonzero(one[..., 0] < 0.6)).mean(axis=1) for one in (light, moved)]
     cell = 2.0 * REACH * stage.size / (NODES - 1)
     np.testing.assert_allclose((places[0] - places[1]) * cell, [0.2, 0.0], atol=cell)

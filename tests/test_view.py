@@ -147,7 +147,7 @@ def test_a_run_is_played_and_gone_through(scene):
         shown.show(3)
         np.testing.assert_allclose(points(shown)[:, :2], trajectory.positions[3], atol=1e-6)
         shown.show(4)
-        assert shown.window._shown.quantities["density"]().mean() == pytest.approx(1000.0, rel=0.3)
+        assert shown.window._quantities["density"]().mean() == pytest.approx(1000.0, rel=0.3)
         shown._former -= 1.0
         shown.tick()
         assert shown.slider.value > 0
@@ -159,7 +159,7 @@ def test_what_drains_took_is_not_shown(scene):
     with window(scene, PORT + 5) as shown:
         shown.tick()
         assert (np.ravel(shown._state["drained"]) > 0.0).any() and points(shown).max() < 0.5
-        assert shown.window._shown.quantities["density"]().min() < 500.0
+        assert shown.window._quantities["density"]().min() < 500.0
         assert len(np.unique(coloured(shown, "density"), axis=0)) > 3
         assert "<span>704" in shown.window.legend.content
 

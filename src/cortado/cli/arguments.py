@@ -1,7 +1,4 @@
-"""Turn functions into commands; arguments that several commands share; and the command line as the user typed it.
-
-Values of arguments are checked here, before a command starts and imports its packages.
-"""
+"""Turn functions into commands; arguments that several commands share; and the command line as the user typed it."""
 
 import io
 import sys
@@ -40,12 +37,12 @@ Json = Annotated[bool, arg(help="Print JSON for machines.", help_behavior_hint="
 Quiet = Annotated[bool, arg(help="Say nothing but results, warnings and errors.", help_behavior_hint="")]
 
 STEPS = 200
-"""Number of steps of a run if the user gives neither steps nor a time."""
+"""Number of steps of a run if the user sets neither steps nor a time."""
 
 
 def command(group: SubcommandApp, answers: bool = False) -> Callable[[Callable[..., Work]], Callable[..., Work]]:
-    """Return a decorator that turns a function into a command of a group, with an option --quiet. A command that
-    ``answers`` prints its result; another command prints which files it wrote."""
+    """Return a decorator that turns a function into a command of a group, with an option --quiet, which hides the
+    printed text unless the command ``answers``."""
 
     def register(function: Callable[..., Work]) -> Callable[..., Work]:
         @wraps(function)
@@ -72,8 +69,6 @@ def _quiet(work: Work, answers: bool) -> str:
 
 @dataclass(frozen=True)
 class Program:
-    """A group of commands, with the name of the program that runs them."""
-
     name: str
     app: SubcommandApp
     description: str
@@ -81,13 +76,13 @@ class Program:
     """Returns the text that the program prints without arguments; if None, it prints its help."""
 
     def parsed(self, arguments: Sequence[str]) -> Any:
-        """Parse the arguments and return what their command has to do. Print help and exit if they ask for it or are
-        wrong."""
+        """Parse the arguments and return what their command has to do; print help or a complaint, and exit, for other
+        arguments."""
         config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
         return self.app.cli(prog=self.name, description=self.description, args=arguments, config=config)
 
     def completion_script(self, shell: str) -> str:
-        """Return the completion script for a shell, as tyro prints it; in bash, names of files are completed where no
+        """Return the completion script for a shell, as tyro prints it; in bash, file names are completed where no
         command or option fits."""
         box = io.StringIO()
         with redirect_stdout(box), suppress(SystemExit):
@@ -105,14 +100,12 @@ class FrameOptions:
     """Frames of the trajectory per simulated second (not of a film); instead of --record-every."""
 
     def check(self) -> None:
-        """Raise `InputError` if --record-every is too small, or if --fps is given too."""
         if self.fps is not None and self.record_every is not None:
             raise InputError("--fps is given, but must be left out, as --record-every says which states are recorded.")
         require_at_least(1, 1 if self.record_every is None else self.record_every, "--record-every")
 
     def choice(self, otherwise: int = 1) -> "FrameChoice":
-        """Return the choice of frames after checking the options: one every ``otherwise`` steps if no option is
-        given."""
+        """Return the choice of frames: by default one every ``otherwise`` steps."""
         from cortado.runs.recording import EverySteps, FramesPerSecond
 
         return EverySteps(self.record_every or otherwise) if self.fps is None else FramesPerSecond(self.fps)
@@ -123,7 +116,7 @@ ALL_FRAMES = FrameOptions()
 
 @dataclass(frozen=True)
 class Where:
-    """The options --scheduler and --workers of a command. Giving both, or too many processes, raises `InputError`."""
+    """The options --scheduler and --workers of a command; `InputError` for both together, or for too many processes."""
 
     scheduler: str | None = None
     """The address of a Dask scheduler."""
@@ -140,14 +133,13 @@ class Where:
 
     @property
     def option(self) -> str | None:
-        """Return the name of the option that was given."""
+        """Name of the option that the user set."""
         return "--scheduler" if self.scheduler is not None else None if self.workers is None else "--workers"
 
     @contextmanager
     def executor(self, device: str, items: int) -> "Iterator[Executor]":
-        """Yield the executor: a Dask scheduler or workers if the options say so, else this process. Workers end with
-        the block. On GPUs each worker has its own GPU. At most ``items`` workers start: that many computations run at a
-        time."""
+        """Yield the executor for ``items`` computations: a Dask scheduler, workers until the block ends, or this
+        process. On GPUs each worker has a separate GPU."""
         from cortado.executors import Distributed, InProcess, local_workers
 
         if self.scheduler is not None:
@@ -162,7 +154,6 @@ class Where:
 
 
 HERE = Where()
-"""Computation in this process."""
 
 
 def require_shared(out: Path, what: str) -> None:
@@ -172,20 +163,18 @@ def require_shared(out: Path, what: str) -> None:
 
 
 def require_at_least(least: int, value: int, option: str) -> None:
-    """Raise `InputError`, naming the option, for a value below ``least``."""
     if value < least:
         raise InputError(f"{option} is {value}, but must be at least {least}.")
 
 
 def require_one_of_both(resume: bool, overwrite: bool) -> None:
-    """Raise `InputError` if both --resume and --overwrite are given."""
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but exclude each other: leave one out.")
 
 
 def steps_or_time(steps: int | None, time: float | None) -> int | None:
-    """Return the number of steps, None if a time [s] is given instead, or `STEPS` without either. Giving both raises
-    `InputError`."""
+    """Return the number of steps, by default `STEPS`, or None if a time [s] is set; raise `InputError` if both are
+    set."""
     if time is None:
         return STEPS if steps is None else steps
     if steps is not None:
@@ -196,8 +185,8 @@ def steps_or_time(steps: int | None, time: float | None) -> int | None:
 
 
 def text_overrides(file: Path, overrides: Sequence[str]) -> list[str]:
-    """Return the overrides of --set for a file as text. Raise `SceneError` for an unreadable file or an unknown key.
-    This check comes before the command's imports, which take a second."""
+    """Return the overrides of --set for a file as text. Raise `SceneError` for an unreadable file or an unknown key,
+    before the command's imports, which take a second."""
     words = as_text(overrides)
     read_toml(file, words)
     return words
@@ -214,5 +203,5 @@ def as_text(options: Sequence[str]) -> list[str]:
 
 
 def command_line() -> list[str]:
-    """Return the command line as the user typed it; a run stores it in its folder."""
+    """Return the command line as the user typed it."""
     return ["cortado", *sys.argv[1:]]

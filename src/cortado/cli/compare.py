@@ -1,8 +1,5 @@
-"""``cortado compare`` compares two runs, or a run's sensors with measured data; ``cortado convergence`` several runs.
-
-For two runs: how far apart their last states are, and possible reasons. For several runs of different resolution: the
-order of convergence and the limit.
-"""
+"""``cortado compare`` compares two runs, or a run's sensors with measured data; ``cortado convergence`` several
+runs."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -28,19 +25,17 @@ IGNORED = ("command", "started", "resumed", "settings", "kind")
 SAME_TIME = 1e-9
 """Relative difference below which two times count as equal: sums of different step lengths have round-off."""
 FIELD_UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
-"""Units of the fields of a frame."""
 
 
 SPACING, TIME_STEP = "discretisation.spacing", "solver.time_step"
 SIZE_UNITS = {SPACING: "m", TIME_STEP: "s"}
 LEAST_RUNS = 3
-"""Smallest number of runs from which an order of convergence is computed."""
 SAME_MASS = 0.005
 """Relative difference below which two masses of fluid count as equal."""
 
 
 def compare_runs(first: Path, second: Path, as_json: bool) -> str:
-    """Return what is equal and what differs in two runs, as text or as JSON. Different runs are not an error."""
+    """Return what is equal and what differs in two runs, as text or as JSON."""
     found = _compared(RunFolder.open(first), RunFolder.open(second))
     return json.dumps(found, indent=2) if as_json else _in_words(found)
 
@@ -66,7 +61,6 @@ def _compared(one: RunFolder, other: RunFolder) -> dict[str, Any]:
 
 
 def _is_equal(found: Mapping[str, Any]) -> bool:
-    """Test whether two runs are equal except for the machine and the time of the run."""
     state = found["last_state"]
     same_state = state is None or (
         "unlike" not in state
@@ -110,8 +104,8 @@ def _metrics(one: RunFolder, other: RunFolder) -> dict[str, Any]:
 
 
 def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
-    """Return the distances of positions and velocities in the last frames of equal time, and these ``times_s``. None if
-    a run has no trajectory."""
+    """Compare positions, velocities and mass fractions in the last frames of equal time; None if a run has no
+    frames."""
     if not (one.trajectory.exists() and other.trajectory.exists()):
         return None
     runs = [Trajectory.load(folder.trajectory) for folder in (one, other)]
@@ -122,11 +116,7 @@ def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
     if not _at_one_time(*found["times_s"]):
         pair = _last_at_one_time(*(run.times for run in runs))
         if pair is None:
-            return {
-                **found,
-                "unlike": "these are different times, and no frames are at the same time",
-                "fields": {},
-            }
+            return {**found, "unlike": "these are different times, and no frames are at the same time", "fields": {}}
         frames = [run[k] for run, k in zip(runs, pair, strict=True)]
     found["compared_at_s"] = frames[0].time
     shapes = [frame.positions.shape for frame in frames]
@@ -137,7 +127,13 @@ def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
     for name, unit in FIELD_UNITS.items():
         values = [getattr(frame, name) for frame in frames]
         if all(value is not None for value in values) and values[0].shape == values[1].shape:
-            fields[name] = {"unit": unit, **_distance(*(value.astype(np.float64) for value in values))}
+            apart = np.linalg.norm(values[0].astype(np.float64) - values[1].astype(np.float64), axis=1)
+            fields[name] = {
+                "unit": unit,
+                "root_mean_square": float(np.sqrt(np.mean(apart**2))),
+                "greatest": float(apart.max()),
+                "particle": int(apart.argmax()),
+            }
     return {**found, "fields": fields}
 
 
@@ -147,25 +143,14 @@ def _at_one_time(one: Any, other: Any) -> Any:
 
 
 def _last_at_one_time(one: np.ndarray, other: np.ndarray) -> tuple[int, int] | None:
-    """Return the numbers of each run's frame at the last time that both runs share, given their times (frames,) [s].
-    The first frames do not count."""
+    """Return the numbers of each run's frame at the last time, after the first frames, that both runs share; times are
+    (frames,) [s]."""
     if len(one) < 2 or len(other) < 2:
         return None
     after = np.clip(np.searchsorted(other, one), 1, len(other) - 1)
     near = np.where(np.abs(other[after - 1] - one) < np.abs(other[after] - one), after - 1, after)
     same = [k for k in range(1, len(one)) if near[k] and _at_one_time(one[k], other[near[k]])]
     return (same[-1], int(near[same[-1]])) if same else None
-
-
-def _distance(one: np.ndarray, other: np.ndarray) -> dict[str, Any]:
-    """Return distances of vectors (n, d) of the same particles: root mean square, greatest, and the particle with the
-    greatest."""
-    apart = np.linalg.norm(one - other, axis=1)
-    return {
-        "root_mean_square": float(np.sqrt(np.mean(apart**2))),
-        "greatest": float(apart.max()),
-        "particle": int(apart.argmax()),
-    }
 
 
 def _in_words(found: Mapping[str, Any]) -> str:
@@ -218,8 +203,7 @@ def _metric_line(metrics: Mapping[str, Any]) -> str:
 
 
 def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
-    """Compare a run's sensors with measured data, as text or as JSON, and write a plot into the run's figures
-    folder."""
+    """Compare a run's sensors with measured data, as text or as JSON, and plot them into the run's figures folder."""
     folder = RunFolder.open(run)
     readings = folder.read_sensors()
     if not readings:
@@ -243,8 +227,6 @@ def _line(one: MeasuredColumn) -> str:
 
 
 class Resolved:
-    """One run of a convergence study, with its resolution and its results."""
-
     def __init__(self, folder: RunFolder, quantities: Sequence[OwnQuantity]):
         """Read a run and compute the user's ``quantities``; raise `InputError` for a run that failed or has not
         ended."""
@@ -258,7 +240,7 @@ class Resolved:
         """[s]"""
         masses = last.constants["reference_density"].astype(np.float64)
         self.mass = float(masses.sum()) * float(self.scene["discretisation"]["spacing"]) ** last.dimension
-        """Mass of all fluid [kg], in 2-D of a layer 1 m thick."""
+        """[kg], in 2-D of a layer 1 m thick"""
         numbers = {f"{kind} energy": ("J", float(result["energy"]["last"][kind])) for kind in ("kinetic", "potential")}
         if self.scene.get("emitter") or self.scene.get("drain"):  # in which particles rest far from the fluid
             masses = masses * is_out(folder.read_scene(), last[0].others, len(masses))
@@ -320,7 +302,7 @@ def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_jso
 
 
 def _warn_of_masses(runs: Sequence[Resolved]) -> None:
-    """Warn if runs differ in their mass of fluid: an order of convergence does not describe that difference."""
+    """Warn if runs differ in their mass of fluid, because an order of convergence does not describe that difference."""
     least, most = (choose(runs, key=lambda run: run.mass) for choose in (min, max))
     if most.mass > (1.0 + SAME_MASS) * least.mass:
         warn(
@@ -345,13 +327,10 @@ def _varied(runs: Sequence[Resolved]) -> str:
 
 
 def _convergence_in_words(table: dict[str, Any]) -> str:
-    """Return the convergence table as text: a line for each result, with the finest run on the right."""
     key = table["by"]
     lines = [["", *(f"run {k}" for k in range(1, len(table["runs"]) + 1)), "order", "limit", "error", ""]]
     sizes = (key, *(other for other in SIZE_UNITS if other != key and other in table))
-    lines += [
-        [f"{name} [{SIZE_UNITS[name]}]", *(f"{size:g}" for size in table[name]), "", "", "", ""] for name in sizes
-    ]
+    lines += [[f"{one} [{SIZE_UNITS[one]}]", *(f"{size:g}" for size in table[one]), "", "", "", ""] for one in sizes]
     for row in table["rows"]:
         limit, error, finest = row["limit"], row["error"], row["values"][-1]
         share = f" ({100.0 * error / abs(finest):.2g} %)" if error is not None and finest else ""
@@ -365,20 +344,15 @@ def _convergence_in_words(table: dict[str, Any]) -> str:
                 row["flag"],
             ]
         )
-    return "\n".join([f"{len(table['runs'])} runs until {table['end_s']:g} s, by {key}", *_aligned(lines)])
-
-
-def _aligned(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Align the cells of lines in columns; the first column is left-aligned."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines]
+    aligned = ("  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines)
+    return "\n".join([f"{len(table['runs'])} runs until {table['end_s']:g} s, by {key}", *aligned])
 
 
 LEAST_ORDER, MOST_ORDER = 1e-3, 20.0
 """Range in which the observed order is searched."""
 LOWEST, HIGHEST = 0.5, 2.0
-"""Orders that are trusted; the methods have 1 to 2. With any other order, the sizes are not yet in the asymptotic
-range."""
+"""Range of trusted orders: the methods have orders from 1 to 2."""
 ROUND_OFF = 1e-6
 """Relative tolerance at both ends of the trusted range of orders."""
 SAFE, UNSURE = 1.25, 3.0
@@ -400,14 +374,12 @@ class Extrapolation:
     limit: float | None
     """Limit in the values' unit, computed with the observed order clipped to `LOWEST` and `HIGHEST`."""
     error: float | None
-    """Estimated error of the value at the finest size, in its unit, times a safety factor: the limit is probably within
-    it. None if a value is NaN."""
+    """Estimated error of the value at the finest size, in its unit, times a safety factor. None if a value is NaN."""
     flag: str = ""
     """Reason why no order is observed or why the observed order is not trusted; empty in the asymptotic range."""
 
     @classmethod
     def of(cls, sizes: Sequence[float], values: Sequence[float]) -> "Extrapolation":
-        """Extrapolate ``values`` (k,) at ``sizes`` (k,), finest last; k is at least 3."""
         (h_3, h_2, h_1), (f_3, f_2, f_1) = sizes[-3:], values[-3:]
         fine, coarse = f_2 - f_1, f_3 - f_2
         if not np.isfinite([fine, coarse]).all():

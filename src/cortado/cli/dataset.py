@@ -33,14 +33,14 @@ from cortado.simulation import Simulation
 from cortado.version import __version__
 
 ASKED = "dataset.json"
-"""The file with the settings of a data set: only a command with equal settings may continue it. The number of runs may
-change."""
+"""File with the settings of a data set; only a command with equal settings, except the number of runs, may continue
+it."""
 MOST_RUNS = 100_000
 
 
 @dataclass(frozen=True)
 class Member:
-    """The function object, sent to worker processes, that computes one run of a data set."""
+    """Computes one run of a data set in a worker process."""
 
     file: Path
     overrides: tuple[str, ...]
@@ -50,7 +50,6 @@ class Member:
     precision: str
 
     def scene(self, number: int) -> Scene:
-        """Return the scene of run ``number``."""
         return load_scene(self.file, [*self.overrides, *Sample(self.table, number).overrides]).lasting(
             steps=self.table.steps
         )
@@ -149,7 +148,6 @@ def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int)
 
 
 def _table(file: Path, overrides: list[str]) -> DatasetTable:
-    """Read the table [dataset] of a file; raise `SceneError`."""
     data = read_toml(file, overrides, ("problem", "optimise", "fit"))
     if "dataset" not in data:
         raise SceneError(str(file), "dataset", MISSING, "a table that says what varies, as docs/datasets.md has one")
@@ -172,8 +170,8 @@ def _checked_runs(runs: int, table: DatasetTable) -> int:
 
 
 def _asked(member: Member) -> dict[str, Any]:
-    """Return the settings of a data set. To find mistakes early, this reads the first scene and the scenes at the ends
-    of all ranges. Raise `SceneError`."""
+    """Return the settings of a data set, and read its first scene and the scenes at the ends of ranges to find mistakes
+    early."""
     table = member.table
     with unwarned():
         ends = [[f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()] for end in (0, 1)]
@@ -188,18 +186,14 @@ def _asked(member: Member) -> dict[str, Any]:
     for key in table.vary:
         if key in ("solver.time_step", "dimension", "discretisation.spacing") or key.startswith("container."):
             raise InputError(f"vary has {key}, which must be the same in all runs of a data set.")
-    scene = _scene(member)
+    with unwarned():  # the runs print its warnings
+        scene = load_scene(member.file, member.overrides)
     if len(scene.phase) > (most := KINDS - MORE_FLUID + 1):
         raise InputError(f"The scene has {len(scene.phase)} phases, but a data set has types for at most {most}.")
     asked = {"scene": json.loads(scene.to_json()), "dataset": table.model_dump(mode="json")}
-    _put_digests(asked["scene"])
+    for named, key in files_named(asked["scene"]):  # such as meshes
+        named[f"{key} content"] = sha256(Path(named[key]).read_bytes()).hexdigest()
     return {**asked, "--precision": member.precision, "cortado": __version__}
-
-
-def _put_digests(tables: Any) -> None:
-    """Store, beside each file name in the tables of a scene (such as a mesh), a digest of the file's content."""
-    for table, key in files_named(tables):
-        table[f"{key} content"] = sha256(Path(table[key]).read_bytes()).hexdigest()
 
 
 def _are_one(member: Member, *overrides: list[str]) -> bool:
@@ -209,12 +203,6 @@ def _are_one(member: Member, *overrides: list[str]) -> bool:
     except SceneError:
         return False
     return scenes[0] == scenes[1]
-
-
-def _scene(member: Member) -> Scene:
-    """Read the scene of the file without printing its warnings: the runs print them."""
-    with unwarned():
-        return load_scene(member.file, member.overrides)
 
 
 def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
@@ -238,20 +226,16 @@ def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
 
 
 def _sizes(content: Mapping[str, Any]) -> str:
-    """Return a text with the number of runs for each purpose, and their length."""
     runs = ", ".join(f"{content[f'num_trajs_{purpose}']} to {purpose}" for purpose in ("train", "valid", "test"))
     return f"{counted(content['sequence_length_train'], 'frame')} each, {runs}".replace("to valid", "to validate")
 
 
 def _warn(told: Mapping[int, list[str]], failures: Mapping[int, str], runs: int) -> None:
-    """Print each warning of the runs once, and which runs are left out."""
     warned = {number: sentences for number, sentences in told.items() if sentences}
     if warned:
         first = min(warned)
-        said = (
-            f"{len(warned)} of {counted(runs, 'run')} came with a warning. The first is run {first}: {warned[first][0]}"
-        )
-        warn(said)
+        came = f"{len(warned)} of {counted(runs, 'run')} came with a warning."
+        warn(f"{came} The first is run {first}: {warned[first][0]}")
     if failures:
         first = min(failures)
         said = f"{len(failures)} of {counted(runs, 'run')} failed and are left out. The first is run {first}: "

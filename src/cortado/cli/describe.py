@@ -1,5 +1,5 @@
-"""``cortado describe``: estimate particles, time step limits, memory, computing time and film of a scene before a run.
-``cortado gradients check``: compute the certificate of a scene's gradients."""
+"""``cortado describe``: estimate the cost of a run before it starts. ``cortado gradients check``: compute the
+certificate of a scene's gradients."""
 
 import json
 import math
@@ -16,11 +16,11 @@ import warp as wp
 
 from cortado.arrays import check_steps
 from cortado.calls import counted, point_in_words
-from cortado.certificate import Certificate, certify
+from cortado.certificate import certify
 from cortado.device.threads import frame_parts, gradient_parts, simulation_parts, step_parts
 from cortado.discretise.shapes import EXCESS
 from cortado.errors import ComputationError, DivergedError, InputError, shown
-from cortado.files.disk import make_folder
+from cortado.files.disk import make_folder, write_atomically
 from cortado.files.terminal import note, tell, timed_note
 from cortado.losses import CentreOfMass, FinalPositions, Image, Loss
 from cortado.optimisation.task_files import load_task, task_in_words
@@ -43,7 +43,7 @@ from cortado.solvers.particles import ParticleSolver
 from cortado.watching import Watch
 
 MANY = 1_000_000
-"""Number of particles from which on their count is printed first, as making them takes seconds or minutes."""
+"""Number of particles from which on a note is printed, because making them takes seconds or minutes."""
 FIRST_STEPS, MOST_STEPS, ENOUGH = 4, 100, 0.5
 """Least and greatest number of steps that are timed, and the total time [s] after which timing stops."""
 SAME = 1e-6
@@ -55,8 +55,8 @@ HEADS, PER_PARTICLE, PER_STEP = 28e3, 24.0, 50.0
 
 
 def measured_speed(simulation: Simulation) -> tuple[int, float]:
-    """Return the number of timed first steps (after twice as many untimed ones), and the time of one step [s] with
-    sensors. Raise `DivergedError` if the scene diverges."""
+    """Return the number of timed first steps, and the time of one step [s]; raise `DivergedError` if the scene
+    diverges."""
     steps = FIRST_STEPS
     while True:
         rollout = simulation.rollout(steps)
@@ -76,10 +76,8 @@ class RunLength:
     """The length of a run, given as a number of steps or as a time, with its frames and its film."""
 
     def __init__(self, simulation: Simulation, steps: int | None, time: float | None, choice: FrameChoice):
-        """Compute the length of a run of ``steps`` or of a ``time`` [s]; raise `InputError` for invalid values."""
         solver, picture = simulation.scene.solver, simulation.scene.picture or Picture()
         self.is_about = solver.chooses and time is not None
-        """Whether the number of steps is an estimate."""
         self.steps = steps_of_run(simulation, steps, time, {}) // (ROOM if self.is_about else 1)
         """Number of steps; an estimate if the run ends at a given time and the solver chooses the steps."""
         self.time = time = time if solver.chooses else self.steps * float(solver.time_step)
@@ -93,13 +91,12 @@ class RunLength:
             size = sum(frame_parts(frames, numbers, simulation.precision.bytes).values())
             self.trajectory = size + (HEADS + PER_PARTICLE * simulation.particles + PER_STEP * self.steps)
         self.film: Pace | None = None
-        """Which frames the film shows, and how fast; None without a film or if its length is unknown."""
+        """None without a film or if the film's length is unknown."""
         if frames is not None and time is not None and 1 < frames <= MOST_FRAMES and picture.film_frames != 0:
             times = np.linspace(0.0, time, frames)
             self.film = Pace.of(times, picture.film_frames, picture.film_speed, choice.rate)
 
     def for_machines(self) -> dict[str, Any]:
-        """Return the numbers of this object by names that end in their units."""
         film = {} if self.film is None else {"film_seconds": self.film.seconds, "film_speed": self.film.speed}
         return {
             "steps": self.steps,
@@ -113,7 +110,6 @@ class RunLength:
 
     @property
     def in_words(self) -> str:
-        """Return a text with the number of steps and the simulated time."""
         motion = "" if self.time is None else f", {self.time:g} s of motion"
         about = "about " if self.is_about else ""
         guess = ", if fluid gets as fast as by a fall through the whole container" if self.is_about else ""
@@ -142,7 +138,10 @@ def describe_scene(
     drawn = {}
     if picture is not None:
         make_folder(picture.parent)
-        drawn = {"picture": str(_drawn(simulation, picture).absolute())}
+        free = slice(simulation.free_particles)
+        colours = colours_of(scene, simulation.mass_fractions, simulation.particles)[free]
+        write_picture(picture, plan(scene, simulation.positions[free], colours, simulation.device))
+        drawn = {"picture": str(picture.absolute())}
     note("Some steps and pictures are timed.")
     found = _described(simulation, length := RunLength(simulation, steps, time, frames))
     for quality in ("traced", "quick")[: 0 if length.film is None else scene.dimension - 1]:
@@ -210,7 +209,7 @@ def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | N
 
 
 def _viscosity(scene: Scene) -> str:
-    """Return a text that says which form the viscous force has, and why it acts at the start or the end of a step."""
+    """Describe the form of the viscous force, and why it acts at the start or the end of a step."""
     form, limit = scene.forces.viscosity, viscous_limit(scene, {})
     if form != "stress" or not math.isfinite(limit):
         return str(form)
@@ -245,8 +244,8 @@ def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
 
 
 def of_emitter(emitter: EmitterTable, spacing: float) -> dict[str, Any]:
-    """Return when an emitter is empty (None if never), the drains that feed it, its speed, and two areas: of its
-    particles' cells and of its opening."""
+    """Return when an emitter is empty (None if never), its drains, its speed, and the areas of its particles' cells and
+    of its opening."""
     dry, areas = emitter.dry_after(spacing), {"area": emitter.area(spacing), "area_asked": emitter.asked_area()}
     known = {"name": emitter.name, "fed_by": list(emitter.fed_by), "speed_m_s": emitter.speed(spacing), **areas}
     return {**known, "runs_dry_at_s": dry if math.isfinite(dry) else None}
@@ -278,13 +277,6 @@ def estimated_bytes(simulation: Simulation, rollout: Rollout) -> tuple[float, fl
     iterations = 0 if counts is None else int(counts.max(initial=0))
     checkpoints = rollout.steps * sum(array.capacity for array in rollout.initial.arrays())
     return forward, forward + checkpoints + sum(gradient_parts(particles, iterations, real).values())
-
-
-def _drawn(simulation: Simulation, path: Path) -> Path:
-    """Draw the scene with its initial fluid, in the colours of its phases."""
-    free = slice(simulation.free_particles)
-    colours = colours_of(simulation.scene, simulation.mass_fractions, simulation.particles)
-    return write_picture(path, plan(simulation.scene, simulation.positions[free], colours[free], simulation.device))
 
 
 def _as_text(found: dict[str, Any], length: RunLength) -> str:
@@ -322,7 +314,7 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
 
 
 def emitter_row(found: dict[str, Any], dimension: int, length: RunLength) -> tuple[str, str]:
-    """Return a table row with an emitter's speed and the time when it is empty, before or after the end of the run."""
+    """Return a table row with an emitter's speed and the time when it is empty."""
     given, asked, dry = found["area"], found["area_asked"], found["runs_dry_at_s"]
     speed = f"fluid comes out of {found['name']} at {found['speed_m_s']:.3g} m/s"
     if abs(given - asked) > EXCESS * asked:
@@ -336,7 +328,7 @@ def emitter_row(found: dict[str, Any], dimension: int, length: RunLength) -> tup
 
 
 def _size(found: dict[str, Any]) -> str:
-    """Return a text with lengths and masses, in which a wrong unit is easy to see."""
+    """Describe lengths and masses, in which a wrong unit is easy to see."""
     fluid, held = (
         " x ".join(f"{length:.3g}" for length in found[key] or ()) for key in ("fluid_size_m", "container_size_m")
     )
@@ -362,7 +354,6 @@ def _time(found: dict[str, Any], length: RunLength) -> str:
 
 
 def _trajectory(length: RunLength) -> str:
-    """Return a text with the number of frames and their size on disk."""
     if length.frames is None:
         return "unknown, as nobody knows what time so many chosen steps simulate; --time says it"
     return (
@@ -371,7 +362,7 @@ def _trajectory(length: RunLength) -> str:
 
 
 def _film(length: RunLength, traced: float | None, quick: float | None) -> str:
-    """Return a text on the film's frames and length, and its drawing times by those of single pictures [s]."""
+    """Describe the film's frames and length, and its drawing times, given the times of single pictures [s]."""
     if length.film is None:
         return "of unknown length; --time says it" if length.time is None else "none"
     if traced is None:
@@ -423,7 +414,11 @@ def check_scene(
     found = json.dumps(certificate.as_dict(), indent=2)
     text = found if as_json else f"Loss: {loss}.\n{certificate}"
     if out is not None:
-        text += _written(certificate, found, out, as_json)
+        from cortado.pictures.run_pictures import gradient_check
+
+        gradient_check(certificate, out / "certificate.png")
+        write_atomically(out / "certificate.json", found.encode())
+        text += "" if as_json else f"\nThe results are in {out.resolve()}"
     if not certificate.right:
         tell(text)
         raise ComputationError(f"The adjoint is wrong for: {', '.join(certificate.wrong)}.")
@@ -438,12 +433,3 @@ def _loss(name: str, simulation: Simulation) -> Loss:
         return CentreOfMass(simulation.positions.mean(axis=0))
     renderer = simulation.renderer()
     return Image(renderer, renderer.render(simulation.initial))
-
-
-def _written(certificate: Certificate, found: str, out: Path, as_json: bool) -> str:
-    from cortado.files.disk import write_atomically
-    from cortado.pictures.run_pictures import gradient_check
-
-    gradient_check(certificate, out / "certificate.png")
-    write_atomically(out / "certificate.json", found.encode())
-    return "" if as_json else f"\nThe results are in {out.resolve()}"

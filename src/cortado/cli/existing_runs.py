@@ -1,5 +1,5 @@
-"""Commands for existing runs, ``cortado picture`` and ``cortado export``; user-defined functions of runs; and the runs
-that arguments name."""
+"""``cortado picture`` and ``cortado export`` of existing runs; user-defined functions of runs; the runs that arguments
+name."""
 
 import csv
 import json
@@ -32,7 +32,7 @@ SWEEP = "sweep.csv"
 
 
 def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
-    """Return the runs in the given folders; from the folder of a sweep all of its runs, in the order of its table. A
+    """Return the runs in the given folders; a sweep's folder stands for all of its runs, in the order of its table. A
     folder without a run raises `InputError`."""
     if not folders:
         raise InputError("RUN is missing, but must be the folder of a run, or of a sweep.")
@@ -89,12 +89,6 @@ def _told(problem: Exception) -> str:
     return " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".")
 
 
-def picture_settings(lines: int | None, colour: str | None) -> dict[str, Any]:
-    """Return keys of [picture] made from the options --lines and --colour, in the form that `Trajectory.film` takes."""
-    given = {"lines": lines, "colour": colour}
-    return {name: value for name, value in given.items() if value is not None}
-
-
 def camera_override(camera: str | None) -> list[str]:
     """Convert ``--camera`` to an override, which comes before those of ``--set`` so that they can add to it."""
     kind, _, solid = (camera or "").partition(":")
@@ -123,8 +117,8 @@ def draw_runs(
     device_name: str,
     settings: Mapping[str, Any],
 ) -> str:
-    """Draw one recorded frame (a negative number counts from the end), or a film of all frames, of one run or of
-    several side by side. Return a sentence that names the file. A run's report shows pictures drawn into its folder."""
+    """Draw one recorded frame, or a film of all frames, of one run or of several side by side; return a sentence that
+    names the file."""
     folders, device = named_runs(runs), device_of(device_name)
     look = scene_of_run(folders[0], overrides)
     others = [scene_of_run(folder, []) for folder in folders[1:]]
@@ -142,7 +136,9 @@ def draw_runs(
         page, times = run_page(one, device), one.times
         place, name = folders[0].figures, "film" if as_film else "picture"
     else:
-        page, times = runs_page(each, labels(scenes, _names(folders)), device)
+        names = [folder.path.name for folder in folders]
+        numbers = [f"run {k}" for k in range(1, len(names) + 1)]
+        page, times = runs_page(each, labels(scenes, names if len(set(names)) == len(names) else numbers), device)
         place, name = Path(os.path.commonpath([folder.path.parent for folder in folders])), "side_by_side"
     if as_film:
         path = out or place / f"{name}.mp4"
@@ -167,12 +163,6 @@ def _trajectory(folder: RunFolder) -> Trajectory:
     if not folder.trajectory.exists():
         raise InputError(f"{folder.path} has no trajectory; the pictures of a search are in {folder.figures}.")
     return Trajectory.load(folder.trajectory)
-
-
-def _names(folders: Sequence[RunFolder]) -> list[str]:
-    """Return the names of the folders; if two names are equal, numbers instead."""
-    found = [folder.path.name for folder in folders]
-    return found if len(set(found)) == len(found) else [f"run {k}" for k in range(1, len(found) + 1)]
 
 
 def export_run(run: Path, to: str, out: Path | None, every: int, overrides: list[str]) -> str:

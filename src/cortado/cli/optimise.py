@@ -1,5 +1,6 @@
-"""``cortado optimise``: solve the inverse problem of a task, resume the search, and judge the result. ``cortado fit``:
-estimate parameters with error bars from measured experiments, and write a report.
+"""``cortado optimise``: solve the inverse problem of a task, resume the search, and judge the result.
+
+``cortado fit``: estimate parameters with error bars from measured experiments, and write a report.
 """
 
 from collections.abc import Mapping, Sequence
@@ -64,8 +65,8 @@ def optimise_task(
     where: Where = HERE,
     pictures: bool = False,
 ) -> str:
-    """Optimise a task, write the run folder, with shaded ``pictures`` if wanted, and return a sentence that names the
-    results. ``where`` gives the processes that compute the samples of an ensemble."""
+    """Optimise a task, write the run folder, and return a sentence that names the results; ``where`` computes
+    ensembles."""
     task = load_task(task_file, overrides)
     if where.option and task.optimise.gradient.samples == 1:
         raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")
@@ -98,13 +99,16 @@ def search_settings(task: Task, precision: str) -> dict[str, Any]:
 
 
 def _kept(folder: RunFolder) -> str:
-    """Return a text that says where the evaluations are stored; empty before the first evaluation."""
+    """Say where the evaluations are stored; empty before the first evaluation."""
     return f"the evaluations so far are in {folder.checkpoint}" if folder.read_metrics() else ""
 
 
 def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pictures: bool) -> str:
     """Run the search, judge its result and write all files; return a sentence that names the results."""
-    shades = pictures and _can_shade(made)
+    missing = lacking(made.task.scene) if pictures else None
+    if missing:
+        say(missing)
+    shades = pictures and not missing
     if shades:
         begin_shaded(made)
     try:
@@ -138,14 +142,6 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     films = [f"figures/{Path(path).name}" for _, path in shaded.found if Path(path).suffix == ".mp4"]
     to_open = ", or ".join([*films[:1], "report.html"])
     return f"The results are in {folder.path}; open {to_open}."
-
-
-def _can_shade(made: Setup) -> bool:
-    """Test whether shaded pictures and films can be made; if a package is missing, say so."""
-    missing = lacking(made.task.scene)
-    if missing:
-        say(missing)
-    return not missing
 
 
 def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> Result:
@@ -260,13 +256,7 @@ _START_HEAD = ("start", "where the search ended", "residuals, relative to the le
 
 
 def fit_task(
-    task_file: Path,
-    out: Path,
-    overrides: list[str],
-    device: str,
-    precision: str,
-    overwrite: bool,
-    command: list[str],
+    task_file: Path, out: Path, overrides: list[str], device: str, precision: str, overwrite: bool, command: list[str]
 ) -> str:
     """Fit the parameters of a task, write the run folder, and return a sentence that names the results."""
     task = load_fit(task_file, overrides)
@@ -303,7 +293,6 @@ def _profiles(task: FitTask, fitted: Fit) -> list[Profile]:
 
 
 def fit_sections(task: FitTask, fitted: Fit, profiles: Sequence[Profile], folder: Path) -> list[Section]:
-    """Return the sections of the report of a fit, in their order in the report."""
     head = ("", "unit", "start", "found", "standard error", "95 %, from", "to", "degrees of freedom", "counted error")
     noise = ("", "unit", "frames", "numbers", "residuals", "noise", "correlation time [s]", "independent frames")
     return [

@@ -24,24 +24,21 @@ MOST_ERROR = 0.3
 MOST_IN_RESULT = 1000
 """Greatest size of a parameter whose estimate is written to result.json; larger ones are only in the checkpoint."""
 VIEWED = 60
-"""Greatest number of states that the animation in the report shows."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of an optimisation compared with the goals in its task's [optimise.check]."""
+    """The result of an optimisation compared with the goals in the table [optimise.check] of the task."""
 
     first: float
-    """Loss at the start."""
     reduction: float
     """Loss at the start / best loss; infinite if the best loss is 0."""
     errors: dict[str, float]
-    """For each parameter the L2 distance of the estimate from the true value, divided by the norm of the true value
-    unless that is 0."""
+    """For each parameter the relative L2 distance of the estimate from the true value, or the absolute distance from
+    0."""
     psnr: float | None
     """Peak signal-to-noise ratio of the last image [dB]; None if the task compares positions."""
     failures: list[str]
-    """Sentences about goals that the result misses."""
 
 
 def judge(
@@ -53,8 +50,10 @@ def judge(
 ) -> Verdict:
     """Judge a result by the task's [optimise.check].
 
-    ``estimate``: the parameters, as the result has only coordinates; ``noise``: the peak signal-to-noise ratio reached
-    [dB]; ``first``: the loss at the start, if the history begins with another loss.
+    Args:
+        estimate: the parameters, if the result has only coordinates.
+        noise: the peak signal-to-noise ratio reached [dB].
+        first: the loss at the start, if the history begins with another loss.
     """
     check, estimate = task.optimise.check, result.parameters if estimate is None else estimate
     first = result.history[0].loss if first is None else first
@@ -75,7 +74,6 @@ def judge(
 
 
 def found_in_words(error: float) -> str:
-    """Return a text on how well a parameter is found, given its relative error."""
     if error > MOST_ERROR:
         why = "the search is too short, it ended in a wrong valley of the loss, or other values do as well"
         return f"not found, {100 * error:.3g}% off: {why}"
@@ -83,15 +81,13 @@ def found_in_words(error: float) -> str:
 
 
 def distance(estimate: ArrayLike, true: ArrayLike) -> float:
-    """Return |estimate - true| / |true|. If only one of the two changes with time, the other is repeated over the
-    steps."""
+    """Return |estimate - true| / |true|, or |estimate| if true is 0."""
     estimate, true = np.broadcast_arrays(estimate, true)
     return float(np.linalg.norm(estimate - true) / (np.linalg.norm(true) or 1.0))
 
 
 def worst_in_words(made: Setup, name: str, estimate: np.ndarray, error: float) -> str:
-    """Return a text on the worst of a parameter's few numbers, if its error exceeds twice the error of all together.
-    Empty otherwise, and if the true values are unknown or 0."""
+    """Describe the worst of a parameter's few numbers, if its error exceeds twice the parameter's error."""
     true, names = made.true_parameter(name), component_names(made.task, name, estimate)
     if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):
         return ""
@@ -120,19 +116,21 @@ def found_lines(made: Setup, estimate: Mapping[str, np.ndarray], knots: Mapping[
 
 
 def found_rows(
-    made: Setup,
-    estimate: Mapping[str, np.ndarray],
-    knots: Mapping[str, KnotValues],
-    errors: Mapping[str, float],
+    made: Setup, estimate: Mapping[str, np.ndarray], knots: Mapping[str, KnotValues], errors: Mapping[str, float]
 ) -> Rows:
     """Return table rows (parameter, unit, first guess, found, hidden, error): one for each number searched, each knot,
-    and each parameter with very many numbers. ``errors`` are by parameter."""
+    and each parameter with very many numbers."""
     rows: Rows = []
     start = made.search.parameters(made.start)
     for name, value in estimate.items():
         unit, true = made.task.known[name].unit, made.true_parameter(name)
         if name in knots:
-            rows += _knot_rows(name, unit, knots[name])
+            own = knots[name]
+            for k, time in enumerate(own.times):
+                hidden, error = "", ""
+                if own.true is not None:
+                    hidden, error = written(own.true[k]), f"{distance(own.estimate[k], own.true[k]):.3%}"
+                rows.append((_at(name, time), unit, own.start[k], own.estimate[k], hidden, error))
             continue
         known = [np.asarray(start[name]), np.asarray(value), *([] if true is None else [true])]
         error = f"{errors[name]:.3%}" if name in errors else ""
@@ -145,16 +143,6 @@ def found_rows(
             numbers = [column.ravel()[k] for column in columns]
             off = [""] if true is None else [f"{distance(*numbers[1:]):.3%}"]
             rows.append((label, unit, *numbers, *([] if true is not None else [""]), *off))
-    return rows
-
-
-def _knot_rows(name: str, unit: str, knots: KnotValues) -> Rows:
-    rows: Rows = []
-    for k, time in enumerate(knots.times):
-        hidden, error = "", ""
-        if knots.true is not None:
-            hidden, error = written(knots.true[k]), f"{distance(knots.estimate[k], knots.true[k]):.3%}"
-        rows.append((_at(name, time), unit, knots.start[k], knots.estimate[k], hidden, error))
     return rows
 
 
@@ -180,16 +168,11 @@ def sections(
     figures: TaskFigures,
     rows: Rows,
 ) -> list[Section]:
-    """Return the sections of the report of a search, in their order; ``told``: the found parameters in words."""
+    """Return the sections of the report of a search; ``told`` has sentences about the found parameters."""
     head = ("", "unit", "first guess", "found", "hidden", "error")
     return [
         asked(made),
-        Section(
-            "What was found",
-            told,
-            verdict.failures,
-            figures.found,
-        ),
+        Section("What was found", told, verdict.failures, figures.found),
         Section("In numbers", head=head, rows=rows),
         Section("To turn and to play", view=_view(made, estimate)),
         Section("Before, found and target", figures=figures.compared),

@@ -1,8 +1,4 @@
-"""Run a command from the command line to its exit code; a failure prints one sentence.
-
-Complaints of tyro about arguments, and errors from a lack of memory, open files or threads, are replaced by sentences
-written here.
-"""
+"""Run a command from the command line to its exit code; a failure prints one sentence."""
 
 import io
 import logging
@@ -61,8 +57,7 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
 
 
 def _understood(program: Program, arguments: Sequence[str]) -> Work:
-    """Parse the arguments and return what their command has to do. Print help or the version and exit if they ask for
-    it."""
+    """Parse the arguments and return what their command has to do, unless they ask for help or the version."""
     box = io.StringIO()
     try:
         with redirect_stderr(box), to_stdout():
@@ -115,12 +110,11 @@ _SENTENCES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"Error parsing (\S+): no type .*\|FLOAT .*? from \[(.*?)\]\. .*", r"\1 is \2, but must be a number"),
     (r"Error parsing (\S+): (.*)", r"\1 cannot be used: \2"),
 )
-"""Patterns of tyro's complaints and the sentences that replace them. Unknown complaints, for example of another
-release, are printed unchanged."""
+"""Patterns of tyro's complaints and the sentences that replace them; unknown complaints are printed unchanged."""
 
 
 def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado") -> str:
-    """Replace tyro's complaint about a program's arguments, printed in a box, by a sentence of ours."""
+    """Replace tyro's complaint about a program's arguments, printed in a box, by a sentence."""
     words = " ".join(arguments)
     lines = ["" if set(line) <= set(_EDGES) else line.strip("│| ") for line in box.splitlines()[1:]]
     text = " ".join(line for line in lines if line)
@@ -140,7 +134,7 @@ number."""
 
 
 def shortage(error: BaseException) -> str | None:
-    """Return a sentence for an error caused by a lack of memory, files or threads, directly or through its causes. None
+    """Return a sentence for an error caused by a lack of memory, files or threads, directly or through its causes; None
     for other errors."""
     for cause in _causes(error):
         if isinstance(cause, MemoryError) or _says(cause, _MEMORY):
@@ -154,7 +148,6 @@ def shortage(error: BaseException) -> str | None:
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield the error and its chain of causes."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__

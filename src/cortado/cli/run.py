@@ -1,7 +1,5 @@
-"""``cortado run``: run a scene forward and write its folder while it runs.
-
-A run that was stopped or killed at any moment can therefore be resumed.
-"""
+"""``cortado run``: run a scene forward and write its folder while it runs, so that a stopped or killed run can be
+resumed."""
 
 import time
 from collections.abc import Sequence
@@ -34,7 +32,7 @@ from cortado.simulation import Simulation
 from cortado.watching import Watch
 
 OFTEN, SHARE = 5.0, 20.0
-"""Notes on steps are written every `OFTEN` seconds, or less often if writing them would take more than `SHARE` of the
+"""Notes on steps are written every `OFTEN` seconds, or less often if writing would take more than 1 / `SHARE` of the
 time."""
 
 
@@ -43,10 +41,9 @@ class RunRequest:
     """The user's options for one run of a scene."""
 
     out: Path
-    """Folder of the run."""
     steps: int | None = None
     time: float | None = None
-    """Simulated time [s], instead of a number of steps."""
+    """Simulated time [s], instead of steps."""
     overrides: Sequence[str] = ()
     device: str = "cpu"
     precision: str = "float32"
@@ -54,14 +51,12 @@ class RunRequest:
     record: Sequence[str] = ()
     """Quantities of the particles that every frame records."""
     state: Path | None = None
-    """A run folder or trajectory file; this run starts from its last state."""
+    """A run folder or trajectory file, from whose last state the run starts."""
     resume: bool = False
     overwrite: bool = False
     pictures: bool = False
-    """True if shaded pictures and the film are drawn."""
     command: Sequence[str] = ()
     report: bool = True
-    """True if figures are drawn and report.html is written."""
 
     def settings(self, simulation: Simulation, rollout: Rollout, state: RestartState | None) -> dict[str, Any]:
         """Return the settings that must be unchanged when the run is resumed."""
@@ -75,7 +70,6 @@ class RunRequest:
 
 
 def run_settings(steps: int, precision: str, frames: FrameChoice) -> dict[str, Any]:
-    """Return the settings that must be unchanged when a run of ``steps`` steps of a scene is resumed."""
     return {"steps": steps, "precision": precision, **frames.settings}
 
 
@@ -92,8 +86,8 @@ class RunRecording:
     """Frames of an earlier process; the rollout continues from the last of them."""
 
     def go_on(self) -> int:
-        """Set the rollout to continue from the last frame in the folder with all notes and readings up to it. Return
-        the number of steps before that frame, 0 without one."""
+        """Continue from the last frame in the folder with all notes and readings up to it; return the number of steps
+        before that frame."""
         if not self.folder.trajectory.exists():
             return 0
         found, begun = Trajectory.load(self.folder.trajectory), self.rollout.clocks[0].steps
@@ -168,7 +162,6 @@ class Notes:
         self._step, self._next = recording.rollout.progress.step, time.monotonic() + OFTEN
 
     def now_and_then(self, step: int) -> None:
-        """Write the notes after a step if it is time."""
         self._step = step
         if (begun := time.monotonic()) >= self._next:
             self._recording.rollout.log.read(step)
@@ -177,7 +170,6 @@ class Notes:
             self._next = ended + max(OFTEN, SHARE * (ended - begun))
 
     def write(self) -> None:
-        """Write the readings of sensors, and the solver's notes on all steps so far."""
         rollout = self._recording.rollout
         self._recording.watch.look()
         if self._step > len(rollout.diagnostics["converged"]):  # an interrupt within a chunk of steps
@@ -230,7 +222,6 @@ def _last_state(path: Path) -> RestartState:
 
 
 def _checksum(state: RestartState) -> str:
-    """Return a checksum of a state, to tell whether two states are equal."""
     told = repr((state.clock.steps, state.clock.time, state.clock.time_step)).encode()
     return sha256(told + b"".join(state[name].tobytes() for name in sorted(state.fields))).hexdigest()[:16]
 

@@ -1,5 +1,4 @@
-"""The summary that ``cortado run`` prints at its end, with the balance of particles that entered and left, and its
-report.
+"""The summary that ``cortado run`` prints at its end, and the report of the run.
 
 The report is written twice: first without shaded pictures, which take long, then with them.
 """
@@ -21,8 +20,9 @@ from cortado.files.terminal import say
 from cortado.particles.state import State
 from cortado.pictures.film import coloured_by, is_out, lacking
 from cortado.pictures.pages import Figures, Section, write_report
+from cortado.pictures.particle_view import scene_view
 from cortado.pictures.plots import images, particles
-from cortado.pictures.run_pictures import density_errors, readings, run_pictures, trajectory_view
+from cortado.pictures.run_pictures import density_errors, readings, run_pictures
 from cortado.pictures.shown_solids import solid_outline
 from cortado.rollout.outcome import divergence_sentence, dry_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
@@ -39,17 +39,15 @@ from cortado.solvers.particles import ParticleSolver
 
 @dataclass(frozen=True)
 class Energy:
-    """The energies of the fluid [J], in 2-D of a layer 1 m thick. Particles waiting in emitters or taken by drains do
-    not count."""
+    """Energies of the fluid [J], in 2-D of a layer 1 m thick, without particles that wait in emitters or were taken by
+    drains."""
 
     kinetic: float
     potential: float
-    """Potential energy in the present gravity, measured from the container's lowest place or, without container, the
-    origin."""
+    """Energy in the present gravity, relative to the container's lowest corner or, without container, to the origin."""
 
     @property
     def total(self) -> float:
-        """Return the sum of kinetic and potential energy [J]."""
         return self.kinetic + self.potential
 
     @classmethod
@@ -70,8 +68,6 @@ class Energy:
 
 
 class RunSummary:
-    """The summary of a run that has taken all of its steps."""
-
     def __init__(
         self,
         simulation: Simulation,
@@ -80,39 +76,31 @@ class RunSummary:
         seconds: float,
         readings: Mapping[str, Readings] | None = None,
     ):
-        """Summarise a run from its ``last`` state, the ``seconds`` of computing in this process, and the ``readings``
-        of sensors by name."""
+        """Summarise a run from its ``last`` state, the ``seconds`` of computing in this process, and sensor readings by
+        name."""
         solver, taken, gravity = rollout.solver, rollout.taken, rollout.parameters["gravity"].numpy()
         self.steps, self.seconds, self.readings = taken, seconds, readings or {}
-        self.computed = taken - rollout.progress.step
-        """Number of steps taken by this process, without those of an earlier process."""
+        self.computed = taken - rollout.progress.step  # without the steps of an earlier process
         self.time = simulated(rollout)
-        """Simulated time [s]."""
         self.sizes = sizes_in_words(rollout)
         self.first = Energy.of(simulation, rollout, rollout.initial, 0)
         self.last = Energy.of(simulation, rollout, last, taken - 1)
         self.turned = bool(np.ptp(gravity[0, :taken], axis=0).any())
-        """True if gravity changed during the run, so that potential energies at start and end cannot be compared."""
+        """True if gravity changed, so that potential energies at start and end cannot be compared."""
         self.densities: tuple[float, float] | None = None
-        """Least and greatest density at the end [kg/m3], without particles waiting in emitters; None for solvers
-        without particles."""
+        """Least and greatest density at the end [kg/m3]; None for solvers without particles."""
         if isinstance(solver, ParticleSolver):
             found = solver.densities(last, rollout.parameters, taken - 1)[_out(simulation, last)]
             self.densities = float(found.min()), float(found.max())
         self.balance = (
             Balance.of(simulation.scene, *map(_others, (rollout.initial, last))) if simulation.scene.drain else None
         )
-        """Balance of particles; None without drains."""
         self.spilt = _spilt(simulation, last)
-        """Particles beside or below an open cup at the end."""
         self.particles = simulation.free_particles
-        """Number of particles that did not begin in an emitter."""
         self.masses = simulation.masses
-        """Masses of the fluid at the start."""
 
     @property
     def milliseconds(self) -> float:
-        """Return the mean computing time of a step [ms]."""
         return 1e3 * self.seconds / max(self.computed, 1)
 
     @property
@@ -136,7 +124,6 @@ class RunSummary:
         }
 
     def rows(self) -> list[tuple[object, ...]]:
-        """Return rows (what, value, unit) of a table."""
         energies = [
             (f"{kind} energy, {when}", f"{getattr(energy, kind):.4g}", "J")
             for when, energy in (("at the start", self.first), ("at the end", self.last))
@@ -184,18 +171,15 @@ class RunSummary:
 
 
 def _out(simulation: Simulation, state: State) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles in the fluid: all except those waiting in emitters and those taken by
-    drains."""
     return is_out(simulation.scene, _others(state), len(simulation.positions))
 
 
 def _others(state: State) -> dict[str, NDArray[Any]]:
-    """Return the fields of a state that say which particles are in the fluid."""
     return {name: state[name].numpy() for name in state.names if name.endswith(OF_OPENINGS)}
 
 
 def _spilt(simulation: Simulation, state: State) -> int:
-    """Return how many particles are outside an open cup, not counting those that began in an emitter."""
+    """Return how many particles are outside an open cup, without particles that began in an emitter."""
     scene, container, free = simulation.scene, simulation.scene.container, simulation.free_particles
     if not np.isfinite(container.region(simulation.dimension).rim):
         return 0
@@ -205,13 +189,11 @@ def _spilt(simulation: Simulation, state: State) -> int:
 
 
 def simulated(rollout: Rollout) -> float:
-    """Return the simulated time of a rollout's last forward run [s]."""
     clock, size = rollout.clocks[0], float(rollout.time_steps[0])
     return clock.after(rollout.taken, size).time - clock.time
 
 
 def sizes_in_words(rollout: Rollout) -> str:
-    """Return a text with the lengths of the steps of the last forward run."""
     chosen = rollout.step_sizes.diagnostics(rollout.taken).get("time_steps")
     if chosen is None or not len(chosen):
         return f"{float(rollout.time_steps[0]):g} s"
@@ -226,14 +208,18 @@ def write_run_report(
     pictures: bool,
     read: Mapping[str, Readings] | None = None,
 ) -> None:
-    """Write the report of a run, with shaded ``pictures`` if wanted. ``told``: results in words; ``read``: sensor
+    """Write the report of a run, with shaded ``pictures`` if wanted. ``told`` has the results; ``read`` has sensor
     readings."""
     scene, trajectory = simulation.scene, Trajectory.load(folder.trajectory)
     asked = Section("What was asked", _asked(simulation, rollout))
-    view = Section("To turn and to play", view=trajectory_view(scene, trajectory))
+    view = Section("To turn and to play", view=scene_view(scene, {scene.name: list(trajectory)}, trajectory.times))
     figures, solver = _figures(simulation, trajectory, folder.figures), _solver(rollout, trajectory, scene, folder)
 
-    sensors = [_sensors(read, folder)] if read else []
+    sensors = []
+    if read:
+        told_of = f"The sensors of the scene, read in every step; the numbers are in {folder.sensors.name}."
+        curves = readings(read, folder.figures / "sensors.png")
+        sensors = [Section("Sensors", [told_of], figures=[("What the sensors read.", curves)])]
 
     def write(shaded: Figures) -> None:
         films = [(caption, path) for caption, path in shaded if Path(path).suffix == ".mp4"]
@@ -252,23 +238,18 @@ def write_run_report(
 
 
 def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Figures:
-    """Draw plain pictures of the first, the middle and the last frame."""
-    scene = simulation.scene
-    shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
-    titles = [f"t = {trajectory.times[frame]:.3f} s" for frame in shown]
-    motions = solid_motions(scene, trajectory.others)
-    none = np.zeros(trajectory.particles)
-    left = [np.ravel(trajectory[frame].others.get("drained", none)) == 0.0 for frame in shown]
+    scene, none = simulation.scene, np.zeros(trajectory.particles)
+    shown = sorted({0, len(trajectory) // 2, len(trajectory) - 1})
+    frames, motions = [trajectory[k] for k in shown], solid_motions(scene, trajectory.others)
+    left = [np.ravel(frame.others.get("drained", none)) == 0.0 for frame in frames]
     path = particles(
-        [trajectory.positions[frame][here] for frame, here in zip(shown, left, strict=True)],
-        titles,
+        [frame.positions[here] for frame, here in zip(frames, left, strict=True)],
+        [f"t = {frame.time:.3f} s" for frame in frames],
         folder / "particles.png",
-        colours=[
-            np.linalg.norm(trajectory.velocities[frame][here], axis=1) for frame, here in zip(shown, left, strict=True)
-        ],
+        colours=[np.linalg.norm(frame.velocities[here], axis=1) for frame, here in zip(frames, left, strict=True)],
         colour_label="speed [m/s]",
         container=scene.container.extent(),
-        lines=[solid_outline(posed(scene, motions, frame)) for frame in shown],
+        lines=[solid_outline(posed(scene, motions, k)) for k in shown],
     )
     along = ", seen along the third axis" * (scene.dimension == 3)
     figures: Figures = [(f"The fluid at the start, half-way and at the end{along}.", path)]
@@ -276,7 +257,6 @@ def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Fi
 
 
 def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], folder: Path) -> Figures:
-    """Draw pictures of a scene with a table [render], and a video if one can be written."""
     renderer = simulation.renderer()
 
     def image(frame: int) -> np.ndarray:
@@ -292,15 +272,7 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
     return figures
 
 
-def _sensors(read: Mapping[str, Readings], folder: RunFolder) -> Section:
-    """Return the section of a report about the sensors of a run, with a plot of their readings."""
-    path = readings(read, folder.figures / "sensors.png")
-    told = f"The sensors of the scene, read in every step; the numbers are in {folder.sensors.name}."
-    return Section("Sensors", [told], figures=[("What the sensors read.", path)])
-
-
 def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
-    """Return a text that describes the run."""
     scene = simulation.scene
     step = float(rollout.time_steps[0])
     length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
@@ -316,7 +288,6 @@ def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
 
 
 def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunFolder) -> Section:
-    """Return the section on the solver: which steps converged, and their density errors."""
     figures: Figures = []
     if len(trajectory.converged) and "density_errors" in trajectory.diagnostics and scene.forces.pressure:
         path = folder.figures / "density_errors.png"
@@ -336,17 +307,13 @@ class Balance:
     """Numbers of particles that entered and left: ``first`` + ``came`` = ``last`` + the sum of ``went``."""
 
     first: int
-    """Particles in the fluid at the start."""
     came: int
-    """Particles that came out of emitters."""
     went: Mapping[str, int]
-    """Particles that each drain took, by its name."""
     last: int
-    """Particles in the fluid at the end."""
 
     @classmethod
     def of(cls, scene: Scene, first: Mapping[str, Any], last: Mapping[str, Any]) -> Self:
-        """Count the particles in the first and the last frame of a run, given the `Frame.others` of both."""
+        """Count the particles from the fields `Frame.others` of the first and the last frame of a run."""
         counts = {drain.name: count_name(drain.name) for drain in scene.drain}
         went = {name: int(np.ravel(last[key])[0] - np.ravel(first[key])[0]) for name, key in counts.items()}
         inside, left = (
@@ -356,11 +323,9 @@ class Balance:
         return cls(inside, left - inside + sum(went.values()), went, left)
 
     def for_machines(self) -> dict[str, Any]:
-        """Return the numbers by name, for result.json."""
         return {"first": self.first, "in": self.came, "out": dict(self.went), "last": self.last}
 
     def rows(self) -> list[tuple[str, int, str]]:
-        """Return rows (what, value, unit) of a table."""
         gone = [(f"particles that went into {name}", count, "") for name, count in self.went.items()]
         came = [("particles that came out of emitters", self.came, "")]
         return [("particles at the start", self.first, ""), *came, *gone, ("particles at the end", self.last, "")]

@@ -156,9 +156,10 @@ def picture(
         _refuse(words, ("colour",), "--colour says so already")
     if not film:
         _refuse(words, ("film_frames", "film_speed"), "one picture is drawn: add --film")
-    from cortado.cli.existing_runs import camera_override, draw_runs, picture_settings
+    from cortado.cli.existing_runs import camera_override, draw_runs
 
-    replaced, settings = camera_override(camera) + words, picture_settings(lines, colour)
+    given, replaced = {"lines": lines, "colour": colour}, camera_override(camera) + words
+    settings = {name: value for name, value in given.items() if value is not None}
     return partial(draw_runs, runs, -1 if frame is None else frame, film, out, replaced, device, settings)
 
 
@@ -211,7 +212,7 @@ def view(
 
 
 def _refuse(overrides: list[str], keys: tuple[str, ...], why: str) -> None:
-    """Raise `InputError` if --set replaces one of the given ``keys`` of [picture]."""
+    """Raise `InputError` if --set replaces one of the ``keys`` of [picture]."""
     for override in overrides:
         name = override.partition("=")[0].strip()
         if name.removeprefix("picture.") in keys:

@@ -84,9 +84,7 @@ app.command(gradients, name="gradients", help="Check the gradients of a scene.")
 
 @command(app)
 def new(
-    name: Annotated[Positional[Path], arg(metavar="NAME")],
-    template: str = "dam",
-    dimension: int | None = None,
+    name: Annotated[Positional[Path], arg(metavar="NAME")], template: str = "dam", dimension: int | None = None
 ) -> Work:
     """Write a commented scene that runs at once, and the schema with which editors check it.
 
@@ -101,8 +99,7 @@ def new(
 
 @command(app, answers=True)
 def examples(
-    copy: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
-    to: Path | None = None,
+    copy: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (), to: Path | None = None
 ) -> Work:
     """List the examples that come with Cortado, or copy some of them.
 
@@ -295,7 +292,6 @@ _GROUPS = {
     ),
 }
 COMMANDS = [command for group in _GROUPS.values() for command, _ in group]
-"""The command line of every example."""
 
 
 def overview() -> str:
@@ -310,12 +306,8 @@ def overview() -> str:
     return "\n".join(lines)
 
 
-CORTADO = Program(
-    "cortado",
-    app,
-    "A differentiable SPH fluid simulator. --version prints which one; cortado alone gives examples.",
-    overview,
-)
+SUMMARY = "A differentiable SPH fluid simulator. --version prints which one; cortado alone gives examples."
+CORTADO = Program("cortado", app, SUMMARY, overview)
 
 
 DAM = "dam"
@@ -323,7 +315,6 @@ DAM = "dam"
 TEMPLATES = Path(__file__).with_name("templates")
 """The folder of the templates: scenes whose first line says what the scene is and how to run it."""
 IN_3D = "_3d"
-"""Ending of the file name of the template `DAM` in 3-D."""
 SCENE_FILE, SCENE_NAME = "SCENE.toml", 'name = "SCENE"'
 """The file name in a template's first line, and the line with the scene's name; both are replaced by the new file's
 name."""
@@ -333,13 +324,12 @@ DATA = (".csv", ".mp4")
 
 
 def templates() -> list[str]:
-    """Return the names of the templates."""
     return [DAM, *sorted({path.stem.removesuffix(IN_3D) for path in TEMPLATES.glob("*.toml")} - {DAM})]
 
 
 def new_scene(path: Path, template: str, dimension: int | None) -> str:
-    """Write a scene, and beside it the schema that editors use to complete and check scenes. Existing files are
-    kept."""
+    """Write a scene, and beside it the schema that editors use to complete and check scenes; existing files are not
+    replaced."""
     if template not in templates():
         raise InputError(f"--template is {shown(template)}, but must be one of {', '.join(templates())}.")
     if dimension is not None and template != DAM:
@@ -402,7 +392,6 @@ def _copied(sources: list[Path], folder: Path) -> str:
 
 
 def _command(path: Path) -> str:
-    """Return the command that runs an example."""
     if path.suffix == ".py":
         return f"python {path}"
     tables = tomllib.loads(path.read_text("utf-8"))

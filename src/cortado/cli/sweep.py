@@ -1,5 +1,4 @@
-"""``cortado sweep``: run a scene or a task with every combination of some values, in parallel, and write a table of the
-results."""
+"""``cortado sweep``: run a scene or a task with every combination of some values, and write a table of the results."""
 
 import csv
 import io
@@ -31,10 +30,9 @@ from cortado.scene.scene import load_scene, read_toml
 MOST_COMBINATIONS = 100_000
 """Greatest number of combinations of a sweep; a larger number is taken for a mistake."""
 _LONGEST_NAME = 120
-"""Greatest number of characters of a folder's name."""
 _PAIRS = {"[": "]", "{": "}"}
 _PLAIN = re.compile(r"[A-Za-z0-9_=,.+-]+")
-"""Pattern of folder names that need no quotes in a shell."""
+"""Folder names that need no quotes in a shell."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +44,12 @@ class Combination:
 
     @property
     def overrides(self) -> list[str]:
-        """Return the values as options ``--set`` of `cortado run` and `cortado optimise`."""
         return [f"{key}={value}" for key, value in self.values]
 
     @property
     def name(self) -> str:
-        """Return the folder's name, made of the values; if these are long or have special characters, of some values
-        and a checksum. The name does not depend on the other combinations of a sweep."""
+        """The folder's name, made of the values; if these are long or have special characters, of some values and a
+        checksum. The name does not depend on the other combinations of a sweep."""
         name = ",".join(self.overrides)
         if _PLAIN.fullmatch(name) and len(name) <= _LONGEST_NAME and not name.startswith(("-", ".")):
             return name
@@ -120,11 +117,8 @@ MOST_NUMBERS = 12
 
 
 def write_table(folder: Path, combinations: Sequence[Combination], results: Mapping[int, Mapping[str, Any]]) -> None:
-    """Write the table, whole or not at all.
-
-    ``results``: contents of result.json, by the number of the combination. Columns: the folder, every key that changes,
-    "done" or "failed", every resulting number, and the reason of a failure.
-    """
+    """Write the table of folders, values, states, results and failures; ``results`` has contents of result.json by
+    number."""
     rows = [
         {
             "folder": combinations[number].name,
@@ -144,12 +138,11 @@ def write_table(folder: Path, combinations: Sequence[Combination], results: Mapp
 
 
 def failed(result: Mapping[str, Any]) -> bool:
-    """Return True if a result has failures."""
     return bool(result["failures"])
 
 
 def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Flatten nested tables, joining names by full stops. Short lists become JSON; long lists are left out."""
+    """Flatten nested tables, joining names by full stops; lists become JSON, long lists are left out."""
     found: dict[str, Any] = {}
     for name, value in result.items():
         if isinstance(value, Mapping):
@@ -167,23 +160,19 @@ SAME_TIME = 1e-9
 
 @dataclass(frozen=True)
 class Member:
-    """The function object, sent to worker processes, that computes one combination of a sweep."""
+    """Computes one combination of a sweep in a worker process."""
 
     file: Path
-    """The scene or the task."""
     duration: float | None
     """Duration of a scene's run [s]; None for a task, whose file gives the number of steps."""
     out: Path
-    """The folder of the sweep."""
     device: str
     precision: str
     frames: FrameOptions
-    """Options for the frames of a scene's runs."""
     report: bool
-    """True if figures and a report are made for each run of a scene."""
 
     def __call__(self, combination: Combination) -> dict[str, Any]:
-        """Return a combination's result, as in result.json; compute it if it is missing. Warnings name the folder."""
+        """Return a combination's result, as in result.json; compute it if it is missing."""
         require_shared(self.out, "the task and the folder of a sweep")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -242,7 +231,6 @@ class Member:
         return folder.read_result() or {"failures": ["It left no result."]}
 
     def _request(self, combination: Combination, begun: bool, words: list[str]) -> RunRequest:
-        """Return the request for the run of a combination; a run that was begun is resumed."""
         steps = self.steps(combination)
         frames = self._frames(steps)
         ((name, value),) = frames.settings.items()
@@ -279,7 +267,9 @@ def run_sweep(
         if duration is None and value:
             raise InputError(f"--{name} is given, but must be left out of a sweep of a task.")
     member = Member(file.absolute(), duration, out.absolute(), device, precision, frames, pictures)
-    done = _there(member, chosen)
+    with unwarned():  # warnings are printed when a combination runs; mistakes are found before computing
+        read = {number: member.finished(one) for number, one in enumerate(chosen)}
+    done = {number: result for number, result in read.items() if result is not None}
     left = [number for number in range(len(chosen)) if number not in done]
     there = len(done)
 
@@ -312,17 +302,8 @@ def run_sweep(
     return f"{all_of_them} none failed; the {table}"
 
 
-def _there(member: Member, chosen: list[Combination]) -> dict[int, dict[str, Any]]:
-    """Return the results of finished combinations, by number. Every combination's scene is read here, to find mistakes
-    before computing; its warnings are printed when it runs."""
-    with unwarned():
-        found = {number: member.finished(one) for number, one in enumerate(chosen)}
-    return {number: result for number, result in found.items() if result is not None}
-
-
 def _duration(file: Path, chosen: list[Combination], steps: int | None, time: float | None) -> float | None:
-    """Return the simulated time of a scene [s]: ``steps`` times the smallest time step, or ``time``. None for a task, a
-    file with the table [optimise]."""
+    """Return the simulated time of a scene [s], or None for a task, a file with the table [optimise]."""
     if "optimise" in read_toml(file):
         for name, value in (("steps", steps), ("time", time)):
             if value is not None:

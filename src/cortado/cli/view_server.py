@@ -2,11 +2,11 @@
 
 The window's address ends in a random token, which gives access. Any page in a browser can send requests to this
 machine, with an ``Origin`` that the browser sets. A page's host name can also be made to point to this machine (DNS
-rebinding). Three kinds of requests are therefore refused: without the token, with another host name, or from another
-page. Programs other than browsers send no ``Origin`` and need only the token.
+rebinding). The server refuses requests without the token, with another host name, or from another page. Programs other
+than browsers send no ``Origin`` and need only the token.
 
-A page may send only the camera's position and valid values of controls. Viser's own server accepts any value of any
-attribute of a control, and further messages, such as one that opens a tunnel to the internet. All of these are ignored.
+A page may send only the camera's position and valid values of controls. Viser's server accepts any value of any
+attribute of a control, and further messages, such as one that opens a tunnel to the internet; they are ignored here.
 """
 
 import logging
@@ -29,7 +29,6 @@ from cortado.errors import InputError
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")
-"""Host names under which a browser on this machine may request the page."""
 ADVICE = "This window has a token in its address: open the whole address that `cortado view` has printed.\n"
 HEADERS = {
     "Referrer-Policy": "no-referrer",
@@ -40,19 +39,17 @@ HEADERS = {
 Answer = Callable[[ServerConnection, Request], Response | None]
 """The type of ``process_request`` in websockets: it returns a page, or None to open a websocket."""
 LARGEST_NUMBER = 1e9
-"""Greatest absolute value of a number in a camera message."""
 LONGEST_MESSAGE = 2**16
-"""Greatest size of a message [bytes]; messages of viser's page have some hundreds."""
+"""[bytes]"""
 Number = Annotated[float, msgspec.Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 Direction = tuple[Number, Number, Number]
 Controls = Callable[[str], Any]
-"""Returns a control by its id; None for an unknown id."""
 KNOWN = "1.1.1"
 """The only version of viser that this module can guard."""
 FAREWELL = 0.3
 """Time [s] to wait for a page's answer when the window closes; a busy page does not answer."""
 _silent = logging.getLogger(__name__)
-"""A logger that drops messages about failed connections, which concern only the other side."""
+"""Drops messages about failed connections, which concern only the other side."""
 _silent.disabled = True
 
 
@@ -63,11 +60,10 @@ class Door:
         self._token = token_hex(16)
 
     def address(self, port: int) -> str:
-        """Return the address at which a browser finds the window."""
         return f"http://{HOST}:{port}/{self._token}/"
 
     def before(self, answer: Answer | None) -> Answer:
-        """Wrap ``answer``: requests with the token get it, others get a refusal."""
+        """Wrap ``answer`` so that requests without the token are refused."""
 
         def guarded(connection: ServerConnection, request: Request) -> Response | None:
             token, _, rest = request.path.removeprefix("/").partition("?")[0].partition("/")
@@ -83,7 +79,7 @@ class Door:
 
 
 def _is_from_here(request: Request, port: int) -> bool:
-    """Test whether a request uses this machine's own host name, and comes from the page at that name or from no
+    """Test whether a request uses one of this machine's host names, and comes from a page at that name or from no
     page."""
     hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
     own = [f"{name}:{port}" for name in NAMES] + (list(NAMES) if port == 80 else [])  # browsers leave out 80
@@ -91,8 +87,6 @@ def _is_from_here(request: Request, port: int) -> bool:
 
 
 class CameraMessage(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
-    """A message with the camera of a page; viser counts a page as connected after its first camera message."""
-
     wxyz: tuple[Number, Number, Number, Number]
     position: Direction
     fov: Number
@@ -105,8 +99,6 @@ class CameraMessage(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage",
 
 
 class Update(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
-    """A message that sets a control to a value."""
-
     uuid: str
     updates: dict[str, Any]
 
@@ -119,7 +111,6 @@ class Hearing(sockets.ServerConnection):
         self._controls = controls
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """Return the next message that `judged` accepts."""
         while True:
             heard = judged(await super().recv(decode), self._controls)
             if heard is not None:
@@ -141,11 +132,9 @@ class GuardedServer:
 
     @property
     def address(self) -> str:
-        """Return the address at which a browser finds the window."""
         return self._door.address(self.viser.get_port())
 
     def close(self) -> None:
-        """Stop the server and end all connections."""
         with redirect_stdout(StringIO()):
             self.viser.stop()
 
@@ -167,8 +156,8 @@ class GuardedServer:
 
 @contextmanager
 def _serving(serve: Callable[..., Any]) -> Iterator[None]:
-    """Within the block, let the package websockets open servers with ``serve``, whose first argument is its usual
-    function. Viser has no option for this, and a later guard would leave the first moments unguarded."""
+    """Let the package websockets open servers with ``serve``, whose first argument is the package's function. Viser has
+    no option for this, and a later guard would leave the first moments unguarded."""
     usual = sockets.serve
     sockets.serve = partial(serve, usual)  # type: ignore[misc, assignment]
     try:
@@ -182,8 +171,7 @@ _encoder = msgspec.msgpack.Encoder()
 
 
 def judged(message: bytes | str, controls: Controls) -> bytes | None:
-    """Return an accepted message, encoded anew so that viser reads the same content as this check; None for a refused
-    one."""
+    """Return an accepted message, encoded anew so that viser reads what was checked; None for a refused message."""
     with suppress(msgspec.MsgspecError, RecursionError, TypeError):
         said = _decoder.decode(message)  # type: ignore[arg-type]  # a text is refused
         if isinstance(said, CameraMessage) or (said.updates.keys() == {"value"} and _can_be(said, controls)):

@@ -14,7 +14,8 @@ from cortado.errors import ComputationError, ExtraMissingError, InputError, show
 from cortado.files.disk import as_path, sentences, unfinished, write_atomically
 from cortado.files.image_encoding import to_srgb
 from cortado.files.terminal import announce, track
-from cortado.pictures.exported import Exported, ExportedFrame, Mesh, Pose
+from cortado.pictures.exported import Exported, ExportedFrame, Pose
+from cortado.pictures.tracing.liquid_surface import Mesh
 from cortado.runs.frames import FRACTION, SolidMotion
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameters import QUANTITIES
@@ -23,7 +24,6 @@ from cortado.simulation import Simulation
 from cortado.version import __version__
 
 Advance = Callable[[], None]
-"""Called after each frame."""
 
 
 def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
@@ -59,7 +59,7 @@ def _write_series(
 
 
 def _write_meshes(run: Exported, folder: Path, advance: Advance, ending: str) -> Path:
-    """Write a series of files with trimesh, in sRGB colours, which programs expect; return the folder."""
+    """Write a series of files with trimesh in sRGB colours; return the folder."""
     _write_series(run, folder, advance, ending, lambda what: _trimesh(what, _srgb).export(file_type=ending))
     return folder
 
@@ -76,12 +76,11 @@ def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
 def _files(
     run: Exported, number: int, frame: ExportedFrame, ending: str
 ) -> dict[str, tuple[str, ExportedFrame | Mesh]]:
-    """Return names and contents of a frame's files, by part: the particles, the surface, and each solid. A solid at
-    rest has one file for all frames."""
+    """Return names and contents of a frame's files, by part; a solid at rest has one file for all frames."""
     found: dict[str, ExportedFrame | Mesh] = {"particles": frame}
     if frame.surface is not None:
         found["surface"] = frame.surface
-    found |= {solid.part: solid.mesh.moved(frame.poses[solid.name]) for solid in run.solids}
+    found |= {solid.part: frame.poses[solid.name].of(solid.mesh) for solid in run.solids}
     at_rest = {solid.part for solid in run.solids if not solid.moves}
     return {
         part: (f"{part}.{ending}" if part in at_rest else _numbered(part, number, ending), what)
@@ -90,12 +89,10 @@ def _files(
 
 
 def _numbered(name: str, number: int, ending: str) -> str:
-    """Return the file name for a frame's number."""
     return f"{name}_{number:05d}.{ending}"
 
 
 def _trimesh(what: Mesh | ExportedFrame, colours: Callable[[Any], Any]) -> Any:
-    """Return a mesh, or the particles of a frame, as a trimesh object with opaque colours."""
     import trimesh
 
     own = np.pad(colours(np.clip(what.colours, 0.0, 1.0)), ((0, 0), (0, 1)), constant_values=255)
@@ -105,12 +102,12 @@ def _trimesh(what: Mesh | ExportedFrame, colours: Callable[[Any], Any]) -> Any:
 
 
 def _srgb(colours: Any) -> Any:
-    """Return linear colours (p, 3) from 0 to 1 as sRGB bytes (p, 3)."""
+    """Return sRGB bytes (p, 3) of linear colours (p, 3) from 0 to 1."""
     return to_srgb(colours[None])[0]
 
 
 def _linear(colours: Any) -> Any:
-    """Return linear colours (p, 3) from 0 to 1 as proportional bytes (p, 3)."""
+    """Return bytes (p, 3) proportional to linear colours (p, 3) from 0 to 1."""
     return np.rint(255.0 * colours).astype(np.uint8)
 
 
@@ -118,8 +115,8 @@ def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
     """Write ``run.usdc`` with the mesh ``/run/surface``, the points ``/run/particles``, and for each solid a transform
     ``/run/solid_NAME`` with a mesh; return its path.
 
-    Frame k is at time code k, and the file stores the number of time codes per second. `WholeFrames` chooses the
-    states. Lengths are metres, colours linear.
+    Frame k of `WholeFrames` is at time code k, and the file stores the number of time codes per second. Lengths are
+    metres, colours linear.
     """
     pxr = _pxr()
     path = folder / "run.usdc"
@@ -127,7 +124,7 @@ def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
     with sentences(path):
         try:
             stage = pxr.Usd.Stage.CreateNew(str(temporary))
-            writer = _Writer(pxr, stage, run, len(run.whole.times), run.whole.rate)
+            writer = _Writer(pxr, stage, run)
             for code, frame in enumerate(run.frames(run.whole)):
                 writer.add(float(code), frame)
                 advance()
@@ -144,17 +141,15 @@ def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
 
 
 class _Writer:
-    """Adds frames to the stage of a USD file."""
-
-    def __init__(self, pxr: Any, stage: Any, run: Exported, frames: int, rate: float):
+    def __init__(self, pxr: Any, stage: Any, run: Exported):
         self._pxr, self._run, geometry = pxr, run, pxr.UsdGeom
         geometry.SetStageMetersPerUnit(stage, 1.0)
         gravity = np.abs(np.asarray(run.scene.forces.gravity))
         geometry.SetStageUpAxis(stage, geometry.Tokens.z if gravity.argmax() == 2 else geometry.Tokens.y)
-        stage.SetTimeCodesPerSecond(rate)
-        stage.SetFramesPerSecond(rate)
+        stage.SetTimeCodesPerSecond(run.whole.rate)
+        stage.SetFramesPerSecond(run.whole.rate)
         stage.SetStartTimeCode(0.0)
-        stage.SetEndTimeCode(float(frames - 1))
+        stage.SetEndTimeCode(float(len(run.whole.times) - 1))
         stage.SetDefaultPrim(geometry.Xform.Define(stage, "/run").GetPrim())
         self._particles = geometry.Points.Define(stage, "/run/particles")
         self._particles.CreateWidthsAttr(self._floats(np.array([run.spacing])))
@@ -171,7 +166,6 @@ class _Writer:
             self._set_mesh(mesh, solid.mesh, pxr.Usd.TimeCode.Default())
 
     def add(self, code: float, frame: ExportedFrame) -> None:
-        """Write a frame to the USD stage at a time code."""
         if self._surface is not None:
             empty = np.zeros((0, 3))
             surface = frame.surface or Mesh(empty, empty, empty, empty, empty)
@@ -241,8 +235,8 @@ def _pxr() -> Any:
 
 
 def _vtp(what: ExportedFrame | Mesh) -> str:
-    """Return the text of a VTP file, with numbers in base64. For a frame it contains a vertex per particle with
-    velocity [m/s] and all fields; for a mesh triangles, normals and, of a surface, velocities [m/s]."""
+    """Return the text of a VTP file: a vertex per particle with velocity [m/s] and all fields, or a mesh with
+    triangles, normals and, of a surface, velocities [m/s]."""
     colours = {"colour": _srgb(np.clip(what.colours, 0.0, 1.0))}
     velocities = {} if what.velocities is None else {"velocity": what.velocities}
     if isinstance(what, ExportedFrame):
@@ -276,7 +270,6 @@ def _polydata(points: np.ndarray, corners: np.ndarray, cells: str, fields: Mappi
 
 
 def _array(name: str, values: np.ndarray) -> Any:
-    """Make a named VTK array, in float32 unless the values are bytes."""
     kept = values if values.dtype == np.uint8 else np.asarray(values, dtype=np.float32)
     found = _vtk().numpy_to_vtk(np.ascontiguousarray(kept), deep=True)
     found.SetName(name)
@@ -285,7 +278,7 @@ def _array(name: str, values: np.ndarray) -> Any:
 
 @cache
 def _vtk() -> Any:
-    """Import only the parts of VTK in use: importing all of it takes seconds."""
+    """Import the parts of VTK in use; importing all of it takes seconds."""
     try:
         from vtkmodules import vtkCommonCore, vtkCommonDataModel, vtkIOXML
         from vtkmodules.util import numpy_support
@@ -311,7 +304,7 @@ def export(
     scene: Scene | str | PathLike[str],
     simulation: Callable[[], Simulation] | None = None,
 ) -> Path:
-    """Export a trajectory for another program, see `Trajectory.export`; return the file to open, or a series'
+    """Export a trajectory for another program; see `Trajectory.export`. Return the file to open, or a series'
     folder."""
     if to not in FORMATS:
         raise InputError(f"to is {shown(to)}, but must be one of {', '.join(FORMATS)}.")
@@ -341,17 +334,16 @@ def _phases(trajectory: Trajectory) -> int:
     return 1 if trajectory.mass_fractions is None else trajectory.mass_fractions.shape[-1]
 
 
-AXES = ["x", "y", "z"]
 Variables = dict[str, tuple[tuple[str, ...], Any, dict[str, str]]]
 
 
 def labelled(trajectory: Trajectory) -> Any:
-    """Return a trajectory as a dataset of xarray, see `Trajectory.to_xarray`."""
+    """Return a trajectory as a dataset of xarray; see `Trajectory.to_xarray`."""
     try:
         import xarray
     except ImportError as error:
         raise ExtraMissingError("xarray", "xarray") from error
-    axes, of_particles = AXES[: trajectory.dimension], ("time", "particle")
+    axes, of_particles = list("xyz"[: trajectory.dimension]), ("time", "particle")
     variables: Variables = {
         "position": ((*of_particles, "space"), trajectory.positions, {"units": "m"}),
         "velocity": ((*of_particles, "space"), trajectory.velocities, {"units": "m/s"}),
@@ -380,9 +372,6 @@ def labelled(trajectory: Trajectory) -> Any:
 
 
 def _of_solids(solids: Mapping[str, SolidMotion], turned: tuple[str, ...]) -> Variables:
-    """Return xarray variables of moving solids, stacked along one dimension; solids with prescribed paths have no
-    velocities."""
-
     def over_time(
         name: str, like: str, axes: tuple[str, ...], unit: str
     ) -> tuple[tuple[str, ...], Any, dict[str, str]]:

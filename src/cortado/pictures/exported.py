@@ -23,7 +23,7 @@ from cortado.pictures.film import coloured_by, is_out, shown_places, those
 from cortado.pictures.painter import Scale, colours_of
 from cortado.pictures.shown_solids import ShownSolid, SolidMesh, shown_solids, turn_in_space
 from cortado.pictures.stage import Stage, upright
-from cortado.pictures.tracing.liquid_surface import Surface, liquid_surface, nearest_colours, spheres
+from cortado.pictures.tracing.liquid_surface import Mesh, liquid_surface, nearest_colours, spheres
 from cortado.pictures.tracing.space import environment_of, particles_of, wetting
 from cortado.runs.frames import SAME, Marks, SolidMotions, fraction_names, posed, sized
 from cortado.runs.trajectory import Frame, Trajectory
@@ -35,22 +35,19 @@ from cortado.simulation import Simulation
 EVEN = 1e-6
 """Relative difference of time intervals below which recorded frames count as evenly spaced."""
 DIGITS = (0, 1, 2, 3)
-"""Greatest number of decimals of a frame rate if recorded frames are not evenly spaced."""
+"""Numbers of decimals that a frame rate may have if recorded frames are not evenly spaced."""
 UNLIKE = 0.05
 """Relative difference between the surface's and the fluid's volume above which a message reports it."""
 ROUND = 0.05
-"""Width of the faces of round solids, relative to the solid's size."""
 LINKED = 1.25
 """Distance in spacings below which two particles belong to one body of fluid."""
 NEAR_SURFACE = 2.0
-"""Greatest distance in spacings at which a particle without link to a surface is assigned to the body of the nearest
-surface."""
+"""Distance in spacings within which a particle without link to a surface belongs to the body of the nearest surface."""
 MOST_SHIFT = 1.0
 """Greatest displacement of a point in one pass, in spacings."""
 PASSES = 2
-"""Number of passes; each moves points outwards, and back to a wall if they have crossed it."""
+"""Number of passes; each moves points outwards, and then back to a wall that they have crossed."""
 ROUNDS = 20
-"""Greatest number of iterations of Newton's method; each moves points by at most a fifth of a spacing."""
 IN_PLACE = 1e-6
 """Round-off in spacings: points that a rotation to the container's axes and back moves by less count as unmoved."""
 
@@ -74,8 +71,8 @@ class WholeFrames:
 
     @classmethod
     def of(cls, times: NDArray[np.float64], marks: Marks | None = None) -> "WholeFrames":
-        """Choose frames for states recorded at ``times`` (m,) [s]: at their ``marks``, if given. Without marks, evenly
-        spaced states are the frames; else the frame rate is a round number near the states' rate."""
+        """Choose frames for states recorded at ``times`` (m,) [s]: at their ``marks``, the states themselves if they
+        are evenly spaced, or at a round frame rate."""
         if marks is not None:
             whole = marks.at(np.arange(int(marks.passed(times[-1:])[0]) + 1))
             recorded = np.searchsorted(times, whole - SAME / marks.rate)
@@ -97,7 +94,7 @@ class WholeFrames:
 
     @property
     def in_words(self) -> str:
-        """Return a text on how the frames differ from recorded states; empty if they are equal."""
+        """Describe how the frames differ from recorded states; empty if they are equal."""
         found = []
         if self.shifts.any():
             most = 1e3 * float(np.abs(self.shifts).max())
@@ -108,8 +105,8 @@ class WholeFrames:
 
 
 def _round_rate(times: NDArray[np.float64]) -> float:
-    """Return the frame rate [1/s] with the fewest digits that assigns each state its own frame. States are recorded at
-    ``times`` (m,) [s] from 0; the last is ignored. Without such a rate return the mean rate."""
+    """Return the frame rate [1/s] with the fewest digits that assigns each state but the last a separate frame, or the
+    mean rate."""
     usual = times[:-1]
     mean = (len(usual) - 1) / float(usual[-1])
     for digits in DIGITS:
@@ -120,75 +117,51 @@ def _round_rate(times: NDArray[np.float64]) -> float:
 
 
 @dataclass(frozen=True)
-class Mesh:
-    """A triangle mesh in 3-D; seen from outside, the corners of triangles run counterclockwise."""
-
-    points: Points
-    """(p, 3) [m]"""
-    triangles: np.ndarray
-    """(t, 3) numbers of points"""
-    normals: Points
-    """(p, 3) unit vectors outwards"""
-    colours: Points
-    """(p, 3) linear, from 0 to 1"""
-    velocities: Points | None = None
-    """(p, 3) [m/s]; None for a solid, whose poses give its motion."""
-
-    def moved(self, pose: "Pose") -> "Mesh":
-        """Return the mesh rotated and shifted to a pose."""
-        return Mesh(self.points @ pose.turn.T + pose.position, self.triangles, self.normals @ pose.turn.T, self.colours)
-
-
-@dataclass(frozen=True)
 class Pose:
-    """Position and rotation of a solid."""
-
     turn: Points
     """(3, 3) rotation matrix"""
     position: Points
-    """(3,) of its middle [m]"""
+    """(3,) [m]"""
+
+    def of(self, mesh: Mesh) -> Mesh:
+        """Return a solid's mesh at this pose."""
+        return replace(mesh, points=mesh.points @ self.turn.T + self.position, normals=mesh.normals @ self.turn.T)
 
     @property
     def matrix(self) -> Points:
-        """Return the pose as a matrix (4, 4) for column vectors: rotation, then translation."""
+        """(4, 4) for column vectors."""
         return np.block([[self.turn, self.position[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 
 @dataclass(frozen=True)
 class ExportedSolid:
-    """One exported solid, at rest or in motion, with its mesh."""
-
     name: str
     part: str
-    """Name in files: "solid_" and the solid's name, with only letters, digits and underscores."""
+    """Name in files."""
     mesh: Mesh
-    """Mesh about the solid's middle, not rotated."""
+    """About the solid's middle, not rotated."""
     moves: bool
 
 
 @dataclass(frozen=True)
 class ExportedFrame:
-    """One exported frame of a run, in three dimensions; for a 2-D run z is 0."""
-
     time: float
     """[s]"""
     positions: Points
-    """(n, 3) [m] of the particles not waiting in emitters; along periodic axes within one period"""
+    """(n, 3) [m]"""
     velocities: Points
     """(n, 3) [m/s]"""
     colours: Points
-    """(n, 3) colours of the particles as in pictures, linear, from 0 to 1"""
+    """(n, 3) linear"""
     fields: Mapping[str, np.ndarray]
     """(n,) or (n, k) by name: the mass fractions of several phases, and recorded quantities"""
     surface: Mesh | None
     """Surface of the fluid; None in 2-D, and if the particles are too far apart for a surface."""
     poses: Mapping[str, Pose]
-    """Poses of all solids, by name."""
 
 
 class Exported:
-    """A run and its scene in the form that exporters write. ``simulation`` computes a ``picture.colour`` that was not
-    recorded; if that is impossible, `InputError` is raised."""
+    """A run and its scene in the form that exporters write; raise `InputError` if colours cannot be computed."""
 
     def __init__(self, trajectory: Trajectory, scene: Scene, simulation: Callable[[], Simulation] | None = None):
         self.times, self.scene = trajectory.times, scene
@@ -202,29 +175,22 @@ class Exported:
         """Time [s], volume within the surface and fluid's volume [m³], of the frame in which the two volumes differ
         most."""
 
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self.times)
-
     @cached_property
     def whole(self) -> WholeFrames:
-        """Return the evenly spaced frames of an animation."""
         return WholeFrames.of(self.times, self._trajectory.marks)
 
     @property
     def series(self) -> WholeFrames | None:
-        """Return the frames of a series of files: those at the run's marks, or None (all states) for a run without
-        marks."""
+        """The frames of a series of files: those at the run's marks, or None (all states) for a run without marks."""
         return None if self._trajectory.marks is None else self.whole
 
     @property
     def spacing(self) -> float:
-        """Return the spacing of particles [m]."""
         return self.scene.discretisation.spacing
 
     @property
     def up(self) -> Points:
-        """Return the rotation (3, 3) that turns the direction opposite to gravity to y; the identity in 2-D."""
+        """Rotation (3, 3) that turns the direction opposite to gravity to y; the identity in 2-D."""
         return upright(np.asarray(self.scene.forces.gravity)) if self.scene.dimension == 3 else np.eye(3)
 
     def frames(self, whole: WholeFrames | None = None) -> Iterator[ExportedFrame]:
@@ -237,7 +203,7 @@ class Exported:
 
     @property
     def in_words(self) -> str:
-        """Return a text on the difference between the volumes within exported surfaces and the fluid's; empty if it is
+        """Describe the difference between the volumes within exported surfaces and the fluid's; empty if it is
         small."""
         if _unlike(self._held) <= UNLIKE:
             return ""
@@ -266,7 +232,6 @@ class Exported:
 
     @cached_property
     def _stage(self) -> Stage:
-        """Return the stage of a 3-D run, which knows if the container's walls cut the fluid."""
         return Stage.of(self.scene, shown_places(self.scene, self._trajectory))
 
     def _surface(self, positions: Points, velocities: Points, colours: Points) -> Mesh | None:
@@ -277,23 +242,20 @@ class Exported:
                 found = contained_liquid(self._stage, positions, colours)
         except ComputationError:
             return None
-        own = nearest_colours(found.points, positions, velocities, self.spacing)
-        return Mesh(found.points, found.triangles, found.normals, found.colours, own)
+        return replace(found, velocities=nearest_colours(found.points, positions, velocities, self.spacing))
 
 
 def _unlike(held: tuple[float, float, float]) -> float:
-    """Return the relative difference between a surface's volume and the fluid's, given the tuple (time, both
-    volumes)."""
+    """Return |volume within the surface / fluid's volume - 1|, given the time and both volumes."""
     return abs(held[1] / held[2] - 1.0)
 
 
 def _first_of_each(scene: Scene) -> dict[str, ShownSolid]:
-    """Return the solids by name, without their periodic images, which follow them in the list."""
     return {one.name: one for one in reversed(shown_solids(scene))}
 
 
 def _part_names(solids: Iterable[str]) -> dict[str, str]:
-    """Return a unique name for files for each solid, by the solid's name."""
+    """Return, by the solid's name, a unique name in files: "solid_" and letters, digits and underscores."""
     found: dict[str, str] = {}
     for number, name in enumerate(solids):
         plain = f"solid_{re.sub(r'[^A-Za-z0-9_]', '_', name)}"
@@ -341,9 +303,9 @@ def with_volume(
     spacing: float,
     kept: Callable[[Points], Points],
 ) -> Points:
-    """Move the points (p, 3) [m] of a surface with triangles (t, 3) along ``ways`` (p, 3), unit vectors outwards or 0.
-    Each body of fluid then encloses ``spacing``³ for each of its particles at ``places`` (n, 3) [m]. ``kept`` returns
-    points beyond a wall to the wall."""
+    """Move the points (p, 3) [m] of a surface along ``ways`` (p, 3), unit vectors outwards or 0, so that each body of
+    fluid encloses ``spacing``³ for each of its particles at ``places`` (n, 3) [m]; ``kept`` returns points beyond a
+    wall to the wall."""
     of_points, of_particles = _bodies(points, triangles, places, spacing)
     count = max(of_points.max(), of_particles.max(initial=-1)) + 1
     wanted = np.bincount(of_particles[of_particles >= 0], minlength=count) * spacing**3
@@ -359,8 +321,8 @@ def with_volume(
 
 
 def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Number the bodies of fluid; return the numbers for points (p,) and particles (n,), -1 for particles without
-    one."""
+    """Number the bodies of fluid; return the numbers for points (p,) and particles (n,), -1 for particles without a
+    body."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -386,8 +348,8 @@ def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: floa
 def _volumes(
     points: Points, ways: Points, triangles: np.ndarray, bodies: np.ndarray, count: int
 ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return a function from distances (bodies,) [m] to volumes (bodies,) [m³] and their derivatives [m²]. The points
-    of each body are moved by its distance along their ``ways``. A volume is a cubic polynomial of the distance."""
+    """Return a function from distances (bodies,) [m], by which points move along their ``ways``, to volumes (bodies,)
+    [m³] and their derivatives [m²]."""
     (a, b, c), (x, y, z) = ([each[corner] for corner in triangles.T] for each in (points, ways))
     own = bodies[triangles[:, 0]]
     terms = (
@@ -405,14 +367,9 @@ def _sixth(a: Points, b: Points, c: Points) -> np.ndarray:
     return np.einsum("tk,tk->t", a, np.cross(b, c)) / 6.0
 
 
-def contained_liquid(stage: Stage, positions: Points, colours: Points, device: Any = "cpu") -> Surface:
-    """Make the fluid's surface in the scene's axes, for particles at positions (n, 3) [m] with colours (n, 3); see
-    `liquid_surface`. At walls the fluid is extended behind the wall, and surface points there are moved back to the
-    wall. All other points are moved until the surface encloses the particles' volume; see `with_volume`.
-
-    Raises:
-        ComputationError: there is no surface.
-    """
+def contained_liquid(stage: Stage, positions: Points, colours: Points, device: Any = "cpu") -> Mesh:
+    """Make the fluid's surface in the scene's axes, for particles at positions (n, 3) [m] with colours (n, 3), so that
+    it ends at walls and encloses the particles' volume. Raise `ComputationError` without a surface."""
     launch, stage = BandLauncher(wp.get_device(device)), replace(stage, solids=())
     with WARP:
         own = particles_of(stage, positions, colours, launch)
@@ -427,12 +384,11 @@ def contained_liquid(stage: Stage, positions: Points, colours: Points, device: A
     normals[~is_free] = (points - kept)[~is_free] / beyond[~is_free, None]
     ways, in_room = np.where(is_free[:, None], normals, 0.0), partial(_in_room, stage)
     points = with_volume(kept, triangles, ways, places, stage.spacing, in_room)
-    return Surface(points @ stage.frame + stage.origin, triangles, normals @ stage.frame, colours)
+    return Mesh(points @ stage.frame + stage.origin, triangles, normals @ stage.frame, colours)
 
 
 def _in_room(stage: Stage, points: Points) -> Points:
-    """Return the points (p, 3) [m] inside the container nearest to given points (p, 3), in picture axes, along the axes
-    where walls cut the fluid."""
+    """Move points (p, 3) [m], in picture axes, into the container, along the axes where walls cut the fluid."""
     if not stage.cuts:
         return points
     lower, upper = stage.room

@@ -1,7 +1,4 @@
-"""Pictures of the frames of one run or of several runs side by side, and films of them.
-
-A `ShownRun` provides a run's stage, and for each frame the state to draw.
-"""
+"""Pictures and films of one run, or of several runs side by side."""
 
 from __future__ import annotations
 
@@ -13,6 +10,7 @@ from functools import cached_property, partial
 from hashlib import sha256
 from importlib.util import find_spec
 from itertools import islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +31,6 @@ from cortado.runs.frames import Film, Pace, SolidMotions, posed, sized, solid_mo
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.appearance import Moment, Picture, View
 from cortado.scene.emitter_table import emitted_name, outlet_name, samples, waits
-from cortado.scene.fluid_particles import resting_places
 from cortado.scene.parameters import sizes
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
@@ -44,49 +41,35 @@ Around = tuple[tuple[int, ...], tuple[int, ...]]
 """Numbers of the frames that a film shows before and after a frame, nearest first."""
 ALONE: Around = (), ()
 Panel = Callable[[int, Around], Points]
-"""A function from a frame's number and the frames around it to a picture (rows, columns, 3), linear from 0 to 1."""
+"""Draws frame number k, given the frames around it: a linear picture (rows, columns, 3), from 0 to 1."""
 
 
 MOST_PICTURES = 9
-"""Greatest number of pictures side by side; more would be too small."""
 LEAST_PIXELS = 64
-"""Least number of pixels along each side of each picture."""
 AIR = 1.25
-"""Least ratio of a picture's height to the height of its contents at the picture's width."""
+"""Greatest ratio of a picture's height to the height of its contents at the picture's width."""
 SLOW = 0.1
-"""Film speed (simulated seconds per second) below which fluid at rest is not averaged over frames, because its motion
-is slow enough to follow."""
+"""Film speed (simulated seconds per second) below which fluid at rest is not averaged over frames."""
 TELLING_FRAMES = 100
-"""Number of frames from which the range of the solids' motion is found."""
-
-
-def alone(images: list[Points]) -> Points:
-    """Return the only picture of a list."""
-    (image,) = images
-    return image
+"""Approximate number of frames whose solid poses the camera must include."""
 
 
 @dataclass(frozen=True)
 class Page:
-    """The contents of each frame of a film: the picture of one panel, or several panels' pictures combined."""
-
     panels: Sequence[Panel]
-    composed: Callable[[list[Points]], Points] = alone
-    """Combines the panels' pictures to one picture."""
+    composed: Callable[[list[Points]], Points] = itemgetter(0)
     fingerprint: str = ""
-    """A checksum of all data shown in the pictures; empty if unknown."""
+    """Checksum of all data shown in the pictures; empty if unknown."""
     notes: str = ""
-    """A sentence for viewers of the film, or an empty text."""
 
     def image(self, frame: int) -> Points:
-        """Return the picture (rows, columns, 3) of a frame, linear from 0 to 1."""
         return self.composed([panel(frame, ALONE) for panel in self.panels])
 
     def images(
         self, frames: Sequence[int], ahead: Ahead = iter, begin: int = 0, window: int = WINDOW
     ) -> Iterator[Points]:
-        """Yield the pictures of a film's frames in order, from ``begin`` on, each drawn with ``window`` frames before
-        and after it; ``ahead`` may draw panels' pictures early."""
+        """Yield the pictures of a film's frames from ``begin`` on, each drawn with ``window`` frames before and after
+        it."""
         shown = range(begin, len(frames))
         drawn = ahead(panel(frames[n], _around(frames, n, window)) for n in shown for panel in self.panels)
         return (self.composed(list(islice(drawn, len(self.panels)))) for _ in shown)
@@ -97,14 +80,12 @@ def _around(frames: Sequence[int], n: int, window: int) -> Around:
 
 
 class FilmedRun:
-    """A `Panel` that draws the states of one run; in 3-D it keeps fluid at rest from flickering."""
+    """A `Panel` for the states of one run; in 3-D it keeps fluid at rest from flickering."""
 
     def __init__(self, artist: PlanePainter | SpacePainter, state: Callable[[int], State]):
-        """Take a painter, and a function from the number of a frame to its ``state``."""
         self._artist, self._state, self._stills = artist, state, dict[int, Any]()
 
     def __call__(self, frame: int, around: Around) -> Points:
-        """Return the picture of a frame."""
         artist, state = self._artist, self._state(frame)
         if not any(around) or isinstance(artist, PlanePainter):
             return artist.image(*state)
@@ -118,9 +99,12 @@ class FilmedRun:
 
 
 def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tuple[list[PlaneStage | Stage], int]:
-    """Fit several stages of one dimension, at one scale, into a page of the first stage's picture size minus ``spare``
-    columns. Every camera sees all that any stage shows. Return the stages and the number of pictures in a row; raise
-    `InputError` if pictures are too small."""
+    """Fit several stages into a page of the first stage's picture size minus ``spare`` columns, with one scale and
+    region; return the stages and the number of pictures in a row.
+
+    Raises:
+        InputError: pictures would be too small.
+    """
     whole, count = stages[0].picture, len(stages)
     page = whole.model_copy(update={"width": max(whole.width - spare, 1)})
     lower, upper = (np.array(ends) for ends in zip(*(stage.ends for stage in stages), strict=True))
@@ -137,8 +121,8 @@ def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tup
 
 
 def in_a_row(count: int, size: Points, page: Picture) -> int:
-    """Return how many of ``count`` pictures to place in a row of a page, so that contents of width and height ``size``
-    (2,) are large and few places stay empty."""
+    """Return how many of ``count`` pictures to place in a row, so that contents of width and height ``size`` (2,) are
+    large and few places of the page stay empty."""
 
     def gain(across: int) -> float:
         down = -(-count // across)
@@ -149,19 +133,14 @@ def in_a_row(count: int, size: Points, page: Picture) -> int:
 
 
 def lacking(scene: Scene) -> str | None:
-    """Return a sentence on a missing package that shaded pictures of the scene need; None if all are installed."""
-    picture = scene.picture or Picture()
-    needed = {"av": "PyAV"} if picture.film_frames != 0 else {}
-    missing = [name for module, name in needed.items() if find_spec(module) is None]
-    if not missing:
+    """Return a sentence about a missing package that shaded pictures of the scene need; None if all are installed."""
+    if (scene.picture or Picture()).film_frames == 0 or find_spec("av"):
         return None
-    verb = "which is" if len(missing) == 1 else "which are"
-    return f"Shaded pictures need {' and '.join(missing)}, {verb} not installed: pip install av."
+    return "Shaded pictures need PyAV, which is not installed: pip install av."
 
 
 def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
-    """Write a film of the frames that ``pace`` chooses. After an interruption the drawn frames are kept, and the next
-    call for the same film continues after them."""
+    """Write a film of the frames that ``pace`` chooses; a second call after an interruption continues the film."""
     shown = [frames[k] for k in pace.frames]
     note = page.fingerprint and f"{page.fingerprint} {len(shown)} {pace.speed}"
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
@@ -176,7 +155,7 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
 
 
 def _ahead(count: int, images: Iterator[Points]) -> Iterator[Points]:
-    """Yield images in order; up to ``count`` images are drawn ahead while earlier ones are used."""
+    """Yield images in order; draw up to ``count`` images ahead in a thread."""
     painter = ThreadPoolExecutor(1, thread_name_prefix="cortado-film")
     try:
         coming = deque(painter.submit(next, images, None) for _ in range(count))
@@ -194,39 +173,29 @@ def _ahead(count: int, images: Iterator[Points]) -> Iterator[Points]:
 
 @dataclass(frozen=True)
 class ShownRun:
-    """A run prepared for pictures and films: its scene, and the values that colour its particles."""
-
     scene: Scene
     trajectory: Trajectory
     values: NDArray | None = None
-    """(frames, n) values that a colour scale converts to colours; None for the colours of phases."""
+    """(frames, n) values for a colour scale; None to use the colours of phases."""
     unit: str | None = None
-    """Unit of the values, if the quantity exists only in some scenes."""
+    """Unit of values."""
 
     @cached_property
     def stage(self) -> PlaneStage | Stage:
-        """Return the stage of the run, with a camera that sees all of the fluid in every frame."""
-        stride = max(len(self.trajectory) // TELLING_FRAMES, 1)
-        poses = [self._pose(k) for k in range(0, len(self.trajectory), stride)] if self._motions else []
-        return stage_of(
-            sized(self.scene, self._motions),
-            shown_places(self.scene, self.trajectory),
-            [pose for pose in poses if pose is not None],
-        )
+        count, scene = len(self.trajectory), sized(self.scene, self._motions)
+        frames = range(0, count, max(count // TELLING_FRAMES, 1)) if self._motions else ()
+        poses = [posed(self.scene, self._motions, k) for k in frames]
+        return stage_of(scene, shown_places(self.scene, self.trajectory), poses)
 
     def panel(self, stage: PlaneStage | Stage, device: object, scale: Scale | None) -> Panel:
-        """Return the panel that draws the run's frames, on ``stage``: the run's own stage with perhaps another
-        camera."""
         return FilmedRun(painter_on(stage, device), lambda k: self._state(k, stage, scale))
 
     @cached_property
     def times(self) -> NDArray[np.float64]:
-        """Return the times (frames,) [s] of the states that are shown; see `Trajectory.due`."""
         return self.trajectory.due
 
     @property
     def fingerprint(self) -> str:
-        """Return a checksum of all data shown in the pictures."""
         trajectory, found = self.trajectory, sha256(f"{__version__} {self.scene.to_json()}".encode())
         for array in (trajectory.due, trajectory.positions[:1], trajectory.positions[-1:]):
             found.update(np.ascontiguousarray(array).tobytes())
@@ -234,7 +203,7 @@ class ShownRun:
 
     def _state(self, k: int, stage: PlaneStage | Stage, scale: Scale | None) -> State:
         frame = self.trajectory[k].moved(float(self.times[k] - self.trajectory.times[k]))
-        shown = those(self._out[k])
+        shown = those(is_out(self.scene, frame.others, self.trajectory.particles))
         colours = colours_of(self.scene, frame.mass_fractions, self.trajectory.particles)
         if scale is not None and self.values is not None:
             colours = scale.colours(self.values[k])
@@ -248,16 +217,10 @@ class ShownRun:
             self.scene, known, np.arange(len(known)), self.times
         )
 
-    @cached_property
-    def _out(self) -> list[NDArray[np.bool_]]:
-        """Return masks (frames, n), True for particles in the fluid."""
-        return [is_out(self.scene, frame.others, self.trajectory.particles) for frame in self.trajectory]
-
     def _pose(self, k: int) -> Scene | None:
         return posed(self.scene, self._motions, k) if self._motions else None
 
     def _view(self, k: int, stage: PlaneStage | Stage) -> View | None:
-        """Return the view of a moving camera in frame k; None for a camera at rest."""
         path = (self.scene.picture or Picture()).camera_path
         if path is None or isinstance(stage, PlaneStage):
             return None
@@ -273,28 +236,17 @@ class ShownRun:
 
 
 def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles that have left emitters and are in no drain, given `Frame.others`. If there
-    is no fluid yet, the first layers of emitters count as out from the start."""
+    """Return a mask (n,) of the particles that have left emitters and are in no drain, from the fields `Frame.others`.
+    If the scene starts without fluid, the first layers of emitters count as out."""
     found = ~waits(scene, others, particles)
     for _, first, sample in () if found.any() else samples(scene, particles):
         found[first : first + sample.layer] = True
     return found & (np.ravel(others["drained"]) == 0.0) if "drained" in others else found
 
 
-def drawn_for_each(scene: Scene, positions: NDArray) -> NDArray[np.int64]:
-    """Return for each particle at positions (n, d) [m] the number (n,) of the particle drawn in its place: its own
-    number, or the first visible particle's if it is stored far away, in an emitter's reserve or taken by a drain."""
-    count = len(positions)
-    if not (scene.drain or scene.emitter):
-        return np.arange(count)
-    off = np.abs(positions - resting_places(scene, count)).max(axis=1)
-    there = ~(off <= scene.discretisation.spacing)  # places are NaN where all axes are periodic
-    return np.where(there, np.arange(count), np.argmax(there))
-
-
 def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """Return the places (frames, n, d) [m] of particles in pictures. Particles waiting in an emitter are placed at its
-    opening, and particles taken by a drain in the drain's middle."""
+    """Return the places (frames, n, d) [m] of particles in pictures: waiting ones at the emitter's opening, and
+    particles taken by a drain in its middle."""
     places, others, count = trajectory.positions, trajectory.others, trajectory.particles
     out = np.array([is_out(scene, frame.others, count) for frame in (trajectory if scene.emitter else ())])
     for name, first, sample in samples(scene, count):
@@ -307,8 +259,7 @@ def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
 
 
 def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
-    """Return an index that selects the particles with ``out`` (n,) from arrays (n, ...), without a copy if all are
-    out."""
+    """Index arrays (n, ...) by a mask (n,); a slice avoids a copy if the mask is True everywhere."""
     return slice(None) if out.all() else out
 
 
@@ -327,8 +278,8 @@ def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
 def coloured_by(
     scene: Scene, trajectory: Trajectory, simulation: Callable[[], Simulation] | None = None
 ) -> NDArray | None:
-    """Return the values (frames, n) that colour particles in pictures: recorded, computed from records, or else
-    computed with a simulation. None for the colours of phases.
+    """Return the values (frames, n) that colour particles in pictures, recorded or computed; None for the colours of
+    phases.
 
     Raises:
         InputError: the quantity was not recorded and cannot be computed.

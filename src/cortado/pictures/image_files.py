@@ -1,5 +1,4 @@
-"""Target pictures: latte art drawn at any resolution; reading and writing of picture files; and reading of video
-frames.
+"""Target pictures of latte art; reading and writing of picture files; and reading of video frames.
 
 A picture is a float64 array (rows, columns, 3) of linear red, green and blue from 0 to 1; its first row is the top. A
 resolution is (columns, rows), as in a scene, or one number for a square.
@@ -32,22 +31,18 @@ MILK: Colour = (0.96, 0.93, 0.86)
 COFFEE: Colour = (0.30, 0.16, 0.08)
 WHITE: Colour = (1.0, 1.0, 1.0)
 DRAWN = 100.0
-"""Approximate memory of a drawn picture, in bytes per pixel."""
+"""[bytes per pixel]"""
 SAMPLES = 6
-"""Number of sample points along each side of a pixel, for computing how much of the pixel a shape covers."""
+"""Number of sample points along each side of a pixel."""
 FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
-"""Formats of the files that are read."""
 MOST_BYTES = 2**28
-"""Greatest size of a picture file [bytes]."""
+"""[bytes]"""
 MOST_PIXELS = 2**26
-"""Greatest number of pixels of a picture that is resampled."""
 MOST_PIXELS_KEPT = 2**24
-"""Greatest number of pixels of a picture that is not resampled."""
 PIXELS_AT_ONCE = 2**20
 ROUNDING = 0.01
 """Fraction of a picture above which cropping causes a warning; rounding the sides crops less."""
 LIGHT = from_srgb(np.arange(256, dtype=np.uint8))
-"""Linear light for every byte value in a file."""
 
 
 @public
@@ -64,10 +59,11 @@ def heart(
 
     Args:
         resolution: columns and rows of pixels, or one number for both.
-        cup: radius of a round cup in the middle, relative to half of the shorter side of the picture; outside it
-            is the background. None: coffee everywhere.
-        size: size of the shape, relative to the cup or, without a cup, to the shorter side of the picture. milk,
-        coffee, background: red, green and blue, linear, from 0 to 1.
+        cup: radius of a round cup in the middle, relative to half of the shorter side of the picture; outside the cup
+            is
+            the background. None: coffee everywhere.
+        size: size of the shape, relative to the cup or, without a cup, to the shorter side of the picture.
+        milk, coffee, background: red, green and blue, linear, from 0 to 1.
 
     Example: ``target = cortado.pictures.heart((128, 128), cup=0.9)  # (128, 128, 3)``
     """
@@ -99,7 +95,7 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
 
     Args:
         resolution: wanted columns and rows: the largest central part with this aspect ratio is resampled, in linear
-        light. None keeps the original pixels.
+            light. None keeps the original pixels.
 
     Raises:
         InputError: the file is missing, is no picture, or has too many pixels.
@@ -128,7 +124,10 @@ def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow warns of large pictures, which are judged here
             with Image.open(path, formats=FORMATS) as file:
-                _check_header(path, file, most)
+                if file.width * file.height > most:
+                    raise _too_many(path, f"{file.width} x {file.height} pixels", most)
+                if file.mode.startswith(("I", "F")):
+                    raise InputError(f"The picture {path} has more than 8 bits for a colour; save it with 8.")
                 file.load()
                 ImageOps.exif_transpose(file, in_place=True)
                 return file.copy()
@@ -158,14 +157,6 @@ def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float
     scale = min(width / columns, height / rows)
     left, top = 0.5 * (width - scale * columns), 0.5 * (height - scale * rows)
     return left, top, width - left, height - top
-
-
-def _check_header(path: str | Path, file: Any, most: int) -> None:
-    """Raise `InputError` for a picture with too many pixels or bits per channel, before decoding it."""
-    if file.width * file.height > most:
-        raise _too_many(path, f"{file.width} x {file.height} pixels", most)
-    if file.mode.startswith(("I", "F")):
-        raise InputError(f"The picture {path} has more than 8 bits for a colour; save it with 8.")
 
 
 def _too_many(path: str | Path, found: str, most: int) -> InputError:
@@ -228,8 +219,6 @@ def _in_heart(x: Any, y: Any) -> Any:
 
 
 def _in_rosetta(x: Any, y: Any) -> Any:
-    """Test if points are inside six layers, a stem or a heart. Equal curvature keeps a constant width of coffee between
-    layers."""
     x = np.abs(x)
     inside = _in_heart(x / 0.31, (y - 0.69) / 0.31) | ((x < 0.02) & (np.abs(y + 0.2) < 0.8))
     height = y - (x**0.75 - 0.55 * x**2)  # of the point of the stem where the layer through x, y leaves it
@@ -247,8 +236,7 @@ def _columns_and_rows(resolution: Resolution) -> tuple[int, int]:
 
 
 def _bands(picture: Any) -> Iterator[tuple[int, Any]]:
-    """Yield blocks of a few opaque rows, each with the number of its first row. Arrays of all rows at once would need
-    many times the picture's memory."""
+    """Yield blocks of a few opaque rows, each with the number of its first row, to save memory."""
     from PIL import Image
 
     height = max(PIXELS_AT_ONCE // picture.width, 1)
@@ -268,7 +256,6 @@ def _whole(picture: Any) -> Picture:
 
 
 def _resampled(picture: Any, columns: int, rows: int) -> Picture:
-    """Return the largest central part with the aspect ratio of columns and rows, resampled to (rows, columns, 3)."""
     from PIL import Image
 
     box = _middle(picture.size, (columns, rows))
@@ -282,9 +269,8 @@ def _resampled(picture: Any, columns: int, rows: int) -> Picture:
 
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
-"""Suffixes of the picture files that are read from a folder."""
 MOST_BYTES_OF_VIDEO = 2**33
-"""Greatest size of a video file [bytes]."""
+"""[bytes]"""
 
 
 def read_frames(
@@ -300,18 +286,22 @@ def read_frames(
         path: a video, or a folder of pictures, which are read in the order of their names.
         resolution: wanted columns and rows: the largest central part with this aspect ratio is resampled.
         crop: left, top, right and bottom of the part of each frame to use, in pixels of the frame as players show it;
-        the whole frame if left out.
-        frame_rate: frames per second, needed for a folder; the video's own rate if left out.
+            by default the full frame.
+        frame_rate: frames per second, needed for a folder; by default the rate of the video.
         every: read only every ``every``-th frame.
 
     Raises:
         InputError: the file is missing or has no frames, or PyAV is missing.
     """
-    is_folder = Path(path).is_dir()
-    if is_folder and frame_rate is None:
-        raise InputError(f"{path} is a folder of frames, but frame_rate is missing: give the frames in a second.")
-    times, frames = list[float](), list[np.ndarray]()
-    for number, (time, picture) in enumerate(_pictures(Path(path)) if is_folder else _decoded(path)):
+    folder, times, frames = Path(path), list[float](), list[np.ndarray]()
+    if folder.is_dir():
+        if frame_rate is None:
+            raise InputError(f"{path} is a folder of frames, but frame_rate is missing: give the frames in a second.")
+        names = sorted(one for one in folder.iterdir() if one.suffix.lower() in ENDINGS)
+        pictures: Iterator[tuple[float, Any]] = ((0.0, open_picture(name)) for name in names)
+    else:
+        pictures = _decoded(path)
+    for number, (time, picture) in enumerate(pictures):
         if number % every == 0:
             cropped = _cropped(path, picture, crop)
             if not frames:
@@ -321,12 +311,6 @@ def read_frames(
     if not frames:
         raise InputError(f"{path} has no frames; pictures in a folder must end in {', '.join(ENDINGS)}.")
     return np.array(times) - times[0], np.stack(frames)
-
-
-def _pictures(folder: Path) -> Iterator[tuple[float, Any]]:
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in ENDINGS:
-            yield 0.0, open_picture(path)
 
 
 def _decoded(path: str | Path) -> Iterator[tuple[float, Any]]:
@@ -342,8 +326,8 @@ def _decoded(path: str | Path) -> Iterator[tuple[float, Any]]:
 
 
 def _upright(frame: Any) -> Any:
-    """Return the picture of a frame as players show it. Telephones store their orientation as a matrix (ISO/IEC
-    14496-12, 8.3.2) that rotates or mirrors the stored picture; here it is rounded to the nearest right angle."""
+    """Return the picture of a frame as players show it, turned and mirrored by the frame's matrix (ISO/IEC 14496-12,
+    8.3.2)."""
     from PIL.Image import Transpose
 
     picture = frame.to_image()

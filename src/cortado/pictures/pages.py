@@ -1,5 +1,7 @@
-"""HTML for notebooks and run folders. Notebooks show an object as its repr with a picture, a film, an animation or a
-table below. The report.html of a run folder embeds pictures and films, and opens from disk without a network.
+"""HTML for notebooks and run folders.
+
+Notebooks show an object as its repr with a picture, a film, an animation or a table below. The report.html of a run
+folder embeds pictures and films, and opens from disk without a network.
 """
 
 from __future__ import annotations
@@ -42,39 +44,26 @@ _KINDS = {
 WIDE = ' style="width: 100%"'
 AGAIN, LATER = "<h2>How to run it again</h2>", "<h2>Drawn later</h2>"
 MOST_WRITTEN_OUT = 12
-"""Greatest number of values that are written out one by one."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a report, with text, figures and a table; empty parts are left out."""
+    """A section of a report; empty parts are left out."""
 
     title: str
     words: Sequence[object] = ()
-    """Paragraphs."""
     failures: Sequence[object] = ()
-    """Paragraphs about what went wrong, which are marked."""
     figures: Sequence[tuple[str, str | Path]] = ()
-    """(caption, path) of pictures (png, jpg, svg, gif, webp) or videos (mp4, webm), embedded in the page"""
+    """(caption, path) of png, jpg, svg, gif, webp, mp4 or webm"""
     view: str = ""
-    """HTML of `particle_view`."""
     head: Sequence[str] = ()
-    """Column heads of the table."""
     rows: Sequence[Sequence[object]] = ()
-    """Rows of the table; the first entry of each row is its name."""
+    """The first entry of each row is its name."""
 
 
 def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> Path:
-    """Write the report of a run and return its path.
-
-    Args:
-        folder: the run folder; the page ends with the run's command, scene and environment.
-        title: heading of the page.
-        sections: sections in their order on the page.
-
-    Raises:
-        InputError: a picture that cannot be read or has an unknown ending, or a page that cannot be written.
-    """
+    """Write the report of a run and return its path; the page ends with the run's command, scene and environment. Raise
+    `InputError` for a picture that cannot be embedded or a page that cannot be written."""
     parts = "\n".join(_section(section) for section in sections)
     player = script() if any(section.view for section in sections) else ""
     look = f"{Path(__file__).with_name('report.css').read_text(encoding='utf-8')}\n{style()}"
@@ -158,7 +147,6 @@ def _figure(caption: str, path: Path) -> str:
 
 
 def _shown(path: Path, words: str, look: str = "") -> str:
-    """Return HTML that embeds a picture or video file in the page, with the caption ``words``."""
     kind = _KINDS.get(path.suffix.lower())
     if kind is None:
         raise InputError(f"{path} cannot be shown; a report takes {', '.join(_KINDS)}.")
@@ -173,7 +161,6 @@ def _shown(path: Path, words: str, look: str = "") -> str:
 
 
 def _again(folder: RunFolder) -> str:
-    """Return HTML of the command of the run, and of the commands that resumed it."""
     try:
         noted = json.loads(folder.environment.read_text(encoding="utf-8"))
         commands = [noted["command"], *(session["command"] for session in noted["resumed"])]
@@ -187,7 +174,6 @@ def _again(folder: RunFolder) -> str:
 
 
 def _details(label: str, path: Path) -> str:
-    """Return HTML of a JSON file of the run, collapsed."""
     if not path.exists():
         return ""
     text = path.read_text(encoding="utf-8")
@@ -197,25 +183,22 @@ def _details(label: str, path: Path) -> str:
 
 
 IN_MOTION = 1_000_000
-"""Greatest size of the animation of a trajectory [bytes]."""
+"""[bytes]"""
 MANY = 2000
-"""Number of particles whose nearest neighbours are searched."""
 MOST_NUMBERS = 6
-"""Greatest number of a parameter's values that the table shows; for more it shows the smallest and the greatest."""
+"""Greatest number of a parameter's values in the table; for more values their range is shown."""
 HEAD = ("parameter", "unit", "first guess", "found")
 
 
 def simulation_page(simulation: Simulation) -> str:
-    """Return HTML of a simulation: its repr, and a picture of its first particles."""
-    first, held = simulation.positions[: simulation.free_particles or None], simulation.scene.container.extent()
-    solids = [solid_outline(simulation.scene)]
-    drawn = picture(simulation, lambda path: particles([first], ["t = 0 s"], path, container=held, lines=solids))
-    return as_words(simulation) + drawn
+    first, scene = simulation.positions[: simulation.free_particles or None], simulation.scene
+    look: Any = {"container": scene.container.extent(), "lines": [solid_outline(scene)]}
+    return as_words(simulation) + picture(simulation, lambda path: particles([first], ["t = 0 s"], path, **look))
 
 
 def trajectory_page(run: Trajectory) -> str:
-    """Return HTML of a trajectory: its repr, and a `particle_view` with y up, in an iframe, where scripts may run.
-    Below are pictures of the first, middle and last frame, coloured by speed."""
+    """Return HTML of a trajectory: its repr, an animation with y up, and pictures of the first, middle and last frame,
+    coloured by speed."""
     if not len(run):
         return f"<pre>{escape(repr(run))}</pre>"
     domain = WITHOUT_PERIODS if run.scene is None else run.scene.container.domain(run.dimension)
@@ -234,20 +217,21 @@ def trajectory_page(run: Trajectory) -> str:
 
 
 def film_page(film: Film) -> str:
-    """Return HTML of a film: its repr, and the embedded video or animation."""
     return as_words(film) + _shown(film.path, repr(film), WIDE)
 
 
 def result_page(
     found: object, message: str, problem: Any, start: Mapping[str, Any], best: Mapping[str, Any], losses: Any
 ) -> str:
-    """Return HTML of the result of a search: start, best parameters, the reason why it ended, and all losses. For a
-    `Problem`, in any coordinates, it shows pictures of the runs with the first and with the best parameters, unless
-    they diverge."""
+    """Return HTML of the result of a search; for a `Problem` with pictures of the runs with the first and with the best
+    parameters, unless they diverge."""
     if hasattr(problem, "coordinates"):
         problem, (start, best) = problem.problem, [problem.parameters(u) for u in (start, best)]
     is_ours = isinstance(problem, Problem) and problem.simulation.batch is None
-    rows = [_row(name, UNITS.get(name, "") if is_ours else "", start[name], value) for name, value in best.items()]
+    rows = [
+        (name.replace("_", " "), (is_ours and UNITS.get(name, "")) or "-", _written(start[name]), _written(value))
+        for name, value in best.items()
+    ]
     parts = [table(HEAD, rows), picture(found, lambda path: loss_curve(losses, path))]
     if is_ours:
         with suppress(CortadoError):  # the first guess may be a run that diverges
@@ -256,11 +240,9 @@ def result_page(
 
 
 def _draw_ends(problem: Problem, points: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the last states (or pictures) of the runs with the first guess and with the found parameters, and a known
-    target."""
-    own = Problem(
-        problem.simulation, problem.steps, problem.loss, state=problem.state
-    )  # the user's keeps its last evaluation
+    """Draw the last states (or pictures) of the runs from ``points``, and a known target."""
+    # the user's problem keeps its last evaluation
+    own = Problem(problem.simulation, problem.steps, problem.loss, state=problem.state)
     step, loss = max(own.loss.losses.items()) if isinstance(own.loss, Frames) else (own.steps, own.loss)
     ends: list[Snapshot] = [own.states(point, [step])[step] for point in points]
     titles = [f"first guess, after {step} steps", "found"]
@@ -274,12 +256,7 @@ def _draw_ends(problem: Problem, points: Sequence[Mapping[str, Any]], path: Path
     particles(sets, titles, path, container=scene.container.extent(), lines=[solid_outline(scene)] * len(sets))
 
 
-def _row(name: str, unit: str, first: Any, found: Any) -> tuple[str, ...]:
-    return name.replace("_", " "), unit or "-", _written(first), _written(found)
-
-
 def _written(value: Any) -> str:
-    """Return as text a number, a few numbers, or the count and range of many."""
     numbers = np.ravel(value)
     if len(numbers) > MOST_NUMBERS:
         return f"{np.shape(value)} numbers, {numbers.min():.4g} to {numbers.max():.4g}"
@@ -287,7 +264,6 @@ def _written(value: Any) -> str:
 
 
 def as_words(found: object) -> str:
-    """Return an object's repr as HTML."""
     return f"<p>{escape(repr(found))}</p>"
 
 
@@ -303,8 +279,6 @@ def picture(found: object, draw: Callable[[Path], Any]) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return HTML of a table of texts."""
-
     def line(kind: str, cells: Sequence[str]) -> str:
         written = (f'<{kind} style="text-align: left; padding: 0 1em .2em 0">{escape(cell)}</{kind}>' for cell in cells)
         return f"<tr>{''.join(written)}</tr>"

@@ -1,8 +1,5 @@
-"""Choose the painter of a scene, in 2-D or 3-D; draw texts, lines and colour scales on pictures; and draw a scene
-before a run.
-
-A scene before a run is drawn with the paths of its solids and emitters and with its dimensions.
-"""
+"""Painters of scenes in 2-D and 3-D; texts, lines and colour scales on pictures; and the picture of a scene before a
+run."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -29,7 +26,6 @@ from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
 
 FINER = 3
-"""Supersampling factor with which lines are drawn, for smooth edges."""
 Text = tuple[tuple[int, int], str, str]
 """A text on a picture: its place (column, row), the text, and Pillow's two-letter anchor."""
 SMALL, SMALLEST = 11, 7
@@ -39,14 +35,13 @@ PALETTE = "viridis"
 OUTERMOST = (0.5, 99.5)
 """Percentiles at the ends of the scale, so that a few extreme particles do not darken all others."""
 UNITS = {"age": "s", **{name: quantity.unit for name, quantity in QUANTITIES.items()}}
-"""Units, by name, of the quantities that exist in all scenes."""
 MOVING = np.array([0.75, 0.20, 0.02])
-"""Linear colour of paths and of the arrows at emitters."""
 POSES = 60
-"""Approximate number of places shown along a path; at most twice as many."""
+"""Approximate number of positions shown along a path; at most twice this number is shown."""
 ARROW = 0.18
-"""Length of an arrow relative to the size of the contents, and of its head relative to the arrow."""
+"""Length of an arrow relative to the size of the contents."""
 HEAD = 0.22
+"""Length of an arrow's head relative to the arrow."""
 
 
 def painter(
@@ -57,27 +52,26 @@ def painter(
 
 
 def painter_on(stage: PlaneStage | Stage, device: Any = "cpu") -> PlanePainter | SpacePainter:
-    """Return the painter of a stage, in 2-D or 3-D; ``device`` traces the rays."""
     return PlanePainter(stage) if isinstance(stage, PlaneStage) else SpacePainter(stage, device)
 
 
 def stage_of(scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
-    """Return the stage of a scene for fluid at positions (n, d) or (frames, n, d) [m]. ``poses`` are scenes with the
-    solids at later poses, which the picture must include too."""
+    """Return the stage of a scene for fluid at positions (n, d) or (frames, n, d) [m]; the picture includes solids at
+    later ``poses``."""
     return (PlaneStage if scene.dimension == 2 else Stage).of(scene, positions, poses)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:
-    """Return the colour (n, 3) of each particle by its phases, in the scene's colours or in others (phases, 3)."""
+    """Return the linear colour (n, 3) of each particle by its phases, in the scene's colours or in ``colours`` (phases,
+    3)."""
     palette = np.array([phase.colour for phase in scene.phase]) if colours is None else np.asarray(colours)
     fractions = np.ones((particles, 1)) if mass_fractions is None else np.asarray(mass_fractions)
     return mixed(fractions, np.clip(palette, 0.0, 1.0))
 
 
 def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") -> Points:
-    """Draw a picture (rows, columns, 3), linear, of a scene before it is run. It shows particles at positions (n, d)
-    [m] as spheres with colours (n, 3), and paths of solids and emitters, with arrows. Along each axis a line shows the
-    total length."""
+    """Draw a linear picture (rows, columns, 3) of a scene before it is run, with paths, arrows and sizes, and with
+    particles at positions (n, d) [m] as spheres of linear colours (n, 3)."""
     look = (scene.picture or Picture()).model_copy(update={"surface": "spheres", "colour": "phase"})
     scene = scene.model_copy(update={"picture": look})
     spacing, paths = scene.discretisation.spacing, _paths(scene)
@@ -99,19 +93,18 @@ def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") 
 
 
 def _paths(scene: Scene) -> list[Points]:
-    """Return the paths (k, d) [m] of the middles of solids, and those of emitters' openings."""
+    """Return the paths (k, d) [m] of the middles of solids and of emitters' openings."""
     found = [places for table in scene.solid if (places := _places(table)) is not None]
     return found + [emitter.path.knots.seen for emitter in scene.emitter if emitter.path is not None]
 
 
 def _places(table: SolidTable) -> Points | None:
-    """Return the places (k, d) [m] of the middle of a solid along its path; None for one without a path."""
+    """Return the positions (k, d) [m] of a solid's middle along its path; None without a path."""
     shifts = courses(table)[0] if table.motion == "path" else None
     return table.middle() + shifts.seen if isinstance(shifts, Knots) else None
 
 
 def _poses(scene: Scene) -> list[Scene]:
-    """Return scenes in which one solid is at one place of its path, for all solids and places."""
     found = []
     for k, table in enumerate(scene.solid):
         places = _places(table)
@@ -123,8 +116,7 @@ def _poses(scene: Scene) -> list[Scene]:
 
 
 def _arrow(scene: Scene, emitter: EmitterTable, positions: Points) -> Points:
-    """Return an arrow (5, d) [m], one stroke for shaft and head, out of an emitter's opening. It is at least as long as
-    the opening is wide; without a container its length depends on positions (n, d) [m]."""
+    """Return an arrow (5, d) [m], one stroke for shaft and head, out of an emitter's opening."""
     start, direction = np.array(emitter.outlet), np.array(emitter.direction)
     size = np.ptp(scene.container.extent() or positions, axis=0).max()
     length = max(ARROW * float(size), emitter.width)
@@ -147,7 +139,6 @@ def _edges(stage: Any, lower: Points, upper: Points) -> list[Points]:
 
 
 def _sizes(stage: Any, edges: list[Points], lower: Points, upper: Points) -> list[Text]:
-    """Return texts with the box's length along each axis, placed beside its edges."""
     found, middle = list[Text](), stage.on_screen(0.5 * (lower + upper)[None])[0]
     for axis, edge in enumerate(edges):
         away = edge.mean(axis=0) - middle
@@ -159,8 +150,8 @@ def _sizes(stage: Any, edges: list[Points], lower: Points, upper: Points) -> lis
 
 
 def labelled(image: Points, text: str, below: str = "") -> Points:
-    """Write one text at the upper left of a linear picture (rows, columns, 3) and another at the lower left. If the
-    first text is too long, its letters are smaller."""
+    """Write ``text`` at the upper left of a linear picture (rows, columns, 3) and ``below`` at the lower left, in
+    place."""
     rows, columns = image.shape[:2]
     size = max(round(0.042 * rows), SMALL)
     left, top = round(0.9 * size), round(0.7 * size)
@@ -169,8 +160,7 @@ def labelled(image: Points, text: str, below: str = "") -> Points:
 
 
 def written(image: Points, texts: Sequence[Text], size: int) -> Points:
-    """Write texts on a picture (rows, columns, 3), linear, in letters of ``size`` pixels. The picture is changed in
-    place: copying it takes longer than writing."""
+    """Write texts on a linear picture (rows, columns, 3), in place, with letters of ``size`` pixels."""
     where, cover = _covered(image.shape[:2], tuple(texts), size)
     image[where] = image[where] * (1.0 - cover) + INK * cover
     return image
@@ -183,8 +173,7 @@ def length_of(text: str, size: int) -> float:
 
 @lru_cache(maxsize=32)
 def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tuple[tuple[slice, slice], Points]:
-    """Return the part of a picture of this shape that contains texts, and how much of each pixel they cover. The result
-    is cached for all frames of a film."""
+    """Return the part of a picture that contains texts, and the fraction of each pixel there that letters cover."""
     from PIL import Image, ImageDraw
 
     mask = Image.new("L", shape[::-1])
@@ -197,7 +186,7 @@ def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tupl
 
 def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) -> Points:
     """Draw lines of a linear colour (3,) on a linear picture (rows, columns, 3), through points (k, 2) given as column
-    and row; ``width`` in pixels."""
+    and row; ``width`` is in pixels."""
     from PIL import Image, ImageDraw
 
     rows, columns = image.shape[:2]
@@ -210,8 +199,8 @@ def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) ->
 
 
 def side_by_side(images: Sequence[Points], across: int, names: Sequence[str] = ()) -> Points:
-    """Arrange pictures of one size in rows of ``across``, separated by thin light lines, each labelled with its name,
-    if any. The last row may be incomplete."""
+    """Arrange pictures of one size in rows of ``across``, separated by thin light lines, and label each with its name,
+    if any."""
     rows, columns = images[0].shape[:2]
     down = -(-len(images) // across)
     page = np.ones((down * rows, across * columns, 3), images[0].dtype)
@@ -236,8 +225,6 @@ def _font(size: int) -> Any:
 
 @dataclass(frozen=True)
 class Scale:
-    """A colour scale: maps values of a quantity to colours."""
-
     name: str
     unit: str
     least: float
@@ -251,7 +238,6 @@ class Scale:
         return cls(name, UNITS.get(name, "") if unit is None else unit, float(least), float(greatest))
 
     def colours(self, values: NDArray) -> Points:
-        """Return linear colours (n, 3) of numbers (n,)."""
         return _colours(np.clip((values - self.least) / (self.greatest - self.least or 1.0), 0.0, 1.0))
 
     def columns(self, rows: int) -> int:
@@ -260,15 +246,14 @@ class Scale:
         return ceil(max(self._wide(size), *(length_of(text, size) for text in self._heads))) + size
 
     def beside(self, image: Points) -> Points:
-        """Return the picture (rows, columns, 3), widened on the right by columns with the scale."""
         rows = image.shape[0]
         edge = np.pad(image[:, -1], ((reach := rows // 16, reach), (0, 0)), mode="edge")
         smooth = np.lib.stride_tricks.sliding_window_view(edge, 2 * reach + 1, axis=0).mean(axis=-1)
         return self.on(np.concatenate([image, np.repeat(smooth[:, None], self.columns(rows), axis=1)], axis=1))
 
     def on(self, image: Points) -> Points:
-        """Return the picture (rows, columns, 3) with the scale drawn over its right edge: colours with numbers, the
-        greatest on top, and above them name and unit."""
+        """Return the picture (rows, columns, 3) with the scale over its right edge, the greatest value on top, below
+        name and unit."""
         rows, columns = image.shape[:2]
         size = _size_of_letters(rows)
         top, bottom, right = round(0.34 * rows), round(0.70 * rows), columns - size // 2
@@ -284,15 +269,12 @@ class Scale:
 
     @property
     def _heads(self) -> tuple[str, str]:
-        """Return the lines above the scale: its name and its unit."""
         return self.name.replace("_", " "), f"[{self.unit}]"
 
     def _wide(self, size: int) -> float:
-        """Return the width in pixels of the scale's colours and numbers."""
         return size + max((length_of(f"{number:.4g}", size) for number in self._ticks()), default=0.0)
 
     def _ticks(self) -> list[float]:
-        """Return the round numbers that label the scale."""
         from matplotlib.ticker import MaxNLocator
 
         if not self.greatest > self.least:
@@ -302,19 +284,17 @@ class Scale:
 
 
 def _colours(shares: NDArray) -> Points:
-    """Return linear colours (n, 3) of numbers from 0 to 1."""
     found: Points = _palette()[np.minimum((len(_palette()) * shares).astype(int), len(_palette()) - 1)]
     return found
 
 
 def _size_of_letters(rows: int) -> int:
-    """Return the size in pixels of letters on a picture with ``rows`` rows."""
     return max(round(0.026 * rows), 9)
 
 
 @cache
 def _palette() -> Points:
-    """Return the colours (256, 3) of the scale, linear."""
+    """Return (256, 3), linear."""
     from matplotlib import colormaps
 
     palette = colormaps[PALETTE]

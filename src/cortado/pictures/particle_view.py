@@ -1,4 +1,4 @@
-"""Animation of the particles of runs as a part of an HTML page; it plays from a file, without server or network."""
+"""Animation of particles as a part of an HTML page; it plays from a file, without server or network."""
 
 from __future__ import annotations
 
@@ -22,21 +22,19 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import INDEX_OF_AXIS, CylinderContainer
 
 MOST_BYTES = 2_200_000
-"""Greatest size [bytes] of positions, speeds and colours in one view; base64 makes them a third larger."""
+"""Greatest size [bytes] of positions, speeds and colours in one view, before base64 makes them a third larger."""
 LEAST_FRAMES, MOST_FRAMES = 24, 120
-"""Least and greatest number of frames; a view of many particles leaves out particles to show at least the least
-number."""
+"""Least and greatest number of frames; if many particles leave room for fewer frames, some particles are left out."""
 SHORTEST, LONGEST = 3.0, 12.0
-"""Least and greatest playing time [s]."""
+"""Playing time [s]."""
 LARGEST = 32767
-"""Largest position as a 16-bit number; the smallest is its negative."""
+"""Largest 16-bit position."""
 _PLAIN = (0.1, 0.3, 0.8)
-"""The linear colour of particles without a colour."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """The particles of a run: positions, speeds and colours over frames."""
+    """The particles of a run over frames."""
 
     name: str
     positions: NDArray[Any]
@@ -48,7 +46,7 @@ class Cloud:
 
 
 def style() -> str:
-    """Return the CSS of all views of a page."""
+    """Return the CSS of all views, which a page with views must contain."""
     return Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
 
 
@@ -59,11 +57,12 @@ def script() -> str:
 
 
 def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BYTES) -> tuple[NDArray[np.intp], int]:
-    """Choose the frames to show, and the stride with which particles are selected, for a view of at most ``most_bytes``
-    bytes.
+    """Choose the frames to show, and the stride with which particles are selected, for a view of at most
+    ``most_bytes``.
 
-    ``numbers``: bytes per particle and frame, summed over all clouds: two for each component of the position, one for
-    the speed, three for a changing colour.
+    Args:
+        numbers: bytes per particle and frame, summed over all clouds: two for each component of the position, one for
+            the speed, three for a changing colour.
     """
     count = min(frames, MOST_FRAMES, max(most_bytes // (numbers * particles), LEAST_FRAMES))
     stride = max(-(-count * numbers * particles // most_bytes), 1)
@@ -73,8 +72,7 @@ def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BY
 def particle_view(
     clouds: Sequence[Cloud], times: ArrayLike, spacing: float, *, lines: ArrayLike = (), stride: int = 1
 ) -> str:
-    """Return HTML that shows the clouds side by side, rotated together; y is up. The page must contain `style`, and
-    `script` after the views.
+    """Return HTML that shows the clouds side by side, rotated together; y is up.
 
     Args:
         clouds: clouds with the same frames and the same number of particles.
@@ -85,7 +83,8 @@ def particle_view(
     """
     times, dimension = np.asarray(times, dtype=float), clouds[0].positions.shape[2]
     ends = np.asarray(lines, dtype=float).reshape(-1, 2, dimension)
-    lower, upper = _extent([*(cloud.positions for cloud in clouds), ends])
+    shown = np.concatenate([array.reshape(-1, dimension) for array in (*(cloud.positions for cloud in clouds), ends)])
+    lower, upper = np.nanmin(shown, axis=0).astype(float), np.nanmax(shown, axis=0).astype(float)
     middle, half = 0.5 * (lower + upper), np.maximum(0.5 * (upper - lower), 0.5 * spacing)
     fastest = max(float(np.nanmax(cloud.speeds, initial=0.0)) for cloud in clouds) or 1.0
     drawn = [
@@ -112,7 +111,6 @@ def particle_view(
 
 
 def _page(data: dict[str, Any], clouds: Sequence[Cloud], fastest: float, stride: int) -> str:
-    """Return the HTML element of a view with its controls."""
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     several = len(clouds) > 1
     names = "".join(f'<span class="name">{escape(cloud.name)}</span>' for cloud in clouds) if several else ""
@@ -139,21 +137,14 @@ def _page(data: dict[str, Any], clouds: Sequence[Cloud], fastest: float, stride:
 </div>"""
 
 
-def _extent(clouds: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return lower and upper ends (d,) [m] of points (..., d)."""
-    points = [cloud.reshape(-1, cloud.shape[-1]) for cloud in clouds if cloud.size]
-    lower = np.min([np.nanmin(cloud, axis=0) for cloud in points], axis=0).astype(float)
-    return lower, np.max([np.nanmax(cloud, axis=0) for cloud in points], axis=0).astype(float)
-
-
 def _space(vectors: NDArray[Any]) -> NDArray[Any]:
-    """Return vectors (..., d) as (..., 3), with few digits."""
+    """Return vectors (..., d) as (..., 3), rounded to six digits."""
     padded = in_space(vectors)
     return np.array([float(f"{number:.6g}") for number in padded.ravel()]).reshape(padded.shape)
 
 
 def _colours(cloud: Cloud) -> NDArray[Any]:
-    """Return the sRGB colours of a cloud as bytes, (n, 3) or (frames, n, 3)."""
+    """Return sRGB bytes, (n, 3) or (frames, n, 3)."""
     particles = cloud.positions.shape[1]
     colours = np.tile(_PLAIN, (particles, 1)) if cloud.colours is None else np.asarray(cloud.colours)
     return to_srgb(colours.reshape(1, -1, 3)).reshape(colours.shape)
@@ -164,12 +155,11 @@ def _base64(array: NDArray[Any]) -> str:
 
 
 ROUND = 48
-"""Number of sides of the polygon drawn for a circle."""
 
 
 def scene_view(scene: Scene, runs: Mapping[str, Iterable[Any]], times: ArrayLike) -> str:
-    """Return HTML that shows runs of a scene side by side; see `particle_view`. ``runs`` gives, by name, a state (such
-    as a `Frame`) for each of the times (frames,) [s]. Moving solids are not shown."""
+    """Return HTML that shows runs of a scene side by side; ``runs`` has by name a state, such as a `Frame`, for each of
+    the times (frames,) [s]."""
     turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
     states, times = {name: list(of_run) for name, of_run in runs.items()}, np.asarray(times)
     particles = len(next(iter(states.values()))[0].positions)
@@ -182,7 +172,7 @@ def scene_view(scene: Scene, runs: Mapping[str, Iterable[Any]], times: ArrayLike
 
 
 def outline(scene: Scene) -> Points:
-    """Return ends (k, 2, d) [m] of the outlines of a scene's container and solids; k is 0 if the scene has neither."""
+    """Return ends (k, 2, d) [m] of the outlines of a scene's container and solids."""
     return np.concatenate([container_outline(scene), solid_outline(scene)])
 
 
@@ -199,7 +189,7 @@ def container_outline(scene: Scene) -> Points:
 
 
 def _cup(container: CylinderContainer) -> Points:
-    """Return the lines of a cylinder: two circles, and four lines between them."""
+    """Return the lines (k, 2, 3) [m] of a cylinder: two circles, and four lines between them."""
     angles = np.linspace(0.0, 2.0 * np.pi, ROUND, endpoint=False)
     axis = INDEX_OF_AXIS[container.axis]
     circle = np.insert(container.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1), axis, 0.0, axis=1)
@@ -211,7 +201,6 @@ def _cup(container: CylinderContainer) -> Points:
 
 
 def _cloud(scene: Scene, name: str, states: list[Any], turn: Points, stride: int) -> Cloud:
-    """Make the cloud of a run of states, with one of every ``stride`` particles."""
     domain = scene.domain
     positions = domain.wrapped(np.stack([state.positions[::stride] for state in states])) @ turn.T
     speeds = np.stack([np.linalg.norm(state.velocities[::stride], axis=1) for state in states])

@@ -1,4 +1,4 @@
-"""Pictures of 2-D fluid: drawn as a body with a smooth edge and a little gloss, in its container, on paper."""
+"""Pictures of 2-D fluid on paper, drawn as a body with a smooth edge and a little gloss."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cortado.device.threads import usable_cores
 from cortado.discretise.shapes import Points, wrapped
-from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids
+from cortado.pictures.shown_solids import ShownSolid, extents_of_solids, shown_solids, union
 from cortado.pictures.stage import fluid_extent, thinned
 from cortado.pictures.tracing.space import State, mirrored
 from cortado.scene.appearance import Picture
@@ -22,15 +22,13 @@ LIGHT = (-0.45, 0.70, 0.55)
 
 
 def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) -> Points:
-    """Return the shaded colours (rows, columns, 3) of a body that covers a fraction of each pixel (rows, columns).
-
-    The shading makes the body look thicker in the middle than at its edge.
+    """Shade a body so that it looks thicker in the middle than at its edge; return colours (rows, columns, 3).
 
     Args:
-        cover: (rows, columns), from 0 to 1.
-        colour: linear, (rows, columns, 3) or (3,).
-        width: width of the edge, in pixels.
-        gleaming: brightness of the lamp's reflection in the body.
+        cover: (rows, columns).
+        colour: (rows, columns, 3) or (3,), linear.
+        width: of the edge, in pixels.
+        gleaming: brightness of the lamp's reflection.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -50,9 +48,8 @@ def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) 
 
 
 FILLED = 0.80
-"""Fraction of the picture's width or height that the container fills."""
+"""Fraction of the picture's width or height that the contents fill."""
 GLASS = (0.40, 0.50, 0.55)
-"""Linear colour of the walls of a container."""
 GLEAM, GLEAM_OF_MIRRORS = 0.12, 0.7
 """Brightness of the lamp's reflection in dull solids, and in mirrors."""
 SOLID_SHADOW = 0.25
@@ -61,7 +58,7 @@ BLUR, DROPPED, AROUND = 0.022, 0.020, 0.12
 """Shadows, relative to the size of the contents: softness, downward offset, and distance from a body beyond which there
 is no shadow."""
 Layer = tuple[Points, Points]
-"""A layer of a picture: its opacity (rows, columns, 1) and its colours (rows, columns, 3)."""
+"""Opacity (rows, columns, 1) and colours (rows, columns, 3)."""
 
 
 @dataclass(frozen=True)
@@ -78,52 +75,50 @@ class PlaneStage:
     """[m]"""
     solids: tuple[ShownSolid, ...] = ()
     seen: tuple[Points, Points] | None = None
-    """Lower and upper ends (2,) [m] of the region in the picture's middle; if left out, those of the contents."""
+    """Lower and upper ends (2,) [m] of the region in the picture's middle; by default those of the contents."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "PlaneStage":
-        """Make the stage of a scene in 2-D, whose fluid is at positions (n, 2) or (frames, n, 2) [m]; ``poses`` are as
-        in `painter`."""
         container = scene.container if isinstance(scene.container, BoxContainer) else None
         spacing, solids = scene.discretisation.spacing, shown_solids(scene)
         if container is not None:
             lower, upper = (np.asarray(end) for end in container.extent())
         else:
-            paper, scenes = 0.0 if any(one.is_tank for one in solids) else spacing, [scene, *poses]
-            lower, upper = fluid_extent(thinned(positions), extents_of_solids(scenes))
-            lower, upper = extent_with((lower - paper, upper + paper), scenes)
+            paper, solid_ends = (
+                0.0 if any(one.is_tank for one in solids) else spacing,
+                extents_of_solids([scene, *poses]),
+            )
+            lower, upper = fluid_extent(thinned(positions), solid_ends)
+            lower, upper = union([(lower - paper, upper + paper), *solid_ends])
         return cls(scene.picture or Picture(), container, lower, upper, spacing, solids)
 
     @property
     def ends(self) -> tuple[Points, Points]:
-        """Return lower and upper ends (2,) [m] of the contents, in the scene's axes."""
         return self.lower, self.upper
 
     @property
     def seen_size(self) -> Points:
-        """Return width and height (2,) [m] of the region in the picture's middle."""
         lower, upper = self.seen or self.ends
         return upper - lower
 
     def framed(self, ends: tuple[Points, Points], picture: Picture) -> "PlaneStage":
-        """Return the stage for a picture of another size, with the region between ``ends`` in its middle."""
         return replace(self, picture=picture, seen=ends)
 
     @cached_property
     def pixel(self) -> float:
-        """Return the width of a pixel [m]."""
+        """Width [m]."""
         size = np.array([self.picture.width, self.picture.height])
         return float((self.seen_size / (FILLED * size)).max())
 
     @property
     def _middle(self) -> Points:
-        """Return the middle (2,) of the picture [m]."""
+        """(2,) [m]"""
         lower, upper = self.seen or self.ends
         return 0.5 * (lower + upper)
 
     @cached_property
     def pixels(self) -> tuple[Points, Points]:
-        """Return x and y (rows, columns) of the middle of each pixel [m]."""
+        """x and y (rows, columns) of the middle of each pixel [m]."""
         columns, rows, middle = self.picture.width, self.picture.height, self._middle
         x = middle[0] + (np.arange(columns) - 0.5 * (columns - 1)) * self.pixel
         y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
@@ -135,18 +130,15 @@ class PlaneStage:
         return np.asarray((np.abs(points - self._middle) <= half + margin).all(axis=1))
 
     def on_screen(self, points: Points) -> Points:
-        """Return column and row (n, 2) in the picture of points (n, 2) [m], as `Stage.on_screen` does."""
+        """Return column and row (n, 2) in the picture of points (n, 2) [m]."""
         off = (points - self._middle) / self.pixel
         return np.stack([0.5 * self.picture.width + off[:, 0], 0.5 * self.picture.height - off[:, 1]], axis=1)
 
-    @property
-    def up_axis(self) -> int:
-        """Return the scene's axis that points upwards in the picture."""
-        return 1
+    up_axis = 1
 
     @property
     def gloss_width(self) -> float:
-        """Return the width of the edges of bodies, in pixels."""
+        """Width in pixels."""
         return max(0.55 * self.spacing / self.pixel, 1.5)
 
     @cached_property
@@ -163,7 +155,6 @@ class PlaneStage:
 
     @cached_property
     def before(self) -> list[Layer]:
-        """Return the layers over the fluid, in order: solids, then the walls of a container and of tanks."""
         layers = [self._body(shown, distance) for shown, distance in self._bodies]
         if self.container is not None:
             layers.append(self._container_walls(self.container))
@@ -171,7 +162,7 @@ class PlaneStage:
 
     @cached_property
     def free(self) -> Points:
-        """Return the fraction (rows, columns) of each pixel that is inside the container and outside all solids."""
+        """Fraction (rows, columns) of each pixel that is inside the container and outside all solids."""
         free = self._room
         for _, distance in self._bodies:
             free = free * (1.0 - self._covered(distance))
@@ -179,18 +170,17 @@ class PlaneStage:
 
     @cached_property
     def shown(self) -> Points:
-        """Return the fraction (rows, columns) of each pixel where fluid is drawn. It includes opaque solids, which are
-        drawn over the fluid later."""
+        """Fraction (rows, columns) of each pixel where fluid is drawn; opaque solids are drawn over the fluid later."""
         return self.free if any(shown.transparency > 0.0 for shown, _ in self._bodies) else self._room
 
     @cached_property
     def _bodies(self) -> list[tuple[ShownSolid, Points]]:
-        """Return the solids around which fluid flows, and the distance of pixels from each solid."""
+        """Solids around which fluid flows, each with the distance of pixels from it."""
         return [(one, self._distance(one)) for one in self.solids if not one.is_tank]
 
     @cached_property
     def _tanks(self) -> list[tuple[ShownSolid, Points]]:
-        """Return the solids that contain fluid (tanks), and the distance of pixels from each tank's cavity."""
+        """Solids that contain fluid, each with the distance of pixels from its cavity."""
         return [(one, self._distance(one)) for one in self.solids if one.is_tank]
 
     def _distance(self, shown: ShownSolid, drop: float = 0.0) -> Points:
@@ -205,11 +195,9 @@ class PlaneStage:
         return found
 
     def _covered(self, distance: Points) -> Points:
-        """Return the fraction (rows, columns) of each pixel that a body covers."""
         return np.clip(0.5 - distance / self.pixel, 0.0, 1.0)
 
     def _paper(self) -> Points:
-        """Draw the paper, a little brighter in the middle and darker in the corners."""
         x, y = self.pixels
         middle, half = self._middle, 0.5 * self.pixel * self.picture.width
         away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
@@ -217,7 +205,7 @@ class PlaneStage:
 
     @cached_property
     def _room(self) -> Points:
-        """Return the fraction (rows, columns) of each pixel that is inside the container and the tanks."""
+        """Fraction (rows, columns) of each pixel that is inside the container and the tanks."""
         room = np.ones(self.pixels[0].shape)
         if self.container is not None:
             x, y = self.pixels
@@ -229,7 +217,7 @@ class PlaneStage:
 
     @property
     def _size(self) -> float:
-        """Return the longer side of the contents [m]."""
+        """[m]"""
         return float((self.upper - self.lower).max())
 
     def _shadow(self) -> Points:
@@ -252,7 +240,6 @@ class PlaneStage:
         return 0.5 * (1.0 - np.tanh(distance / (BLUR * self._size)))
 
     def _body(self, shown: ShownSolid, distance: Points) -> Layer:
-        """Return the layer of a solid around which fluid flows, drawn only inside the container."""
         cover = self._covered(distance)
         gleaming = GLEAM + (GLEAM_OF_MIRRORS - GLEAM) * shown.finish.reflectivity
         light = glossy(np.where(self._room > 0.5, cover, 1.0), shown.colour, self.gloss_width, gleaming)
@@ -273,7 +260,8 @@ class PlaneStage:
         return self._walls(distance, part, np.array(GLASS if container.finish is None else container.finish.colour))
 
     def _walls(self, distance: Points, part: Points | float, colour: Points) -> Layer:
-        """Return the layer of walls, by the distance [m] of pixels from their inner side; ``part`` of them is there."""
+        """Return the layer of walls, given the distance [m] of pixels from the inner side and the fraction ``part``
+        with a wall."""
         wall = 0.01 * self._size
         band = np.clip(distance / self.pixel + 0.5, 0.0, 1.0) * np.clip((wall - distance) / self.pixel + 0.5, 0.0, 1.0)
         shine = 1.0 - 0.35 * np.clip(distance / wall, 0.0, 1.0)
@@ -293,18 +281,14 @@ TOUCHING = 0.9
 
 @dataclass(frozen=True)
 class PlanePainter:
-    """A painter that draws states of one 2-D scene."""
-
     stage: PlaneStage
 
     def image(self, *state: Any) -> Points:
-        """Draw the picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
         positions, colours, pose = State(*state)[:3]
         own = self if pose is None else PlanePainter(replace(self.stage, solids=shown_solids(pose)))
         return own._drawn(np.asarray(positions, dtype=np.float64), np.asarray(colours, dtype=np.float64))
 
     def _drawn(self, positions: Points, colours: Points) -> Points:
-        """Draw particles of fluid in the given colours, and the solids at their poses on the stage."""
         stage, (cover, colour) = self.stage, self._fluid(positions, colours)
         body, width = np.where(stage.free > 0.5, cover, 1.0), stage.gloss_width
         fluid = glossy(body, colour, width) if stage.picture.shaded else colour
@@ -329,8 +313,8 @@ class PlanePainter:
         if not len(wet):
             empty = np.zeros(self.stage.pixels[0].shape)
             return empty, np.zeros((*empty.shape, 3))
-        wet_tree = cKDTree(wet)
-        own = _weight(_distances(wet_tree, wet, reach), reach)
+        distances, _ = cKDTree(wet).query(wet, k=24, distance_upper_bound=reach, workers=usable_cores())
+        own = _weight(distances, reach)
         strength = np.minimum(1.0 / own.sum(axis=1), DROP)
         corner = wet.min(axis=0) - reach
         counts = np.ceil((wet.max(axis=0) + reach - corner) / cell).astype(int) + 1
@@ -346,8 +330,8 @@ class PlanePainter:
         return cover, np.clip(colour, 0.0, 1.0)
 
     def _wetting(self, positions: Points) -> tuple[Points, np.ndarray]:
-        """Return positions (n, 2) with mirror images behind touched walls and with periodic images, and the number of
-        each one's particle."""
+        """Return positions (n, 2) with mirror images behind touched walls and with periodic images, and each position's
+        particle number."""
         stage, of, reach = self.stage, np.arange(len(positions)), TOUCHING * self.stage.spacing
         lengths = np.zeros(2) if stage.container is None else stage.container.periods(2)[1]
         positions = stage.lower + wrapped(positions - stage.lower, lengths)
@@ -361,12 +345,6 @@ class PlanePainter:
                 behind[:, axis] = behind[:, axis] + way if way else 2.0 * place - behind[:, axis]
                 positions, of = np.concatenate([positions, behind]), np.concatenate([of, of[near]])
         return positions, of
-
-
-def _distances(tree: object, points: Points, reach: float) -> Points:
-    """Return distances (p, k) [m] to the nearest particles; infinite if fewer particles are within reach."""
-    distances, _ = tree.query(points, k=24, distance_upper_bound=reach, workers=usable_cores())  # type: ignore[attr-defined]
-    return distances
 
 
 def _weight(distances: Points, reach: float) -> Points:

@@ -1,4 +1,4 @@
-"""Plots with matplotlib in a common style; each PNG is written whole or not at all."""
+"""Plots with matplotlib in a common style; each PNG is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -59,15 +59,13 @@ def drawing(path: str | Path, width: float = 9.0, height: float = 5.2) -> Iterat
 
 
 def whole_numbers(axis: Any) -> None:
-    """Put ticks of an axis at whole numbers only."""
     from matplotlib.ticker import MaxNLocator
 
     axis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
 
 
 def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", label: str = "loss") -> Path:
-    """Plot losses (evaluations,) over the evaluations, on a logarithmic scale if any loss is positive. Losses that are
-    not finite are left out; on a logarithmic scale also those that are not positive."""
+    """Plot losses (evaluations,) over the evaluations, on a logarithmic scale if any loss is positive."""
     values = np.asarray(losses, dtype=float)
     shown = np.isfinite(values)
     logarithmic = bool(np.any(values[shown] > 0.0))
@@ -101,15 +99,8 @@ def panels(
     true: ArrayLike | None = None,
     start: ArrayLike | None = None,
 ) -> Path:
-    """Plot each component of ``found`` in its own panel, over whole numbers.
-
-    Args:
-        x: (k,) evaluations or steps.
-        found: (k, c).
-        names: names of the c components.
-        true: (c,) or (k, c), true values, dashed; None if unknown.
-        start: (c,) or (k, c), the first guess, drawn faintly.
-    """
+    """Plot each component of ``found`` (k, c) in a separate panel over ``x`` (k,). ``true`` and ``start`` are (c,) or
+    (k, c)."""
     x, found = np.asarray(x), np.asarray(found, dtype=float)
     count = found.shape[1]
     with drawing(path, height=1.6 + 1.9 * count) as figure:
@@ -133,13 +124,8 @@ def panels(
 _MOST_IN_A_ROW = 4
 
 
-def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path, title: str = "") -> Path:
-    """Plot images in a row, such as start, target and result; more than 4 images are plotted in a grid.
-
-    Args:
-        images: one (rows, columns, 3) linear image for each panel, from 0 to 1; the first row is at the top.
-        titles: one for each panel. title: title of the whole figure.
-    """
+def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path) -> Path:
+    """Plot linear images (rows, columns, 3) in a row, such as start, target and result, or more than 4 in a grid."""
     shown = [to_srgb(image) for image in images]
     if not shown or len(shown) != len(titles):
         raise InputError(f"There are {len(shown)} images and {len(titles)} titles; give at least one of each, paired.")
@@ -147,7 +133,7 @@ def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path,
     down = -(-len(shown) // across)
     tallness = max(image.shape[0] / image.shape[1] for image in shown)
     panel = min(6.0, 11.0 / across, 7.0 / tallness)  # width [inch]
-    height = down * (panel * tallness + 0.35) + (0.6 if title else 0.25)
+    height = down * (panel * tallness + 0.35) + 0.25
     with drawing(path, max(across * (panel + 0.1), 8.0), max(height, 2.4)) as figure:
         panels = figure.subplots(down, across, squeeze=False).ravel()
         for axes in panels:
@@ -155,8 +141,6 @@ def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path,
         for axes, image, name in zip(panels, shown, titles, strict=False):
             axes.imshow(image)
             axes.set_title(name)
-        if title:
-            figure.suptitle(title, weight="bold")
     return Path(path)
 
 
@@ -180,19 +164,20 @@ def particles(
     """Plot particle sets side by side, such as before, after and target.
 
     In 3-D the view is along the third axis: x to the right, y upwards, larger z nearer; nearer particles cover farther
-    ones. All panels have the same scale. Above 150 000 particles, only every k-th is drawn.
+    ones. Above 150 000 particles, only every k-th is drawn.
 
     Args:
         positions: one (n, d) [m] for each panel.
-        titles: one for each panel.
-        colours: for each panel (n,) numbers, drawn with one scale (speed, density), or (n, 3) red, green,
-            blue, linear light in [0, 1]; None shades by depth.
+        colours: for each panel (n,) numbers, drawn with one scale (speed, density), or (n, 3) linear colours from 0 to
+            1;
+            None shades by depth.
         colour_label: label of the colour scale, with its unit.
         container: lower and upper corner (d,) [m], outlined.
-        lines: for each panel (k, 2, d) ends of lines [m] that are drawn over the particles, such as those of solids.
-        dimension: 2 or 3; that of the first set when left out. In 2-D a third component is ignored.
+        lines: for each panel (k, 2, d) ends of lines [m], drawn over the particles, such as outlines of solids.
+        dimension: 2 or 3, by default the dimension of the first set; in 2-D a third component is ignored.
     """
     from matplotlib.collections import LineCollection
+    from matplotlib.patches import Rectangle
 
     sets = [np.asarray(one, dtype=float)[:, :dimension] for one in positions]
     values = [None] * len(sets) if colours is None else [np.asarray(one, dtype=float) for one in colours]
@@ -207,7 +192,8 @@ def particles(
         for axes, points, own, title, drawn in zip(panels, sets, values, titles, ends, strict=True):
             _draw_set(axes, points, scale.rgb(points, own), title)
             if container is not None:
-                _outline(axes, container)
+                low, high = np.asarray(container, dtype=float)[:, :2]
+                axes.add_patch(Rectangle(low, *(high - low), fill=False, edgecolor=FAINT, linewidth=1.4))
             if len(drawn):
                 axes.add_collection(LineCollection(list(drawn), colors=INK, linewidths=1.2))
             axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal", xlabel="x [m]")
@@ -254,19 +240,18 @@ class _ColourScale:
         self.mappable = self._map if numbers else None
 
     def rgb(self, points: NDArray[Any], colours: NDArray[Any] | None) -> NDArray[Any]:
-        """Return colours (n, 3) in [0, 1] of points, from the given colours or from the points' depth."""
+        """Return colours (n, 3) from 0 to 1 of points, from ``colours`` or, if None, from the points' depth."""
         if colours is not None and colours.ndim == 2:
             return to_srgb(colours[None])[0] / 255.0
         return self._map.to_rgba(_depth(points) if colours is None else colours)[:, :3]
 
 
 def _depth(points: NDArray[Any]) -> NDArray[Any]:
-    """Return the depth (n,) [m] of points, their third component, zero in 2-D."""
+    """Return (n,) [m]."""
     return points[:, 2] if points.shape[1] == 3 else np.zeros(len(points))
 
 
 def _draw_set(axes: Any, points: NDArray[Any], colours: NDArray[Any], title: str) -> None:
-    """Draw discs of one particle spacing in diameter; nearer discs cover farther ones."""
     from matplotlib.collections import EllipseCollection
 
     kept = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -291,10 +276,3 @@ def _spacing(points: NDArray[Any]) -> float:
         return 0.02
     chosen = points[:: -(-len(points) // 1000)]
     return float(np.median(cKDTree(points).query(chosen, k=2)[0][:, 1])) or 0.02
-
-
-def _outline(axes: Any, container: tuple[ArrayLike, ArrayLike]) -> None:
-    from matplotlib.patches import Rectangle
-
-    lower, upper = np.asarray(container, dtype=float)[:, :2]
-    axes.add_patch(Rectangle(lower, *(upper - lower), fill=False, edgecolor=FAINT, linewidth=1.4))

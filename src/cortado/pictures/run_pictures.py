@@ -1,8 +1,4 @@
-"""Pictures, films and plots of a run.
-
-Pictures and films follow the table [picture] of the scene and the settings of a call. Plots show the convergence of
-steps, sensor readings, and checks of gradients.
-"""
+"""Pictures, films and plots of a run."""
 
 from __future__ import annotations
 
@@ -24,11 +20,10 @@ from cortado.files.disk import as_path
 from cortado.files.image_encoding import ShadedPicture
 from cortado.files.terminal import announce
 from cortado.particles.state import Entry
-from cortado.pictures.film import LEAST_PIXELS, Page, ShownRun, alone, coloured_by, film, lacking
+from cortado.pictures.film import LEAST_PIXELS, Page, ShownRun, coloured_by, film, lacking
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.pages import Figures
 from cortado.pictures.painter import Scale, side_by_side
-from cortado.pictures.particle_view import scene_view
 from cortado.pictures.plane import PlaneStage
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, whole_numbers
 from cortado.pictures.stage import Stage
@@ -42,14 +37,13 @@ from cortado.scene.tables import field_name
 from cortado.simulation import Simulation
 
 SHEET = 3
-"""Number of pictures in a row of a contact sheet, and number of rows."""
 
 
 def run_pictures(
     scene: Scene, trajectory: Trajectory, folder: Path, device: Any, values: NDArray | None = None
 ) -> Figures:
     """Draw a run's first and last state, a contact sheet and a film into a folder; return (caption, path) of each.
-    Sheet and film have quality "quick" unless the scene sets the quality. ``values`` colour the particles."""
+    Sheet and film have quality "quick" unless the scene sets the quality."""
     run, last, picture = ShownRun(scene, trajectory, values), len(trajectory) - 1, scene.picture or Picture()
     page, is_quick = run_page(run, device), picture.quality is None and scene.dimension == 3
     stills: Figures = []
@@ -76,16 +70,15 @@ def run_pictures(
 
 
 def run_page(run: ShownRun, device: Any) -> Page:
-    """Return the page that draws a run's frames by number."""
     if run.values is None:
         return Page([run.panel(run.stage, device, None)], fingerprint=run.fingerprint)
     scale = Scale.of((run.scene.picture or Picture()).colour, run.values, run.unit)
     stage, composed = _with_scale(run.stage, scale)
-    return Page([run.panel(stage, device, scale)], lambda images: composed(alone(images)), run.fingerprint)
+    return Page([run.panel(stage, device, scale)], lambda images: composed(images[0]), run.fingerprint)
 
 
 def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | Stage, Callable[[Points], Points]]:
-    """Return the stage and the method that draws the scale at the right edge: over the picture, or beside a narrower
+    """Return the stage and the method that draws the colour scale: over the picture's right edge, or beside a narrower
     picture if the scale would cover contents."""
     free = stage.picture.width - scale.columns(stage.picture.height)
     is_covered = stage.on_screen(corners(*stage.ends))[:, 0].max() > free
@@ -94,13 +87,7 @@ def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | S
     return stage.framed(stage.ends, stage.picture.model_copy(update={"width": free})), scale.beside
 
 
-def trajectory_view(scene: Scene, trajectory: Trajectory) -> str:
-    """Return HTML with an animation of a run; see `scene_view`."""
-    return scene_view(scene, {scene.name: list(trajectory)}, trajectory.times)
-
-
 Units = Mapping[str, str]
-"""Units, by name, of fields that exist only in some scenes."""
 
 
 def shown_run(
@@ -121,7 +108,6 @@ def shown_run(
 
 
 def film_of(run: ShownRun, path: str | Path, device: Any) -> Film:
-    """Write a film of a run."""
     if missing := lacking(run.scene):
         raise InputError(missing)
     pace = pace_of(run.times, run.scene.picture or Picture(), common_rate([run.trajectory.marks]))
@@ -129,7 +115,6 @@ def film_of(run: ShownRun, path: str | Path, device: Any) -> Film:
 
 
 def simulation_picture(simulation: Simulation, frame: Frame, settings: Mapping[str, Any]) -> ShadedPicture:
-    """Draw a shaded picture of a frame, see `Simulation.picture`."""
     if not isinstance(frame, Frame):
         raise InputError(f"frame is {shown(frame)}, but must be one frame of a trajectory, such as trajectory[-1].")
     units = _units_of_fields(simulation)
@@ -144,7 +129,6 @@ def simulation_picture(simulation: Simulation, frame: Frame, settings: Mapping[s
 def simulation_film(
     simulation: Simulation, trajectory: Trajectory, path: str | Path, settings: Mapping[str, Any]
 ) -> Film:
-    """Write a film of a trajectory of a simulation, see `Simulation.film`."""
     if not isinstance(trajectory, Trajectory):
         raise InputError(f"trajectory is {shown(trajectory)}, but must be one, as simulation.run returns it.")
     units = _units_of_fields(simulation)
@@ -155,7 +139,6 @@ def simulation_film(
 def trajectory_picture(
     trajectory: Trajectory, k: int, scene: Scene | str | Path | None, device: str, settings: Mapping[str, Any]
 ) -> ShadedPicture:
-    """Draw a shaded picture of frame k of a trajectory, see `Trajectory.picture`."""
     count = len(trajectory)
     if k not in range(-count, count):
         raise InputError(f"k is {shown(k)}, but must be the number of one of {count} frames, such as 0 or -1.")
@@ -166,12 +149,11 @@ def trajectory_picture(
 def trajectory_film(
     trajectory: Trajectory, path: str | Path, scene: Scene | str | Path | None, device: str, settings: Mapping[str, Any]
 ) -> Film:
-    """Write a film of a trajectory, see `Trajectory.film`."""
     return film_of(shown_run(trajectory, _scene_of(trajectory, scene), settings), path, device_of(device))
 
 
 def device_of(name: str) -> Any:
-    """Return the Warp device with this name; raise `InputError` if there is none."""
+    """Return the Warp device with this name; raise `InputError` for an unknown name."""
     start_warp()
     return device_named(name)
 
@@ -184,14 +166,12 @@ def _scene_of(trajectory: Trajectory, given: Scene | str | Path | None) -> Scene
 
 
 def _units_of_fields(simulation: Simulation) -> dict[str, str]:
-    """Return, by name, the units of the particle fields that user-defined parts keep."""
     drawn = (Entry.NUMBER, Entry.VECTOR)
     known = (field for field in simulation.initial.fields if field.entry in drawn and field.axis is Axis.PARTICLE)
     return {field.name: field.unit for field in known if field.name not in NAMES}
 
 
 def _alone(frame: Frame) -> Trajectory:
-    """Return the trajectory of one frame."""
     arrays = {"positions": frame.positions, "velocities": frame.velocities, "mass_fractions": frame.mass_fractions}
     return Trajectory(
         times=np.array([frame.time]),
@@ -204,16 +184,12 @@ def _alone(frame: Frame) -> Trajectory:
 
 
 WIDE = 16.0 / 9.0
-"""Ratio of columns to rows for pictures given only by their number of lines."""
+"""Ratio of columns to rows for pictures of which a user sets only the number of lines."""
 
 
 def shown_as(scene: Scene, settings: Mapping[str, Any], fields: Collection[str] = ()) -> Scene:
-    """Return the scene with keys of [picture] replaced. ``lines`` sets width and height; ``camera`` may be a path such
-    as `pictures.Orbit`; ``colour`` may also name one of ``fields``, which exist only in some scenes.
-
-    Raises:
-        SceneError: settings that do not fit.
-    """
+    """Return the scene with keys of [picture] replaced; ``colour`` may also name one of ``fields``. Raise `SceneError`
+    for settings that do not fit."""
     given = {} if scene.picture is None else scene.picture.model_dump()
     wanted = {**given, **settings}
     if "lines" in settings:
@@ -235,11 +211,8 @@ def shown_as(scene: Scene, settings: Mapping[str, Any], fields: Collection[str] 
 
 
 def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
-    """Plot density error [%] and iterations of each solver loop over the steps; steps that did not converge are marked.
-
-    Args:
-        tolerance: the solver's tolerance [-], drawn as a line.
-    """
+    """Plot the density error [%] and the iterations of each solver loop over the steps; steps that did not converge are
+    marked."""
     steps = np.arange(1, len(trajectory.converged) + 1)
     loops = {name: column for name, column in trajectory.diagnostics.items() if column.dtype.kind == "i"}
     errors = 100.0 * trajectory.density_errors
@@ -310,11 +283,7 @@ if TYPE_CHECKING:
 
 
 def gradient_check(certificate: Certificate, path: str | Path) -> Path:
-    """Plot four panels: central differences compared with forward mode, growth of the adjoint, horizon, and estimators.
-
-    The horizon is shown for the parameter with the shortest horizon. If the adjoint is wrong, the last two panels are
-    empty.
-    """
+    """Plot central differences against forward mode, growth of the adjoint, the shortest horizon, and estimators."""
     with drawing(path, 12.0, 8.4) as figure:
         (differences, growth), (horizon, estimators) = figure.subplots(2, 2)
         _differences(differences, certificate)

@@ -86,7 +86,7 @@ def film_side_by_side(
 
 
 def _trajectories(runs: Any) -> list[Trajectory]:
-    """Return the given trajectories, with or without labels; raise `InputError` for other objects."""
+    """Return trajectories from a mapping or an iterable; raise `InputError` for other objects."""
     each = runs.values() if isinstance(runs, Mapping) else runs
     if not isinstance(each, Iterable) or isinstance(runs, Trajectory):
         raise InputError(f"runs is {shown(runs)}, but must be several trajectories, with labels or without.")
@@ -100,8 +100,8 @@ def _trajectories(runs: Any) -> list[Trajectory]:
 def shown_alike(
     scenes: Sequence[Scene], trajectories: Sequence[Trajectory], settings: Mapping[str, Any]
 ) -> list[Scene]:
-    """Return the runs' scenes, all with the first scene's table [picture], after `shown_as` has replaced keys. Raise
-    `InputError` if runs cannot be shown together, or if a package is missing."""
+    """Return the runs' scenes with the first scene's table [picture], after `shown_as`; raise `InputError` for unlike
+    runs."""
     if not 0 < len(scenes) <= MOST_PICTURES:
         raise InputError(f"There are {len(scenes)} runs, but 1 to {MOST_PICTURES} can be side by side.")
     if len({scene.dimension for scene in scenes}) > 1:
@@ -121,7 +121,8 @@ def shown_alike(
 
 
 def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tuple[Page, NDArray[Any]]:
-    """Return a page with runs of scenes that are `shown_alike`, each with name and time, and its frames' times [s]."""
+    """Return a page of runs whose scenes are `shown_alike`, each labelled with name and time, and its frames' times
+    [s]."""
     times = common_times([run.times for run in runs])
     values = [run.values.ravel() for run in runs if run.values is not None]
     picture = runs[0].scene.picture or Picture()
@@ -143,8 +144,6 @@ def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tu
 
 
 def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
-    """Return the pictures of a panel for the shown frames, labelled with name and time."""
-
     def drawn(k: int, around: Around) -> Points:
         before, after = (tuple(int(shown.nearest[n]) for n in side) for side in around)
         return labelled(panel(int(shown.nearest[k]), (before, after)), name, shown.time_in_words(k))
@@ -153,18 +152,16 @@ def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
 
 
 def _composed(across: int, scale: Scale | None, images: list[Points]) -> Points:
-    """Combine pictures to the page, with the colour scale beside them."""
     page = side_by_side(images, across)
     return page if scale is None else scale.beside(page)
 
 
 SAME = 0.01
-"""Fraction of the frame interval below which two frames count as simultaneous."""
 
 
 def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return the times (frames,) [s] of a film of several runs, given each run's times. They are the times of the run
-    with the highest frame rate, extended at both ends by those of other runs."""
+    """Return the times (frames,) [s] of a film of several runs: those of the run with the highest frame rate, extended
+    at both ends by those of other runs."""
     found = np.zeros(0)
     for times in sorted(each, key=lambda own: (interval_of(own), -len(own))):
         if not len(found):
@@ -188,34 +185,31 @@ class ShownFrames:
     own: NDArray[Any]
     """(own frames,) recording times [s]"""
     times: NDArray[Any]
-    """(frames,) times of the film, in simulated time [s]"""
+    """(frames,) [s]"""
 
     @cached_property
     def nearest(self) -> NDArray[np.int64]:
-        """Return the numbers (frames,) of the run's frames."""
         return np.rint(np.interp(self.times, self.own, np.arange(len(self.own)))).astype(np.int64)
 
     @cached_property
     def during(self) -> NDArray[np.bool_]:
-        """Return a mask (frames,) of the times between the start and the end of the run."""
+        """Mask (frames,) of the times between the start and the end of the run."""
         near = SAME * interval_of(self.times)
         return (self.times > self.own[0] - near) & (self.times < self.own[-1] + near)
 
     @property
     def off(self) -> float:
-        """Return the greatest difference [s] between a frame's time and the film's time, between start and end of the
-        run."""
+        """Greatest difference [s] between a shown frame's time and the film's time, while the run lasts."""
         return float(np.abs(self.own[self.nearest] - self.times)[self.during].max(initial=0.0))
 
     def time_in_words(self, k: int) -> str:
-        """Return as text the recording time of the frame shown as frame k, with enough digits to distinguish frames."""
+        """Describe the recording time of the frame shown as frame k, with enough digits to distinguish frames."""
         interval = interval_of(self.times)
         digits = max(ceil(-log10(interval)), 0) if 0.0 < interval < np.inf else 3
         time = f"{self.own[self.nearest[k]]:.{digits}f} s"
         return time if self.during[k] else f"stands still at {time}"
 
     def notes(self, name: str) -> list[str]:
-        """Return notes for viewers about the run ``name``, such as a late start or an early end."""
         ends = f'"{name}" ends at {self.own[-1]:.4g} s and stands still from then on'
         begins = f'"{name}" begins at {self.own[0]:.4g} s'
         return [note for note, is_on in ((begins, self.during[0]), (ends, self.during[-1])) if not is_on]
@@ -227,7 +221,7 @@ MOST_KEYS, LONGEST = 3, 64
 
 def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
     """Return a label for each scene: its name if all names differ, else the values in which the scenes differ, such as
-    ``viscosity = 0.1 Pa s``. ``otherwise``: labels to use if no values or too many differ."""
+    ``viscosity = 0.1 Pa s``. Return ``otherwise`` if no values or too many differ."""
     tables = [computed(json.loads(scene.to_json())) for scene in scenes]
     keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table, "missing")))
     short = [key.rpartition(".")[2] for key in keys]
@@ -244,7 +238,6 @@ def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
 
 
 def _value(table: Any, key: str) -> str:
-    """Return as text the value with a dotted name in a scene's table."""
     for part in key.split("."):
         try:
             table = table[int(part)] if isinstance(table, list) else table[part]

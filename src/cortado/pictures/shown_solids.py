@@ -35,7 +35,6 @@ def sides_of(corners: Numbers) -> Numbers:
 
 
 def lengths_of(vertices: Points, sides: Numbers) -> Points:
-    """Return the lengths (s,) of sides (s, 2) [m]."""
     return np.asarray(np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1))
 
 
@@ -52,7 +51,7 @@ def unit(vectors: NDArray[Any]) -> Points:
 
 def cosines_of(vertices: Points, corners: Numbers) -> Points:
     """Return cosines (t, 3) of the angle between the normals of each triangle and its neighbour at the side opposite to
-    each corner. Sides without exactly one neighbour have -1."""
+    each corner; -1 for sides without exactly one neighbour."""
     flat = unit(across_of(vertices, corners))
     _, which, counts = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True, return_counts=True)
     which = which.reshape(-1)
@@ -62,8 +61,6 @@ def cosines_of(vertices: Points, corners: Numbers) -> Points:
 
 @dataclass(frozen=True)
 class ShownSolid:
-    """A solid at a pose, for pictures."""
-
     name: str
     shape: Solid
     """Shape about the solid's middle, not rotated; for a tank, of the cavity."""
@@ -73,41 +70,33 @@ class ShownSolid:
     """(d, d) rotation matrix"""
     finish: Finish
     is_tank: bool
-    """True if the solid contains fluid."""
 
     @property
     def colour(self) -> Points:
-        """Return the linear colour (3,) of the solid."""
+        """(3,) linear."""
         return np.array(self.finish.colour)
 
     @property
     def transparency(self) -> float:
-        """Return the transparency of the solid, from 0 to 1."""
         return self.finish.transparency
 
     @property
     def body(self) -> Solid:
-        """Return the shape placed at the solid's position and turn."""
         return Placed(self.shape, self.position, self.turn)
 
     @property
     def solid(self) -> Solid:
-        """Return the region that fluid cannot enter: for a tank, the outside of the cavity."""
+        """The region that fluid cannot enter: for a tank, the outside of the cavity."""
         return Hollow(self.body) if self.is_tank else self.body
 
-    def moved(self, position: Points, turn: Points) -> "ShownSolid":
-        """Return the solid at another pose: with its middle at ``position`` (d,) [m] and rotation matrix ``turn`` (d,
-        d)."""
-        return replace(self, position=position, turn=turn)
-
     def within(self, frame: Points, origin: Points) -> "ShownSolid":
-        """Return the solid in other coordinates: with axes ``frame`` (d, d) and origin ``origin`` (d,) [m]."""
-        return self.moved(frame @ (self.position - origin), frame @ self.turn)
+        """Return the solid in coordinates with axes ``frame`` (d, d) and origin ``origin`` (d,) [m]."""
+        return replace(self, position=frame @ (self.position - origin), turn=frame @ self.turn)
 
 
 def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
-    """Return the solids of a scene at the poses in its tables, moved into the period along periodic axes. They are
-    followed by periodic images that reach into the container."""
+    """Return the solids of a scene at the poses in its tables, within the period, followed by periodic images that
+    reach into the container."""
     found, domain = [], scene.domain
     for table in scene.solid:
         shape, is_tank = table.shown_shape(scene.discretisation.spacing), table.side == "inside"
@@ -117,33 +106,26 @@ def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
     if ends is None or not lengths.any():
         return tuple(found)
     shifts = list(product(*[(0.0, -length, length) if length else (0.0,) for length in lengths]))[1:]
-    images = [one.moved(one.position + np.array(shift), one.turn) for one in found for shift in shifts]
-    return (*found, *(one for one in images if _overlap(one.body.extent(), ends)))
+    images = []
+    for one, shift in product(found, shifts):
+        image = replace(one, position=one.position + np.array(shift))
+        lower, upper = image.body.extent()
+        if (lower < ends[1]).all() and (ends[0] < upper).all():
+            images.append(image)
+    return *found, *images
 
 
 def extents_of_solids(scenes: Iterable[Scene]) -> list[tuple[Points, Points]]:
-    """Return lower and upper ends (d,) [m] of each solid of the scenes."""
     return [one.body.extent() for scene in scenes for one in shown_solids(scene)]
 
 
-def extent_with(ends: tuple[Points, Points], scenes: Iterable[Scene]) -> tuple[Points, Points]:
-    """Return lower and upper ends (d,) [m] of the smallest box around a given box and the solids of scenes."""
-    return union([ends, *extents_of_solids(scenes)])
-
-
 def union(boxes: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
-    """Return lower and upper ends (d,) [m] of the smallest box around boxes, given as pairs of such ends."""
+    """Return lower and upper ends (d,) [m] of the smallest box around boxes, given as pairs of ends."""
     both = np.array(boxes)
     return both[:, 0].min(axis=0), both[:, 1].max(axis=0)
 
 
-def _overlap(one: tuple[Points, Points], other: tuple[Points, Points]) -> bool:
-    """Test whether two boxes overlap."""
-    return bool((one[0] < other[1]).all() and (other[0] < one[1]).all())
-
-
 SIDES = 48
-"""Number of sides of the polygon drawn for a circle."""
 FLAT = 1.0 - 1e-9
 """Cosine of the angle between two triangles below which they do not count as coplanar."""
 
@@ -186,8 +168,8 @@ def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
 def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
     """Cut triangles (t, 3) of vertices (v, 3) [m] into smaller ones, and return the parent (p,) of each.
 
-    Each side is cut into 2^k equal parts no longer than ``longest`` [m], with the least k; so adjacent triangles fit.
-    Other sides of the parts are longer by at most a factor of the square root of 2.
+    Each side is cut into 2^k equal parts no longer than ``longest`` [m], with the least k, so that adjacent triangles
+    fit. Other sides of the parts are longer by at most a factor of the square root of 2.
     """
     parts = _parts(lengths_of(vertices, sides_of(corners)), longest).reshape(-1, 3)
     thin = (parts.min(axis=1) == 1) & (np.sort(parts, axis=1)[:, 1] > 1)
@@ -205,12 +187,10 @@ def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points,
 
 
 def _parts(lengths: Points, longest: float) -> Numbers:
-    """Return the number of parts into which each side is cut."""
     return 2 ** np.ceil(np.log2(np.maximum(lengths / longest, 1.0))).astype(np.int64)
 
 
 def _halved(vertices: Points, corners: Numbers, parents: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
-    """Bisect long sides of triangles repeatedly."""
     while len(corners):
         sides, which = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True)
         is_long = _parts(lengths_of(vertices, sides), longest) > 1
@@ -244,8 +224,8 @@ def _cut(corners: Numbers, middles: Numbers, parents: Numbers) -> tuple[Numbers,
 
 
 def _in_strips(triangles: Points, parents: Numbers, first: int, second: int) -> tuple[Points, Numbers, Numbers]:
-    """Cut thin triangles (t, 3, 3) [m] across their long sides: that from the first corner to the second into ``first``
-    parts, that to the third into ``second`` parts."""
+    """Cut thin triangles (t, 3, 3) [m] across their long sides: the side from the first corner to the second into
+    ``first`` parts, the side to the third corner into ``second`` parts."""
     tip, *ends = triangles.transpose(1, 0, 2)
     rows = [tip + (k / n) * (end - tip) for n, end in zip((first, second), ends, strict=True) for k in range(1, n + 1)]
     vertices = np.stack([tip, *rows], axis=1)
@@ -271,7 +251,7 @@ FAR = 1e9
 
 @dataclass(frozen=True)
 class SolidMesh:
-    """A mesh of triangles of solids in space; outside is the side from which corners run counterclockwise."""
+    """A triangle mesh of solids in space; seen from outside, corners run counterclockwise."""
 
     points: Points
     """(p, 3) [m]"""
@@ -285,7 +265,6 @@ class SolidMesh:
 
     @classmethod
     def of(cls, faces: Faces, longest: float) -> "SolidMesh":
-        """Make the mesh of the surface of a solid in 3-D, with sides no longer than about ``longest`` [m]."""
         flat_points, flat_corners, _ = merged(faces.vertices, faces.corners)
         points, corners, parents = refined(flat_points, flat_corners, longest)
         across = across_of(points, corners)
@@ -309,12 +288,10 @@ class SolidMesh:
         return values
 
     def moved(self, turn: Points, position: Points) -> "SolidMesh":
-        """Return the mesh rotated by a matrix (3, 3) and then shifted (3,) [m]."""
         return SolidMesh(self.points @ turn.T + position, self.normals @ turn.T, self.triangles, self.from_edges)
 
     @classmethod
     def joined(cls, parts: Sequence["SolidMesh"]) -> "SolidMesh":
-        """Join several meshes to one."""
         starts = np.cumsum([0, *(len(part.points) for part in parts)])
         return cls(
             points=np.concatenate([part.points for part in parts]),
@@ -341,7 +318,7 @@ def _normals(corners: Numbers, across: Points) -> Points:
 
 
 def _from_edges(points: Points, corners: Numbers, parts: Points, parents: Numbers) -> Points:
-    """Compute `SolidMesh.from_edges` of triangles (p, 3, 3) [m] that are parts of parents (p,) among triangles (t,
+    """Compute `SolidMesh.from_edges` of triangles (p, 3, 3) [m] that are parts of ``parents`` (p,) among triangles (t,
     3)."""
     sides = points[sides_of(corners).reshape(-1, 3, 2)]
     across = unit(across_of(points, corners))

@@ -8,7 +8,7 @@ import numpy as np
 
 from cortado.discretise.room import WITHOUT_PERIODS, Domain
 from cortado.discretise.shapes import Points, corners
-from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids, union
+from cortado.pictures.shown_solids import ShownSolid, extents_of_solids, shown_solids, union
 from cortado.scene.appearance import LIQUIDS, Picture, View
 from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import INDEX_OF_AXIS, BoxContainer, Container, CylinderContainer
@@ -16,8 +16,7 @@ from cortado.scene.shape_tables import INDEX_OF_AXIS, BoxContainer, Container, C
 DROPS = 0.002
 """Fraction of particles at each end of an axis that may lie outside the picture."""
 SPILT, BEYOND = 0.1, 0.15
-"""Fraction of particles at each end of an axis that does not widen the picture if far away; and the picture's margin
-around all others, relative to their extent."""
+"""Fraction of particles at each end of an axis that does not widen the picture if far away."""
 NEAR = 0.25
 """Distance from first state, solids and container within which every drop counts, relative to their size."""
 ENOUGH = 1_000_000
@@ -25,8 +24,8 @@ ENOUGH = 1_000_000
 
 
 def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIODS) -> list[Points]:
-    """Return states (m, d) [m] that determine the fluid's extent, from positions (n, d) or (frames, n, d) [m]: all, or
-    `ENOUGH` positions in total if there are more. They are moved into the period of ``domain``."""
+    """Return states (m, d) [m] that determine the fluid's extent, within the period, from positions (n, d) or (frames,
+    n, d) [m]."""
     states = [positions] if isinstance(positions, np.ndarray) and positions.ndim == 2 else list(positions)
     stride = max(sum(map(len, states)) // ENOUGH, 1)
     return [domain.wrapped(state[k % min(stride, len(state) or 1) :: stride]) for k, state in enumerate(states)]
@@ -35,9 +34,8 @@ def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIO
 def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
     """Return lower and upper ends (d,) [m] of the fluid that a picture shows, in states (n, d) [m].
 
-    ``around`` are the ends of everything else in the picture. All of the first state counts. Of later states the bulk
-    counts, and drops near the box around the first state and everything else. Drops that fall far away do not shrink
-    the picture.
+    All of the first state counts. Of later states the bulk counts, and drops near the box around the first state and
+    ``around``. Drops that fall far away do not shrink the picture.
     """
     first, *later = states
     found = [_ends(first, DROPS)]
@@ -57,8 +55,8 @@ def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points
 
 
 def _ends(positions: Points, share: float) -> tuple[Points, Points]:
-    """Return lower and upper ends (d,) [m] of positions (n, d) [m], leaving out a fraction ``share`` at both ends of
-    each axis."""
+    """Return lower and upper ends (d,) [m] of positions (n, d) [m], without a fraction ``share`` at both ends of each
+    axis."""
     lower, upper = np.quantile(positions, (share, 1.0 - share), axis=0)
     return lower, upper
 
@@ -72,11 +70,10 @@ LAYERS, LAYERS_OF_SPHERES = 3.0, 1e3
 
 
 def media_of(scene: Scene, size: float) -> tuple[Points, float]:
-    """Return scattering and absorption (phases, 2) [1/m] for contents of ``size`` [m], and the fraction of light
-    transmitted through `SPAN`, averaged over phases.
+    """Return scattering and absorption (phases, 2) [1/m] for contents of ``size`` [m], and the mean over phases of the
+    fraction of light transmitted through `SPAN`.
 
-    They are the materials' values, unless the picture sets a transparency or particles have other colours than their
-    phases. One layer of particles of an opaque fluid without a material hides everything behind.
+    A phase's material sets the values, unless the picture sets a transparency, or colours that are not those of phases.
     """
     picture, spacing = scene.picture or Picture(), scene.discretisation.spacing
     by_phase, transparency = picture.colour == "phase", picture.transparency
@@ -102,13 +99,13 @@ def media_of(scene: Scene, size: float) -> tuple[Points, float]:
 MARGIN = 1.10
 """Ratio of a picture's width to that of its contents."""
 AROUND = 1.08
-"""Distance factor for an orbiting camera, as the contents are not central from all sides."""
+"""Distance factor for an orbiting camera, because the contents are not central from all sides."""
 AIR = 0.1
 """Space beside fluid without a container, relative to the fluid's width."""
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
-"""Elevation of the camera [degrees]: for a view into an opaque cup, as of latte art, and for all others."""
+"""Elevation of the camera [degrees], for a view into an opaque cup and for all other views."""
 AZIMUTH = 24.0
-"""Azimuth of the camera, to the right of the direction towards the viewer [degrees]."""
+"""Azimuth of the camera [degrees], to the right of the direction towards the viewer."""
 
 
 @dataclass(frozen=True)
@@ -117,70 +114,65 @@ class Stage:
     contents."""
 
     frame: Points
-    """(3, 3) rotation from the scene's axes to those of the picture"""
+    """(3, 3) rotation from the scene's axes to picture axes"""
     origin: Points
     """(3,) [m], in the scene's axes"""
     lower: Points
-    """(3,) lower ends of the contents [m], in the frame of the picture"""
+    """(3,) lower ends of the contents [m], in picture axes"""
     upper: Points
     """(3,) [m]"""
     seen: tuple[Points, Points]
     """Lower and upper ends (3,) [m] of the region that the camera sees, in picture axes."""
     elevation: float
-    """Elevation [degrees] of the camera, unless the table [picture] sets its place."""
+    """[degrees]"""
     eye: Points
     """(3,) position of the camera [m]"""
     look_at: Points
     """(3,) [m]"""
     azimuth: float
-    """Azimuth [degrees] of the camera's home view; the lamps keep their places when the camera moves."""
+    """Azimuth [degrees] of the camera's home view; the lamps do not move with the camera."""
     picture: Picture
     container: Any
     spacing: float
     """[m]"""
     transparency: float
-    """Transparency of a tenth of the contents, filled with fluid: from 0 to 1."""
+    """Fraction of light transmitted through fluid of thickness `SPAN`."""
     media: Points
     """(phases, 2) scattering and absorption [1/m], as `media_of`"""
     cuts: bool
     """True if fluid is shown only inside the container."""
     solids: tuple[ShownSolid, ...]
-    """The solids in the frame of the picture."""
+    """In picture axes."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "Stage":
-        """Make the stage of a scene in 3-D, whose fluid is at positions (n, 3) or (frames, n, 3) [m]; ``poses`` are as
-        in `painter`."""
         states, picture = thinned(positions, scene.container.domain(3)), scene.picture or Picture()
         ends = scene.container.extent()
-        scenes = [scene, *poses]
-        lower, upper = fluid_extent(states, extents_of_solids(scenes) if ends is None else [ends])
+        around = extents_of_solids([scene, *poses]) if ends is None else [ends]
+        lower, upper = fluid_extent(states, around)
         frame = upright(np.asarray(scene.forces.gravity))
         if ends is None:
             air = 0.5 * scene.discretisation.spacing + AIR * (1.0 - np.abs(frame[1])) * (upper - lower)
             air = 0.0 * air if any(table.side == "inside" for table in scene.solid) else air
-            lower, upper = extent_with((lower - air, upper + air), scenes)
+            lower, upper = union([(lower - air, upper + air), *around])
         else:
             lower, upper = np.minimum(lower, ends[0]), np.maximum(upper, ends[1])
         origin = 0.5 * (lower + upper)
-        shown = (corners(lower, upper) - origin) @ frame.T
-        low, high = _box(shown)
-        several = len(scene.phase) > 1
-        from_above = several and (scene.render is None or scene.render.view == "top")
+        low, high = _box((corners(lower, upper) - origin) @ frame.T)
+        from_above = len(scene.phase) > 1 and (scene.render is None or scene.render.view == "top")
         into_cup = from_above and isinstance(scene.container, CylinderContainer)
         into_cup |= any(table.shape == "cup" and not table.transparency for table in scene.solid)
         elevation = FROM_ABOVE if into_cup else FROM_THE_SIDE
         media, transparency = media_of(scene, float((high - low).max()))
         spacing = scene.discretisation.spacing
         cuts = ends is not None and not spilled(scene.container, np.concatenate(states), spacing)
-        nowhere = np.zeros(3), np.zeros(3), 0.0
-        seen = (low, high), elevation, *nowhere
-        own = cls(frame, origin, low, high, *seen, picture, scene.container, spacing, transparency, media, cuts, ())
+        home = (low, high), elevation, np.zeros(3), np.zeros(3), 0.0
+        own = cls(frame, origin, low, high, *home, picture, scene.container, spacing, transparency, media, cuts, ())
         return own.framed((lower, upper), picture).at(scene, None)
 
     def framed(self, ends: tuple[Points, Points], picture: Picture) -> "Stage":
-        """Return the stage for a picture of another size. The camera sees all between ``ends`` (3,) [m] in the scene's
-        axes, unless ``picture`` sets its place."""
+        """Return the stage for a picture of another size, with a camera that sees all between ``ends`` (3,) [m] in the
+        scene's axes."""
         lower, upper = _box((corners(*ends) - self.origin) @ self.frame.T)
         eye, look_at = fitted(lower, upper, self.elevation, picture)
         if picture.look_at is not None:
@@ -194,23 +186,20 @@ class Stage:
 
     @property
     def ends(self) -> tuple[Points, Points]:
-        """Return lower and upper ends (3,) [m] of the contents, in the scene's axes."""
         return _box(corners(self.lower, self.upper) @ self.frame + self.origin)
 
     @property
     def seen_size(self) -> Points:
-        """Return width and height (2,) [m] of the camera's view of the contents, perpendicular to its direction."""
+        """Width and height (2,) [m] of the camera's view of the contents, perpendicular to its direction."""
         return np.ptp(corners(*self.seen) @ np.stack(screen_axes(self.look_at - self.eye), axis=1), axis=0)
 
     @property
     def home(self) -> View:
-        """Return the camera's home view, in the scene's axes."""
         return View(*(self.frame.T @ place + self.origin for place in (self.eye, self.look_at)))
 
     @property
     def home_around(self) -> View:
-        """Return the home view, moved far enough away to see all from every side, unless [picture] sets the camera's
-        place."""
+        """The home view from far enough to see all from every side, unless [picture] sets the camera's position."""
         if self.picture.camera is not None:
             return self.home
         back, middle = self.eye - self.look_at, 0.5 * (self.seen[0] + self.seen[1])
@@ -221,8 +210,8 @@ class Stage:
         return View(*(self.frame.T @ place + self.origin for place in (eye, middle)))
 
     def at(self, pose: Scene | None, view: View | None) -> "Stage":
-        """Return the stage with solids at the poses in the scene ``pose``, and with the camera at ``view``, each if
-        given."""
+        """Return the stage with solids at the poses in the scene ``pose``, and with the camera at ``view``, unless
+        None."""
         found = self
         if pose is not None:
             solids = tuple(one.within(self.frame, self.origin) for one in shown_solids(pose))
@@ -234,17 +223,17 @@ class Stage:
 
     @property
     def cuts_solids(self) -> bool:
-        """Return True if solids are shown only inside the container, which is not so for a cup without a lid."""
+        """True if solids are shown only inside the container; False without container and for a cup without a lid."""
         return bool(getattr(self.container, "lid", self.container.extent() is not None))
 
     @property
     def size(self) -> float:
-        """Return the longest side of the contents [m]."""
+        """[m]"""
         return float((self.upper - self.lower).max())
 
     @property
     def clearness(self) -> float:
-        """Return the fraction of light that reaches fluid through other fluid."""
+        """Fraction of light that reaches fluid through other fluid."""
         return 0.85 * self.transparency
 
     def placed(self, positions: Points) -> Points:
@@ -263,12 +252,11 @@ class Stage:
 
     @property
     def up_axis(self) -> int:
-        """Return the scene's axis that points upwards."""
         return int(np.abs(self.frame[1]).argmax())
 
     @property
     def glass_frame(self) -> Points:
-        """Return the rotation (3, 3) from the picture's frame to one in which a cylinder's axis is the second."""
+        """The rotation (3, 3) from picture axes to axes of which a cylinder's axis is the second."""
         if not isinstance(self.container, CylinderContainer):
             return np.eye(3)
         axis = INDEX_OF_AXIS[self.container.axis]
@@ -277,13 +265,13 @@ class Stage:
 
     @property
     def glass_ends(self) -> tuple[Points, Points]:
-        """Return lower and upper ends of the container [m], (3,) each, in the axes of `glass_frame`."""
+        """Lower and upper ends of the container [m], (3,) each, in the axes of `glass_frame`."""
         return _box(self.placed(corners(*self.container.extent())) @ self.glass_frame.T)
 
     @property
     def room(self) -> tuple[Points, Points]:
-        """Return the ends [m], (3,) each, of the region where fluid is shown, in the axes of `glass_frame`. They are
-        infinite upwards, as emitters may be there, and along periodic axes."""
+        """Ends [m], (3,) each, of the region where fluid is shown, in the axes of `glass_frame`. The ends are infinite
+        along periodic axes and upwards, because emitters may be above the container."""
         lower, upper = (end.copy() for end in self.glass_ends)
         up = self.glass_frame @ (0.0, 1.0, 0.0)
         axis = int(np.abs(up).argmax())
@@ -296,7 +284,7 @@ class Stage:
 
     @property
     def panes(self) -> Points:
-        """Return (2, 3), 1 where a box has a pane of glass at its lower and upper ends, else 0; the top is open."""
+        """(2, 3), 1 where a box has a pane of glass at its lower and upper ends, else 0."""
         found = np.ones((2, 3))
         if isinstance(self.container, BoxContainer):
             found *= 1.0 - np.abs(self.frame) @ np.asarray(self.container.periodic, dtype=float)
@@ -305,22 +293,17 @@ class Stage:
 
     @property
     def sun(self) -> Points:
-        """Return the unit vector (3,) towards the lamp: behind the camera, on its left."""
+        """Unit vector (3,)."""
         light = self.picture.sun_and_sky
-        return self._direction(light.azimuth, light.elevation)
+        return _towards(self.azimuth + light.azimuth, light.elevation)
 
     @property
     def fill(self) -> Points:
-        """Return the unit vector (3,) towards the weak lamp: on the right, low."""
-        return self._direction(70.0, 28.0)
-
-    def _direction(self, azimuth: float, elevation: float) -> Points:
-        """Return a unit vector (3,); the azimuth [degrees] counts from the camera at home, to the right."""
-        return _towards(self.azimuth + azimuth, elevation)
+        """Unit vector (3,)."""
+        return _towards(self.azimuth + 70.0, 28.0)
 
 
 def _box(points: Points) -> tuple[Points, Points]:
-    """Return lower and upper ends (3,) of points (n, 3)."""
     return points.min(axis=0), points.max(axis=0)
 
 
@@ -343,6 +326,7 @@ def upright(gravity: Points) -> Points:
 
 
 def _towards(azimuth: float, elevation: float) -> Points:
+    """Return a unit vector (3,); the azimuth [degrees] counts from the viewer's direction to the right."""
     a, e = np.radians([azimuth, elevation])
     return np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
 

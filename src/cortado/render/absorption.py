@@ -6,10 +6,8 @@ the division. With T_0 = 1,
 
     image = sum_s T_s kappa ds P_s E(u_s) + T_S background,    T_(s + 1) = T_s exp(-u_s).
 
-In the adjoint, the light from behind a sample is the image minus the light summed up to the sample. So one pass over
-the samples suffices, however dark they are.
-
-`RayMarcher` computes the picture of a field, its tangent and its adjoint.
+In the adjoint, the light from behind a sample is the image minus the light summed up to the sample. One pass over
+the samples therefore suffices, even if they are dark.
 """
 
 from dataclasses import dataclass
@@ -70,10 +68,10 @@ def brightness_functions(precision: Precision) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class AbsorptionKernels(Kernels):
-    """The kernels that march along rays through the colour field, with their derivatives."""
+    """Kernels that march along rays through the colour field, with their derivatives."""
 
     gather: Any
-    """Kernel from the adjoints of samples to those of nodes."""
+    """From the adjoints of samples to those of nodes."""
 
 
 @cache
@@ -82,19 +80,15 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
     real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
     change = camera_tangent_type(precision)
-    rays, interpolation = ray_functions(precision), interpolation_functions(precision)
-    start, direction, distance = rays.start, rays.direction, rays.distance
-    start_tangent, direction_tangent = rays.start_tangent, rays.direction_tangent
-    samples_within, pixels_before = rays.samples_within, rays.pixels_before
-    value, gradient, trilinear_weight = interpolation.value, interpolation.gradient, interpolation.trilinear_weight
-    derivative = interpolation.derivative
+    start, direction, distance, *tangents, samples_within, pixels_before = ray_functions(precision)
+    start_tangent, direction_tangent = tangents
+    value, gradient, derivative, trilinear_weight = interpolation_functions(precision)
     brightness, brightness_derivative = brightness_functions(precision)
     place, *_ = node_functions(precision)
     module = kernel_module(f"absorption_{precision.name}")
 
     @wp.func
     def diagonal(nodes: nodes_struct) -> vector:
-        """Return the diagonal vector of one cell [m]."""
         return vector(nodes.cell, nodes.cell, nodes.cell)
 
     samples, poses = wp.array2d(dtype=rgba), wp.array(dtype=pose)
@@ -189,8 +183,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def gather(camera, nodes, spans, samples_bar: samples, field_bar):
-        """Sum each node's adjoint over the samples in the eight cells around it; the cells' projection on the screen
-        gives the rays."""
+        """Sum each node's adjoint over the samples in the eight cells around the node."""
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)
         lower = x_g - diagonal(nodes)
@@ -224,7 +217,6 @@ def camera_struct(camera: Camera, step: float, precision: Precision) -> Any:
 
 
 def camera_tangent(along: ViewTangent, step: float, precision: Precision) -> Any:
-    """Return the Warp struct of the change of a view with samples ``step`` [m] apart."""
     struct = camera_tangent_type(precision)()
     struct.position, struct.turn = precision.vector(*along.translation), precision.vector(*along.rotation)
     struct.half_width, struct.growth = along.half_width
@@ -233,7 +225,7 @@ def camera_tangent(along: ViewTangent, step: float, precision: Precision) -> Any
 
 
 class RayMarcher:
-    """A renderer of fields to pictures of one view by ray marching; `adjoint` overwrites its last result."""
+    """Renders fields to pictures of one view by ray marching; `adjoint` overwrites its last result."""
 
     def __init__(self, view: View, nodes: Any, precision: Precision, device: Any):
         """Allocate for a view of a grid of nodes, which is `ColourField.nodes`."""
@@ -248,18 +240,12 @@ class RayMarcher:
         self.image, self._image_bar = (self._zeros(self.pixels, dtype=precision.vector) for _ in range(2))
         """(pixels,) linear RGB, row by row."""
         self._spans = self._zeros(self.pixels, dtype=wp.vec2i)
-        self._known = {
-            "camera": self._camera,
-            "nodes": nodes,
-            "thickness": self._thickness,
-            "image": self.image,
-            "spans": self._spans,
-        }
+        self._known = {"camera": self._camera, "nodes": nodes, "thickness": self._thickness}
+        self._known |= {"image": self.image, "spans": self._spans}
         self._pose_bar = self._zeros(self.pixels, dtype=self._pose)
         self._sum = sum_of(self._pose, self.pixels, device)
 
     def march(self, field: wp.array) -> None:
-        """Compute the image of a field (nz, ny, nx)."""
         launch(self._kernels.forward, self.pixels, self._device, self._known, background=self._background, field=field)
 
     def tangent(self, field: wp.array, field_dot: wp.array, along: ViewTangent) -> wp.array:

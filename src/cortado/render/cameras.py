@@ -1,5 +1,4 @@
-"""Cameras (position, direction, range of depth), and views: a camera, the fluid's extinction, the background, and
-changes of all these.
+"""Cameras and views; a view is a camera, the fluid's extinction and the background.
 
 If a view is not known exactly, `Calibration` makes its camera's numbers parameters.
 """
@@ -27,7 +26,6 @@ def vector(name: str, values: Sequence[float] | np.ndarray, length: int = 3) -> 
 
 
 def positive(name: str, value: float) -> None:
-    """Raise `InputError` for a number that is not positive and finite."""
     if not 0 < as_one_number(name, value) < np.inf:
         raise InputError(f"{name} is {shown(value)}, but must be a positive number.")
 
@@ -67,7 +65,7 @@ class Camera:
 
     @property
     def reach(self) -> float:
-        """Distance at which samples end [m]: ``far``, after its default has been filled in."""
+        """``far``, after its default has been filled in [m]."""
         assert self.far is not None
         return self.far
 
@@ -241,7 +239,6 @@ class TopView:
 
     @cached_property
     def camera(self) -> Camera:
-        """Camera above the whole field, looking down."""
         lower, upper = np.array(self.lower), np.array(self.upper)
         back = np.eye(3)[self.up_axis]
         right = np.eye(3)[1 if self.up_axis == 0 else 0]
@@ -251,14 +248,8 @@ class TopView:
         width = max(extent @ right, abs(extent @ up) * columns / rows)
         top = np.where(back, upper, 0.5 * (lower + upper))
         margin = 8 * self.spacing
-        return Orthographic(
-            tuple(top + margin * back),
-            tuple(top),
-            tuple(up),
-            width,
-            resolution=self.resolution,
-            far=2 * margin + extent @ back,
-        )
+        sight = tuple(top + margin * back), tuple(top), tuple(up)
+        return Orthographic(*sight, width, resolution=self.resolution, far=2 * margin + extent @ back)
 
     @property
     def extinction(self) -> float:
@@ -281,9 +272,12 @@ class ViewTangent:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Unknown numbers of a view as parameters, starting from an approximate (aimed) view. Their names are "translation"
-    (3,) [m] and "rotation" (3,) [rad] of the camera, its "field_of_view" [degrees] or, with parallel rays, "width" [m],
-    and the "extinction" of the fluid [1/m]."""
+    """Unknown numbers of a view as parameters, starting from an approximate (``aimed``) view.
+
+    The parameters are "translation" (3,) [m] and "rotation" (3,) [rad] of the camera, its "field_of_view" [degrees] or,
+    with
+    parallel rays, "width" [m], and the "extinction" of the fluid [1/m].
+    """
 
     aimed: View
     names: tuple[str, ...] = ()
@@ -322,7 +316,7 @@ class Calibration:
         return Volume(camera, float(all_values["extinction"]), self.aimed.background)
 
     def tangent(self, values: Mapping[str, np.ndarray], directions: Mapping[str, np.ndarray]) -> ViewTangent:
-        """Return the change of the view at these values along the given directions of some of them."""
+        """Return the change of the view at ``values`` along ``directions`` of some of them."""
         from scipy.spatial.transform import Rotation
 
         rotation: Vector = ZERO

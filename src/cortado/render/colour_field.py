@@ -6,7 +6,7 @@ The colour of a particle is mixed from its phases' colours. Coverage and colour 
     A_g = V sum_j W(x_g - x_j),    P_g = V sum_j W(x_g - x_j) colour_j
 
 The coverage A is 1 inside the fluid. P is colour times coverage; no formula divides by A. Along periodic axes a
-particle's images count like the particle. Both sums are gathers: a node sums over particles, cell by cell; in the
+particle's images count like the particle. The sums are gathers: a node sums over particles, cell by cell; in the
 adjoint a particle sums over the nodes within its support.
 """
 
@@ -30,7 +30,7 @@ from cortado.errors import InputError
 from cortado.particles.neighbourhood import Discretisation
 
 MOST_NODES = 2**27
-"""Greatest number of nodes of a colour field: 2 GiB in float32."""
+"""2 GiB in float32."""
 MOST_CELLS = 2**20
 """Greatest number of cells of the grid in which particles are sorted."""
 
@@ -48,13 +48,13 @@ def nodes_type(precision: Precision) -> Any:
 
     class Nodes:
         origin: vector
-        """The first node [m]."""
+        """First node [m]."""
         cell: real
         """Distance of neighbouring nodes [m]."""
         frequency: real
         """1 / cell [1 / m]."""
         shape: wp.vec3i
-        """Number of nodes along x, y and z."""
+        """Along x, y, z."""
         periodic: wp.int32
         period: vector
         """Period of each axis [m], greater than two supports; 0 along an axis that is not periodic."""
@@ -100,7 +100,6 @@ def node_functions(precision: Precision) -> tuple[Any, Any, Any]:
 
 @cache
 def colours_type(precision: Precision, phases: int) -> Any:
-    """Return the Warp matrix type (phases, 3) of phase colours."""
     return wp.types.matrix(shape=(phases, 3), dtype=precision.real)
 
 
@@ -310,16 +309,14 @@ class ColourField:
             precision.fractions(phases),
             colours_type(precision, phases),
         )
-        self._x, self._x_bar, self._colour, self._colour_bar = (
-            zeros(particles, dtype=precision.vector) for _ in range(4)
-        )
+        vectors = (zeros(particles, dtype=precision.vector) for _ in range(4))
+        self._x, self._x_bar, self._colour, self._colour_bar = vectors
         self._fractions, self._fractions_bar = (zeros(particles, dtype=mix) for _ in range(2))
         self._colours, self._colours_dot = zeros(1, dtype=palette), zeros(1, dtype=palette)
         self._colours_bar = zeros(particles, dtype=palette)
         self._known = {"order": self._sort.order, "colours": self._colours, "c_scene": self._fractions}
         self._sum = sum_of(palette, particles, device)
         self.nodes = nodes_over(lower, upper, periods, cell, support, precision)
-        """The struct of nodes that kernels take."""
         require(field_parts(prod(self.nodes.shape), precision.bytes), "take a larger cell", device)
         self.values = zeros(tuple(self.nodes.shape)[::-1], dtype=rgba_type(precision))
         """(nz, ny, nx) colour times coverage, and coverage [-]."""
@@ -331,10 +328,8 @@ class ColourField:
         self._colours.assign(colours[None])
         own = {"x": self._x, "colour": self._colour}
         launch(self._tint.forward, self._particles, self._device, self._known, own, x_scene=positions)
-        grid, shape = self._sort.grid, self.values.shape
-        launch(
-            self._field.forward, shape, self._device, self._kernel, own, nodes=self.nodes, grid=grid, field=self.values
-        )
+        given = {"nodes": self.nodes, "grid": self._sort.grid, "field": self.values}
+        launch(self._field.forward, self.values.shape, self._device, self._kernel, own, given)
 
     def tangent(self, positions_dot: wp.array, fractions_dot: wp.array, colours_dot: np.ndarray) -> wp.array:
         """Return the tangent (nz, ny, nx) of the last field, along tangents of positions (n,), fractions (n,) and
@@ -356,12 +351,8 @@ class ColourField:
         """Return derivatives with respect to positions (n,), fractions (n,) and colours (phases, 3), given that with
         respect to the field."""
         own = {"x": self._x, "colour": self._colour, "nodes": self.nodes, "field_bar": field_bar}
-        bars = {
-            "x_scene_bar": self._x_bar,
-            "colour_scene_bar": self._colour_bar,
-            "c_scene_bar": self._fractions_bar,
-            "colours_bar": self._colours_bar,
-        }
+        bars = {"x_scene_bar": self._x_bar, "colour_scene_bar": self._colour_bar}
+        bars |= {"c_scene_bar": self._fractions_bar, "colours_bar": self._colours_bar}
         launch(self._field.adjoint, self._particles, self._device, self._kernel, self._known, own, bars)
         launch(self._tint.adjoint, self._particles, self._device, self._known, bars)
         colours = self._sum(self._colours_bar).numpy()[0].astype(np.float64)

@@ -1,7 +1,5 @@
 """Rays of a camera, and the interpolation of the colour field at samples on a ray.
 
-Functions compute each pixel's ray, the samples along a ray, and the samples inside a box.
-
 In the camera's frame x points to the right, y up and z backwards. Pixel coordinates (u, v) run from -1 to 1 over the
 width of the picture, v upwards and in the same unit. At depth z the pixel (u, v) sees (w u, w v, -z), with the half
 width w = half_width + growth z. The formula holds for parallel rays (growth 0) and for rays from a point (half_width
@@ -11,7 +9,6 @@ A sample is interpolated trilinearly between nodes; outside the grid the field i
 continuous everywhere, and a field of one layer (2-D) is a sheet one node distance thick.
 """
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -23,7 +20,6 @@ from cortado.render.colour_field import nodes_type, rgba_type
 
 @cache
 def camera_type(precision: Precision) -> Any:
-    """Return the Warp struct of a camera."""
     real, vector = precision.real, precision.vector
     matrix = wp.types.matrix(shape=(3, 3), dtype=real)
 
@@ -64,24 +60,10 @@ def camera_tangent_type(precision: Precision) -> Any:
     return wp.struct(CameraTangent)
 
 
-@dataclass(frozen=True)
-class RayFunctions:
-    """Warp functions of a camera's rays."""
-
-    start: Any
-    direction: Any
-    distance: Any
-    start_tangent: Any
-    direction_tangent: Any
-    samples_within: Any
-    pixels_before: Any
-
-
 @cache
-def ray_functions(precision: Precision) -> RayFunctions:
-    """Return Warp functions of rays: ``start`` and ``direction`` of a pixel's ray, ``distance`` of a sample along it,
-    and ``start_tangent`` and ``direction_tangent`` for a changing view. ``samples_within`` returns the samples in a
-    box, ``pixels_before`` the pixels whose rays may hit it."""
+def ray_functions(precision: Precision) -> tuple[Any, ...]:
+    """Return Warp functions of a pixel's ray and its samples; ``samples_within`` returns the samples in a box,
+    ``pixels_before`` the pixels whose rays may hit it."""
     real, vector = precision.real, precision.vector
     camera_struct, tangent_struct = camera_type(precision), camera_tangent_type(precision)
     tiny, huge = wp.constant(real(precision.tiny)), wp.constant(real(1.0 / precision.tiny))
@@ -141,7 +123,7 @@ def ray_functions(precision: Precision) -> RayFunctions:
     def pixels_before(lower: vector, upper: vector, c: camera_struct) -> wp.vec4i:
         """Return the range of columns and rows that may show a box: first and last + 1 of each, never too few.
 
-        If the whole box is in front of the camera, the extremes on the screen are at corners. If the box reaches behind
+        If the box is in front of the camera, the extremes on the screen are at corners. If the box reaches behind
         a perspective camera, it may cover any part of the screen, so all rows and columns are returned.
         """
         n_x = real(c.columns)
@@ -181,21 +163,11 @@ def ray_functions(precision: Precision) -> RayFunctions:
             int(wp.clamp(wp.ceil(bottom) + real(1.0), real(0.0), n_y)),
         )
 
-    return RayFunctions(start, direction, distance, start_tangent, direction_tangent, samples_within, pixels_before)
-
-
-@dataclass(frozen=True)
-class InterpolationFunctions:
-    """Warp functions of trilinear interpolation between the nodes of a field."""
-
-    value: Any
-    gradient: Any
-    derivative: Any
-    trilinear_weight: Any
+    return start, direction, distance, start_tangent, direction_tangent, samples_within, pixels_before
 
 
 @cache
-def interpolation_functions(precision: Precision) -> InterpolationFunctions:
+def interpolation_functions(precision: Precision) -> tuple[Any, ...]:
     """Return Warp functions ``value`` at a point, ``gradient`` (of bar . value), ``derivative`` (of the value, along a
     direction) and ``trilinear_weight`` (of one node)."""
     real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
@@ -244,8 +216,8 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
 
     @wp.func
     def gradient(x: vector, bar: rgba, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> vector:
-        """Return the gradient of bar . value. On the face between two cells, where it jumps, it is that of the cell
-        that begins there."""
+        """Return the gradient of bar . value. On the face between two cells, where it jumps, the gradient is that of
+        the upper cell."""
         i, j, k, f = cell(x, nodes)
         total = vector()
         for a in range(2):
@@ -256,8 +228,8 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
 
     @wp.func
     def derivative(x: vector, x_dot: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
-        """Return the derivative of the value at a moving point. On the face between two cells it uses the cell that
-        begins there, as `gradient` does."""
+        """Return the derivative of the value at a moving point; on the face between two cells, the upper cell
+        counts."""
         i, j, k, f = cell(x, nodes)
         total = rgba()
         for a in range(2):
@@ -275,4 +247,4 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
         w_z = wp.max(real(1.0) - wp.abs(s[2]), real(0.0))
         return w_x * w_y * w_z
 
-    return InterpolationFunctions(value, gradient, derivative, trilinear_weight)
+    return value, gradient, derivative, trilinear_weight

@@ -27,19 +27,18 @@ from cortado.scene.tables import sentences
 
 @dataclass(frozen=True)
 class RenderAdjoint:
-    """The derivative of a function of the image. The Warp arrays belong to the renderer, and its next call overwrites
-    them."""
+    """The derivative of a function of the image. The next call of the renderer overwrites the Warp arrays."""
 
     positions: wp.array
-    """Derivative with respect to positions, (n,) vectors [1 / m]."""
+    """With respect to positions, (n,) vectors [1 / m]."""
     fractions: wp.array
-    """Derivative with respect to mass fractions, (n,) vectors of one number for each phase [-]."""
+    """With respect to mass fractions, (n,) vectors of one number for each phase [-]."""
     colours: np.ndarray
-    """Derivative with respect to the phases' colours, (phases, 3) [-]."""
+    """With respect to the phases' colours, (phases, 3) [-]."""
     translation: np.ndarray
-    """Derivative (3,) with respect to the camera's position [1 / m]."""
+    """With respect to the camera's position, (3,) [1 / m]."""
     rotation: np.ndarray
-    """Derivative (3,) with respect to a rotation vector of the camera about its position [1 / rad]."""
+    """With respect to a rotation vector of the camera about its position, (3,) [1 / rad]."""
 
 
 @public
@@ -126,7 +125,6 @@ class Renderer:
         return f"Renderer({view}, {columns} x {rows} pixels, {counted(self._particles, 'particle')})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle or copy the renderer by storing its constructor's arguments."""
         settings = {**self._settings, "device": self._device.alias}
         return _made_again, (self.view, settings, self._precision.name)
 
@@ -253,8 +251,7 @@ class Renderer:
         return positions, fractions, self._colours if colours is None else colours
 
     def _on_device(self, name: str, values: Any, components: int, dtype: Any) -> wp.array:
-        """Return a Warp array (n,) of vectors: a given Warp array after checks, or one made from an array (n,
-        components)."""
+        """Return a Warp array (n,) of vectors: a checked Warp array, or one made from an array (n, components)."""
         if not isinstance(values, wp.array):
             array = _of_shape(name, values, (self._particles, components))
             if not np.isfinite(array).all():
@@ -281,8 +278,8 @@ def _of_shape(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
 UP = {2: 2, 3: 1}
 """Axis that points upwards, by dimension; in 2-D the one perpendicular to the plane."""
 FINENESS = {2: 0.5, 3: 1.0}
-"""Node distance over particle spacing, by dimension. On coarser grids a particle's picture depends on its place between
-nodes, and optimisers can get stuck there. In 2-D finer nodes cost very little."""
+"""Node distance over particle spacing, by dimension. On coarser grids a particle's picture depends on its position
+between nodes, and optimisers can get stuck there."""
 CLEARNESS = 8.0
 """Width of the scene / depth of visibility in a "volume" view, unless the scene sets the extinction."""
 CAMERA = ("position", "look_at", "field_of_view", "extinction")
@@ -290,7 +287,7 @@ CAMERA = ("position", "look_at", "field_of_view", "extinction")
 
 
 class Pictured(Protocol):
-    """Protocol of the parts of a `cortado.Simulation` that its renderer uses."""
+    """The parts of a `cortado.Simulation` that its renderer uses."""
 
     scene: Scene
     positions: np.ndarray
@@ -302,7 +299,7 @@ class Pictured(Protocol):
 
     @property
     def dimension(self) -> int:
-        """Number of space dimensions, 2 or 3."""
+        """2 or 3."""
 
 
 def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **settings: Any) -> Renderer:
@@ -337,8 +334,7 @@ def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **setti
 
 
 def _table(scene: Scene, settings: dict[str, Any]) -> Render:
-    """Return a scene's table [render] with some keys replaced; the camera's keys are kept only if the view stays the
-    same."""
+    """Return a scene's table [render] with some keys replaced; the camera's keys are dropped if the view changes."""
     given = {} if scene.render is None else scene.render.model_dump(exclude_unset=True)
     view = settings.get("view")
     if isinstance(view, str) and view != given.get("view"):

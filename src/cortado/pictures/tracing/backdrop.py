@@ -13,8 +13,6 @@ from cortado.pictures.tracing.near_particles import Floats, Ints, Vec2s, Vec3s, 
 
 @wp.struct
 class LitSurface:
-    """A surface of triangles with the data of their corners."""
-
     mesh: wp.uint64
     corners: Ints
     """(3 triangles,) indices of points"""
@@ -25,11 +23,10 @@ class LitSurface:
     light: Vec3s
     """(points,) light that falls on the surface, in units in which a white surface reflects 1"""
     media: Vec2s
-    """(points,) of a fluid: scattering and absorption [1/m]"""
+    """(points,) scattering and absorption [1/m]"""
     is_flat: wp.int32
-    """True if colours are shown unshaded, without light and shadow."""
     reach: wp.float32
-    """Greatest distance behind a wall of the triangles of fluid that touches the wall [m]."""
+    """Greatest distance [m] that triangles of fluid extend behind a wall."""
     left: Vec2s
     """(triangles,) of transparent solids: fraction of light transmitted, seen from inside and from outside"""
     reflectivity: Floats
@@ -39,8 +36,7 @@ class LitSurface:
 
 
 @wp.func
-def at_corners(surface: LitSurface, values: Vec3s, face: wp.int32, u: wp.float32, v: wp.float32):
-    """Interpolate values at the corners of a triangle to a point in it."""
+def at_corners(surface: LitSurface, values: wp.array(dtype=Any), face: wp.int32, u: wp.float32, v: wp.float32):
     return (
         u * values[surface.corners[3 * face]]
         + v * values[surface.corners[3 * face + 1]]
@@ -64,18 +60,14 @@ def facing(normal: wp.vec3, face_normal: wp.vec3, d: wp.vec3):
 
 @wp.struct
 class SurfaceHit:
-    """The hit of a ray on a surface."""
-
     found: wp.bool
     is_solid: wp.bool
-    """True for the surface of an opaque solid."""
     t: wp.float32
     normal: wp.vec3
-    """Normal on the side that the ray comes from."""
+    """On the side that the ray comes from."""
     colour: wp.vec3
     light: wp.vec3
     reflectivity: wp.float32
-    """Reflectivity of a solid."""
     face: wp.int32
     u: wp.float32
     v: wp.float32
@@ -83,7 +75,6 @@ class SurfaceHit:
 
 @wp.func
 def at_surface(surface: LitSurface, t: wp.float32, d: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32):
-    """Return the hit of a ray on a triangle, with normal and colour there."""
     i = surface.corners[3 * face]
     j = surface.corners[3 * face + 1]
     k = surface.corners[3 * face + 2]
@@ -101,18 +92,7 @@ def at_surface(surface: LitSurface, t: wp.float32, d: wp.vec3, face: wp.int32, u
     return met
 
 
-@wp.func
-def medium_at(surface: LitSurface, met: SurfaceHit):
-    """Return scattering and absorption [1/m] of the fluid that a ray enters."""
-    return (
-        met.u * surface.media[surface.corners[3 * met.face]]
-        + met.v * surface.media[surface.corners[3 * met.face + 1]]
-        + (1.0 - met.u - met.v) * surface.media[surface.corners[3 * met.face + 2]]
-    )
-
-
 OPAQUE, CLEAR = wp.constant(0), wp.constant(1)
-"""Which of the surfaces of solids."""
 NO_GLASS, GLASS_BOX, GLASS_CYLINDER = 0, 1, 2
 FAR = wp.constant(wp.float32(1.0e9))
 
@@ -124,39 +104,28 @@ def shading_module(has_opaque: bool, has_clear: bool) -> Any:
 
 @wp.struct
 class Solids:
-    """The solids around or inside which fluid flows, as meshes on the device."""
-
     opaque: wp.uint64
-    """The mesh of opaque solids."""
     are_cut: wp.int32
-    """True where opaque solids are shown within the container only."""
     clear: wp.uint64
     """The mesh of transparent solids and of tanks; all space outside a tank's cavity counts as inside the tank."""
     has_tank: wp.int32
     surfaces: wp.array(dtype=LitSurface)
-    """(2,) of opaque and of clear ones, if there are any; in an array, as functions get a copy of their arguments"""
+    """(2,) of opaque and of clear solids, in an array because functions get a copy of their arguments"""
 
 
 @wp.struct
 class Environment:
-    """Everything around the fluid, as kernels of the ray tracer take it."""
-
     size: wp.float32
     """Size of the contents [m], which scales floor, grid and rims."""
     nearest: wp.float32
     """Distance [m] between a ray's start and the surface from which it starts."""
     segments: wp.int32
-    """Greatest number of segments of a ray refracted into fluid: inside fluid, and between two bodies of fluid."""
     sun: wp.vec3
-    """Unit vector towards the lamp."""
     fill: wp.vec3
-    """Unit vector towards a second, weak lamp, which is only seen in reflections."""
+    """Unit vector towards a second, weak lamp, which is only visible in reflections."""
     lamp: wp.vec3
-    """Colour of the first lamp in reflections."""
     strip: wp.vec3
-    """Colour of the second lamp in reflections."""
     sunlight: wp.vec3
-    """Light of the lamp on surfaces that face it."""
     horizon: wp.vec3
     zenith: wp.vec3
     has_floor: wp.int32
@@ -164,31 +133,26 @@ class Environment:
     floor_height: wp.float32
     """[m]"""
     floor_centre: wp.vec3
-    """[m]; its height does not matter"""
+    """[m]"""
     grid: wp.float32
-    """Distance between the lines on the floor [m]; none if 0."""
+    """Distance between the lines on the floor [m]; 0 without lines."""
     shadow_corner: wp.vec3
-    """[m] where the first node of the shadow lies"""
     shadow_cell: wp.float32
-    """Distance between its nodes [m]."""
     glass: wp.int32
-    """NO_GLASS, GLASS_BOX or GLASS_CYLINDER, whose axis is the second of its own frame."""
     glass_frame: wp.mat33
-    """Rotation from the frame of the picture to that of the container."""
+    """Rotation from picture axes to container axes; a cylinder's axis is the second."""
     glass_lower: wp.vec3
-    """[m] in its own frame"""
+    """[m], container axes"""
     glass_upper: wp.vec3
     """[m]"""
     has_room: wp.int32
-    """True where fluid is shown within the container only."""
     room_lower: wp.vec3
-    """[m] in the frame of the container: where that ends; -FAR where it does not"""
+    """Lower ends of the shown region in container axes [m]; -FAR along axes without an end."""
     room_upper: wp.vec3
     """[m]"""
     panes: wp.mat33
     """1 where the container has a pane, 0 where it is open: rows for lower and upper ends, columns for axes."""
     edge_colour: wp.vec3
-    """Colour of the container's edges."""
     has_walls: wp.int32
     """True for an opaque container: walls are invisible from outside and visible from inside."""
     wall_colour: wp.vec3
@@ -204,7 +168,7 @@ def smooth_step(lower: wp.float32, upper: wp.float32, x: wp.float32):
 
 @wp.func
 def schlick(normal_reflectance: wp.float32, cosine: wp.float32):
-    """Return Fresnel's reflectance, as Schlick (1994) approximates it."""
+    """Return Fresnel's reflectance in Schlick's approximation (1994)."""
     m = wp.clamp(1.0 - cosine, 0.0, 1.0)
     m2 = m * m
     return normal_reflectance + (1.0 - normal_reflectance) * m2 * m2 * m
@@ -226,13 +190,12 @@ def sky(s: Environment, d: wp.vec3):
 
 @wp.func
 def open_light(s: Environment, normal: wp.vec3):
-    """Return the light that falls on an unobstructed surface."""
     return 0.35 * (s.horizon + s.zenith) + s.sunlight * wp.max(wp.dot(normal, s.sun), 0.0)
 
 
 @wp.func
 def shadow_at(s: Environment, shadow: Vec3s2d, x: wp.float32, z: wp.float32):
-    """Return the fraction of light that reaches a place of the floor, interpolated between nodes; 1 outside the
+    """Return the fraction of light that reaches a point of the floor, interpolated between nodes; 1 outside the
     nodes."""
     u = (x - s.shadow_corner[0]) / s.shadow_cell
     v = (z - s.shadow_corner[2]) / s.shadow_cell
@@ -270,7 +233,7 @@ def floor(s: Environment, shadow: Vec3s2d, p: wp.vec3, footprint: wp.float32):
 
 @wp.func
 def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spread: wp.float32):
-    """Return the light of a ray that meets neither fluid nor glass; ``spread``: the width of a pixel at 1 m [m]."""
+    """Return the light of a ray that meets neither fluid nor glass; ``spread`` is the width of a pixel at 1 m [m]."""
     if s.has_floor > 0 and d[1] < -1.0e-4:
         t = (s.floor_height - o[1]) / d[1]
         if t > 0.0:
@@ -281,7 +244,7 @@ def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spr
 
 @wp.func
 def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, span: wp.vec2):
-    """Return the part of a ray's span that lies between two planes across an axis; o and d along that axis."""
+    """Return the part of a ray's span between two planes across an axis; o and d are components along that axis."""
     if wp.abs(d) > 1.0e-9:
         t1 = (lower - o) / d
         t2 = (upper - o) / d
@@ -328,7 +291,7 @@ def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def room(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Return the span of a ray in which fluid is shown; from FAR to -FAR if there is no such span."""
+    """Return the span of a ray in which fluid is shown; from FAR to -FAR without a span."""
     if s.has_room == 0:
         return wp.vec2(-FAR, FAR)
     return within_walls(s, o, d)
@@ -362,7 +325,6 @@ def wall_normal(s: Environment, p: wp.vec3):
 
 
 EDGE = (0.50, 0.62, 0.64)
-"""Linear colour of an edge of clear glass."""
 GLASS_EDGE = wp.constant(wp.vec3(*EDGE))
 
 
@@ -382,7 +344,8 @@ class Passed:
 def pane(
     s: Environment, d: wp.vec3, normal: wp.vec3, rim: wp.float32, is_pane: wp.float32, colour: wp.vec3, behind: Passed
 ):
-    """Add a sheet of glass behind the sheets already passed; ``rim``: visibility of its coloured edge, from 0 to 1."""
+    """Add a sheet of glass behind the sheets already passed; ``rim`` is the visibility of its coloured edge, from 0 to
+    1."""
     cosine = wp.abs(wp.dot(d, normal))
     f = schlick(0.04, cosine)
     reflectance = is_pane * wp.min(1.4 * f / (1.0 + f), MILKY)
@@ -399,5 +362,4 @@ def pane(
 
 @wp.func
 def rim_of(off: wp.float32, width: wp.float32):
-    """Return the visibility of an edge at a distance from it."""
     return 0.8 * (1.0 - smooth_step(0.55 * width, width, off))

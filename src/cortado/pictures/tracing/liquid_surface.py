@@ -33,17 +33,19 @@ ROUND = 10_000
 
 
 @dataclass(frozen=True)
-class Surface:
-    """A surface of triangles in space; outside is the side from which their corners run counter-clockwise."""
+class Mesh:
+    """A triangle mesh in 3-D; seen from outside, the corners of triangles run counterclockwise."""
 
     points: Points
     """(p, 3) [m]"""
     triangles: np.ndarray
-    """(t, 3) indices of points"""
+    """(t, 3) numbers of points"""
     normals: Points
     """(p, 3) unit vectors outwards"""
     colours: Points
-    """(p, 3) linear, from 0 to 1"""
+    """(p, 3) linear"""
+    velocities: Points | None = None
+    """(p, 3) [m/s]; None if unknown and for a solid, whose poses give its motion."""
 
 
 def nearest_colours(points: Points, positions: Points, colours: Points, spacing: float) -> Points:
@@ -57,11 +59,12 @@ def nearest_colours(points: Points, positions: Points, colours: Points, spacing:
     return np.einsum("pk,pkc->pc", weights, colours[which]) / weights.sum(axis=1)[:, None]
 
 
-def spheres(positions: Points, colours: Points, spacing: float) -> Surface:
-    """Make a sphere around each of the particles (n, 3) [m], in its colour (n, 3), that touches those next to it."""
+def spheres(positions: Points, colours: Points, spacing: float) -> Mesh:
+    """Make a sphere around each of the particles (n, 3) [m], in its colour (n, 3); spheres of adjacent particles
+    touch."""
     corners, triangles = _sphere(2 if len(positions) <= ROUND else 1)
     n, k = len(positions), len(corners)
-    return Surface(
+    return Mesh(
         points=(positions[:, None] + 0.5 * spacing * corners).reshape(-1, 3),
         triangles=(k * np.arange(n)[:, None, None] + triangles).reshape(-1, 3).astype(np.int32),
         normals=np.tile(corners, (n, 1)),
@@ -71,7 +74,8 @@ def spheres(positions: Points, colours: Points, spacing: float) -> Surface:
 
 @cache
 def _sphere(levels: int) -> tuple[Points, np.ndarray]:
-    """Make corners (k, 3) and triangles of a unit sphere: an octahedron with each triangle cut into four repeatedly."""
+    """Make corners (k, 3) and triangles of a unit sphere: an octahedron with each triangle cut into four ``levels``
+    times."""
     corners = [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
     octants = ((i, 2 + j, 4 + k, (i + j + k) % 2) for i in (0, 1) for j in (0, 1) for k in (0, 1))
     triangles = [(a, c, b) if turned else (a, b, c) for a, b, c, turned in octants]
@@ -98,34 +102,29 @@ def _sphere(levels: int) -> tuple[Points, np.ndarray]:
 REACH = 3.0
 """Reach of the particles' bumps, in spacings."""
 REACH_OF_COLOURS = 2.25
-"""Reach within which particles give colours, in spacings."""
+"""Reach within which particles contribute to colours, in spacings."""
 ROUNDS, ROUNDS_OF_LIGHT = 36, 9
-"""Of smoothing: of the surface, and of the light on it, which comes from few directions."""
 CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
-"""Up to how many particles cubes have which width, in spacings."""
+"""Greatest number of particles for each width of cubes, in spacings."""
 WeightedLook = wp.types.vector(6, wp.float32)
-"""A `Look` times a weight, and the weight."""
 MOST_CELLS = 1 << 26
 """Greatest number of cells, one spacing wide, in which particles are searched."""
 CLEAREST = wp.constant(wp.float32(1.0e-3))
 """Scattering and absorption [1/m] too small to be visible."""
 WITHIN, ASIDE = wp.constant(wp.float32(10.62)), wp.constant(wp.float32(1.93))
-"""Sum of the bumps of all particles around one within a lattice. On a side, an edge or a corner of the lattice it is
-less by exp(-1.93 a²), where the mean place of these particles is a spacings aside."""
+"""Sum of the bumps around a particle within a lattice. At the boundary the sum is less by exp(-1.93 a²), with the mean
+position of these particles a spacings aside."""
 DROP, SHEET = wp.constant(wp.float32(0.82)), wp.constant(wp.float32(0.74))
-"""Parts of the level that particles have which are alone, and which are in a sheet, or in a spray that fills half of
-space."""
+"""Factors of the level of isolated particles, and of particles in a sheet or in a spray that fills half of space."""
 FILLED = wp.constant(wp.vec3(0.45, 0.6, 0.85))
-"""Three filled parts of space. Up to the first, the level goes from the level of a drop to the level of a sheet. From
-the second to the third it goes on to the level within fluid."""
+"""Filled fractions of space: the factor goes from `DROP` at 0 to `SHEET` at the first, and to 1 between the second and
+third."""
 FULL = wp.constant(wp.float32(2.84))
 """Sum of the bumps of other particles near a particle above which the particle is not in a thin sheet."""
 
 
 @dataclass(frozen=True)
 class LiquidSurface:
-    """A fluid's surface of triangles on a device; outside is the side from which corners run counter-clockwise."""
-
     points: wp.array
     """(p,) of vec3 [m]"""
     triangles: wp.array
@@ -133,28 +132,27 @@ class LiquidSurface:
     normals: wp.array
     """(p,) of vec3, unit vectors outwards"""
     colours: wp.array
-    """(p,) of vec3, linear, from 0 to 1"""
+    """(p,) of vec3, linear"""
     media: wp.array
     """(p,) of vec2, scattering and absorption [1/m]"""
     neighbours: wp.array
-    """(p,) the points beside each, as `smoothed` takes them"""
+    """(p,) adjacent points, as `smoothed` takes them"""
 
     def softened(self, light: wp.array, launch: BandLauncher) -> wp.array:
-        """Return the light at its points (p,) of vec3 without the steps that few directions leave."""
         everywhere = wp.ones(len(light), dtype=wp.float32, device=launch.device)
         return smoothed(light, self.neighbours, everywhere, ROUNDS_OF_LIGHT, launch)
 
 
 @wp.func
 def crowd(s: NearParticles, j: wp.int32):
-    """Return the number of other particles near a particle, by its volume, times that, and the volume itself."""
+    """Return the number of other particles near a particle times its volume, and the volume."""
     return s.volumes[j] * wp.vec2(1.0 / s.volumes[j] - 1.0, 1.0)
 
 
 @wp.func
 def tint(s: NearParticles, j: wp.int32):
-    """Return a particle's look for averages: colours count by themselves, media by their logarithms. Milk across a
-    wall, which is far and scatters ten thousand times more, makes no milk of water."""
+    """Return a particle's look for averages: colours, and logarithms of media, so that distant milk does not cloud
+    water."""
     x = s.looks[j]
     return WeightedLook(x[0], x[1], x[2], wp.log(x[3] + CLEAREST), wp.log(x[4] + CLEAREST), 1.0)
 
@@ -184,7 +182,7 @@ def find_looks(first: wp.int32, s: NearParticles, reach: wp.float32, points: Vec
 
 @wp.func
 def place(s: NearParticles, j: wp.int32):
-    """Return a particle's place and 1: sums of them give the mean place and the number of particles."""
+    """Return a particle's position and 1, whose sums give the mean position and the number of particles."""
     x = s.places[j] - s.lower
     return wp.vec4(x[0], x[1], x[2], 1.0)
 
@@ -194,8 +192,8 @@ place_near = sum_near(place, wp.vec4)
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: Floats):
-    """Write particles' volumes, reduced where the neighbourhood within ``reach`` is not filled, as in drops and sheets.
-    Otherwise their drawn surface would be too thick."""
+    """Write particles' volumes, reduced where the neighbourhood within ``reach`` is not filled, so that sheets are not
+    too thick."""
     i = first + wp.tid()
     near = place_near(s, s.places[i], reach)
     off = (wp.vec3(near[0], near[1], near[2]) / near[3] - s.places[i] + s.lower) / s.spacing
@@ -206,12 +204,12 @@ def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: Fl
 
 
 Level = tuple[Any, wp.array]
-"""The level of a fluid: its `Blocks`, and the numbers of those that its surface may pass."""
+"""`Blocks`, and the numbers of those that the surface may pass."""
 
 
 def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0) -> tuple[Level, Any]:
-    """Return the level of the particles' fluid and the `NearParticles` from which it is computed. Drops, sheets and
-    spray get about the volume of their particles. Cubes are at least ``least`` spacings wide."""
+    """Return the level of the particles' fluid, with cubes at least ``least`` spacings wide, and its
+    `NearParticles`."""
     reach, ends = REACH * spacing, _shown(particles, spacing, launch)
     cube = max(next(width for most, width in CUBE_WIDTHS if len(particles) <= most), least)
     s = near_particles(particles, ends, spacing, reach, launch)
@@ -226,13 +224,8 @@ def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, lea
 def liquid_surface(
     particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0, level: Level | None = None
 ) -> LiquidSurface:
-    """Make the surface of particles' fluid: a level of their density, smoothed by weights that keep thin sheets
-    (Löschner et al. 2023), with the looks of the nearest particles. ``level``: if left out, the result of
-    `liquid_level`.
-
-    Raises:
-        ComputationError: the particles have no surface.
-    """
+    """Make the surface of particles' fluid: a level of their density, smoothed by weights that preserve thin sheets
+    (Löschner et al. 2023). Raise `ComputationError` if there is none."""
     device, reach = launch.device, REACH * spacing
     if level is None:
         level, s = liquid_level(particles, spacing, launch, least)

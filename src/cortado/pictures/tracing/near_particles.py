@@ -1,4 +1,4 @@
-"""Particles on the device that draws them, selection of marked particles, and sums over the particles near a place."""
+"""Particles on the device that draws them, selection of marked particles, and sums over the particles near a point."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,19 +21,17 @@ Ints, Ints2d = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 Floats, Floats2d = wp.array(dtype=wp.float32), wp.array2d(dtype=wp.float32)
 Vec2s, Vec3s = wp.array(dtype=wp.vec2), wp.array(dtype=wp.vec3)
 Vec3s2d, Vec4s2d = wp.array2d(dtype=wp.vec3), wp.array2d(dtype=wp.vec4)
-"""Types of arrays that kernels and Warp functions take."""
 
 MODULE = kernel_module("liquid")
 MODULE.options["max_unroll"] = 2  # compiles in half the time
 Look = wp.types.vector(5, wp.float32)
 """Red, green and blue, linear from 0 to 1, then scattering and absorption [1/m]."""
 OPAQUE = (1e6, 0.0)
-"""The medium of opaque fluid: scattering and absorption [1/m]."""
+"""Scattering and absorption [1/m] of opaque fluid."""
 PARTS = 4096
-"""Number of parts of the particles, whose ends are found one by one."""
+"""Number of parts into which particles are divided to find their ends."""
 AT_ONCE = 8000
-"""Number of particles whose values are mixed at a time: for more, BLAS loses more time by waiting for threads than it
-saves."""
+"""Number of particles whose values are mixed at a time; with more, BLAS starts threads and takes longer."""
 
 
 def mixed(fractions: Points, values: Points) -> Points:
@@ -46,8 +44,6 @@ def mixed(fractions: Points, values: Points) -> Points:
 
 @dataclass(frozen=True)
 class Particles:
-    """Particles on a device, with their places and looks."""
-
     places: wp.array
     """(n,) of vec3 [m]"""
     looks: wp.array
@@ -57,8 +53,8 @@ class Particles:
     def on(
         cls, device: Any, places: Points, colours: Points, media: Points | tuple[float, float] = OPAQUE
     ) -> "Particles":
-        """Copy particles from arrays of NumPy, (n, 3) each, with ``media`` (n, 2), or (2,) for all: scattering and
-        absorption [1/m]. Raises `ComputationError` for places that are not finite."""
+        """Copy NumPy arrays (n, 3), with ``media`` (n, 2) or (2,): scattering and absorption [1/m]. Raise
+        `ComputationError` for positions that are not finite."""
         finite = np.isfinite(places)
         if not finite.all():
             astray = len(places) - int(finite.all(axis=1).sum())
@@ -74,13 +70,14 @@ class Particles:
         return len(self.places)
 
     def and_images(self, places: Points, of: np.ndarray) -> "Particles":
-        """Return the particles with others behind them, at places (m, 3) [m], each looking like one, (m,)."""
+        """Return the particles followed by others at ``places`` (m, 3) [m], which look like the particles ``of``
+        (m,)."""
         looks = np.concatenate([self.looks.numpy(), self.looks.numpy()[of]])
         both = np.concatenate([self.places.numpy(), places])
         return Particles.on(self.places.device, both, looks[:, :3], looks[:, 3:])
 
     def ends(self, launch: BandLauncher) -> tuple[Points, Points]:
-        """Return lower and upper ends of the particles, (3,) each [m]."""
+        """(3,) [m] each."""
         count, device = min(PARTS, len(self)), self.places.device
         lower, upper = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
         launch(find_ends, count, places=self.places, lower=lower, upper=upper)
@@ -89,7 +86,6 @@ class Particles:
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_ends(first: wp.int32, places: Vec3s, lower: Vec3s, upper: Vec3s):
-    """Find the ends of every part of the particles."""
     part = first + wp.tid()
     low = places[part]
     high = places[part]
@@ -110,7 +106,7 @@ def list_marked(first: wp.int32, marks: Ints, counts: Ints, numbers: Ints):
 
 
 def marked(marks: wp.array, launch: BandLauncher) -> tuple[wp.array, wp.array]:
-    """Return the numbers of the marks (n,) that are 1 and not 0, and how many of them there are up to each, (n,)."""
+    """Return the numbers of the marks (n,) that are 1, and the cumulative sum (n,) of the marks."""
     counts = wp.empty_like(marks)
     wp.utils.array_scan(marks, counts)
     numbers = wp.empty(last_of(counts), dtype=wp.int32, device=marks.device)
@@ -119,28 +115,24 @@ def marked(marks: wp.array, launch: BandLauncher) -> tuple[wp.array, wp.array]:
 
 
 def last_of(numbers: wp.array) -> int:
-    """Read the last of whole numbers (n,) on a device."""
     return int(numbers[len(numbers) - 1 :].numpy()[0])
 
 
 @wp.struct
 class NearParticles:
-    """Particles sorted by cells, for sums over those near a place."""
-
     lower: wp.vec3
-    """Corner of the first cell [m]."""
+    """[m]"""
     spacing: wp.float32
-    """Spacing [m], which is the width of a cell, too."""
+    """[m], width of cells"""
     shape: wp.vec3i
-    """Cells along each axis."""
     starts: Ints
-    """(cells + 1,) the first particle of each"""
+    """(cells + 1,) number of the first particle of each cell"""
     places: Vec3s
     """(n,) [m]"""
     looks: wp.array(dtype=Look)
     """(n,)"""
     volumes: Floats
-    """(n,) of each, such that their bumps add up to about 1 within fluid; a particle alone has 1"""
+    """(n,), such that bumps times volumes add up to about 1 within fluid; an isolated particle has volume 1"""
 
 
 @wp.func
@@ -153,7 +145,6 @@ def bump(q: wp.float32):
 
 
 def bump_at(q: float) -> float:
-    """Return the cubic spline `bump` of a Python number."""
     return 1.0 - 6.0 * q * q * (1.0 - q) if q < 0.5 else 2.0 * max(1.0 - q, 0.0) ** 3
 
 

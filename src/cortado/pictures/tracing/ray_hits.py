@@ -37,8 +37,6 @@ LAYERS = 8
 
 @wp.struct
 class SolidHit:
-    """The hit of a ray on an opaque solid."""
-
     t: wp.float32
     """Distance along the ray; FAR if it hits no solid."""
     is_cut: wp.bool
@@ -50,7 +48,6 @@ class SolidHit:
 
 @wp.func
 def reach_solid(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Find where a ray meets an opaque solid."""
     met = SolidHit()
     met.t = FAR
     part = wp.vec2(-FAR, FAR)
@@ -75,7 +72,6 @@ def reach_solid(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Find where a ray meets an opaque solid, with the data of the surface there."""
     reached = reach_solid(s, o, d)
     met = SurfaceHit()
     met.found = False
@@ -108,10 +104,7 @@ def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32
 
 @wp.func
 def clear_layers(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32, before: Passed):
-    """Add the surfaces of transparent solids that a ray passes up to ``most`` [m].
-
-    Surfaces on the floor are left out: there the floor is drawn.
-    """
+    """Add the surfaces of transparent solids that a ray passes up to ``most`` [m], except surfaces on the floor."""
     passed = before
     start = s.nearest
     for _ in range(LAYERS):
@@ -136,7 +129,6 @@ def clear_layers(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, sprea
 
 @wp.func
 def wall_hit(s: Environment, t: wp.float32, normal: wp.vec3):
-    """Return the hit of a ray at t on a wall with a normal, inwards."""
     met = SurfaceHit()
     met.found = True
     met.is_solid = True
@@ -168,7 +160,7 @@ def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before
 
 @wp.func
 def box_pane(s: Environment, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32, width: wp.float32, before: Passed):
-    """Add the side of the box where a ray, o and d in its own frame, passes at t."""
+    """Add the side of the box that a ray passes at t; o and d are in container axes."""
     q = o + t * d
     axis = wp.int32(0)
     best = FAR
@@ -201,7 +193,6 @@ def box_glass(
     o: wp.vec3,
     d: wp.vec3,
     world: wp.vec3,
-    least: wp.float32,
     most: wp.float32,
     spread: wp.float32,
     before: Passed,
@@ -213,16 +204,16 @@ def box_glass(
     leave = span[1]
     passed = before
     if enter < leave:
-        if enter > least and enter < most:
+        if enter > s.nearest and enter < most:
             passed = box_pane(s, o, d, world, enter, wp.max(0.006 * s.size, 1.2 * spread * enter), passed)
-        if leave > least and leave < most:
+        if leave > s.nearest and leave < most:
             passed = box_pane(s, o, d, world, leave, wp.max(0.006 * s.size, 1.2 * spread * leave), passed)
     return passed
 
 
 @wp.func
 def tube(s: Environment, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32, width: wp.float32, before: Passed):
-    """Add the side of the cylinder where a ray passes at t; there is nothing above and below it."""
+    """Add the side of the cylinder that a ray passes at t; the ends are open."""
     q = o + t * d
     if q[1] < s.glass_lower[1] or q[1] > s.glass_upper[1]:
         return before
@@ -247,7 +238,6 @@ def cylinder_glass(
     o: wp.vec3,
     d: wp.vec3,
     world: wp.vec3,
-    least: wp.float32,
     most: wp.float32,
     spread: wp.float32,
     before: Passed,
@@ -256,17 +246,15 @@ def cylinder_glass(
     t1 = span[0]
     t2 = span[1]
     passed = before
-    if t1 > least and t1 < most:
+    if t1 > s.nearest and t1 < most:
         passed = tube(s, o, d, world, t1, wp.max(0.010 * s.size, 1.2 * spread * t1), passed)
-    if t2 > least and t2 < most:
+    if t2 > s.nearest and t2 < most:
         passed = tube(s, o, d, world, t2, wp.max(0.010 * s.size, 1.2 * spread * t2), passed)
     return passed
 
 
 @cache
 def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
-    """Make the Warp functions `glass` and `background` for scenes with opaque or transparent solids or none."""
-
     @wp.func
     def glass(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32):
         """Return the glass that a ray passes up to the distance ``most`` [m]."""
@@ -276,9 +264,9 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
         own_o = s.glass_frame * o
         own_d = s.glass_frame * d
         if s.glass == 1:
-            passed = box_glass(s, own_o, own_d, d, s.nearest, most, spread, passed)
+            passed = box_glass(s, own_o, own_d, d, most, spread, passed)
         if s.glass == 2:
-            passed = cylinder_glass(s, own_o, own_d, d, s.nearest, most, spread, passed)
+            passed = cylinder_glass(s, own_o, own_d, d, most, spread, passed)
         if has_clear:
             passed = clear_layers(s, o, d, most, spread, passed)
         if s.has_walls > 0:
@@ -287,7 +275,6 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
 
     @wp.func
     def background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spread: wp.float32):
-        """Return the light along a ray that hits no fluid."""
         most = FAR
         if s.has_floor > 0 and d[1] < -1.0e-4:
             most = wp.max((s.floor_height - o[1]) / d[1], 0.0)
@@ -304,7 +291,8 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
 
 @wp.func
 def at_wall(s: Environment, surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, normal: wp.vec3):
-    """Find where a ray hits, at a point p, the wall that fluid touches, beyond which its triangles go on."""
+    """Find where a ray hits, at a point p, the wall that fluid touches; triangles of the fluid extend behind the
+    wall."""
     near = wp.mesh_query_point_no_sign(surface.mesh, p, surface.reach)
     if not near.result:  # deep within fluid that has just reached the wall
         near = wp.mesh_query_point_no_sign(surface.mesh, p, s.size)
@@ -315,8 +303,7 @@ def at_wall(s: Environment, surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.f
 
 @wp.func
 def behind_wall(surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, normal: wp.vec3):
-    """Find the hit of `at_wall` more quickly, by the triangle of the surface straight behind the wall, along
-    ``normal``. There is no hit if the triangle is not near, or if p is outside the fluid."""
+    """Find the hit of `at_wall` more quickly, by a near triangle of the surface behind the wall along ``normal``."""
     met = SurfaceHit()
     met.found = False
     hit = wp.mesh_query_ray(surface.mesh, p, normal, surface.reach)
@@ -328,7 +315,6 @@ def behind_wall(surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, norm
 
 @wp.func
 def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
-    """Find where a ray enters the fluid within a part of the ray that contains no transparent solid."""
     met = SurfaceHit()
     met.found = False
     met.t = FAR
@@ -395,8 +381,6 @@ def into_fluid_among_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: w
 
 @cache
 def surface_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
-    """Make the Warp functions `meet` and `leave` for scenes with opaque or transparent solids or none."""
-
     @wp.func
     def meet(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
         """Find where a ray from outside enters the fluid, unless it meets an opaque solid before."""
@@ -416,8 +400,7 @@ def surface_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
 
     @wp.func
     def leave(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, most: wp.float32):
-        """Find where a ray inside the fluid leaves the fluid or hits an opaque solid. It is followed for at most
-        ``most`` [m]."""
+        """Find where a ray inside the fluid leaves the fluid or hits an opaque solid, within ``most`` [m]."""
         part = room(s, o, d)
         wall_at = wp.where(part[1] > 0.0, part[1], FAR)
         hit = wp.mesh_query_ray(surface.mesh, o, d, wp.min(wall_at, most))

@@ -1,7 +1,5 @@
-"""Surfaces of the solids of a stage on the device that traces rays, and the shadow on the floor.
-
-Fluid and solids cast the shadow; it is soft and has the colour of the fluid.
-"""
+"""Surfaces of the solids of a stage on the device that traces rays, and the soft shadow of fluid and solids on the
+floor."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,9 +27,8 @@ REACH = 1.5
 KEY, AROUND = 0.022, 0.05
 """Softness of the shadows of the lamp and of the sky, relative to the size of the contents."""
 CLOSE = 0.15
-"""Approximate height above the floor from which on nothing shades the sky, relative to the size of the contents."""
+"""Approximate height above which objects do not shade the floor from the sky, relative to the size of the contents."""
 SKY = 0.32
-"""Fraction of the light that comes from the sky."""
 
 
 Soften = Callable[[wp.array], wp.array]
@@ -39,19 +36,18 @@ Soften = Callable[[wp.array], wp.array]
 
 @dataclass(frozen=True)
 class DeviceSurface:
-    """A triangle surface on a device, without light at first. Its arrays exist as long as this object."""
+    """A triangle surface on a device, without light at first; its arrays exist as long as this object."""
 
     mesh: wp.Mesh
     lit: Any
-    """The surface as `LitSurface`."""
+    """`LitSurface`"""
     softened: Soften | None = None
-    """Removes steps from the light at points (p,) of vec3, which comes from few directions."""
 
     @classmethod
     def of(
         cls, points: wp.array, triangles: wp.array, normals: wp.array, colours: wp.array, softened: Soften | None = None
     ) -> "DeviceSurface":
-        """Make a surface of triangles (3 t,), points (p,) of vec3 [m], normals and linear colours (p,)."""
+        """Take triangles (3 t,) and points (p,) of vec3 [m]."""
         mesh, found = wp.Mesh(points, triangles), LitSurface()
         found.mesh, found.corners, found.normals, found.colours = mesh.id, triangles, normals, colours
         found.light, found.media = wp.zeros_like(points), wp.zeros(len(points), dtype=wp.vec2, device=points.device)
@@ -67,7 +63,7 @@ class DeviceSurface:
         colours: Points,
         softened: Soften | None = None,
     ) -> "DeviceSurface":
-        """Make a surface from NumPy's arrays of triangles (t, 3), points, normals and colours (p, 3)."""
+        """Take triangles (t, 3) and points (p, 3) [m]."""
         corners = wp.array(triangles.ravel(), dtype=wp.int32, device=device)
         own = [wp.array(one, dtype=wp.vec3, device=device) for one in (points, normals, colours)]
         return cls.of(own[0], corners, own[1], own[2], softened)
@@ -105,7 +101,7 @@ typed = TypesByName(
 @typed
 def cast(places, looks, volumes, corner, cell, slope, fading, begin, thickness):
     """Add the shadow of each part of an object to the nearest four floor nodes along a slope: colour times thickness,
-    and thickness, faded with height by ``fading`` [1/m]. ``begin``: index of the first node."""
+    and thickness, faded with height by ``fading`` [1/m]."""
     i = wp.tid()
     height = places[i][1] - corner[1]
     x = (places[i][0] - height * slope[0] - corner[0]) / cell
@@ -126,7 +122,6 @@ def cast(places, looks, volumes, corner, cell, slope, fading, begin, thickness):
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def blur(first, across, weights, sharp, found):
-    """Blur thicknesses at nodes along one axis of the floor; with ``across`` along the other one."""
     n = first + wp.tid()
     i = n / sharp.shape[1]
     j = n % sharp.shape[1]
@@ -141,7 +136,7 @@ def blur(first, across, weights, sharp, found):
 
 @wp.func
 def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.float32):
-    """Return the fraction of light absorbed by a thickness; its own colour is absorbed less than others."""
+    """Return the fraction of light absorbed by a thickness; light of the object's colour is absorbed less."""
     reached = 1.0 - wp.exp(-above[3] / (0.75 * layer))
     colour = wp.vec3(above[0], above[1], above[2])
     hue = colour / wp.max(wp.max(colour), 1.0e-6 * wp.max(above[3], 1.0e-12))
@@ -162,23 +157,8 @@ def darken(first, key, around, strength, layer, opacity, tinted, begin, light):
     light[u, v] = wp.min(light[u, v], left)
 
 
-@dataclass(frozen=True)
-class Caster:
-    """An object that casts a shadow, in many small parts."""
-
-    parts: Particles
-    """The parts, in the frame of the picture."""
-    to_lamp: wp.array
-    """(n,) the volumes of the parts [m3], as the lamp sees them"""
-    to_sky: wp.array
-    """(n,) the volumes as the sky sees them"""
-    opacity: float = 1.0
-    tinted: float = 0.0
-    """Additional transmission of light of the object's own colour, from 0 to 1."""
-
-
 class FloorShadow:
-    """The shadow on the floor: the fraction of light that reaches each floor node."""
+    """The fraction of light that reaches each floor node."""
 
     def __init__(self, stage: Stage, launch: BandLauncher):
         middle = 0.5 * (stage.lower + stage.upper)
@@ -186,19 +166,16 @@ class FloorShadow:
         self.corner = np.array([middle[0], stage.lower[1], middle[2]]) - np.array([REACH, 0.0, REACH]) * stage.size
         """(3,) position of the first node [m]"""
         self.cell = 2.0 * REACH * stage.size / (NODES - 1)
-        """Distance between nodes [m]."""
+        """[m]"""
         self.light = wp.ones((NODES, NODES), dtype=wp.vec3, device=self._device)
         """(nodes, nodes) fraction of light at the nodes along x and z"""
 
     def of_fluid(self, particles: Particles) -> None:
-        """Add the shadow of particles, in the frame of the picture."""
         stage = self._stage
         volumes = wp.full(len(particles), stage.spacing**3, dtype=wp.float32, device=self._device)
-        caster = Caster(particles, volumes, volumes, tinted=0.4 * stage.transparency)
-        self._add(caster, 0.8 * stage.spacing, stage.spacing)
+        self._add(particles, volumes, volumes, 0.8 * stage.spacing, tinted=0.4 * stage.transparency)
 
     def of_solid(self, shown: ShownSolid, mesh: SolidMesh) -> None:
-        """Add the shadow of a solid."""
         stage = self._stage
         a, b, c = mesh.points[mesh.triangles].transpose(1, 0, 2)
         middle = (a + b + c) / 3.0
@@ -209,28 +186,37 @@ class FloorShadow:
         volumes = 3.0 * stage.spacing * np.abs(np.stack([area @ stage.sun / stage.sun[1], area[:, 1]]))
         parts = Particles.on(self._device, middle, np.tile(shown.colour, (len(middle), 1)))
         to_lamp, to_sky = (self._array(one) for one in volumes)
-        self._add(Caster(parts, to_lamp, to_sky, opacity=1.0 - shown.transparency), 0.0, stage.spacing)
+        self._add(parts, to_lamp, to_sky, 0.0, opacity=1.0 - shown.transparency)
 
-    def _add(self, caster: Caster, least: float, layer: float) -> None:
-        if not len(caster.parts):
+    def _add(
+        self,
+        parts: Particles,
+        to_lamp: wp.array,
+        to_sky: wp.array,
+        least: float,
+        opacity: float = 1.0,
+        tinted: float = 0.0,
+    ) -> None:
+        """Add the shadow of particles with volumes (n,) [m3] as lamp and sky see them, at least ``least`` [m] soft.
+        ``tinted`` is the additional transmission of light of the object's colour."""
+        if not len(parts):
             return
         stage = self._stage
         slope = stage.sun[::2] / stage.sun[1]
         soft = [max(part * stage.size, least) / self.cell for part in (KEY, AROUND)]
         bells = [_bell(sigma) for sigma in soft]
-        begin, shape = self._reached(caster.parts, slope, max(map(len, bells)))
+        begin, shape = self._reached(parts, slope, max(map(len, bells)))
         seen = {"begin": wp.vec2i(*begin), "corner": wp.vec3(*self.corner), "cell": self.cell}
-        fading = 1.0 / (CLOSE * stage.size)
-        key = self._thickness(caster, caster.to_lamp, bells[0], shape, slope=wp.vec2(*slope), fading=0.0, **seen)
-        own = {"slope": wp.vec2(0.0, 0.0), "fading": fading}
-        around = self._thickness(caster, caster.to_sky, bells[1], shape, **own, **seen)
+        key = self._thickness(parts, to_lamp, bells[0], shape, slope=wp.vec2(*slope), fading=0.0, **seen)
+        own = {"slope": wp.vec2(0.0, 0.0), "fading": 1.0 / (CLOSE * stage.size)}
+        around = self._thickness(parts, to_sky, bells[1], shape, **own, **seen)
         strength = wp.vec2(stage.picture.sun_and_sky.shadow, SKY)
-        how = {"strength": strength, "layer": layer, "opacity": caster.opacity, "tinted": caster.tinted}
+        how = {"strength": strength, "layer": stage.spacing, "opacity": opacity, "tinted": tinted}
         self._launch(darken, key.size, key=key, around=around, **how, begin=seen["begin"], light=self.light)
 
     def _reached(self, parts: Particles, slope: Points, around: int) -> tuple[list[int], tuple[int, int]]:
         """Return the first floor node that an object's shadow may reach, with a margin of ``around`` nodes, and the
-        number of nodes along each side. Other nodes stay fully lit and cost no time."""
+        number of nodes along each side."""
         lower, upper = (end - self.corner for end in parts.ends(self._launch))
         shifts = np.outer((0.0, lower[1], upper[1]), slope)
         first = np.floor((lower[::2] - shifts.max(axis=0)) / self.cell) - around
@@ -239,10 +225,12 @@ class FloorShadow:
         rows, columns = (last - first + 2).tolist()
         return first.tolist(), (rows, columns)
 
-    def _thickness(self, caster: Caster, volumes: wp.array, bell: Points, shape: tuple[int, int], **where: Any) -> Any:
+    def _thickness(
+        self, parts: Particles, volumes: wp.array, bell: Points, shape: tuple[int, int], **where: Any
+    ) -> Any:
         """Return thicknesses as vec4, which `cast` adds up at nodes of this shape, blurred by a bell."""
         sharp = wp.zeros(shape, dtype=wp.vec4, device=self._device)
-        given = {"places": caster.parts.places, "looks": caster.parts.looks, "volumes": volumes}
+        given = {"places": parts.places, "looks": parts.looks, "volumes": volumes}
         launch_once(cast, len(volumes), self._device, **given, **where, thickness=sharp)
         weights, other = self._array(bell), wp.empty_like(sharp)
         self._launch(blur, sharp.size, across=0, weights=weights, sharp=sharp, found=other)
@@ -270,29 +258,29 @@ class SolidSurfaces:
 
     @property
     def kinds(self) -> tuple[bool, bool]:
-        """Return two booleans: whether opaque and whether transparent solids exist."""
+        """Whether opaque and whether transparent solids exist."""
         clear = [_is_clear(one) for one in self._stage.solids]
         return not all(clear), any(clear)
 
     def cast(self, shadow: FloorShadow, solids: Sequence[ShownSolid]) -> None:
-        """Add the shadows of ``solids``: the stage's solids at their present poses."""
         for one, mesh in self._placed(solids):
             if not one.is_tank:
                 shadow.of_solid(one, mesh)
 
     def on_device(self, solids: Sequence[ShownSolid]) -> tuple[Any, list[DeviceSurface]]:
-        """Return `Solids` and their surfaces, which must be kept and lit, for ``solids`` of the stage, in poses."""
+        """Return `Solids` and their surfaces, which the caller must store and illuminate, for ``solids`` at their
+        present poses."""
         found, surfaces, lit = Solids(), list[DeviceSurface](), [LitSurface(), LitSurface()]
         found.are_cut, placed = int(self._stage.cuts_solids), self._placed(solids)
         opaque, clear = ([pair for pair in placed if _is_clear(pair[0]) == kind] for kind in (False, True))
         if opaque:
-            surfaces.append(self._surface(_joined(opaque), opaque))
+            surfaces.append(self._surface(SolidMesh.joined([mesh for _, mesh in opaque]), opaque))
             lit[0] = surfaces[-1].lit
             found.opaque = lit[0].mesh
             mirrors = [np.full(len(own.triangles), one.finish.reflectivity) for one, own in opaque]
             lit[0].reflectivity = wp.array(np.concatenate(mirrors), dtype=wp.float32, device=self._device)
         if clear:
-            mesh = _joined(clear)
+            mesh = SolidMesh.joined([own for _, own in clear])
             surfaces.append(self._surface(mesh, clear))
             lit[1] = surfaces[-1].lit
             found.clear = lit[1].mesh
@@ -307,17 +295,12 @@ class SolidSurfaces:
         return [(one, self._own[one.name].moved(one.turn, one.position)) for one in solids]
 
     def _surface(self, mesh: SolidMesh, solids: Sequence[Placed]) -> DeviceSurface:
-        """Make the surface of the mesh of several solids."""
         colours = np.concatenate([np.tile(one.colour, (len(own.points), 1)) for one, own in solids])
 
         def softened(light: wp.array) -> wp.array:
             return wp.array(mesh.smoothed(light.numpy()), dtype=wp.vec3, device=self._device)
 
         return DeviceSurface.on(self._device, mesh.points, mesh.triangles, mesh.normals, colours, softened)
-
-
-def _joined(solids: Sequence[Placed]) -> SolidMesh:
-    return SolidMesh.joined([mesh for _, mesh in solids])
 
 
 def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:
@@ -329,11 +312,10 @@ def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:
 
 
 def _is_clear(shown: ShownSolid) -> bool:
-    """Test whether fluid is seen through a solid, or in it."""
     return shown.is_tank or shown.transparency > 0.0
 
 
 def _left(shown: ShownSolid) -> tuple[float, float]:
-    """Return the fraction of light transmitted by one surface, seen from inside a solid and from outside. Tanks can
-    always be seen into, whatever their walls are."""
+    """Return the fraction of light transmitted by one surface, seen from inside a solid and from outside; tanks can
+    always be seen into."""
     return (1.0, shown.transparency) if shown.is_tank else (shown.transparency**0.5,) * 2

@@ -1,5 +1,8 @@
-"""Pictures of fluid in 3-D, by a ray tracer on the device of the run. Particles that touch walls and solids get mirror
-images, so that the surface continues behind these and no gap is visible between fluid and wall."""
+"""Pictures of fluid in 3-D, by a ray tracer on the device of the run.
+
+Particles that touch walls and solids get mirror images, so that the surface continues behind walls and solids and no
+gap is visible.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,8 +68,7 @@ def mirrored(
     """Return mirror images (m, d) [m] of points (n, d) [m] behind solids, and the point of each, (m,).
 
     A point closer to a solid than ``touching`` [m] has an image behind each touched side, and behind the corner between
-    two touched sides. If the solid is too thin to hide fluid drawn at the images, they are closer to the surface or
-    left out.
+    two touched sides. Images that a thin solid would not hide are closer to the surface or left out.
     """
     dimension = points.shape[1]
     images, of = [np.zeros((0, dimension))], [np.zeros(0, dtype=int)]
@@ -83,8 +85,8 @@ def mirrored(
 
 
 def _ways(points: Points, shown: ShownSolid, touching: float, spacing: float) -> list[Points]:
-    """Return for each touched side the vectors (n, d) [m] from points (n, d) [m] to their images behind this side; 0
-    without an image. Sides are searched towards the solid's nearest point and along its axes."""
+    """Return for each touched side the vectors (n, d) [m] from points (n, d) [m] to their images behind this side, or
+    0."""
     solid, normals, ways = shown.solid, list[Points](), list[Points]()
     for probe in touching * np.concatenate([np.zeros((1, len(shown.turn))), shown.turn.T, -shown.turn.T]):
         feet, away = solid.nearest(points + probe), solid.outward(points + probe)
@@ -104,7 +106,7 @@ def _ways(points: Points, shown: ShownSolid, touching: float, spacing: float) ->
 
 TOUCHING, TOUCHING_SOLID, TOUCHING_ROUND = wp.constant(wp.float32(0.8)), 1.1, wp.constant(wp.float32(1.5))
 """Distances in spacings below which fluid touches a flat wall, a solid and a round wall. A cubic lattice in a round cup
-ends up to one and a half spacings from its wall."""
+ends up to one and a half spacings from the wall."""
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -116,8 +118,8 @@ def turn(first: wp.int32, frame: wp.mat33, places: Vec3s):
 def particles_of(
     stage: Stage, positions: np.ndarray, colours: np.ndarray, launch: BandLauncher, fractions: Points | None = None
 ) -> Particles:
-    """Return particles in the picture's frame, at positions (n, 3) [m] in the scene's axes, with colours (n, 3) and
-    mass fractions (n, phases), even ones if left out. Along periodic axes they are moved into the period."""
+    """Return particles in picture axes, from positions (n, 3) [m] in the scene's axes, colours (n, 3) and mass
+    fractions (n, phases), by default even ones."""
     media = stage.media.mean(axis=0) if fractions is None else mixed(fractions, stage.media)
     places = stage.container.domain(3).wrapped(positions)
     found = Particles.on(launch.device, np.subtract(places, stage.origin), colours, media)
@@ -127,8 +129,8 @@ def particles_of(
 
 @wp.func
 def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32):
-    """Return which mirror images a particle (in the container's axes) has along an axis: bit 1 for the lower wall, bit
-    2 for the upper. Along a cylinder's first axis, they are behind its round wall."""
+    """Return which mirror images a particle at q, in container axes, has along an axis: bit 1 for the lower wall, bit 2
+    for the upper. Along a cylinder's first axis, images are behind its round wall."""
     found = wp.int32(0)
     if s.glass == wp.static(GLASS_BOX) or axis == 1:
         if wp.abs(q[axis] - s.room_lower[axis]) < TOUCHING * spacing:
@@ -145,8 +147,7 @@ def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32
 
 @wp.func
 def image_along(s: Environment, q: wp.vec3, axis: wp.int32, which: wp.int32, spacing: wp.float32):
-    """Return the vector from a particle to an image: 0 for image 0, the particle itself; others are those of
-    `images_along`."""
+    """Return the vector from a particle at q to an image of `images_along`, or to itself (image 0)."""
     way = wp.vec3(0.0)
     if which == 0:
         return way
@@ -164,7 +165,6 @@ def has_image(which: wp.int32, images: wp.int32):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def count_images(first: wp.int32, s: Environment, spacing: wp.float32, places: Vec3s, counts: Ints):
-    """Count the images of each particle, including the particle itself."""
     i = first + wp.tid()
     q = s.glass_frame * places[i]
     count = wp.int32(1)
@@ -224,7 +224,7 @@ def wetting(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) ->
 
 
 def environment_of(stage: Stage) -> Any:
-    """Return the `Environment` of a stage, without its solids, which are added elsewhere."""
+    """Return the `Environment` of a stage, without solids and shadow."""
     picture, light, s = stage.picture, stage.picture.sun_and_sky, Environment()
     horizon = np.asarray(light.background)
     s.size, s.nearest, s.segments = stage.size, 1e-4 * stage.size, effort_of(stage.picture).segments
@@ -253,40 +253,34 @@ def environment_of(stage: Stage) -> Any:
 
 
 def _round_length(length: float) -> float:
-    """Return the next of 1, 2 and 5 times a power of ten below a length."""
+    """Return the greatest of 1, 2 and 5 times a power of ten that is not above a length."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= length * (1.0 + 1e-9)))
 
 
 class State(NamedTuple):
-    """A state of a run, for drawing."""
-
     positions: Points
-    """(n, d) of particles [m], in the scene's axes"""
+    """(n, d) [m], in the scene's axes"""
     colours: Points
-    """(n, 3) of particles, linear from 0 to 1"""
+    """(n, 3) linear"""
     pose: Scene | None = None
-    """The scene with its solids at the state's poses; if left out, at the scene's own."""
+    """The scene with its solids at the state's poses; None for poses that do not change."""
     view: View | None = None
-    """View of the camera; the home view if left out."""
+    """View of a moving camera; None for the home view."""
     fractions: Points | None = None
-    """(n, phases) mass fractions of particles; left out with one phase"""
+    """(n, phases) mass fractions; None with one phase"""
 
 
 @dataclass(frozen=True)
 class Scenery:
-    """The fluid of one state with its surroundings, in the frame of the picture."""
-
     stage: Stage
-    """Stage with solids and camera of the state."""
     environment: Any
-    """`Environment`"""
     surface: DeviceSurface
     shadow: FloorShadow
 
 
 def scenery(home: Stage, state: State, launch: BandLauncher, steady: Any = None) -> Scenery:
-    """Make the scenery of a state in 3-D; ``steady`` is a `Still` drawn instead of the state's own."""
+    """Make the scenery of a state in 3-D; ``steady`` is a `Still` that replaces the state's level and shadow."""
     stage, s, particles, shadow = _placed(home, state, launch)
     if steady is None:
         shadow.of_fluid(particles)
@@ -301,14 +295,12 @@ def still(home: Stage, state: State, launch: BandLauncher) -> Any:
     if stage.picture.surface != "liquid" or not len(particles):
         return None
     shadow.of_fluid(particles)
-    level, near = liquid_level(
-        wetting(stage, s, particles, launch), stage.spacing, launch, effort_of(stage.picture).cube
-    )
+    images = wetting(stage, s, particles, launch)
+    level, near = liquid_level(images, stage.spacing, launch, effort_of(stage.picture).cube)
     return still_of(level, near, shadow.light, launch)
 
 
 def _placed(home: Stage, state: State, launch: BandLauncher) -> tuple[Stage, Any, Particles, FloorShadow]:
-    """Return the stage of a state, its `Environment`, its particles, and a floor without a shadow."""
     stage = home.at(state.pose, state.view)
     s, shadow = environment_of(stage), FloorShadow(stage, launch)
     s.shadow_corner, s.shadow_cell = wp.vec3(*shadow.corner), shadow.cell
@@ -318,8 +310,9 @@ def _placed(home: Stage, state: State, launch: BandLauncher) -> tuple[Stage, Any
 def _surface(
     stage: Stage, s: Any, particles: Particles, launch: BandLauncher, level: Level | None = None
 ) -> DeviceSurface:
-    if not len(particles):
-        return _nothing(stage, launch.device)
+    if not len(particles):  # meshes need a triangle: one too small and too far below the floor to be seen
+        places = stage.lower - 1e3 * stage.size + 1e-6 * stage.size * np.eye(3)
+        return DeviceSurface.on(launch.device, places, np.arange(3), np.eye(3), np.eye(3))
     if stage.picture.surface == "liquid":
         cube = effort_of(stage.picture).cube
         found = liquid_surface(wetting(stage, s, particles, launch), stage.spacing, launch, cube, level)
@@ -333,32 +326,16 @@ def _surface(
     return surface
 
 
-def _nothing(stage: Stage, device: Any) -> DeviceSurface:
-    """Make a triangle that is too small and too far below the floor to be seen: meshes need one."""
-    places = stage.lower - 1e3 * stage.size + 1e-6 * stage.size * np.eye(3)
-    return DeviceSurface.on(device, places, np.arange(3), np.eye(3), np.eye(3))
-
-
 class SpacePainter:
-    """A painter that draws states of one scene with a fixed number of particles in space."""
-
     def __init__(self, stage: Stage, device: Any = "cpu"):
         self.stage, self.device = stage, wp.get_device(device)
         self._launch = BandLauncher(self.device)
         self._solids = SolidSurfaces(stage, self.device) if stage.solids else None
         kinds = self._solids.kinds if self._solids is not None else (False, False)
         self._trace, self._illuminates = trace_kernel(*kinds), illuminate_kernel(*kinds)
-        self._kernels = (
-            self._trace,
-            self._illuminates,
-            find_contrast,
-            list_marked,
-            turn,
-            cast,
-            cell_kernels(FLOAT32).count,
-        )
-        """One kernel of each module that a picture needs, so that the modules are compiled in parallel before the first
-        picture."""
+        shading = self._trace, self._illuminates
+        self._kernels = *shading, find_contrast, list_marked, turn, cast, cell_kernels(FLOAT32).count
+        """One kernel of each module that a picture needs, so that the modules compile in parallel."""
         effort, is_liquid = effort_of(stage.picture), stage.picture.surface == "liquid"
         self._lamps = self._rays_to_light(*(effort.lights if is_liquid else SPHERE_LIGHTS))
         self._lamps_of_solids = self._rays_to_light(*SOLID_LIGHTS)
@@ -366,14 +343,11 @@ class SpacePainter:
         self._offsets = [wp.array(one, dtype=wp.vec2, device=device) for one in (MIDDLE, ROTATED_GRID[: effort.again])]
 
     def image(self, *state: Any) -> Points:
-        """Draw the picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
         with WARP:
             compile_ahead(self, self.device)
             return self._rays(scenery(self.stage, State(*state), self._launch))
 
     def still(self, state: State) -> Any:
-        """Return the data of a `State` that other frames of a film need; None if the film does not steady fluid at
-        rest."""
         with WARP:
             compile_ahead(self, self.device)
             return still(self.stage, state, self._launch)
@@ -409,7 +383,6 @@ class SpacePainter:
         return found
 
     def _illuminate(self, surface: DeviceSurface, lamps: tuple[wp.array, wp.array], given: dict[str, Any]) -> None:
-        """Find the light on a surface, by rays in the directions of lamps."""
         around, in_lamp = lamps
         own = {"points": surface.mesh.points, "normals": surface.lit.normals, "light": surface.lit.light}
         how = {"reach": 0.2 * self.stage.size, "clearness": self.stage.clearness}
@@ -419,7 +392,6 @@ class SpacePainter:
             wp.copy(surface.lit.light, surface.softened(surface.lit.light))
 
     def _rays_to_light(self, around: int, lamp: int) -> tuple[wp.array, wp.array]:
-        """Return directions to all around, and to ``lamp`` points of the lamp."""
         in_lamp = self.stage.sun + (0.16 if lamp > 1 else 0.0) * _directions(lamp)
         in_lamp /= np.linalg.norm(in_lamp, axis=1)[:, None]
         found = [wp.array(one, dtype=wp.vec3, device=self.device) for one in (_directions(around), in_lamp)]

@@ -1,9 +1,9 @@
 """Keep fluid at rest from moving in films: its drawn surface is averaged over the frames in which it is at rest.
 
-Particles of water at rest keep drifting and move its surface by fractions of a spacing. In each block of the lattice
-the mean level tells how far the fluid has moved in earlier and later frames. Consecutive frames with a displacement
-below a fraction of a spacing contribute to the drawn level. Where fluid moves further between frames, and in drops, no
-other frame contributes, and the level stays the same bit for bit.
+Particles of water at rest drift and move its surface by fractions of a spacing. In each block of the lattice the mean
+level tells how far the fluid has moved in earlier and later frames. Consecutive frames with a displacement below a
+fraction of a spacing contribute to the drawn level. Where fluid moves further between frames, and in drops, no other
+frame contributes, and the level stays the same bit for bit.
 """
 
 from collections.abc import Sequence
@@ -27,17 +27,14 @@ from cortado.pictures.tracing.near_particles import (
 from cortado.pictures.tracing.surface_net import CUBES, WIDTH, Blocks, block_at, index_of, place_of
 
 WINDOW, SHADOW_WINDOW = 30, 6
-"""Number of frames before and after a frame that contribute to its level, and to its shadow, with weights that fall
-with distance."""
+"""Number of frames before and after a frame that contribute to its level, and to its shadow, with falling weights."""
 LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.35, 0.7), (0.4, 0.8), (0.02, 0.04)
-"""How far the fluid in a block is, in spacings, and how much the level at a node and the light on the floor differ, for
-a frame to count fully, and not at all."""
+"""Limits of the displacement [spacings], the change of level and the change of light: up to the first limit a frame
+counts fully, from the second on it does not count."""
 BODY_REACH, BODY = 6.0, (7.0, 12.0)
-"""The distance around a block within which fluid is looked for, in spacings, and the amounts of it that make a drop and
-a body of fluid. They are numbers of particles, of the 85 that there are within fluid; particles farther away count
-less."""
+"""Distance around a block within which particles are counted [spacings], and the weighted counts of a drop and of a
+body of fluid; there are 85 within fluid."""
 TOUCHING = wp.constant(27)
-"""Number of blocks that touch one, itself included."""
 
 
 @wp.struct
@@ -46,13 +43,11 @@ class Still:
 
     b: Blocks
     blocks: Ints
-    """Numbers of those that the surface may pass."""
     first: wp.vec3i
-    """The first block, counted from the origin."""
     means: Floats
-    """(blocks that the surface may pass,) mean of the level"""
+    """(blocks,) mean level"""
     bodies: Floats
-    """(blocks that the surface may pass,) 1 in a body of fluid, and 0 in drops"""
+    """(blocks,) 1 in a body of fluid, and 0 in drops"""
     light: Vec3s2d
     """(nodes, nodes) light that the fluid leaves on the floor"""
 
@@ -104,8 +99,8 @@ def find_means(first, own, s, reach, means, bodies):
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def find_ways(first, own, others, width, touching, indices, ways):
-    """For each block, of a ``width`` in spacings: find how far its fluid has moved in other frames [spacings], which
-    block of theirs it is, and which blocks touch it."""
+    """Compute for each block how far its fluid has moved in other frames [spacings], and the matching and adjacent
+    blocks."""
     n = first + wp.tid()
     at = block_at(own.b, own.blocks[n])
     for k in range(TOUCHING):
@@ -189,8 +184,6 @@ def average_light(first, own, others, before, window, limits, found):
 
 
 def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandLauncher) -> Any:
-    """Make the `Still` of a frame, with which other frames are averaged. ``level`` is its `Blocks` and the numbers of
-    those that the surface may cross, ``s`` its particles, and ``light`` the light on the floor."""
     found = Still()
     found.b, found.blocks = level
     wide = found.b.cube * float(WIDTH)
@@ -202,8 +195,8 @@ def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandL
 
 
 def steadied(own: Any, before: Sequence[Any], after: Sequence[Any], spacing: float, launch: BandLauncher) -> Any:
-    """Return the `Still` of one frame, averaged with those of the frames before and after it, nearest first, as far as
-    their lattices have equal cubes; ``spacing`` is that of the particles [m]."""
+    """Average the `Still` of a frame with those of the frames before and after it, nearest first, until a lattice has
+    cubes of another size; ``spacing`` is that of the particles [m]."""
     before, after = (list(takewhile(lambda other: other.b.cube == own.b.cube, side)) for side in (before, after))
     if not before and not after:
         return own

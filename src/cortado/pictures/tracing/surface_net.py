@@ -29,34 +29,30 @@ from cortado.pictures.tracing.near_particles import (
 WIDTH = wp.constant(4)
 """Cubes along each axis of a block."""
 CUBES = wp.constant(64)
-"""Number of cubes of a block."""
 LEVEL = wp.constant(wp.float32(0.6))
-"""Level of the surface: within fluid the level is about 1."""
+"""Level of the surface; within fluid the level is about 1."""
 
 
 ROUNDS_OF_NORMALS = 15
-"""Rounds of smoothing of normals."""
 Neighbours = wp.types.vector(6, wp.int32)
-"""Corners in the cubes below and above along each axis; -1 where there is none."""
+"""Corners in the cubes below and above along each axis, or -1."""
 
 
 @wp.struct
 class Blocks:
-    """A lattice in blocks of cubes. Nodes have whole numbers (i, j, k) from the corner of the first block on; a cube
-    has that of its lowest node."""
+    """A lattice in blocks of cubes; a cube has the whole numbers (i, j, k) of its lowest node."""
 
     lower: wp.vec3
     """Corner of the first block [m]."""
     cube: wp.float32
-    """Width of a cube [m]."""
+    """Width [m]."""
     shape: wp.vec3i
-    """Blocks along each axis."""
     corners: wp.array3d(dtype=wp.float32)
-    """(blocks + 1 along each axis) the level at the lower corner of each block"""
+    """(blocks + 1 along each axis) level at the lower corner of each block"""
     places: Ints
-    """(blocks,) number of blocks up to each that are in ``levels``, itself among them if it is"""
+    """(blocks,) cumulative number of blocks that are in ``levels``"""
     levels: Floats2d
-    """(blocks that the surface may pass, CUBES) the level at the nodes of each"""
+    """(blocks that the surface may pass, CUBES) level at nodes"""
 
 
 @wp.func
@@ -66,7 +62,6 @@ def number_of(b: Blocks, i: wp.int32, j: wp.int32, k: wp.int32):
 
 @wp.func
 def block_at(b: Blocks, number: wp.int32):
-    """Return the place of a block along each axis, by its number."""
     i = number % b.shape[0]
     j = (number / b.shape[0]) % b.shape[1]
     return wp.vec3i(i, j, number / (b.shape[0] * b.shape[1]))
@@ -74,7 +69,7 @@ def block_at(b: Blocks, number: wp.int32):
 
 @wp.func
 def index_of(b: Blocks, at: wp.vec3i):
-    """Return the index of a block in ``levels``; -1 where it has none, and -2 outside the lattice."""
+    """Return the index of a block in ``levels``; -1 without levels, and -2 outside the lattice."""
     if wp.min(wp.min(at[0], at[1]), at[2]) < 0 or at[0] >= b.shape[0] or at[1] >= b.shape[1] or at[2] >= b.shape[2]:
         return -2
     block = number_of(b, at[0], at[1], at[2])
@@ -86,7 +81,7 @@ def index_of(b: Blocks, at: wp.vec3i):
 
 @wp.func
 def entry_of(b: Blocks, node: wp.vec3i):
-    """Return the entry of a node in ``levels``, as one number; -1 where it has none."""
+    """Return the entry of a node in ``levels``, as one number, or -1."""
     index = index_of(b, node / WIDTH)
     if index < 0:
         return -1
@@ -96,8 +91,7 @@ def entry_of(b: Blocks, node: wp.vec3i):
 
 @wp.func
 def level_at(b: Blocks, node: wp.vec3i):
-    """Return the level at a node. If it was not computed, return that of its block's corner, which is on the same side
-    of the surface."""
+    """Return the level at a node, or, if it was not computed, that of its block's corner, which is on the same side."""
     entry = entry_of(b, node)
     if entry < 0:
         return b.corners[node[0] / WIDTH, node[1] / WIDTH, node[2] / WIDTH]
@@ -147,8 +141,7 @@ def find_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_passed(first: wp.int32, b: Blocks, left: wp.float32, passed: Ints):
-    """Mark in ``passed`` the blocks that the isosurface may cross, judged by the values at their eight corners.
-    ``left`` is the smoothing kernel, 1 at its centre, at half of a block's diagonal."""
+    """Mark in ``passed`` the blocks that the isosurface may cross, judged by the values at their eight corners."""
     n = first + wp.tid()
     at = block_at(b, n)
     least = wp.float32(1.0e9)
@@ -190,15 +183,13 @@ def level_blocks(
 
 @wp.struct
 class Cubes:
-    """The cubes of the blocks that the surface may pass, with the numbers of the net's corners in them."""
-
     b: Blocks
     blocks: Ints
     """(blocks that the surface may pass,)"""
     corners: Ints
-    """(cubes + 1,) how many corners come before that of each cube"""
+    """(cubes + 1,) number of corners in earlier cubes"""
     sides: Ints
-    """(cubes + 1,) how many quadrilaterals come before those across the sides from the lowest node of each cube"""
+    """(cubes + 1,) number of quadrilaterals at the lowest nodes of earlier cubes"""
 
 
 @wp.func
@@ -223,7 +214,6 @@ def count_corners(first: wp.int32, b: Blocks, blocks: Ints, signs: Ints, corners
 
 @wp.func
 def corner_in(cubes: Cubes, node: wp.vec3i):
-    """Return the number of the net's corner in a cube; -1 where there is none."""
     entry = entry_of(cubes.b, node)
     if entry < 0:
         return -1
@@ -246,7 +236,6 @@ def differ(signs: wp.int32, m: wp.int32, n: wp.int32):
 def place_corners(
     first: wp.int32, cubes: Cubes, signs: Ints, points: Vec3s, own_signs: Ints, neighbours: wp.array(dtype=Neighbours)
 ):
-    """Place each cube's corner of the net in the middle of the points where the surface passes its sides."""
     n = first + wp.tid()
     v = cubes.corners[n]
     if cubes.corners[n + 1] == v:
@@ -336,7 +325,7 @@ def smooth(first: wp.int32, neighbours: wp.array(dtype=Neighbours), weights: Flo
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_normals(first: wp.int32, signs: Ints, neighbours: wp.array(dtype=Neighbours), points: Vec3s, normals: Vec3s):
-    """Compute at each corner the mean of the normals of the quadrilaterals around it, by their areas."""
+    """Compute at each corner the mean of the normals of the quadrilaterals around it, weighted by area."""
     v = first + wp.tid()
     beside = neighbours[v]
     total = wp.vec3(0.0)
@@ -369,10 +358,7 @@ def smooth_normals(first: wp.int32, neighbours: wp.array(dtype=Neighbours), valu
 
 @dataclass(frozen=True)
 class SurfaceNet:
-    """A net of the surface on the device, with one corner in each cube that it passes."""
-
     cubes: Any
-    """`Cubes`"""
     cube_signs: wp.array
     """(cubes,) bits of the nodes within the fluid"""
     points: wp.array
@@ -382,7 +368,6 @@ class SurfaceNet:
     neighbours: wp.array
     """(corners,)"""
     sides: int
-    """Number of quadrilaterals."""
 
 
 def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:

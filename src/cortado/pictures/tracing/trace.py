@@ -22,7 +22,7 @@ from cortado.pictures.tracing.backdrop import (
     Environment,
     LitSurface,
     SurfaceHit,
-    medium_at,
+    at_corners,
     mirrored,
     schlick,
     shading_module,
@@ -34,12 +34,9 @@ from cortado.scene.appearance import Picture
 
 
 class Effort(NamedTuple):
-    """Settings of the ray tracer for a picture quality."""
-
     cube: float
     """Least width of the surface lattice's cubes, in spacings."""
     segments: int
-    """Greatest number of segments of a ray refracted into fluid."""
     contrast: float
     """Contrast around a pixel, in linear light, above which the pixel gets more rays."""
     again: int
@@ -50,11 +47,10 @@ class Effort(NamedTuple):
 
 EFFORTS = {"traced": Effort(0.0, 4, 0.045, 4, (20, 4)), "quick": Effort(0.5, 1, 0.045, 2, (8, 2))}
 SPHERE_LIGHTS, SOLID_LIGHTS = (10, 1), (40, 6)
-"""Numbers of such rays for spheres, and for solids, which have fewer points and flat sides."""
+"""`Effort.lights` for spheres, and for solids, which have fewer points and flat sides."""
 
 
 def effort_of(picture: Picture) -> Effort:
-    """Return the ray tracer's settings for a picture."""
     return EFFORTS[picture.quality or "traced"]
 
 
@@ -64,10 +60,10 @@ BOUNCED = wp.constant(wp.float32(0.45))
 
 @wp.func
 def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light: wp.vec3):
-    """Return the part of ``light`` that reaches a point from direction d past solids.
+    """Return the part of ``light`` that reaches a point from direction d past solids within ``reach`` [m].
 
-    A solid within ``reach`` [m] blocks light, less so with distance, and sends a little light of its own colour. Points
-    inside a solid are invisible and get all light.
+    A solid blocks light, less so with distance, and sends a little light of its colour. Points inside a solid are
+    invisible and get all light.
     """
     hit = wp.mesh_query_ray(s.solids.opaque, p, d, reach)
     if not hit.result or hit.sign < 0.0:
@@ -95,15 +91,13 @@ typed = TypesByName(
 
 @cache
 def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
-    """Make the kernel that finds the light on surfaces, for scenes with opaque or transparent solids or none."""
     module = shading_module(has_opaque, has_clear)
 
     @wp.kernel(module=module, enable_backward=False)
     @typed
     def illuminate(first, s, surface, points, normals, directions, sun_directions, reach, clearness, light):
-        """Compute the light on each point of a surface with normals: from the lamp, and from all directions without
-        other fluid or a solid within ``reach`` [m]. ``clearness``, 0 to 1: fraction of light transmitted through
-        fluid."""
+        """Compute the light on each point of a surface: from the lamp, and from all directions without other fluid or a
+        solid within ``reach`` [m]."""
         i = first + wp.tid()
         n = normals[i]
         p = points[i] + s.nearest * n
@@ -141,10 +135,9 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
 
 INDEX = wp.constant(wp.float32(1.33))
-"""Refractive index of water."""
 FAINT = wp.constant(wp.float32(0.05))
-"""Reflectance below which light leaving fluid is not split. Above it a rescaled reflectance is used, which grows from 0
-here to 1 at total reflection: otherwise the picture would show an edge at this angle."""
+"""Reflectance below which light leaving fluid is not split; above it, rescaling the reflectance avoids a visible
+edge."""
 DARK = wp.constant(wp.float32(10.0))
 """Number of mean free paths in fluid beyond which light is neglected: a fraction of 5e-5 gets that far."""
 
@@ -183,7 +176,6 @@ def tinted(colour: wp.vec3, taken: wp.float32):
 
 @cache
 def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
-    """Make the kernel that traces rays, for scenes with opaque or transparent solids, or faster with none."""
     module = shading_module(has_opaque, has_clear)
     glass, background = glass_functions(has_opaque, has_clear)
     meet, leave = surface_functions(has_opaque, has_clear)
@@ -198,7 +190,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         d = direction
         c = entered.colour
         lit = entered.light
-        medium = medium_at(surface, entered)
+        medium = at_corners(surface, surface.media, entered.face, entered.u, entered.v)
         inside = wp.bool(True)
         for _ in range(s.segments):
             if inside:
@@ -245,7 +237,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
                 through = through * (1.0 - reflectance)
                 c = met.colour
                 lit = met.light
-                medium = medium_at(surface, met)
+                medium = at_corners(surface, surface.media, met.face, met.u, met.v)
                 sine2 = (1.0 - cosine * cosine) / (INDEX * INDEX)
                 d = wp.normalize(d / INDEX + (cosine / INDEX - wp.sqrt(1.0 - sine2)) * n)
                 o = p - s.nearest * n
@@ -257,7 +249,6 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
     @wp.func
     def seen(s: Environment, shadow: Vec3s2d, surface: LitSurface, o: wp.vec3, d: wp.vec3, spread: wp.float32):
-        """Return the light that reaches the eye along a ray."""
         met = meet(s, surface, o, d)
         floor_at = FAR
         if s.has_floor > 0 and d[1] < -1.0e-4:
@@ -302,8 +293,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed
     def trace(first, eye: Eye, s, surface, shadow, pixels, offsets, image):
-        """Compute the light of some pixels, the mean over points of each; ``offsets``: places in the pixel, from -0.5
-        to 0.5."""
+        """Compute the light of some pixels: the mean over ``offsets`` in the pixel, from -0.5 to 0.5."""
         pixel = pixels[first + wp.tid()]
         spread = 2.0 * wp.length(eye.right) / wp.float32(eye.columns)
         light = wp.vec3(0.0)
@@ -321,11 +311,11 @@ ROTATED_GRID = ((-0.375, -0.125), (0.375, 0.125), (-0.125, 0.375), (0.125, -0.37
 """Offsets of additional rays from the middle of a pixel, in pixels."""
 MIDDLE = ((0.0, 0.0),)
 TILE = 8, 4
-"""Pixels that rays are sent through together."""
+"""Columns and rows."""
 
 
 def in_tiles(columns: int, rows: int) -> np.ndarray:
-    """Return the numbers of every second pixel, as on a chequerboard, ordered in small tiles, whose rays are nearly
+    """Return the numbers of every second pixel, as on a chequerboard, in small tiles, whose rays are nearly
     parallel."""
     wide, high = TILE
     row, column = np.divmod(np.arange(columns * rows), columns)
@@ -336,10 +326,8 @@ def in_tiles(columns: int, rows: int) -> np.ndarray:
 
 @wp.kernel(module=kernel_module("contrast"), enable_backward=False)
 def find_contrast(first: wp.int32, columns: wp.int32, image: Vec3s, contrast: wp.float32, found: Ints):
-    """Fill the black squares of a chequered ``image``, whose white squares are drawn, by the mean of their neighbours.
-    Mark in ``found`` the pixels that need more rays. These have colours that differ by more than ``contrast`` between
-    the white squares on two sides of a black one, or around the corners of a white one.
-    """
+    """Fill the black squares of a chequered ``image`` by the mean of their neighbours. Mark in ``found`` the black and
+    white squares around which colours differ by more than ``contrast``."""
     i = first + wp.tid()
     column = i % columns
     row = i / columns
