@@ -250,18 +250,10 @@ def by_name():
     """Good arguments, by the names that functions and classes have for them."""
     found = {name: value for call in CALLS.values() for name, value in call(at())[1].items()}
     positions = found["problem"].end(found["start"]).positions
-    own = {
-        **{"path": "run.vtkhdf", "sensor": cortado.sensors.WaveGauge([0.1, 0.0]), "dimension": 2},
-        **{"position": [0.1, 0.1], "times": 0.001 * np.arange(1, 5), "values": np.zeros(4), "normal": [1.0, 0.0]},
-        **{
-            "noise": 0.1,
-            "frames": np.zeros((4, 8, 10, 3)),
-            "time_step": 0.0021,
-            "task": "Carry",
-            "positions": positions,
-        },
-    }
-    return {**found, **own}
+    found |= {"path": "run.vtkhdf", "sensor": cortado.sensors.WaveGauge([0.1, 0.0]), "dimension": 2}
+    found |= {"position": [0.1, 0.1], "times": 0.001 * np.arange(1, 5), "values": np.zeros(4), "normal": [1.0, 0.0]}
+    found |= {"noise": 0.1, "frames": np.zeros((4, 8, 10, 3)), "time_step": 0.0021, "task": "Carry"}
+    return found | {"positions": positions}
 
 
 def odd_calls(function):

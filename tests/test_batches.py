@@ -88,6 +88,14 @@ def test_a_scene_of_a_batch_has_the_bits_of_its_single_run(case, precision):
             np.testing.assert_array_equal(runs[b].diagnostics[name], column)
 
 
+def assert_same(one: Problem, other: Problem, given: dict[str, Any]) -> None:
+    """Values and gradients of two problems are the same."""
+    (values, gradient), (wanted, wanted_gradient) = (each.value_and_gradient(given) for each in (one, other))
+    np.testing.assert_array_equal(values, wanted)
+    for name, bar in wanted_gradient.items():
+        np.testing.assert_array_equal(gradient[name], bar)
+
+
 class _OneByOne:
     """A loss without what it has for whole batches."""
 
@@ -100,12 +108,7 @@ def test_a_loss_of_all_scenes_at_once_has_the_bits_of_one_by_one(precision):
     make, own, shared = CASES["iterations"]
     simulation = Simulation(make(), precision=precision, batch=len(next(iter(own.values()))))
     loss = FinalPositions(Simulation(make(), precision=precision).positions)
-    at_once, one_by_one = (Problem(simulation, STEPS, each) for each in (loss, _OneByOne(loss)))
-    values, gradient = at_once.value_and_gradient({**own, **shared})
-    wanted, wanted_gradient = one_by_one.value_and_gradient({**own, **shared})
-    np.testing.assert_array_equal(values, wanted)
-    for name, bar in wanted_gradient.items():
-        np.testing.assert_array_equal(gradient[name], bar)
+    assert_same(*(Problem(simulation, STEPS, each) for each in (loss, _OneByOne(loss))), {**own, **shared})
 
 
 def test_a_loss_of_all_scenes_at_once_is_checked():
@@ -155,12 +158,8 @@ def test_tangents_of_a_batch_are_those_of_single_runs(case):
 def test_a_small_memory_budget_gives_the_same_bits():
     make, own, shared = CASES["iterations"]
     simulation = Simulation(make(), batch=5)
-    whole, small = (Problem(simulation, STEPS, CentreOfMass(np.full(3, 0.1)), budget) for budget in (2**30, 0))
-    loss, gradient = whole.value_and_gradient({**own, **shared})
-    same_loss, same_gradient = small.value_and_gradient({**own, **shared})
-    np.testing.assert_array_equal(loss, same_loss)
-    for name, bar in gradient.items():
-        np.testing.assert_array_equal(bar, same_gradient[name])
+    budgets = (Problem(simulation, STEPS, CentreOfMass(np.full(3, 0.1)), budget) for budget in (2**30, 0))
+    assert_same(*budgets, {**own, **shared})
 
 
 def test_a_lost_scene_stops_and_the_others_go_on():

@@ -101,15 +101,9 @@ IN_SPACE = [
     {"name": "cup", "shape": "cup", "base": [0.6, 0.1, 0.3], "radius": 0.1, "height": 0.3, "thickness": 0.1},
     {"name": "block", "shape": "mesh", "file": BLOCK, "scale": 0.2, "position": [1.0, 0.3, 0.3], "material": "steel"},
 ]
+SINK = {"shape": "sink", "name": "a", "position": [0.2, 0.0], "radius": 0.06}
 DRAINS = [
-    {
-        "shape": "sink",
-        "name": "a",
-        "position": [0.2, 0.0],
-        "radius": 0.06,
-        "times": [0.0, 1.0],
-        "flow_rates": [0.3, 0.1],
-    },
+    {**SINK, "times": [0.0, 1.0], "flow_rates": [0.3, 0.1]},
     {"shape": "box", "name": "b", "lower": [0.3, 0.3], "upper": [0.36, 0.36]},
     {"shape": "plane", "name": "c", "position": [0.0, 0.201], "direction": [-1.0, 1.0]},
 ]

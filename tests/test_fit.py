@@ -144,23 +144,26 @@ def simulation():
     return cortado.Simulation(SCENE, precision="float64")
 
 
+def clean(simulation, **observations):
+    """An experiment without noise."""
+    found = measured.Experiment(simulation, observations)
+    return found.measured_again(found.predicted({"viscosity": TRUE, **found.start}))
+
+
 @pytest.fixture(scope="module")
 def experiment(simulation):
-    """All that can be measured, without noise."""
+    """All that can be measured."""
     times = TIME_STEP * np.linspace(2.0, STEPS, 6)
     renderer = simulation.renderer(resolution=(16, 12))
     first = simulation.positions[::5] + 0.004
     empty = np.zeros((6, 1))
-    found = measured.Experiment(
+    return clean(
         simulation,
-        {
-            "camera": measured.Video(renderer, times, np.zeros((6, 12, 16, 3)), calibrate=("translation", "width")),
-            "tracers": measured.Tracks(simulation, first, times - 0.3 * TIME_STEP, np.zeros((6, *first.shape))),
-            "gauge": measured.SensorSeries(WaveGauge([0.1, 0.0], radius=0.08), times, empty, 2),
-            "scales": measured.SensorSeries(WallForce(), times[-4:], empty[-4:], 2, columns=["force_y"]),
-        },
+        camera=measured.Video(renderer, times, np.zeros((6, 12, 16, 3)), calibrate=("translation", "width")),
+        tracers=measured.Tracks(simulation, first, times - 0.3 * TIME_STEP, np.zeros((6, *first.shape))),
+        gauge=measured.SensorSeries(WaveGauge([0.1, 0.0], radius=0.08), times, empty, 2),
+        scales=measured.SensorSeries(WallForce(), times[-4:], empty[-4:], 2, columns=["force_y"]),
     )
-    return found.measured_again(found.predicted({"viscosity": TRUE, **found.start}))
 
 
 def assert_slopes(experiment, at, directions, h):
@@ -201,18 +204,12 @@ def test_viscosity_acts_as_in_a_run_with_the_value_that_is_tried():
 
 @pytest.fixture(scope="module")
 def clocked(simulation):
-    """Tracers and a gauge whose clocks are calibrated, without noise."""
+    """Tracers and a gauge whose clocks are calibrated."""
     times, first = TIME_STEP * np.linspace(2.3, STEPS - 0.6, 9), simulation.positions[::5]
-    clock = {"calibrate": ["start"]}
-    empty = np.zeros((9, 1))
-    found = measured.Experiment(
-        simulation,
-        {
-            "tracers": measured.Tracks(simulation, first, times, np.zeros((9, *first.shape)), **clock),
-            "gauge": measured.SensorSeries(WaveGauge([0.1, 0.0], radius=0.08), times, empty, 2, **clock),
-        },
-    )
-    return found.measured_again(found.predicted({"viscosity": TRUE, **found.start}))
+    tracers = measured.Tracks(simulation, first, times, np.zeros((9, *first.shape)), calibrate=["start"])
+    gauge = WaveGauge([0.1, 0.0], radius=0.08)
+    series = measured.SensorSeries(gauge, times, np.zeros((9, 1)), 2, calibrate=["start"])
+    return clean(simulation, tracers=tracers, gauge=series)
 
 
 def test_the_derivative_along_a_clock_is_that_of_time(clocked):
@@ -266,9 +263,7 @@ def test_frames_of_a_video_are_drawn_beside_what_was_found(simulation, tmp_path,
 def shaken(simulation):
     """Tracers that a shaking camera sees."""
     times, first = TIME_STEP * np.linspace(2.0, STEPS, 10), simulation.positions[::3]
-    own = measured.Tracks(simulation, first, times, np.zeros((10, *first.shape)))
-    found = measured.Experiment(simulation, {"tracers": own})
-    return found.measured_again(found.predicted({"viscosity": TRUE}))
+    return clean(simulation, tracers=measured.Tracks(simulation, first, times, np.zeros((10, *first.shape))))
 
 
 def with_shake(shaken, seed, size=2e-4):
@@ -350,8 +345,7 @@ def weighed(simulation):
     """A scale below the container, with times enough for trends."""
     times = TIME_STEP * np.linspace(1.0, STEPS, 20)
     scale = measured.SensorSeries(WallForce(), times, np.zeros((20, 1)), 2, columns=["force_y"])
-    found = measured.Experiment(simulation, {"scale": scale})
-    return found.measured_again(found.predicted({"viscosity": TRUE}))
+    return clean(simulation, scale=scale)
 
 
 def with_noise(experiment, size, wrong=0.0):

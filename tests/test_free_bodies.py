@@ -142,21 +142,24 @@ def test_a_mass_in_the_plane_has_the_area_and_the_inertia_of_its_shape(name):
     np.testing.assert_allclose(mass.inertia, np.diag([0.0, 0.0, inertia]), rtol=1e-10)
 
 
+def hit(d, x, density, steps, slip="free", **tables):
+    """Fluid hits a body from ``x`` on in free space: the run, in which all of their momentum is kept."""
+    s, solver = 0.05 if d == 2 else 0.08, {"kind": "projection", "time_step": 0.002}
+    fluid = box([-0.5] + [-0.25] * (d - 1), [-0.1] + [0.25] * (d - 1), phase="water", velocity=[1.0, 0.2, 0.0][:d])
+    body = box([x, -0.4, -0.3][:d], [0.3, 0.1, 0.1][:d], name="raft", motion="free", density=density, slip=slip)
+    tables |= {"container": {"shape": "none"}, "forces": {"gravity": [0.0] * d}, "discretisation": {"spacing": s}}
+    scene = plane(body, dimension=d, fluid=[fluid], solver=solver, **tables)
+    run = Simulation(scene, precision="float64").run(steps, record_every=20)
+    mass = density * Mass.of(scene.solid[0].own_solid()).volume
+    momentum = 1000.0 * s**d * run.velocities.sum(axis=1) + mass * run.solids["raft"].velocities
+    assert np.abs(momentum - momentum[0]).max() < 1e-12 * np.abs(momentum[0]).max()
+    return run
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_body_and_fluid_in_free_space_keep_their_momentum(dimension):
-    """Water hits a body; without the body's share of the pressures it would keep its velocity."""
-    d, s = dimension, 0.05 if dimension == 2 else 0.08
-    water = box([-0.5] + [-0.25] * (d - 1), [-0.1] + [0.25] * (d - 1), phase="water", velocity=[1.0, 0.2, 0.0][:d])
-    body = box([0.0, -0.4, -0.3][:d], [0.3, 0.1, 0.1][:d], name="raft", motion="free", density=400.0)
-    tables = {"container": {"shape": "none"}, "forces": {"gravity": [0.0] * d}}
-    solver = {"kind": "projection", "time_step": 0.002}
-    scene = plane(body, dimension=d, discretisation={"spacing": s}, fluid=[water], solver=solver, **tables)
-    run = Simulation(scene, precision="float64").run(100, record_every=25)
-    solid = run.solids["raft"]
-    mass = 400.0 * Mass.of(scene.solid[0].own_solid()).volume
-    momentum = 1000.0 * s**dimension * run.velocities.sum(axis=1) + mass * solid.velocities
-    assert np.abs(momentum - momentum[0]).max() < 1e-12 * np.abs(momentum[0]).max()
-    assert solid.velocities[-1][0] > 0.3
+    """Without the body's share of the pressures it would keep its velocity."""
+    assert hit(dimension, 0.0, 400.0, 100).solids["raft"].velocities[-1][0] > 0.3
 
 
 def test_a_body_in_nothing_falls_and_turns_as_bodies_do():

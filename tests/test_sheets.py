@@ -23,7 +23,7 @@ from cortado.scene.tables import rotation_matrix
 from cortado.solvers.projection.sides import NEAREST, Sides
 from scenes import box, simulated
 from test_moving_solids import WATER, plane, space
-from test_solid_parameters import BALL, STEPS, check, point_of, problem_of
+from test_solid_parameters import BALL, STEPS, check, check_batch, point_of, problem_of
 
 BLADE = {"name": "blade", "shape": "sheet", "corners": [[0.2, 0.2], [0.35, 0.2], [0.4, 0.3]], "slip": "no"}
 BLADE |= {"motion": "path", "angular_velocity": 6.0, "velocity": [0.2, 0.1]}
@@ -190,15 +190,8 @@ def test_derivatives_are_right_where_particles_are_kept_on_their_side(name, spee
 
 def test_a_batch_and_a_run_that_goes_on_have_the_bits_of_single_runs():
     scene = SCENES["plane"]()
-    points = [hurled(scene, 10.0, seed)[0] for seed in range(2)]
-    one, loss = simulated(scene), CentreOfMass([0.5, 0.3])
-    several = Problem(Simulation(scene, batch=2, precision="float64"), STEPS, loss)
-    values, gradients = several.value_and_gradient({name: np.stack([p[name] for p in points]) for name in points[0]})
-    for b, point in enumerate(points):
-        value, gradient = Problem(one, STEPS, loss).value_and_gradient(point)
-        assert values[b] == value
-        for name, array in gradient.items():
-            np.testing.assert_array_equal(gradients[name][b], array, err_msg=name)
+    check_batch(scene, [hurled(scene, 10.0, seed)[0] for seed in range(2)])
+    one = simulated(scene)
     whole = one.run(6)
     rest = one.run(4, state=one.run(2).last_state)
     np.testing.assert_array_equal(rest.positions[-1], whole.positions[-1])

@@ -178,11 +178,10 @@ def test_a_displacement_and_a_turn_are_from_where_it_begins():
     np.testing.assert_allclose(motion.rotations[1:], point["rotor.rotation"] + point["rotor.turn"], rtol=1e-14)
 
 
-def test_scenes_of_a_batch_have_the_bits_of_single_ones():
-    scene = plane(ROTOR, BALL)
-    points = [point_of(scene, seed=seed)[0] for seed in range(2)]
+def check_batch(scene, points):
+    """At several points a batch has the bits of single scenes."""
     one, loss = simulated(scene), CentreOfMass([0.5, 0.3])
-    several = Problem(Simulation(scene, batch=2, precision="float64"), STEPS, loss)
+    several = Problem(Simulation(scene, batch=len(points), precision="float64"), STEPS, loss)
     together = {name: np.stack([point[name] for point in points]) for name in points[0]}
     values, gradients = several.value_and_gradient(together)
     for b, point in enumerate(points):
@@ -190,6 +189,11 @@ def test_scenes_of_a_batch_have_the_bits_of_single_ones():
         assert values[b] == value
         for name, array in gradient.items():
             np.testing.assert_array_equal(gradients[name][b], array, err_msg=name)
+
+
+def test_scenes_of_a_batch_have_the_bits_of_single_ones():
+    scene = plane(ROTOR, BALL)
+    check_batch(scene, [point_of(scene, seed=seed)[0] for seed in range(2)])
 
 
 def test_a_run_that_goes_on_has_the_bits_and_the_derivatives_of_a_whole_one():
