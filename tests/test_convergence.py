@@ -136,7 +136,7 @@ def test_runs_that_do_not_belong_together_are_refused(cortado_command):
         ("abc", "but all runs must end at the same time"),
         ("abd", "differ in phase.0.viscosity"),
         ("abe", "in float64, but must be in float32"),
-        ("aab", "have one solver.time_step"),
+        ("aab", "have the same solver.time_step"),
         ("aaa", "do not differ"),
     ):
         code, out, err = cortado_command("convergence", *runs)

@@ -337,7 +337,7 @@ def test_wrong_calls_are_sentences(file, change, words, cortado_command, quick):
 def test_a_folder_of_something_else_is_kept(file, tmp_path, cortado_command, quick):
     assert cortado_command("dataset", file, "--runs", 5, "--out", "data")[0] == 0
     for change, words in (
-        (("--runs", 4), "--runs is 4, but must be at least 5: data has as many"),
+        (("--runs", 4), "--runs is 4, but must be at least 5: data contains as many"),
         (("--runs", 9, "--set", "dataset.seed=1"), "columns.toml: dataset.seed is 1, but must be 0, as in the data"),
         (("--runs", 5, "--precision", "float64"), "--precision is 'float64', but must be 'float32', as in"),
         (("--runs", 5, "--set", "phase.0.rest_density=900.0"), "phase.0.rest_density is 900.0, but must be 1000.0, as"),

@@ -414,7 +414,7 @@ def test_the_command_line_writes_every_other_frame_of_a_run(tmp_path, cortado_co
     names = {"particles_00000.obj", "particles_00001.obj", "solid_block.obj"}
     assert {one.name for one in (folder.path / "obj").iterdir()} == names
     code, _, err = cortado_command("export", folder.path, "--to", "obj")
-    assert code == 2 and "is not empty; choose another folder" in err
+    assert code == 2 and "is not empty; choose a new or an empty folder" in err
     code, _, err = cortado_command("export", tmp_path, "--to", "usd")
     assert code == 2 and "There is no run in" in err
 
@@ -448,7 +448,7 @@ def test_wrong_calls_are_sentences(tmp_path):
     other = "scene has 2 dimensions and 1 phases, but must be that of the trajectory, with 3 and 2"
     for made, arguments, words in [
         (run, (tmp_path, "stl"), r"to is 'stl', but must be one of ply, obj, glb, usd, vtp\."),
-        (run, (tmp_path, "ply"), "is not empty; choose another folder"),
+        (run, (tmp_path, "ply"), "is not empty; choose a new or an empty folder"),
         (replace(run, scene=None), (new, "ply"), "scene is missing, but must be given, as a trajectory from a file"),
         (run, (new, "ply", plane), other),
         (run[:0], (new, "ply"), "has no frame"),

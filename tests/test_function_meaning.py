@@ -207,7 +207,7 @@ def at_the_line_of_another():
         (lambda: digits, "digits rounds to digits"),
         (lambda: numpy_sign, "numpy_sign cannot be compiled: it calls np.sign, but may only call functions of Warp"),
         (lambda: shadowed, "shadowed cannot be compiled: it calls clamp, but may only call functions of Warp"),
-        (lambda: summed, "summed cannot be compiled: it calls sum, which is no"),
+        (lambda: summed, "summed cannot be compiled: it calls sum, but may only call"),
         (lambda: elsewhere, r"elsewhere has the index int\(b\), but must have whole numbers there"),
         (lambda: twice_named, "twice_named gives k, which a loop counts with, another value too"),
         (lambda: helped_ratio, "helped_ratio calls a function of Warp with '1 / 2', which is another number in Python"),

@@ -67,7 +67,7 @@ def polygon_faces(corners: Points) -> Faces:
 
 def nearest_on_edges(points: Points, edges: Points) -> Points:
     """Return the nearest points (n, 2) of edges (k, 2, 2) to points (n, 2) [m]."""
-    best, found = np.full(len(points), np.inf), np.empty_like(points)
+    best, found = np.full(len(points), np.inf), np.zeros_like(points)
     for first, last in edges:
         side = last - first
         along = np.clip((points - first) @ side / (side @ side), 0.0, 1.0)

@@ -46,7 +46,8 @@ class WallArrays(Rows):
 
 def pose_arrays(members: int, solids: int, precision: Precision, device: Any) -> dict[str, wp.array]:
     """Make arrays (members, solids) of the poses of solids before and after a step, by argument names: middles [m],
-    rotations, scales, and tangents. The tangent of a rotation is the vector by which the solid turns further."""
+    rotations from the frame of the solid to space, scales, and tangents. The tangent of a rotation is the rotation
+    vector by which the solid turns further, per unit of the change."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     kinds = {"before": vector, "turns_before": matrix, "after": vector, "turns": matrix}
     kinds |= dict.fromkeys(("before_dot", "turned_before_dot", "after_dot", "turned_dot"), vector)
