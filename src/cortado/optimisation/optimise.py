@@ -251,10 +251,11 @@ def optimise(
     as keywords. ``settings``: settings of such an optimiser, as in ``optimise(problem, start, "adam",
     learning_rate=0.1, iterations=50)``. ``iterations``: greatest number of updates; Adam and gradient
     descent then evaluate the last iterate, too. ``bounds``: by name, (lower, upper), each a number, an array of the
-    parameter's shape, or None. ``gradient``: gradient estimator for the problem. ``checkpoint``: folder for the replay log, to which every evaluation is written before the next evaluation begins.
-    ``resume``: continue the run in ``checkpoint`` with the same bits as without an interruption, or begin a new run in
-    an empty folder. A resumed run may have another number of ``iterations``. ``on_iteration``: called with the `Record`
-    of every evaluation, including those read from the checkpoint, but not of `LineSearch`'s trials.
+    parameter's shape, or None. ``gradient``: gradient estimator for the problem. ``checkpoint``: folder
+    for the replay log, to which every evaluation is written before the next evaluation begins. ``resume``: continue the
+    run in ``checkpoint`` with the same bits as without an interruption, or begin a new run in an empty folder. A
+    resumed run may have another number of ``iterations``. ``on_iteration``: called with the `Record` of every
+    evaluation, including those read from the checkpoint, but not of `LineSearch`'s trials.
 
     A step is refused if the run after the step diverges, or a parameter is out of range. Adam and gradient descent then
     halve the step until it succeeds, and all later steps too. The line searches take shorter trials. `Result.refused`
