@@ -215,7 +215,7 @@ def write_run_report(
     view = Section("To turn and to play", view=scene_view(scene, {scene.name: list(trajectory)}, trajectory.times))
     figures, solver = _figures(simulation, trajectory, folder.figures), _solver(rollout, trajectory, scene, folder)
 
-    sensors = []
+    sensors: list[Section] = []
     if read:
         told_of = f"The sensors of the scene, read in every step; the numbers are in {folder.sensors.name}."
         curves = readings(read, folder.figures / "sensors.png")
