@@ -108,7 +108,7 @@ FACTS = {
         PLAIN.discretisation.support,
     ),
     "the same with PCISPH": (OLD.discretisation.kernel, OLD.discretisation.support),
-    "`discretisation.jitter` where all axes are periodic, and beside another axis": (
+    "`discretisation.jitter` with the projection and all axes periodic, and in other scenes": (
         PERIODIC.discretisation.jitter,
         PLAIN.discretisation.jitter,
     ),
@@ -144,7 +144,9 @@ def test_defaults_that_depend_on_the_solver_are_those_of_scenes():
     support = f"`{PLAIN.discretisation.support}` with the projection if `kernel` is left out too, else `{given}`"
     kernel = f'`"{PLAIN.discretisation.kernel}"` with the projection if `support` is left out too, else'
     wide = scene(discretisation={"spacing": 0.05, "support": 3.0}).discretisation.kernel
-    assert {"support": support, "kernel": f'{kernel} `"{wide}"`'} == scene_page.DEFAULTS
+    jitter = f"`{PERIODIC.discretisation.jitter}` with the projection if all axes are periodic, else"
+    said = {"support": support, "kernel": f'{kernel} `"{wide}"`', "jitter": f"{jitter} `{PLAIN.discretisation.jitter}`"}
+    assert said == scene_page.DEFAULTS
     assert all(default in TODAY["docs/scene_file.md"] for default in scene_page.DEFAULTS.values())
 
 

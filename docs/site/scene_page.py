@@ -65,8 +65,12 @@ LINKS = {
 DEFAULTS = {
     "support": "`2.6` with the projection if `kernel` is left out too, else `2.0`",
     "kernel": '`"wendland_c2"` with the projection if `support` is left out too, else `"cubic_spline"`',
+    "jitter": "`0.05` with the projection if all axes are periodic, else `0.0`",
 }
 """Of keys of `[discretisation]`, which the solver decides; `tests/test_facts.py` holds them against scenes."""
+OF_EMITTERS = {"jitter": "`0.05` with the projection, else `0.0`"}
+"""The same of keys of `[[emitter]]`."""
+DECIDED = {"DiscretisationTable": DEFAULTS, "EmitterTable": OF_EMITTERS}
 
 
 def _with_law(rheology: str) -> str:
@@ -88,8 +92,8 @@ A scene does not change once it is made. `scene.replaced("solver.time_step=0.001
 another one.
 
 d stands for the number of dimensions, 2 or 3. Defaults of vectors are for 3-D: in 2-D the last component is left out.
-Keys that are *needed* have to be there, and all others may be left out. A sentence that names the file and the key
-refuses what is wrong. Each example replaces the table of the same name in the file above.
+Keys that are *needed* have to be there, and all others may be left out. Cortado refuses what is wrong, with a sentence
+that names the file and the key. Each example replaces the table of the same name in the file above.
 
 ## At the top of the file
 
@@ -499,7 +503,7 @@ def page() -> str:
         for model, below, example in tables:
             table = schema["$defs"][model]
             if not below:
-                parts += [rows(table, defaults=DEFAULTS if model == "DiscretisationTable" else None), toml(example)]
+                parts += [rows(table, defaults=DECIDED.get(model)), toml(example)]
                 continue
             if common:
                 parts += [COMMON, shown(common)]

@@ -366,7 +366,8 @@ class FitTable(Table):
     bounds: Values | None = None
     """Lower and upper bound by parameter name; a number with equal bounds is not fitted."""
     iterations: Annotated[int, count(1, 10_000)] = 50
-    """Greatest number of trial points of each of the two fits."""
+    """Greatest number of trial points of each of the two fits: the first weights all residuals equally, the second by
+    the noise that the first finds."""
     starts: Annotated[int, count(1, 100)] | None = None
     """Number of starts of the fit; by default 1, and three more if the first fit ends in doubt. Further starts lie
     within the bounds, or within two decades of a positive number."""

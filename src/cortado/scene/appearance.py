@@ -300,8 +300,9 @@ class Picture(Table):
     field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=120.0)] = 28.0
     """The angle that the width of the picture spans [degrees], in 3-D."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
-    """Fraction of the light, from 0 to 1, that passes through fluid a tenth as thick as the container is long. If left
-    out, it is 0.9 with one phase, and 0 with several phases or if another colour than that of the phases is shown."""
+    """Fraction of the light, from 0 to 1, that passes through fluid a tenth as thick as the container is long, in 3-D.
+    If left out, it is 0.9 with one phase, and 0 with several phases or if another colour than that of the phases is
+    shown."""
     floor: Flag = True
     """Whether the picture shows a floor, in 3-D."""
     light: Annotated[str, OneOf(LIGHTS)] = "studio"

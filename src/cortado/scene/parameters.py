@@ -181,8 +181,8 @@ PARAMETERS = (
     Parameter(
         "tilt",
         "°",
-        "how far the scene's gravity leans, with its size kept, in the place of gravity: where it points along -y, "
-        "towards x and, in 3-D, towards z",
+        "angle by which the scene's gravity is turned, in the place of gravity; its size stays. Gravity along -y turns "
+        "towards x by the first number and, in 3-D, towards z by the second",
         Axis.STEP,
         lambda s: np.zeros(s.scene.dimension - 1),
         components=lambda dimension, phases: dimension - 1,

@@ -111,7 +111,7 @@ class WallForceTable(SensorTable):
 
 
 class SolidLoadTable(SensorTable):
-    """A sensor of the fluid's force on a solid, and of its torque about the solid's position."""
+    """A sensor of the fluid's force on a solid, and of its torque about the solid's middle."""
 
     kind: Literal["solid_load"]
     """Kind of the sensor."""

@@ -50,7 +50,7 @@ class BoxShape(Table):
 
     shape: Literal["box"] = "box"
     lower: Vector[Length]
-    """(d,) Corner with the least coordinates, before any rotation [m]."""
+    """(d,) Corner with the least coordinates [m], before a rotation if the table has one."""
     upper: Vector[Length]
     """(d,) Corner with the greatest coordinates [m]."""
 
@@ -89,7 +89,7 @@ class CylinderShape(Table):
     height: Annotated[float, quantity("m", gt=0.0)]
     """Length along the axis, from the base [m]."""
     axis: Literal["x", "y", "z"] = "y"
-    """Axis of space along which the cylinder stands, before any rotation."""
+    """Axis of space along which the cylinder stands, before a rotation if the table has one."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if dimension == 2:

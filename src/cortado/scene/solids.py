@@ -45,7 +45,7 @@ class SolidTable(Coloured):
     position: tuple[Length, ...] | None = None
     """(d,) Position of the centroid of its volume [m]; if left out, the other keys of the shape determine it."""
     rotation: Rotation | None = None
-    """Initial rotation about its middle [rad]; not rotated if left out. In 3-D a rotation vector, in 2-D one number,
+    """Initial rotation about the centroid [rad]; not rotated if left out. In 3-D a rotation vector, in 2-D one number,
     counterclockwise."""
     motion: Literal["fixed", "path", "free"] = "fixed"
     """How the solid moves. "fixed": not at all. "path": along `times` with `positions` or `rotations`, along the file
@@ -76,7 +76,7 @@ class SolidTable(Coloured):
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of the path, increasing from 0 on [s]; after the last time the solid rests."""
     positions: tuple[tuple[Length, ...], ...] | None = None
-    """(k, d) Positions of the middle at these times [m]; the first is the position at the start."""
+    """(k, d) Positions of the middle (the centroid) at these times [m]; the first is the position at the start."""
     rotations: tuple[Rotation, ...] | None = None
     """(k, 3) Rotation vectors since the start at these times, in 2-D (k,) angles [rad]; the first is 0."""
     path: File | None = None
@@ -90,7 +90,7 @@ class SolidTable(Coloured):
     """Duration of the ramp [s]: from 0 to this time, the path is multiplied by a factor that grows smoothly (C2) from 0
     to 1."""
     velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
-    """(d,) Velocity of the middle [m/s], constant; for a free body, the velocity at the start."""
+    """(d,) Velocity of the middle [m/s], constant; for a free body, the velocity of its centre of mass at the start."""
     angular_velocity: Turning | None = None
     """Angular velocity about the middle [rad/s], constant; for a free body, the angular velocity at the start. In 3-D a
     vector, in 2-D one number, counterclockwise."""

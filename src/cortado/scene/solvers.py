@@ -107,7 +107,8 @@ class PcisphSolver(SolverTable):
     maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
     """Maximum number of pressure iterations in a step."""
     density_tolerance: Annotated[float, quantity(ge=0.0)] = 0.01
-    """Iterations end once the average of (rho - rho_0) / rho_0 is below this value."""
+    """Iterations end once the average error of the density is below this value. The error of a particle is
+    (rho - rho_0) / rho_0, or 0 where that is negative."""
     maximum_density_tolerance: Annotated[float, quantity(ge=0.0)] | None = None
     """Iterations end only once the maximum of (rho - rho_0) / rho_0 is below this value, too; no condition if left
     out."""
