@@ -30,6 +30,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -348,6 +349,8 @@ def command(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", default="", help="a word in the names of rows, or texts")
     parser.add_argument("--processes", type=int, default=1)
     given = parser.parse_args(arguments)
+    if given.write and given.only in "texts" and find_spec("torch") is None:
+        parser.error("PyTorch is not installed: the texts of cortado.torch would be lost")
     old = {} if given.write else json.loads(given.compare.read_text(encoding="utf-8"))
     old = {name: one for name, one in old.items() if given.only in name}
     new = frozen(given.only, given.processes)

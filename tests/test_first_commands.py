@@ -207,7 +207,7 @@ def test_what_is_copied_is_a_name_and_no_path(cortado_command, name):
 # ---- schema ------------------------------------------------------------------------------------------------------
 def test_the_schema_that_is_shipped_is_that_of_the_tables(cortado_command):
     VALIDATOR.check_schema(VALIDATOR.schema)
-    assert SCHEMA.read_text("utf-8") == file_schema_text(), "renew it: cortado schema > src/cortado/scene.schema.json"
+    assert SCHEMA.read_text("utf-8") == file_schema_text(), "renew it: see docs/adding_parts.md"
     assert json.loads(cortado_command("schema")[1]) == file_schema()
 
 
