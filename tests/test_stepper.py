@@ -472,7 +472,7 @@ def test_directions_and_residuals_that_do_not_fit_are_sentences():
         (lambda: stepper.vjp(3, {}), not_its_own),
         (lambda: stepper.vjp(residual, {}, 3), "gradient is 3, but must be an AdjointEstimator"),
         (lambda: stepper.vjp(residual, {}, gradients.Exact), "gradient is <class .*Exact.>, but must be an Adj"),
-        (lambda: stepper.vjp(residual, {}, gradients.AdjointViscosity(order=2)), "order is 2, but must be 1 where"),
+        (lambda: stepper.vjp(residual, {}, gradients.AdjointViscosity(order=2)), "order is 2, but must be 1 for"),
         (lambda: stepper.step(state, along="mobility"), "must be a list of names"),
         (lambda: stepper.step(state, along=3), "along is 3"),
         (lambda: stepper.step(state, along=["mobil"]), "'mobil' is unknown"),

@@ -174,6 +174,7 @@ class State(Arrays):
         """Take the arrays of declared fields; ``batch`` is the number of scenes, None for a single one."""
         super().__init__(arrays)
         self.fields, self.batch = fields, batch
+        self._narrow: dict[int, dict[str, Any]] = {}
 
     @property
     def positions(self) -> wp.array:
@@ -214,6 +215,16 @@ class State(Arrays):
         field = self[name]
         shape = (len(field),) if self.batch is None else (self.batch, len(field) // self.batch)
         return components(field, (*shape, *getattr(field.dtype, "_shape_", ())))
+
+    def narrow(self, dimension: int) -> dict[str, Any]:
+        """Return views of all fields by name, in the shapes of `numpy`: NumPy arrays on a CPU, else Warp arrays."""
+        if dimension not in self._narrow:
+            on_host, vectors = self.positions.device.is_cpu, {f.name for f in self.fields if f.entry is Entry.VECTOR}
+            whole = {name: self.numbers(name) for name in self.names}
+            views = {name: array.numpy() if on_host else array for name, array in whole.items()}
+            cut = {name: (*[slice(None)] * (views[name].ndim - 1), slice(dimension)) for name in vectors}
+            self._narrow[dimension] = {n: a[cut[n]] if n in vectors and dimension < 3 else a for n, a in views.items()}
+        return self._narrow[dimension]
 
     def set(self, values: Mapping[str, Any]) -> None:
         """Write fields by name: vectors (n, d), numbers (n,), fractions (n, phases), in a batch (batch, n, ...)."""

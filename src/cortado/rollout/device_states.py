@@ -176,7 +176,7 @@ class DeviceStates(HostStates):
 
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
         self._require_taken(state)
-        space.begin(rollout, values, varied, state.scenes, state.arrays)
+        space.begin(rollout, values, varied, state.scenes, lambda first: first.assign(state.arrays))
         rollout.step_sizes.begin_at(rollout.initial)
 
     def follow(self, rollout: Rollout, state: DeviceState) -> None:

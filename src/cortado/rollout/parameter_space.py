@@ -1,11 +1,10 @@
 """Parameters by name: checks, and the conversion to the arrays of a rollout and back; the number of steps of a run."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from cortado.arrays import as_numbers, as_one_number, check_steps
 from cortado.device.threads import WARP
@@ -55,7 +54,6 @@ class ParameterSpace:
         self._told: set[str] = set()
         self._begun: tuple[Rollout, int, Arrays, frozenset[str]] | None = None
         """The last rollout that began, with evaluation, values, and names of varied parameters."""
-        self._constants: dict[str, wp.array] = {}
         self._judged: Arrays | None = None
         self._strongest: tuple[Arrays, float] | None = None
         """Values of the last check of stability limits, except gravity, and the strongest gravity [m/s2] so far."""
@@ -120,27 +118,27 @@ class ParameterSpace:
         values: Arrays,
         varied: Iterable[str] = (),
         states: Sequence[RestartState] = (),
-        arrays: State | None = None,
+        write: Callable[[State], None] | None = None,
     ) -> None:
         """Set the first state and the parameters of a rollout to ``values``, or by default to the scene's values.
 
         ``varied``: parameters whose derivatives are needed; with the mobility, a substep of diffusion is taken even if
-        the mobility is 0. ``states`` replace the scene's first state, with fields from ``arrays`` if given.
+        the mobility is 0. ``states`` replace the scene's first state, with fields by ``write`` if given.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
-        if arrays is not None and self._goes_on(rollout, values, varied, states):
-            self._go_on(rollout, members, states, arrays)
-            self._keep(rollout, values, varied, members, arrays)
+        if write is not None and self._goes_on(rollout, values, varied, states):
+            self._go_on(rollout, members, states, write)
+            self._keep(rollout, values, varied, members)
             return
-        if arrays is not None:
+        if write is not None:
             self.check_restarts(states, values)
         sought = viscosity_sentence(simulation.scene, "the viscosity is a parameter") if "viscosity" in varied else None
         self._warn(sought)
         rollout.begin_evaluation()
         rollout.goes_on = bool(states)
         rollout.clocks = [state.clock for state in states] or [Clock()] * len(rollout.clocks)
-        if arrays is not None:
-            rollout.initial.assign(arrays)
+        if write is not None:
+            write(rollout.initial)
         elif not states:
             rollout.initial.assign(simulation.initial)
         firsts = [dict(state.fields) for state in states] or [self._one.first(own) for own in members]
@@ -171,23 +169,15 @@ class ParameterSpace:
             )
         several = len(simulation.scene.phase) > 1
         rollout.substeps = max(*substeps, 1) if "mobility" in varied and several else max(substeps)
-        each = self._keep(rollout, values, varied, members, arrays)
+        each = self._keep(rollout, values, varied, members)
         if simulation.scene.solver.chooses:
             begin_choosing(rollout, simulation.scene, self._one, each)
 
-    def _keep(
-        self,
-        rollout: Rollout,
-        values: Arrays,
-        varied: Iterable[str],
-        members: list[Arrays],
-        arrays: State | None,
-    ) -> list[Arrays]:
+    def _keep(self, rollout: Rollout, values: Arrays, varied: Iterable[str], members: list[Arrays]) -> list[Arrays]:
         each, scene = members * (len(rollout.clocks) // len(members)), self._simulation.scene
         rollout.advice = lambda member: divergence_advice(scene, each[member], float(rollout.time_steps[member]))
         own = {name: value.copy() for name, value in values.items()}
         self._begun = rollout, rollout.evaluation, own, _VARIED.intersection(varied)
-        self._constants = {} if arrays is None else {f.name: arrays[f.name] for f in arrays.fields if f.is_constant}
         return each
 
     def _goes_on(self, rollout: Rollout, values: Arrays, varied: Iterable[str], states: Sequence[RestartState]) -> bool:
@@ -204,12 +194,16 @@ class ParameterSpace:
             and [state.origin for state in states] == rollout.origins
         )
 
-    def _go_on(self, rollout: Rollout, members: list[Arrays], states: Sequence[RestartState], arrays: State) -> None:
+    def _go_on(
+        self,
+        rollout: Rollout,
+        members: list[Arrays],
+        states: Sequence[RestartState],
+        write: Callable[[State], None],
+    ) -> None:
         rollout.begin_evaluation()
         rollout.clocks = [state.clock for state in states]
-        for name in arrays.names:
-            if arrays[name] is not self._constants.get(name):
-                wp.copy(rollout.initial[name], arrays[name])
+        write(rollout.initial)
         if "gravity" in members[0]:
             rows = max(self._steps, 1), self._simulation.dimension
             rollout.parameters.set({"gravity": np.stack([np.broadcast_to(m["gravity"], rows) for m in members])})

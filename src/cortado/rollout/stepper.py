@@ -190,11 +190,11 @@ class Stepper:
         return DeviceStates(self._simulation).on_host(state)
 
     @in_turn
-    def advance(self, state: Given | DeviceState, parameters: Values | None = None) -> States | DeviceState:
-        """Return the state after the steps, on the device if ``state`` is. Parameters over time may be Warp arrays on
-        the device in the simulation's precision, which are not checked."""
+    def advance(self, state: Any, parameters: Values | None = None, place: HostStates | None = None) -> Any:
+        """Return the state after the steps, on the device if ``state`` is, or in the form of ``place``. Parameters over
+        time may be Warp arrays on the device in the simulation's precision, which are not checked."""
         values, rows = self._given(parameters)
-        place = self._begin(state, values, rows)
+        place = self._begin(state, values, rows, place=place)
         return place.state(self.rollout, self._forward(keep=False), self.rollout.steps, state)
 
     @in_turn
@@ -212,15 +212,19 @@ class Stepper:
 
     @in_turn
     def step(
-        self, state: Given | DeviceState, parameters: Values | None = None, along: Iterable[str] = ()
-    ) -> tuple[States | DeviceState, StepResidual]:
+        self,
+        state: Any,
+        parameters: Values | None = None,
+        along: Iterable[str] = (),
+        place: HostStates | None = None,
+    ) -> tuple[Any, StepResidual]:
         """Return the state after the steps, and a residual for `vjp` and `jvp`. Any number of residuals may exist.
 
         ``along``: further parameters in directions of `jvp`. Only the mobility must be named, because fluid with
         mobility 0 is computed without diffusion. Parameters may be on the device, as for `advance`.
         """
         values, rows = self._given(parameters)
-        place = self._begin(state, values, rows, {*values, *self._space.checked_names("along", along)})
+        place = self._begin(state, values, rows, {*values, *self._space.checked_names("along", along)}, place)
         last = place.state(self.rollout, self._forward(keep=True), self.rollout.steps, state)
         return last, StepResidual(Residual(self.rollout), values, rows, place)
 
@@ -296,13 +300,14 @@ class Stepper:
 
     def _begin(
         self,
-        state: Given | DeviceState,
+        state: Any,
         values: Arrays,
         rows: Mapping[str, wp.array],
         varied: Iterable[str] = (),
+        place: HostStates | None = None,
     ) -> HostStates:
         """Set the first state and parameters of the rollout; return the interface to states on the host or device."""
-        place = (DeviceStates if isinstance(state, DeviceState) else HostStates)(self._simulation)
+        place = place or (DeviceStates if isinstance(state, DeviceState) else HostStates)(self._simulation)
         place.begin(self._space, self.rollout, state, values, set(varied))
         self._rows.write(rows, self.rollout.parameters)
         return place

@@ -31,7 +31,6 @@ from cortado.optimisation.layers.layer import (
 from cortado.problem import Problem
 from cortado.render import Renderer
 from cortado.rollout.checkpoints import MEMORY_BUDGET
-from cortado.rollout.device_states import DeviceState, DeviceStates
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.rollout import Residual, Rollout
 from cortado.rollout.stepper import Stepper, StepResidual
@@ -88,40 +87,28 @@ class Steps(OfSimulation):
 
     @in_turn
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        values = self._parameters.on_device(given)
-        state = self.states.state(part(given, STATE), values)
-        residual: StepResidual | None = None
+        values, state = self._parameters.on_device(given), part(given, STATE)
         if keep:
-            end, residual = self._stepper.step(state, values)
-        else:
-            end = self._stepper.advance(state, values)
-        assert isinstance(end, DeviceState)
-        return named(STATE, self.states.arrays(end)), residual
+            end, residual = self._stepper.step(state, values, place=self.states)
+            return named(STATE, end), residual
+        return named(STATE, self._stepper.advance(state, values, self.states)), None
 
     @in_turn
     def pull(self, residual: StepResidual, bars: Named) -> Named:
-        before, found = self._stepper.vjp(residual, self._derivatives(bars), self._gradient)
+        before, found = self._stepper.vjp(residual, part(bars, STATE), self._gradient)
         return {**self._named(before), **self._parameters.adjoints(found, residual.values)}
 
     @in_turn
     def push(self, residual: StepResidual, dots: Named) -> Named:
-        return self._named(self._stepper.jvp(residual, self._derivatives(dots), self._parameters.on_device(dots)))
+        return self._named(self._stepper.jvp(residual, part(dots, STATE), self._parameters.on_device(dots)))
+
+    def _named(self, found: dict[str, Any]) -> dict[str, Array]:
+        return named(STATE, {**found, STATE_TIME: np.asarray(found[STATE_TIME]), **self._last_step()})
 
     def many(self, size: int) -> Layer:
         if self._gradient is not None and not self._gradient.batches:
             return OneByOne(self, size)
         return Steps(self._simulation.batch_of(size), self._steps, self._gradient, each=True)
-
-    def _derivatives(self, given: Named) -> dict[str, Any]:
-        own = part(given, STATE)
-        fields = self.states.written({name: array for name, array in own.items() if name in self.states.fields})
-        found = {name: fields.numbers(name) for name in own if name in self.states.fields}
-        members = self.states.shapes[STATE_TIME]
-        return found | {name: np.reshape(on_host(own[name]), members) for name in (STATE_TIME,) if name in own}
-
-    def _named(self, found: dict[str, Any]) -> dict[str, Array]:
-        fields = {**self.states.narrowed(found), STATE_TIME: np.asarray(found[STATE_TIME])}
-        return named(STATE, {**fields, **self._last_step()})
 
 
 class Evaluation:
@@ -186,8 +173,7 @@ class Value(OfSimulation):
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
         values, own, problem = self._parameters.values(given), part(given, STATE), self._problem
         if own:
-            state = self.states.state(own, values)
-            problem = problem.beginning_at(problem.simulation.on_host(state))
+            problem = problem.beginning_at(self.states.restart_states(own, values))
         if not keep:
             return {LOSS: np.asarray(problem.value(values))}, None
         found = Evaluation(problem, values, self._estimator, bool(own))
@@ -258,10 +244,10 @@ class Measure(OfSimulation):
     @in_turn
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
         simulation, values = self._simulation, self._space.checked(self._parameters.values(given))
-        state = self.states.state(part(given, STATE), values)
-        DeviceStates(simulation).begin(self._space, self._rollout, state, values, set(values))
-        moment = Moment.of(self._rollout, 0, state.arrays, simulation.evaluator)
-        snapshot = Snapshot(state.arrays, simulation.dimension, self._space.colours(values), moment)
+        self.states.begin(self._space, self._rollout, part(given, STATE), values, set(values))
+        state = self._rollout.initial.copy()
+        moment = Moment.of(self._rollout, 0, state, simulation.evaluator)
+        snapshot = Snapshot(state, simulation.dimension, self._space.colours(values), moment)
         found = snapshot[str(self._name)] if self._sensor is None else value_of(self._sensor, snapshot)
         return {READING: found}, Look(snapshot, Residual(self._rollout), values) if keep else None
 
@@ -277,10 +263,10 @@ class Measure(OfSimulation):
             return {READING: np.array([sum((row[n] * on_host(dot)).sum() for n, dot in dots.items()) for row in rows])}
         residual.step.bring_back()
         rollout, own = self._rollout, part(dots, STATE)
-        fields = self.states.written({name: dot for name, dot in own.items() if name in self.states.fields})
+        fields = rollout.solver.new_state()
+        times = self.states.write("direction", own, fields).reshape(1)
         along = self._space.checked(self._parameters.values(dots), "direction")
         parameters = rollout.solver.new_parameters(1)
-        times = np.reshape(on_host(own.get(STATE_TIME, np.zeros(1))), 1).astype(np.float64)
         self._space.set_direction(rollout, residual.values, along, fields, parameters, times)
         moment, row = residual.snapshot.moment, row_of(rollout, parameters.written, 0)
         assert moment is not None
@@ -297,7 +283,7 @@ class Measure(OfSimulation):
             parameters[name].assign(own)
         times = self._space.time_adjoints(rollout, look.values, parameters)
         gradient = self._space.gradient(rollout, look.values, whole.state, parameters)
-        fields = {name: on_host(array).astype(np.float64) for name, array in self.states.read(whole.state).items()}
+        fields = {name: on_host(array).astype(np.float64) for name, array in self.states.read(whole.state, {}).items()}
         return {
             **named(STATE, {**fields, STATE_TIME: times[0], **self._last_step()}),
             **self._parameters.adjoints(gradient, look.values),

@@ -6,10 +6,11 @@ Parameters are equal for all evaluations of a layer, or have an entry for each e
 import warnings
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b
+from itertools import repeat
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,8 +19,9 @@ import warp as wp
 from cortado.calls import counted
 from cortado.errors import CortadoWarning, DivergedError, InputError
 from cortado.particles.state import Entry, State
-from cortado.rollout.device_states import DeviceRows, DeviceState, DeviceStates
+from cortado.rollout.device_states import DeviceRows, DeviceState, HostStates, OfLost, clocks_after
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
+from cortado.rollout.rollout import Rollout
 from cortado.rollout.run_checks import check_clock, origin_of, shapes_of_fields
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.restart import Clock, Origin, RestartState
@@ -184,6 +186,10 @@ def stacked(found: Iterable[Named]) -> dict[str, Array]:
     return {name: _stack([table[name] for table in tables]) for name in tables[0]}
 
 
+def _copy(array: Array) -> Array:
+    return wp.clone(array, requires_grad=False) if isinstance(array, wp.array) else np.array(array)
+
+
 def _rows(array: Array, chosen: int | np.ndarray) -> Array:
     if not isinstance(array, wp.array):
         return np.asarray(array[chosen])
@@ -203,21 +209,19 @@ def _stack(arrays: list[Array]) -> Array:
     return whole
 
 
-class NamedStates:
-    """A converter between a simulation's states and named arrays in the simulation's precision.
+class NamedStates(HostStates):
+    """The interface of steps to states and derivatives as named arrays in the simulation's precision.
 
     The arrays have the names and shapes of the fields of a `RestartState`, and a ``time`` [s]; in a batch they have a
-    first axis for the scenes.
+    first axis for the scenes. On a GPU, states and derivatives are not checked, to avoid copies to the host.
     """
 
     def __init__(self, simulation: Simulation):
-        self._simulation, self._place = simulation, DeviceStates(simulation)
-        self._space = ParameterSpace(simulation, 0)
+        super().__init__(simulation)
+        self._simulation: Simulation = simulation
+        self._space, self._is_cpu = ParameterSpace(simulation, 0), bool(simulation.device.is_cpu)
         self._known: OrderedDict[bytes, tuple[Origin, ...]] = OrderedDict()
         """Origins of particles of valid states, by checksum."""
-        constant = (field.name for field in simulation.initial.fields if field.is_constant)
-        self._constants: dict[str, tuple[np.ndarray, wp.array] | None] = dict.fromkeys(constant)
-        """Last given numbers of fields that no step changes, and their arrays."""
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -231,83 +235,95 @@ class NamedStates:
         """Return the names of the arrays that are on the device."""
         return self._simulation.initial.names
 
-    def state(self, given: Named, parameters: Arrays) -> DeviceState:
-        """Convert arrays to a state before steps with ``parameters``; raise `InputError` for a state that is impossible
-        in this scene. On a GPU, states and derivatives are not checked, to avoid copies to the host."""
-        arrays = self.written({name: given[name] for name in self.fields})
-        times, sizes = (self._numbers(given, name) for name in (STATE_TIME, LAST_STEP))
-        solver = self._simulation.scene.solver
-        own = parameters.get("time_step", 1.0 if solver.chooses else solver.time_step)
-        steps = np.broadcast_to(np.float64(own), times.shape)
-        clocks = [self._clock(*own) for own in zip(times.tolist(), steps.tolist(), sizes.tolist(), strict=True)]
-        for clock in clocks:
-            check_clock(clock)
-        origins = self._judged(arrays, clocks, parameters)
-        scenes = tuple(RestartState({}, *own) for own in zip(clocks, origins, strict=True))
-        self._simulation.judged_states.update(scenes)
-        return DeviceState(arrays, scenes)
+    def begin(self, space: ParameterSpace, rollout: Rollout, state: Named, values: Arrays, varied: set[str]) -> None:
+        """Set the first state and checked parameters of a rollout; raise `InputError` for a state that is impossible
+        in this scene."""
+        scenes = self._judged(state, values)
+        space.begin(rollout, values, varied, scenes, lambda first: self._copy_to(first, state))
 
-    def arrays(self, state: DeviceState) -> dict[str, Array]:
-        """Convert a state to named arrays, the inverse of `state`."""
-        members = self.shapes[STATE_TIME]
-        clocks = [scene.clock for scene in state.scenes]
-        found: dict[str, Array] = self.read(state.arrays)
-        found[STATE_TIME] = np.reshape([clock.time for clock in clocks], members)
-        if LAST_STEP in self.shapes:
-            found[LAST_STEP] = np.reshape([clock.time_step for clock in clocks], members)
-        if all(scene in self._simulation.judged_states and scene.origin for scene in state.scenes):
-            self._remember(state.arrays, tuple(scene.origin for scene in state.scenes if scene.origin))
+    def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> Named:
+        """Copy the state of a rollout after ``steps`` steps to named arrays, NaN for lost scenes."""
+        fields = self.read(state, dict.fromkeys(rollout.lost, np.nan))
+        return self._with_clocks(fields, clocks_after(rollout, steps), rollout.origins)
+
+    def arrays(self, state: DeviceState) -> Named:
+        """Copy a state on the device to named arrays."""
+        origins = [one.origin for one in state.scenes if one.origin and one in self._simulation.judged_states]
+        return self._with_clocks(self.read(state.arrays, {}), [one.clock for one in state.scenes], origins)
+
+    def restart_states(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
+        """Return restart states of all scenes before steps with parameter ``values``; raise `InputError` for a state
+        that is impossible in this scene."""
+        judged = self._judged(given, values)
+        found = tuple(self._states(given, [one.clock for one in judged], [one.origin for one in judged]))
+        self._simulation.judged_states.update(found)
         return found
 
-    def written(self, given: Named) -> State:
-        """Copy fields, or derivatives with respect to fields, to a `State`, with 0 for missing fields."""
-        if self._simulation.device.is_cpu:
-            like = self._simulation.initial
-            own = {name: self._on_host(name, like[name], given.get(name)) for name in like.names}
-            return State(like.fields, own, like.batch)
-        state = self._simulation.solver.new_state()
-        for name, array in given.items():
-            own = self._narrow(name, state.numbers(name))
-            if not isinstance(array, np.ndarray) and array.dtype == own.dtype and array.device == own.device:
+    def write(self, what: str, given: Named, to: State) -> np.ndarray:
+        to.clear()
+        self._copy_to(to, given)
+        return self._numbers(given, STATE_TIME).reshape(self.shapes[STATE_TIME])
+
+    def read(self, state: State, lost: OfLost) -> dict[str, Any]:
+        views = state.narrow(self._simulation.dimension).items()
+        doubles = () if self._is_cpu else [field.name for field in state.fields if field.entry is Entry.DOUBLE]
+        found = {name: _copy(on_host(array) if name in doubles else array) for name, array in views}
+        for b, number in lost.items():
+            for array in found.values():
+                member = array if self._simulation.batch is None else array[b]
+                member.fill(number) if isinstance(member, np.ndarray) else member.fill_(number)
+        return found
+
+    def _copy_to(self, state: State, given: Named) -> None:
+        for name, own in state.narrow(self._simulation.dimension).items():
+            if name not in given:
+                continue
+            array = given[name]
+            if isinstance(own, np.ndarray):
+                own[...] = on_host(array).reshape(own.shape)
+            elif isinstance(array, wp.array) and array.dtype == own.dtype and array.device == own.device:
                 wp.copy(own, array.reshape(own.shape))
             else:
                 own.assign(on_host(array).reshape(own.shape))
-        return state
 
-    def _on_host(self, name: str, like: wp.array, given: Array | None) -> wp.array:
-        """Return an array like ``like`` with given numbers or 0, in NumPy's memory, for constant fields with unchanged
-        numbers the same array."""
-        last = self._constants.get(name) if given is not None else None
-        if last is not None and np.array_equal(on_host(given), last[0]):
-            return last[1]
-        numbers = np.zeros_like(like.numpy())
-        if given is not None:
-            narrow = self._narrow(name, numbers)
-            narrow[:] = on_host(given).reshape(narrow.shape)
-        found = wp.array(numbers, dtype=like.dtype, device="cpu", copy=False)
-        if name in self._constants and given is not None:
-            self._constants[name] = numbers.reshape(np.shape(given)), found
+    def _with_clocks(self, fields: dict[str, Array], clocks: list[Clock], origins: list[Origin]) -> Named:
+        if self._is_cpu and len(origins) == len(clocks):
+            self._remember(self._checksum(fields), tuple(origins))
+        members, found = self.shapes[STATE_TIME], dict(fields)
+        found[STATE_TIME] = np.reshape([clock.time for clock in clocks], members)
+        if LAST_STEP in self.shapes:
+            found[LAST_STEP] = np.reshape([clock.time_step for clock in clocks], members)
         return found
 
-    def read(self, state: State) -> dict[str, Array]:
-        """Return the fields of a `State` as named arrays, on a CPU possibly in the state's memory."""
-        return self.narrowed({name: state.numbers(name) for name in self.fields})
+    def _judged(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
+        """Return the clocks and origins of all scenes as restart states without fields."""
+        solver = self._simulation.scene.solver
+        times, sizes = (self._numbers(given, name) for name in (STATE_TIME, LAST_STEP))
+        steps = np.full(times.shape, values.get("time_step", 1.0 if solver.chooses else solver.time_step))
+        clocks = [self._clock(*own) for own in zip(times.tolist(), steps.tolist(), sizes.tolist(), strict=True)]
+        for clock in clocks:
+            check_clock(clock)
+        scenes = tuple(map(RestartState, repeat({}), clocks, self._origins(given, clocks, values)))
+        self._simulation.judged_states.update(scenes)
+        return scenes
 
-    def narrowed(self, found: Named) -> dict[str, Array]:
-        is_cpu = self._simulation.device.is_cpu
-        read = {n: on_host(found[n]) if is_cpu or e is Entry.DOUBLE else found[n] for n, e in self._entries.items()}
-        narrow = {name: self._narrow(name, array) for name, array in read.items()}
-        return {name: a if isinstance(a, np.ndarray) else a.contiguous() for name, a in narrow.items()}
+    def _origins(self, given: Named, clocks: list[Clock], values: Arrays) -> tuple[Origin, ...]:
+        own = {name: values[name] for name in ("rest_density",) if name in values}
+        key = self._checksum(given) if self._is_cpu else np.asarray(own.get("rest_density", ())).tobytes()
+        if key not in self._known:
+            if self._is_cpu:
+                self._space.check_restarts(self._states(given, clocks, [None] * len(clocks)), own)
+            densities = self._simulation.parameters()["rest_density"]
+            each = (np.atleast_1d(one.get("rest_density", densities)) for one in self._space.members(own))
+            self._remember(key, tuple(origin_of(self._simulation, density) for density in each))
+        return self._known[key]
 
-    @cached_property
-    def _entries(self) -> dict[str, Entry]:
-        return {field.name: field.entry for field in self._simulation.initial.fields}
-
-    def _narrow(self, name: str, whole: Array) -> Array:
-        """Return a view of a field's numbers with vectors cut to the scene's components."""
-        if self._entries[name] is not Entry.VECTOR or self._simulation.dimension == 3:
-            return whole
-        return whole[:, :, :2] if whole.ndim == 3 else whole[:, :2]
+    def _states(self, given: Named, clocks: Sequence[Clock], origins: Sequence[Origin | None]) -> list[RestartState]:
+        real, batch = self._simulation.precision.numpy, self._simulation.batch
+        kinds = {f.name: np.float64 if f.entry is Entry.DOUBLE else real for f in self._simulation.initial.fields}
+        arrays: dict[str, np.ndarray] = {name: on_host(given[name]).astype(kind) for name, kind in kinds.items()}
+        each = [arrays] if batch is None else [{name: array[b] for name, array in arrays.items()} for b in range(batch)]
+        return [RestartState(*own).fixed() for own in zip(each, clocks, origins, strict=True)]
 
     def _numbers(self, given: Named, name: str) -> np.ndarray:
         """Return a named array as numbers (members,) in float64, by default 0."""
@@ -323,32 +339,16 @@ class NamedStates:
         room = 2.0 * float(np.finfo(self._simulation.precision.numpy).eps)
         return Clock(steps, steps * step) if abs(time - steps * step) <= room * time else Clock(0, time)
 
-    def _judged(self, arrays: State, clocks: list[Clock], parameters: Arrays) -> tuple[Origin, ...]:
-        known = self._known.get(self._checksum(arrays)) if self._simulation.device.is_cpu else None
-        if known is not None:
-            return known
-        own = {name: parameters[name] for name in ("rest_density",) if name in parameters}
-        members = self._space.members(own)
-        if self._simulation.device.is_cpu:
-            unknown = [RestartState({}, clock) for clock in clocks]
-            self._space.check_restarts(self._place.states(arrays, unknown), own)
-        densities = self._simulation.parameters()["rest_density"]
-        origins = (origin_of(self._simulation, np.atleast_1d(one.get("rest_density", densities))) for one in members)
-        found = tuple(origins)
-        self._remember(arrays, found)
-        return found
+    def _remember(self, key: bytes, origins: tuple[Origin, ...]) -> None:
+        self._known[key] = origins
+        while len(self._known) > 256:
+            self._known.popitem(last=False)
 
-    def _remember(self, arrays: State, origins: tuple[Origin, ...]) -> None:
-        if self._simulation.device.is_cpu:
-            self._known[self._checksum(arrays)] = origins
-            while len(self._known) > 256:
-                self._known.popitem(last=False)
-
-    def _checksum(self, arrays: State) -> bytes:
-        """Return a checksum of a state's numbers, in 2-D without third components, whose 0 may have a sign."""
-        found = blake2b(digest_size=16)
-        for name in arrays.names:
-            found.update(np.ascontiguousarray(self._narrow(name, arrays.numbers(name).numpy())).data)
+    def _checksum(self, fields: Named) -> bytes:
+        """Return a checksum of a state's numbers in the simulation's precision."""
+        found, real = blake2b(digest_size=16), self._simulation.precision.numpy
+        for name in self.fields:
+            found.update(np.ascontiguousarray(fields[name], dtype=real).data)
         return found.digest()
 
 

@@ -135,7 +135,8 @@ def restart_state(
         name: bridge.numbers(f"parameter {name}", value) for name, value in table_of("parameters", parameters).items()
     }
     with layer.turn:
-        return simulation.on_host(layer.states.state(arrays, own))
+        found = layer.states.restart_states(arrays, own)
+        return found[0] if simulation.batch is None else found
 
 
 def step(
