@@ -1,15 +1,16 @@
 """``python -m benchmarks.gradients.policies``: policies trained in closed loop, with gradients and without.
 
 A network looks at the fluid of the tasks Carry and Splash before every action and is to bring in as much reward as it
-can, over 800 steps. It is trained by L-BFGS (Nocedal 1980) on the gradients of `cortado.jax.step`, exact and by
-`AdjointViscosity`, and by the cross-entropy method (CEM) on values alone, all with the same number of simulated steps.
-A gradient counts as many steps as it takes time: it is timed at the start against values of the same episode. Episodes
-differ in their first positions, by 2 % of a spacing. What is shown is the mean reward of an action in four test
-episodes, which nobody trains with and which do not count.
+can, over 800 steps. It is trained by L-BFGS (Nocedal 1980) on the gradients of `cortado.jax.step` or
+`cortado.torch.step`, exact and by `AdjointViscosity`, and by the cross-entropy method (CEM) on values alone, all with
+the same number of simulated steps. A gradient counts as many steps as it takes time: it is timed at the start against
+values of the same episode. Episodes differ in their first positions, by 2 % of a spacing. What is shown is the mean
+reward of an action in four test episodes, which nobody trains with and which do not count.
 
     python -m benchmarks.gradients.policies --task carry --seeds 1 --steps 200 --budget 20000    # small, minutes
     python -m benchmarks.gradients.policies --task carry --processes 15                          # a core each
     python -m benchmarks.gradients.policies --task carry --method CEM --device cuda:0            # batches
+    python -m benchmarks.gradients.policies --task carry --library torch --method AdjointViscosity Exact
 """
 
 import argparse
@@ -29,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import cortado.jax
-from cortado import Simulation, gradients
+from cortado import DivergedError, Simulation, gradients
 from cortado.environments.catalogue import Carry, Letter, Splash
 from cortado.environments.task import Actuator, Task
 from cortado.pictures.plots import PALETTE, drawing
@@ -49,22 +50,42 @@ POPULATION, ELITE, WIDTH, NARROWEST = 20, 5, 0.5, 0.05
 Row = dict[str, Any]
 
 
-class Driven:
-    """An actuator in JAX: the parameter over the steps of an action, linear in its state and the action."""
+class InJax:
+    """The operations of a loop on arrays of JAX."""
 
-    def __init__(self, actuator: Actuator, steps: int, time_step: float):
+    library, cat, stack, tanh, sin, cos = cortado.jax, jnp.concatenate, jnp.stack, jnp.tanh, jnp.sin, jnp.cos
+    least = staticmethod(lambda x: x.min(-1))
+    compiled = staticmethod(jax.jit)
+
+    @staticmethod
+    def array(x: Any) -> Any:
+        return jnp.asarray(x, jnp.float32)
+
+    @staticmethod
+    def scan(act: Callable[[Any, Any], tuple[Any, Any]], begun: Any, count: int) -> Any:
+        return jax.lax.scan(act, begun, jnp.arange(count, dtype=jnp.float32))[1]
+
+    @staticmethod
+    def with_slope(loss: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        return jax.jit(jax.value_and_grad(loss))
+
+
+class Driven:
+    """An actuator: the parameter over the steps of an action, linear in its state and the action."""
+
+    def __init__(self, xp: Any, actuator: Actuator, steps: int, time_step: float):
         a = len(actuator.axes)
         now = np.zeros((4, 2, a))
         now[1, 0] = now[2, 1] = 1.0
         after, rows = actuator.advance(now, np.arange(4)[:, None] // 3 * np.ones((4, a)), steps, time_step)
-        self._actuator, self._base, self._after = actuator, jnp.asarray(rows[0], jnp.float32), jnp.asarray(after[1:])
-        self._rows = jnp.asarray(rows[1:] - rows[0], jnp.float32)
+        self._base, self._after, self._rows = (xp.array(x) for x in (rows[0], after[1:], rows[1:] - rows[0]))
+        self._wide = None if actuator.is_number else xp.array(np.eye(len(actuator.rest))[list(actuator.axes)])
 
     def __call__(self, now: Any, u: Any) -> tuple[Any, Any]:
         """Return the state (2, a) after an action (a,), and the parameter (steps, d) or (steps,)."""
-        given, one = (now[0], now[1], u), self._actuator
+        given = now[0], now[1], u
         after = sum(own * x for own, x in zip(self._after, given, strict=True))
-        wide = given if one.is_number else [jnp.zeros(len(one.rest)).at[jnp.array(one.axes)].set(x) for x in given]
+        wide = given if self._wide is None else [x @ self._wide for x in given]
         return after, self._base + sum(own * x for own, x in zip(self._rows, wide, strict=True))
 
 
@@ -101,64 +122,72 @@ class Loop:
         x = self.simulation.positions
         return x + JITTER * self.task.spacing * random.standard_normal((count, *x.shape))
 
-    def loss(self, estimator: Any) -> Callable[[Any, Any], Any]:
+    def loss(self, estimator: Any, xp: Any = InJax) -> Callable[[Any, Any], Any]:
         """Return the loss of weights (w,) and first positions (n, 2), differentiable by an estimator."""
-        task, simulation, first = self.task, self.simulation, cortado.jax.state(self.simulation)
-        driven = [Driven(one, task.substeps, task.time_step) for one in task.actuators]
-        (seen, said), rewarded = self.sizes, REWARDS[task.name](task, simulation)
+        task, simulation, first = self.task, self.simulation, xp.library.state(self.simulation)
+        driven = [Driven(xp, one, task.substeps, task.time_step) for one in task.actuators]
+        (seen, said), rewarded = self.sizes, REWARDS[task.name](xp, task, simulation)
 
         def loss(weights: Any, positions: Any) -> Any:
-            cuts = np.cumsum([seen * HIDDEN, HIDDEN, HIDDEN * said])
-            inner, bias, outer, last = jnp.split(weights, cuts)
+            inner, bias, outer, last = _cut(weights, [seen * HIDDEN, HIDDEN, HIDDEN * said, said])
 
             def act(carried: Any, number: Any) -> tuple[Any, Any]:
                 state, now = carried
                 x, v = state["positions"], state["velocities"]
-                fluid = [x.mean(0) - middle, 0.3 * v.mean(0), 5.0 * x.std(0), v.std(0)]
+                fluid = [x.mean(0) - middle, 0.3 * v.mean(0), 5.0 * _spread(x), _spread(v)]
                 own = [own.ravel() for own in now]
-                known = jnp.concatenate([*fluid, *own, jnp.full(said, number / self.actions)])
-                u = jnp.tanh(jnp.tanh(known @ inner.reshape(seen, HIDDEN) + bias) @ outer.reshape(HIDDEN, said) + last)
-                parts, after, rows = jnp.split(u, splits), [], {}
+                known = xp.cat([*fluid, *own, zeros[:said] + number / self.actions])
+                u = xp.tanh(xp.tanh(known @ inner.reshape(seen, HIDDEN) + bias) @ outer.reshape(HIDDEN, said) + last)
+                parts, after, rows = _cut(u, axes), [], {}
                 for one, actuator, was, part in zip(driven, task.actuators, now, parts, strict=True):
                     later, rows[actuator.parameter] = one(was, part)
                     after.append(later)
-                state = cortado.jax.step(simulation, state, rows, task.substeps, estimator)
+                state = xp.library.step(simulation, state, rows, task.substeps, estimator)
                 return (state, after), rewarded(state)
 
-            splits = np.cumsum([len(one.axes) for one in task.actuators])[:-1].tolist()
-            middle = jnp.asarray(simulation.positions.mean(0), jnp.float32)
-            rest = [jnp.zeros((2, len(one.axes))) for one in task.actuators]
+            axes, zeros = [len(one.axes) for one in task.actuators], xp.array(np.zeros(2 * said))
+            middle = xp.array(simulation.positions.mean(0))
+            rest = [part.reshape(2, -1) for part in _cut(zeros, [2 * count for count in axes])]
             begun = {**first, "positions": positions}, rest
-            _, found = jax.lax.scan(act, begun, jnp.arange(self.actions, dtype=jnp.float32))
-            return -found.mean()
+            return -xp.scan(act, begun, self.actions).mean()
 
         return loss
 
 
-def share(x: Any, lower: Any, upper: Any, width: float) -> Any:
+def _cut(x: Any, lengths: list[int]) -> list[Any]:
+    ends = np.cumsum(lengths).tolist()
+    return [x[end - length : end] for end, length in zip(ends, lengths, strict=True)]
+
+
+def _spread(x: Any) -> Any:
+    return ((x - x.mean(0)) ** 2).mean(0) ** 0.5
+
+
+def share(xp: Any, x: Any, lower: Any, upper: Any, width: float) -> Any:
     """Return the share of particles (n, 2) in boxes (boxes, 2), as `cortado.environments.terms.Share` counts them."""
-    way = x[:, None] - jnp.clip(x[:, None], jnp.asarray(lower, x.dtype), jnp.asarray(upper, x.dtype))
-    return (1.0 / (1.0 + (way**2).sum(-1).min(-1) / width**2)).mean()
+    way = x[:, None] - x[:, None].clip(xp.array(lower), xp.array(upper))
+    return (1.0 / (1.0 + xp.least((way**2).sum(-1)) / width**2)).mean()
 
 
-def carried(task: Carry, simulation: Simulation) -> Callable[[Any], Any]:
+def carried(xp: Any, task: Carry, simulation: Simulation) -> Callable[[Any], Any]:
     """Return the reward of Carry, whose goal is in the middle of all goals."""
     goal, middle = float(np.mean(task.goals)), simulation.scene.solid[0].middle()
     lower, upper = -middle, np.array([task.width, task.height]) - middle
 
     def reward(state: Any) -> Any:
         place, turn = state["cup.position"][0], state["cup.turn"][0]
-        cos, sin = jnp.cos(turn), jnp.sin(turn)
-        own = (state["positions"] - place) @ jnp.array([[cos, -sin], [sin, cos]])
-        return -jnp.abs(place[0] - goal) - 10.0 + 10.0 * share(own, lower[None], upper[None], task.coarse_spacing)
+        cos, sin = xp.cos(turn), xp.sin(turn)
+        x, y = (state["positions"] - place).T
+        own = xp.stack([cos * x + sin * y, cos * y - sin * x], -1)
+        return -abs(place[0] - goal) - 10.0 + 10.0 * share(xp, own, lower[None], upper[None], task.coarse_spacing)
 
     return reward
 
 
-def splashed(task: Splash, simulation: Simulation) -> Callable[[Any], Any]:
+def splashed(xp: Any, task: Splash, simulation: Simulation) -> Callable[[Any], Any]:
     """Return the reward of Splash, whose goal is in the middle of all goals."""
     (lower,), (upper,) = Letter(task.half)(np.mean(task.goals, axis=0)[None])
-    return lambda state: share(state["positions"], lower, upper, task.coarse_spacing)
+    return lambda state: share(xp, state["positions"], lower, upper, task.coarse_spacing)
 
 
 REWARDS: dict[str, Any] = {"Carry": carried, "Splash": splashed}
@@ -167,21 +196,23 @@ REWARDS: dict[str, Any] = {"Carry": carried, "Splash": splashed}
 class Descent:
     """L-BFGS with a search along each direction, on one episode until no step lowers its loss, then on another."""
 
-    def __init__(self, loop: Loop, estimator: Any, weights: NDArray[Any], random: np.random.Generator, device: str):
-        self._loop, self._random, self._weights = loop, random, weights
-        self._value, self._slope = jax.jit(loop.loss(None)), jax.jit(jax.value_and_grad(loop.loss(estimator)))
+    def __init__(
+        self, loop: Loop, estimator: Any, weights: NDArray[Any], random: np.random.Generator, device: str, xp: Any
+    ):
+        self._loop, self._random, self._weights, self._xp = loop, random, weights, xp
+        self._value, self._slope = xp.compiled(loop.loss(None, xp)), xp.with_slope(loop.loss(estimator, xp))
         self._begin()
         given = self._given(weights)
         self._longer = seconds(device, self._slope, *given) / seconds(device, self._value, *given)
 
     def _begin(self) -> None:
         """Draw an episode, of which nothing is known yet."""
-        self._start = jnp.asarray(self._loop.starts(self._random, 1)[0], jnp.float32)
+        self._start = self._xp.array(self._loop.starts(self._random, 1)[0])
         self._pairs: list[tuple[NDArray[Any], NDArray[Any]]] = []
         self._last: tuple[float, NDArray[Any]] | None = None
 
     def _given(self, weights: NDArray[Any]) -> tuple[Any, Any]:
-        return jnp.asarray(weights, jnp.float32), self._start
+        return self._xp.array(weights), self._start
 
     def _along(self, slope: NDArray[Any]) -> NDArray[Any]:
         """Return the direction of descent, by the two loops of Nocedal (1980)."""
@@ -223,7 +254,7 @@ class Descent:
         """Return the loss of an episode; infinite if particles were lost."""
         try:
             return float(self._value(*self._given(weights)))
-        except jax.errors.JaxRuntimeError:
+        except (DivergedError, jax.errors.JaxRuntimeError):
             return np.inf
 
     def _measure(self) -> tuple[float, NDArray[Any]]:
@@ -264,6 +295,7 @@ class Job:
     steps: int
     budget: int
     device: str
+    library: str
 
     def run(self) -> Row:
         """Return rewards of test episodes over the number of simulated steps."""
@@ -282,7 +314,7 @@ class Job:
         method = (
             CrossEntropy(loop, weights, random)
             if self.method == "CEM"
-            else Descent(loop, METHODS[self.method], weights, random, self.device)
+            else Descent(loop, METHODS[self.method], weights, random, self.device, library(self.library))
         )
         cost = 0.0
         while taken + cost <= self.budget:
@@ -293,6 +325,15 @@ class Job:
                 check()
         own = {"task": self.task, "method": self.method, "seed": self.seed}
         return {**own, "steps": [at for at, _ in history], "rewards": [reward for _, reward in history]}
+
+
+def library(name: str) -> Any:
+    """Return the operations of a library on arrays: "jax" or "torch"."""
+    if name == "jax":
+        return InJax
+    from benchmarks.gradients.in_torch import InTorch
+
+    return InTorch
 
 
 def seconds(device: str, function: Any, *given: Any) -> float:
@@ -344,11 +385,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=800, help="simulated steps of an episode")
     parser.add_argument("--budget", type=int, default=112_000, help="simulated steps of a training")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--library", choices=["jax", "torch"], default="jax", help="of the gradients")
     parser.add_argument("--processes", type=int, default=1, help="more than 1: a seed and method at a time in each")
     parser.add_argument("--out", type=Path, default=Path("runs/policies"), help="files of former calls are kept")
     asked = parser.parse_args()
     each = [(task, method, seed) for task in asked.task for method in asked.method for seed in asked.seeds]
-    jobs = [Job(*own, asked.steps, asked.budget, asked.device) for own in each]
+    jobs = [Job(*own, asked.steps, asked.budget, asked.device, asked.library) for own in each]
     asked.out.mkdir(parents=True, exist_ok=True)
     if asked.processes > 1:
         os.environ.setdefault("CORTADO_CORES", "1")
