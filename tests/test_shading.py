@@ -24,7 +24,7 @@ from cortado.pictures.run_pictures import run_pictures
 from cortado.pictures.stage import Stage, screen_axes, upright
 from cortado.pictures.tracing.liquid_surface import spheres
 from cortado.pictures.tracing.solid_surfaces import NODES, FloorShadow
-from cortado.pictures.tracing.space import State, environment_of, particles_of, scenery, wetting
+from cortado.pictures.tracing.space import SpacePainter, State, environment_of, particles_of, wetting
 from cortado.pictures.tracing.trace import find_contrast
 from cortado.runs.frames import Film, Pace, pace_of
 from cortado.runs.run_folder import RunFolder
@@ -285,7 +285,8 @@ def test_a_lattice_in_a_round_cup_reaches_its_glass():
         fluid, container = ({**cup, "radius": radius, "height": height} for height in (0.4, 0.8))
         scene = scene_of(fluid=[{**fluid, "phase": "one"}], container=container)
         positions, colours = first_state(scene)
-        off = scenery(Stage.of(scene, positions), State(positions, colours), CPU).surface.mesh.points.numpy()
+        _, _, surface, _ = SpacePainter(Stage.of(scene, positions)).scenery(State(positions, colours))
+        off = surface.mesh.points.numpy()
         level = off[np.abs(off[:, 1] + 0.2) < 0.1]  # halfway up the fluid
         turn = np.arctan2(level[:, 2], level[:, 0])
         reached = [np.hypot(*level[np.abs(turn - at) < 0.1][:, ::2].T).max() for at in np.linspace(-3.0, 3.0, 31)]
@@ -407,7 +408,6 @@ def test_a_film_has_as_many_frames_as_are_asked_for_and_says_what_is_left_out():
     assert REAL_TIME not in str(asked) and REAL_TIME not in str(Pace.of(times, speed=0.5))
     with pytest.warns(CortadoWarning, match=r"the film has 7 frames of the 90 that picture.film_frames asks for"):
         assert len(pace_of(np.arange(7.0), Picture(film_frames=90)).frames) == 7
-    assert str(Pace.unknown(50)) == "50 frames, 4.0 s, step by step"
 
 
 def test_a_package_that_is_missing_is_named(monkeypatch):

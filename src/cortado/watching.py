@@ -12,7 +12,7 @@ from cortado.errors import DivergedError, InputError
 from cortado.losses.loss import Snapshot, SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.rollout import Observer, Rollout
-from cortado.rollout.stepper import Steppable
+from cortado.rollout.scene_parameters import Simulated
 from cortado.runs.probes import SENSORS, sensors_of, warn_of_places
 from cortado.runs.quantity_values import Moment, QuantityEvaluator
 from cortado.runs.recording import StepReader, Waiting
@@ -21,9 +21,8 @@ from cortado.scene.parameter_values import Arrays
 from cortado.scene.parameters import QUANTITIES, check_quantity
 
 
-class Watched(Steppable, Protocol):
-    @property
-    def walls(self) -> NDArray: ...
+class Watched(Simulated, Protocol):
+    walls: NDArray
 
     def evaluator(self) -> QuantityEvaluator: ...
 

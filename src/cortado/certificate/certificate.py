@@ -46,6 +46,7 @@ from cortado.scene.parameters import Range, Role
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
+Random = np.random.Generator
 BESIDE = 0.1 * PERTURBATION
 """Size of random changes of the first positions, in spacings, and of the first velocities, relative to the speed of a
 fall. They take fluid at rest off kinks of the loss, such as that of |v| at 0."""
@@ -289,9 +290,7 @@ def _consistency(
     return together, tuple(name for name in along if not alone[name].right) or tuple(along)
 
 
-def _beside(
-    problem: Problem, values: Arrays, along: Arrays, random: np.random.Generator
-) -> tuple[Consistency | None, int]:
+def _beside(problem: Problem, values: Arrays, along: Arrays, random: Random) -> tuple[Consistency | None, int]:
     """Check all parameters at slightly, randomly moved first positions and velocities. Return the check and its number
     of steps; the check is None if the moved run loses a particle in the first step.
 

@@ -111,11 +111,11 @@ class RunRecording:
         constants, origin, start = self.simulation.constants(rollout), rollout.origins[0], rollout.clocks[0].time
         noted, expected = rollout.diagnostics, self.frames.expected(rollout)
         kept = 1 if self.kept is None else len(self.kept)
-        known = first, constants, steps, noted, origin, self.watch.names
+        layout = {"times": times, "constants": constants, "steps": steps, "expected": expected, "kept": kept}
         marks = None if self.frames.rate is None else Marks(start, self.frames.rate)
         whole = (100, "run, % of its time") if ends_at_a_time(rollout) else (rollout.steps, "run")
-        file = self.folder.trajectory, times, *known, marks, expected, kept
-        with frame_writer(*file) as writer, track(*whole) as advance:
+        file = frame_writer(self.folder.trajectory, first, noted, origin, marks, quantities=self.watch.names, **layout)
+        with file as writer, track(*whole) as advance:
             notes, done = Notes(self, writer), 0
             if self.kept is None:
                 append_frame(writer, first, rollout.clocks[0].steps, self.watch.frame(0, rollout.initial))

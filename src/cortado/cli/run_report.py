@@ -26,7 +26,7 @@ from cortado.pictures.run_pictures import density_errors, readings, run_pictures
 from cortado.pictures.shown_solids import solid_outline
 from cortado.rollout.outcome import divergence_sentence, dry_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
-from cortado.runs.frames import Pace, common_rate, posed, solid_motions
+from cortado.runs.frames import Pace, SolidMotions, common_rate, posed
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensor import Readings, summary
 from cortado.runs.trajectory import Trajectory
@@ -240,7 +240,7 @@ def write_run_report(
 def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Figures:
     scene, none = simulation.scene, np.zeros(trajectory.particles)
     shown = sorted({0, len(trajectory) // 2, len(trajectory) - 1})
-    frames, motions = [trajectory[k] for k in shown], solid_motions(scene, trajectory.others)
+    frames, motions = [trajectory[k] for k in shown], SolidMotions.of(trajectory.others, scene.dimension)
     left = [np.ravel(frame.others.get("drained", none)) == 0.0 for frame in frames]
     path = particles(
         [frame.positions[here] for frame, here in zip(frames, left, strict=True)],

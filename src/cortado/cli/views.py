@@ -20,10 +20,11 @@ from cortado.losses.loss import ADJOINT_FIELDS
 from cortado.pictures.film import is_out
 from cortado.pictures.painter import colours_of
 from cortado.pictures.particle_view import container_outline, outline
-from cortado.pictures.shown_solids import ShownSolid, own_faces, own_lines, shown_solids, turn_in_space
+from cortado.pictures.shown_solids import ShownSolid, own_faces, own_lines, shown_solids
 from cortado.pictures.stage import upright
 from cortado.rollout.rollout import Rollout
-from cortado.runs.frames import posed, sized, solid_motions
+from cortado.runs.frames import SolidMotions, posed, sized
+from cortado.runs.particle_sums import square
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.emitter_table import EmitterTable, path_name
@@ -174,7 +175,7 @@ def _quaternion(turn: Points) -> np.ndarray:
     """Convert a rotation matrix (d, d) to a quaternion (w, x, y, z), (4,)."""
     from scipy.spatial.transform import Rotation
 
-    return np.roll(Rotation.from_matrix(turn_in_space(turn)).as_quat(), 1)
+    return np.roll(Rotation.from_matrix(square(turn)).as_quat(), 1)
 
 
 def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> str:
@@ -236,7 +237,7 @@ class RecordedView:
     def __init__(self, scene: Scene, trajectory: Trajectory, simulation: Callable[[], Simulation], port: int):
         self.scene, self.trajectory, self._simulation = scene, trajectory, simulation
         own = own_fields(trajectory[0].others, trajectory.particles)
-        large = sized(scene, solid_motions(scene, trajectory.others))
+        large = sized(scene, SolidMotions.of(trajectory.others, scene.dimension))
         self.window = Window(large, port, {**UNITS, **dict.fromkeys(own, "")})
         gui, last = self.window.server.gui, len(trajectory) - 1
         self.playing = gui.add_checkbox("Play", last > 0)
@@ -269,7 +270,8 @@ class RecordedView:
         quantities = quantities_of(frame.velocities, self._simulation, self.trajectory[: k + 1].last_state, {})
         quantities |= own_fields(frame.others, self.trajectory.particles)
         quantities |= {name: partial(sizes_of, values) for name, values in frame.quantities.items()}
-        self.window.place_solids(posed(self.scene, solid_motions(self.scene, self.trajectory.others), k))
+        motions = SolidMotions.of(self.trajectory.others, self.scene.dimension)
+        self.window.place_solids(posed(self.scene, motions, k))
         out = is_out(self.scene, frame.others, self.trajectory.particles)
         self.window.show(frame.positions, colours, out, quantities)
 
@@ -336,7 +338,7 @@ class LiveView:
         quantities = quantities_of(state["velocities"], lambda: self.simulation, state, controls)
         quantities |= own_fields(state.fields, particles)
         scene, fields = self.simulation.scene, {name: np.asarray(field)[None] for name, field in state.fields.items()}
-        self.window.place_solids(posed(scene, solid_motions(scene, fields), 0))
+        self.window.place_solids(posed(scene, SolidMotions.of(fields, scene.dimension), 0))
         self.window.show(state["positions"], colours, is_out(scene, state.fields, particles), quantities)
 
     def _gravity(self) -> np.ndarray:

@@ -47,14 +47,15 @@ def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArr
     found = np.empty(light.shape, dtype=np.uint8)
 
     def convert(row: int) -> None:
-        found[row : row + ROWS] = _values(light[row : row + ROWS])
+        found[row : row + ROWS] = srgb_bytes(light[row : row + ROWS])
 
     for _ in each(convert, range(0, len(light), ROWS)):
         pass
     return found
 
 
-def _values(light: NDArray[Any]) -> NDArray[np.uint8]:
+def srgb_bytes(light: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the sRGB bytes of linear light of any shape, clipped to 0..1."""
     if not np.isfinite(light).all():
         raise InputError("The image has values that are not finite; check how it was computed.")
     light = np.clip(light, light.dtype.type(0.0), light.dtype.type(1.0))

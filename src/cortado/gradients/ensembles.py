@@ -7,16 +7,15 @@ import numpy as np
 
 from cortado.arrays import as_number, as_numbers, is_whole, require_at_most, require_whole
 from cortado.calls import keep_own
-from cortado.device.precision import Precision
 from cortado.device.threads import require
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, OutOfRangeError, shown, warn
 from cortado.executors import Executor, InProcess, checked_executor
 from cortado.gradients.estimator import (
+    NO_RUN,
     Differentiable,
     Estimate,
     GradientEstimator,
     Point,
-    Sample,
     checked_estimate,
     checked_estimator,
     evaluated,
@@ -79,16 +78,15 @@ class Ensemble:
         values = {name: as_numbers(f"parameter {name}", value) for name, value in parameters.items()}
         widths = {name: self._spread(name) for name in values}
         for name, value in values.items():
-            _check_resolved(name, value, widths[name], problem.simulation.precision)
+            precision = problem.simulation.precision
+            lost = np.asarray(value, precision.numpy) == np.asarray(value + widths[name], precision.numpy)
+            if lost.any():  # all samples would be equal
+                wanted = f"large enough to change {value[lost].flat[0]:g} in {precision.name}"
+                raise InputError(f"spread of {name} is {widths[name]:g}, but must be {wanted}.")
         spreads = np.concatenate([np.full(value.size, widths[name]) for name, value in values.items()])
         start = problem.simulation.positions
         position_noise = self.position_noise * problem.simulation.scene.discretisation.spacing
         return Sampler(values, spreads, start, position_noise, np.random.default_rng([self.seed, draw]))
-
-    def evaluated(self, problem: Differentiable, points: Iterable[Point], observe: Observer | None) -> list[Estimate]:
-        """Return estimates at points, in order; ``observe`` needs the states and keeps the runs in this process."""
-        executor = self.executor if observe is None else InProcess()
-        return evaluated(problem, points, executor, observe)
 
     def require_memory(self, runs: int, numbers: int) -> None:
         """Raise `InputError` unless memory suffices for the results of ``runs`` runs with ``numbers`` numbers each."""
@@ -126,25 +124,17 @@ class Sampler:
         """Return a random displacement (n, d) of the first positions [m]."""
         return self.position_noise * self.random.standard_normal(self.start.shape)
 
-    def sample(self, u: np.ndarray, displacement: np.ndarray, estimator: GradientEstimator | None = None) -> Sample:
+    def sample(self, u: np.ndarray, displacement: np.ndarray, estimator: GradientEstimator | None = None) -> Point:
         """Return a sample with parameters moved by ``u`` (numbers,), in units of the spreads, and displaced first
         positions."""
         values = _moved(self.values, self.spreads * u)
         if self.position_noise:
             values["initial_positions"] = values.get("initial_positions", self.start) + displacement
-        return Sample(values, estimator)
+        return Point(values, estimator, errors=NO_RUN, is_sample=True)
 
     def named(self, numbers: np.ndarray) -> Arrays:
         """Split a vector (numbers,) into arrays by the parameters' names."""
         return _moved({name: np.zeros_like(value) for name, value in self.values.items()}, numbers)
-
-
-def _check_resolved(name: str, value: np.ndarray, spread: float, precision: Precision) -> None:
-    """Raise `InputError` if a spread is smaller than round-off, because all samples would be equal."""
-    lost = np.asarray(value, precision.numpy) == np.asarray(value + spread, precision.numpy)
-    if lost.any():
-        wanted = f"large enough to change {value[lost].flat[0]:g} in {precision.name}"
-        raise InputError(f"spread of {name} is {spread:g}, but must be {wanted}.")
 
 
 def _moved(values: Arrays, change: np.ndarray) -> Arrays:
@@ -234,7 +224,7 @@ class RandomizedSmoothing(Ensemble):
                     yield ensemble.sample(r * q, displacement)
                     yield ensemble.sample(-r * q, displacement)
 
-        at_them, *runs = self.evaluated(problem, points(), None)
+        at_them, *runs = evaluated(problem, points(), self.executor)
         kept = remaining(runs, len(directions), "differences")
         found = np.zeros((self.samples, numbers))
         for k in np.flatnonzero(kept):
@@ -289,7 +279,7 @@ class EnsembleMean(Ensemble):
                 yield ensemble.sample(u, displacement, self.estimator)
                 yield ensemble.sample(-u, -displacement, self.estimator)
 
-        at_them, *samples = self.evaluated(problem, points(), observe)
+        at_them, *samples = evaluated(problem, points(), self.executor, observe)
         kept = np.repeat(remaining(samples, self.samples // 2, "antithetic pairs"), 2)
         checked = [checked_estimate(samples[k], ensemble.values) for k in np.flatnonzero(kept)]
         numbers = np.array([joined(one.gradient, ensemble.values) for one in checked])
@@ -387,7 +377,7 @@ class Guided(Ensemble):
                     yield ensemble.sample(r * part, displacement)
                     yield ensemble.sample(-r * part, displacement)
 
-        runs = self.evaluated(problem, points(), None)
+        runs = evaluated(problem, points(), self.executor)
         kept = remaining(runs, self.differences, "samples of the differences")
         pairs = np.array([one.loss for one in runs]).reshape(self.differences, len(parts), 2)[kept]
         slopes = (pairs[..., 0] - pairs[..., 1]) / (2.0 * np.array(reach))

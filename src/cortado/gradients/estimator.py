@@ -8,10 +8,10 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
-from cortado.arrays import as_numbers, as_one_number
+from cortado.arrays import as_numbers, as_one_number, require_methods
 from cortado.calls import counted, sized
 from cortado.errors import DivergedError, InputError, OutOfRangeError, shown
-from cortado.executors import Executor, OnResult
+from cortado.executors import Executor, InProcess, OnResult
 from cortado.particles.state import Parameters, State
 from cortado.rollout.rollout import BackwardStep, Observer, Rollout
 from cortado.scene.parameter_values import Arrays, Values
@@ -117,8 +117,7 @@ class GradientEstimator(Protocol):
 
 def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
     """Return the estimator; raise `InputError` for anything else, such as the class of an estimator."""
-    if isinstance(estimator, type) or not hasattr(estimator, "estimate"):
-        raise InputError(f"estimator is {shown(estimator)}, but must be an object such as cortado.gradients.Exact().")
+    require_methods("estimator", estimator, ("estimate",), "an object such as cortado.gradients.Exact()")
     return estimator
 
 
@@ -210,39 +209,29 @@ class Point:
     loss_if_diverged: float = np.nan
     errors: tuple[type[Exception], ...] = ()
     """Errors after which the point has a substitute loss."""
+    is_sample: bool = False
+    """True for a random point of an ensemble, whose estimate is not checked, as perturbed first positions need no
+    gradient; an `InputError` says that it is a sample."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
         """Return the loss at the point and its gradient, which is empty without an estimator."""
         try:
-            found = self.found(problem, observe)
-            return found if self.estimator is None else checked_estimate(found, self.values, problem.simulation.batch)
+            if self.estimator is None:
+                return Estimate(problem.value(self.values), {})
+            found = self.estimator.estimate(problem, self.values, observe)
+            return found if self.is_sample else checked_estimate(found, self.values, problem.simulation.batch)
         except self.errors as error:
-            return self.without_a_run(error, self.loss_if_diverged)
-
-    def found(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        if self.estimator is None:
-            return Estimate(problem.value(self.values), {})
-        return self.estimator.estimate(problem, self.values, observe)
-
-    def without_a_run(self, why: Exception, loss: float = np.nan) -> Estimate:
-        """Return the estimate of a point whose run failed, with a gradient of NaN."""
-        names = self.values if self.estimator is not None else ()
-        return Estimate(loss, {name: np.full(np.shape(self.values[name]), np.nan) for name in names}, diverged=why)
-
-
-@dataclass(frozen=True)
-class Sample(Point):
-    """A random point of an ensemble."""
-
-    def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """Return the unchecked estimate, because perturbed first positions need no gradient; an `InputError` says that
-        the point is a sample."""
-        try:
-            return self.found(problem, observe)
-        except NO_RUN as error:
             return self.without_a_run(error)
         except InputError as error:
-            raise InputError(f"A sample of the ensemble does not fit: {error}") from error
+            if self.is_sample:
+                raise InputError(f"A sample of the ensemble does not fit: {error}") from error
+            raise
+
+    def without_a_run(self, why: Exception) -> Estimate:
+        """Return the estimate of a point whose run failed, with a gradient of NaN."""
+        names = self.values if self.estimator is not None else ()
+        gradient = {name: np.full(np.shape(self.values[name]), np.nan) for name in names}
+        return Estimate(self.loss_if_diverged, gradient, diverged=why)
 
 
 Group = tuple[Point, ...]
@@ -287,8 +276,10 @@ def evaluated(
     observe: Observer | None = None,
     on_result: OnResult | None = None,
 ) -> list[Estimate]:
-    """Compute estimates at points by an executor, many in one launch, and return them in order."""
+    """Compute estimates at points by an executor, many in one launch, and return them in order; ``observe`` needs the
+    states and keeps the runs in this process."""
     evaluation, firsts = Evaluation(problem, observe), [0]
+    executor = executor if observe is None else InProcess()
 
     def groups() -> Iterator[Group]:
         for group in evaluation.groups(points, executor.threads):

@@ -177,7 +177,7 @@ class Exact(AdjointEstimator):
     batches = True
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
-        return AdjointStep(rollout, rollout.solver.adjoint(rollout.steps))
+        return AdjointStep(rollout)
 
 
 @dataclass(frozen=True)
@@ -217,32 +217,22 @@ class _TapeStep:
         self._before.assign(state)
         self.solver.follow(self._given)
         wp.copy(self._own["time_step"], self._parameters["time_step"])  # of this step, where it is chosen
-        tape = wp.Tape()
+        tape: Any = wp.Tape()
         try:
-            self._back(tape, counts, bar)
+            with tape:
+                self.solver.replay(self._before, self._own, counts)
+                self.solver.write_state(counts, self._own, self._after)
+            tape.backward(grads=dict(zip(self._after.arrays(), bar.arrays(), strict=True)))
+            for own, total in zip(self._before.arrays(), bar.arrays(), strict=True):
+                wp.copy(total, own.grad)
         finally:
-            self._forget(tape)
-
-    def _back(self, tape: wp.Tape, counts: Counts, bar: State) -> None:
-        with tape:
-            self.solver.replay(self._before, self._own, counts)
-            self.solver.write_state(counts, self._own, self._after)
-        tape.backward(grads=dict(zip(self._after.arrays(), bar.arrays(), strict=True)))
-        for own, total in zip(self._before.arrays(), bar.arrays(), strict=True):
-            wp.copy(total, own.grad)
-
-    def _forget(self, tape: Any) -> None:
-        """Set all adjoints to 0 except those of the parameters, which are summed over steps."""
-        kept = {own.ptr for own in self._own.arrays()}
-        for array, gradient in tape.gradients.items():
-            if isinstance(array, wp.array) and array.ptr not in kept:
-                gradient.zero_()
+            kept = {own.ptr for own in self._own.arrays()}  # summed over steps
+            for array, gradient in tape.gradients.items():
+                if isinstance(array, wp.array) and array.ptr not in kept:
+                    gradient.zero_()
 
     def parameters(self) -> Parameters:
         return self._own.gradients()
-
-
-EXACT = Exact()
 
 
 @dataclass(frozen=True)
@@ -307,7 +297,7 @@ class AdjointViscosity(AdjointEstimator):
         """Return the backward step for order 1; raise `InputError` for order 2, which takes two passes."""
         if self.order != 1:
             raise InputError(f"order is {self.order}, but must be 1 for derivatives with respect to an earlier state.")
-        step = EXACT.derivative(rollout)
+        step = AdjointStep(rollout)
         return _ViscousStep(step, rollout, self) if self.coefficient > 0.0 else step
 
     def back(self, forward_pass: ForwardPass, observe: Observer | None = None) -> Arrays:

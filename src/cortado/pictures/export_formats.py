@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
-from os import PathLike
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,15 +11,15 @@ import numpy as np
 from cortado.discretise.shapes import Points, in_space
 from cortado.errors import ComputationError, ExtraMissingError, InputError, shown
 from cortado.files.disk import as_path, sentences, unfinished, write_atomically
-from cortado.files.image_encoding import to_srgb
+from cortado.files.image_encoding import srgb_bytes
 from cortado.files.terminal import announce, track
 from cortado.pictures.exported import Exported, ExportedFrame, Pose
+from cortado.pictures.film import Computed
 from cortado.pictures.tracing.liquid_surface import Mesh
 from cortado.runs.frames import FRACTION, SolidMotion
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameters import QUANTITIES
 from cortado.scene.scene import Scene, as_scene
-from cortado.simulation import Simulation
 from cortado.version import __version__
 
 Advance = Callable[[], None]
@@ -59,8 +58,7 @@ def _write_series(
 
 
 def _write_meshes(run: Exported, folder: Path, advance: Advance, ending: str) -> Path:
-    """Write a series of files with trimesh in sRGB colours; return the folder."""
-    _write_series(run, folder, advance, ending, lambda what: _trimesh(what, _srgb).export(file_type=ending))
+    _write_series(run, folder, advance, ending, lambda what: _trimesh(what, srgb_bytes).export(file_type=ending))
     return folder
 
 
@@ -73,19 +71,15 @@ def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
     return folder / "run.pvd"
 
 
-def _files(
-    run: Exported, number: int, frame: ExportedFrame, ending: str
-) -> dict[str, tuple[str, ExportedFrame | Mesh]]:
+def _files(run: Exported, number: int, frame: ExportedFrame, ending: str) -> dict[str, tuple[str, Any]]:
     """Return names and contents of a frame's files, by part; a solid at rest has one file for all frames."""
-    found: dict[str, ExportedFrame | Mesh] = {"particles": frame}
+    found: dict[str, Any] = {"particles": (_numbered("particles", number, ending), frame)}
     if frame.surface is not None:
-        found["surface"] = frame.surface
-    found |= {solid.part: frame.poses[solid.name].of(solid.mesh) for solid in run.solids}
-    at_rest = {solid.part for solid in run.solids if not solid.moves}
-    return {
-        part: (f"{part}.{ending}" if part in at_rest else _numbered(part, number, ending), what)
-        for part, what in found.items()
-    }
+        found["surface"] = _numbered("surface", number, ending), frame.surface
+    for solid in run.solids:
+        name = _numbered(solid.part, number, ending) if solid.moves else f"{solid.part}.{ending}"
+        found[solid.part] = name, frame.poses[solid.name].of(solid.mesh)
+    return found
 
 
 def _numbered(name: str, number: int, ending: str) -> str:
@@ -95,20 +89,14 @@ def _numbered(name: str, number: int, ending: str) -> str:
 def _trimesh(what: Mesh | ExportedFrame, colours: Callable[[Any], Any]) -> Any:
     import trimesh
 
-    own = np.pad(colours(np.clip(what.colours, 0.0, 1.0)), ((0, 0), (0, 1)), constant_values=255)
+    own = np.pad(colours(what.colours), ((0, 0), (0, 1)), constant_values=255)
     if isinstance(what, ExportedFrame):
         return trimesh.PointCloud(what.positions, colors=own)
     return trimesh.Trimesh(what.points, what.triangles, vertex_normals=what.normals, vertex_colors=own, process=False)
 
 
-def _srgb(colours: Any) -> Any:
-    """Return sRGB bytes (p, 3) of linear colours (p, 3) from 0 to 1."""
-    return to_srgb(colours[None])[0]
-
-
 def _linear(colours: Any) -> Any:
-    """Return bytes (p, 3) proportional to linear colours (p, 3) from 0 to 1."""
-    return np.rint(255.0 * colours).astype(np.uint8)
+    return np.rint(255.0 * np.clip(colours, 0.0, 1.0)).astype(np.uint8)
 
 
 def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
@@ -237,7 +225,7 @@ def _pxr() -> Any:
 def _vtp(what: ExportedFrame | Mesh) -> str:
     """Return the text of a VTP file: a vertex per particle with velocity [m/s] and all fields, or a mesh with
     triangles, normals and, of a surface, velocities [m/s]."""
-    colours = {"colour": _srgb(np.clip(what.colours, 0.0, 1.0))}
+    colours = {"colour": srgb_bytes(what.colours)}
     velocities = {} if what.velocities is None else {"velocity": what.velocities}
     if isinstance(what, ExportedFrame):
         own = {name: in_space(values) if values.ndim == 2 else values for name, values in what.fields.items()}
@@ -298,11 +286,7 @@ FORMATS: dict[str, Callable[[Exported, Path, Advance], Path]] = {
 
 
 def export(
-    trajectory: Trajectory,
-    folder: str | PathLike[str],
-    to: str,
-    scene: Scene | str | PathLike[str],
-    simulation: Callable[[], Simulation] | None = None,
+    trajectory: Trajectory, folder: str | Path, to: str, scene: Scene | str | Path, simulation: Computed = None
 ) -> Path:
     """Export a trajectory for another program; see `Trajectory.export`. Return the file to open, or a series'
     folder."""
@@ -311,10 +295,11 @@ def export(
     if not len(trajectory):
         raise InputError("The trajectory has no frame, but must have one to be exported.")
     of, into = as_scene(scene), Path(as_path("folder", folder))
-    if of.dimension != trajectory.dimension or len(of.phase) != _phases(trajectory):
+    phases = 1 if trajectory.mass_fractions is None else trajectory.mass_fractions.shape[-1]
+    if of.dimension != trajectory.dimension or len(of.phase) != phases:
         raise InputError(
             f"scene has {of.dimension} dimensions and {len(of.phase)} phases, but must be that of the trajectory, with "
-            f"{trajectory.dimension} and {_phases(trajectory)}."
+            f"{trajectory.dimension} and {phases}."
         )
     run = Exported(trajectory, of, simulation)
     with sentences(into):
@@ -330,13 +315,6 @@ def export(
     return path
 
 
-def _phases(trajectory: Trajectory) -> int:
-    return 1 if trajectory.mass_fractions is None else trajectory.mass_fractions.shape[-1]
-
-
-Variables = dict[str, tuple[tuple[str, ...], Any, dict[str, str]]]
-
-
 def labelled(trajectory: Trajectory) -> Any:
     """Return a trajectory as a dataset of xarray; see `Trajectory.to_xarray`."""
     try:
@@ -344,7 +322,7 @@ def labelled(trajectory: Trajectory) -> Any:
     except ImportError as error:
         raise ExtraMissingError("xarray", "xarray") from error
     axes, of_particles = list("xyz"[: trajectory.dimension]), ("time", "particle")
-    variables: Variables = {
+    variables: dict[str, Any] = {
         "position": ((*of_particles, "space"), trajectory.positions, {"units": "m"}),
         "velocity": ((*of_particles, "space"), trajectory.velocities, {"units": "m/s"}),
     }
@@ -363,7 +341,7 @@ def labelled(trajectory: Trajectory) -> Any:
     if trajectory.solids:
         coordinates |= {"solid": ("solid", list(trajectory.solids))}
         coordinates |= {"rotation_axis": ("rotation_axis", axes)} if trajectory.dimension == 3 else {}
-        variables |= _of_solids(trajectory.solids, ("rotation_axis",) if trajectory.dimension == 3 else ())
+        variables |= _of_solids([*trajectory.solids.values()], ("rotation_axis",) if trajectory.dimension == 3 else ())
     attributes: dict[str, Any] = {"source": f"Cortado {__version__}"}
     if trajectory.origin is not None:
         attributes["spacing"] = trajectory.origin.spacing
@@ -371,17 +349,15 @@ def labelled(trajectory: Trajectory) -> Any:
     return xarray.Dataset(variables, coordinates, attributes)
 
 
-def _of_solids(solids: Mapping[str, SolidMotion], turned: tuple[str, ...]) -> Variables:
-    def over_time(
-        name: str, like: str, axes: tuple[str, ...], unit: str
-    ) -> tuple[tuple[str, ...], Any, dict[str, str]]:
-        pairs = [(getattr(one, name), getattr(one, like)) for one in solids.values()]
+def _of_solids(solids: list[SolidMotion], turned: tuple[str, ...]) -> dict[str, Any]:
+    def over_time(name: str, like: str, axes: tuple[str, ...], unit: str) -> tuple[Any, ...]:
+        pairs = [(getattr(one, name), getattr(one, like)) for one in solids]
         rows = [np.full_like(other, np.nan) if own is None else own for own, other in pairs]
         return ("time", "solid", *axes), np.stack(rows, axis=1), {"units": unit}
 
     return {
         "solid_position": over_time("positions", "positions", ("space",), "m"),
-        "solid_scale": (("solid",), [one.scale for one in solids.values()], {"units": "1"}),
+        "solid_scale": (("solid",), [one.scale for one in solids], {"units": "1"}),
         "solid_rotation": over_time("rotations", "rotations", turned, "rad"),
         "solid_velocity": over_time("velocities", "positions", ("space",), "m/s"),
         "solid_angular_velocity": over_time("angular_velocities", "rotations", turned, "rad/s"),

@@ -5,10 +5,11 @@ points around a connected body of fluid are moved in or out by the same distance
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import floor
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -19,18 +20,18 @@ from cortado.device.launching import BandLauncher
 from cortado.device.threads import WARP, usable_cores
 from cortado.discretise.shapes import Points, in_space
 from cortado.errors import ComputationError
-from cortado.pictures.film import coloured_by, is_out, shown_places, those
+from cortado.pictures.film import Computed, coloured_by, is_out, shown_places, those
 from cortado.pictures.painter import Scale, colours_of
-from cortado.pictures.shown_solids import ShownSolid, SolidMesh, shown_solids, turn_in_space
+from cortado.pictures.shown_solids import ShownSolid, SolidMesh, shown_solids
 from cortado.pictures.stage import Stage, upright
 from cortado.pictures.tracing.liquid_surface import Mesh, liquid_surface, nearest_colours, spheres
 from cortado.pictures.tracing.space import environment_of, particles_of, wetting
 from cortado.runs.frames import SAME, Marks, SolidMotions, fraction_names, posed, sized
+from cortado.runs.particle_sums import square
 from cortado.runs.trajectory import Frame, Trajectory
 from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import CylinderContainer
-from cortado.simulation import Simulation
 
 EVEN = 1e-6
 """Relative difference of time intervals below which recorded frames count as evenly spaced."""
@@ -137,7 +138,7 @@ class Pose:
 class ExportedSolid:
     name: str
     part: str
-    """Name in files."""
+    """Unique name in files: "solid_" and letters, digits and underscores."""
     mesh: Mesh
     """About the solid's middle, not rotated."""
     moves: bool
@@ -163,17 +164,18 @@ class ExportedFrame:
 class Exported:
     """A run and its scene in the form that exporters write; raise `InputError` if colours cannot be computed."""
 
-    def __init__(self, trajectory: Trajectory, scene: Scene, simulation: Callable[[], Simulation] | None = None):
+    def __init__(self, trajectory: Trajectory, scene: Scene, simulation: Computed = None):
         self.times, self.scene = trajectory.times, scene
         self._values = coloured_by(scene, trajectory, simulation)
         self._scale = None if self._values is None else Scale.of((scene.picture or Picture()).colour, self._values, "")
-        shown = _first_of_each(sized(scene, trajectory.solids))
-        parts = _part_names(shown)
-        self.solids = [_solid(one, parts[one.name], one.name in trajectory.solids) for one in shown.values()]
+        self.solids = list[ExportedSolid]()
+        for number, (name, one) in enumerate(_first_of_each(sized(scene, trajectory.solids)).items()):
+            part = f"solid_{re.sub(r'[^A-Za-z0-9_]', '_', name)}"
+            part = f"{part}_{number}" if part in {solid.part for solid in self.solids} else part
+            self.solids.append(_solid(one, part, name in trajectory.solids))
         self._trajectory = trajectory
-        self._held = (0.0, 1.0, 1.0)
-        """Time [s], volume within the surface and fluid's volume [m³], of the frame in which the two volumes differ
-        most."""
+        self._held = (0.0, 0.0, 1.0, 1.0)
+        """|volume within the surface / fluid's volume - 1|, time [s] and both volumes [m³], where this is greatest."""
 
     @cached_property
     def whole(self) -> WholeFrames:
@@ -205,9 +207,9 @@ class Exported:
     def in_words(self) -> str:
         """Describe the difference between the volumes within exported surfaces and the fluid's; empty if it is
         small."""
-        if _unlike(self._held) <= UNLIKE:
+        unlike, time, held, whole = self._held
+        if unlike <= UNLIKE:
             return ""
-        time, held, whole = self._held
         return f"at {time:.4g} s the surface encloses {held:.4g} m³, where there are {whole:.4g} m³ of fluid"
 
     def _frame(self, frame: Frame, recorded: int, solids: SolidMotions, number: int) -> ExportedFrame:
@@ -223,11 +225,11 @@ class Exported:
         named = dict(zip(fraction_names(fractions.shape[1]), fractions.T, strict=True)) | dict(frame.quantities)
         colours, fields = colours[shown], {name: values[shown] for name, values in named.items()}
         placed = _first_of_each(posed(self.scene, solids, number))
-        poses = {name: Pose(turn_in_space(one.turn), in_space(one.position)) for name, one in placed.items()}
+        poses = {name: Pose(square(one.turn), in_space(one.position)) for name, one in placed.items()}
         surface = self._surface(positions, velocities, colours) if self.scene.dimension == 3 else None
         if surface is not None and self._stage.picture.surface != "spheres":
-            volumes = enclosed(surface.points, surface.triangles), self.spacing**3 * len(positions)
-            self._held = max(self._held, (frame.time, *volumes), key=_unlike)
+            held, whole = enclosed(surface.points, surface.triangles), self.spacing**3 * len(positions)
+            self._held = max(self._held, (abs(held / whole - 1.0), frame.time, held, whole), key=itemgetter(0))
         return ExportedFrame(frame.time, positions, velocities, colours, fields, surface, poses)
 
     @cached_property
@@ -245,22 +247,8 @@ class Exported:
         return replace(found, velocities=nearest_colours(found.points, positions, velocities, self.spacing))
 
 
-def _unlike(held: tuple[float, float, float]) -> float:
-    """Return |volume within the surface / fluid's volume - 1|, given the time and both volumes."""
-    return abs(held[1] / held[2] - 1.0)
-
-
 def _first_of_each(scene: Scene) -> dict[str, ShownSolid]:
     return {one.name: one for one in reversed(shown_solids(scene))}
-
-
-def _part_names(solids: Iterable[str]) -> dict[str, str]:
-    """Return, by the solid's name, a unique name in files: "solid_" and letters, digits and underscores."""
-    found: dict[str, str] = {}
-    for number, name in enumerate(solids):
-        plain = f"solid_{re.sub(r'[^A-Za-z0-9_]', '_', name)}"
-        found[name] = f"{plain}_{number}" if plain in found.values() else plain
-    return found
 
 
 def _solid(shown: ShownSolid, part: str, moves: bool) -> ExportedSolid:
@@ -295,13 +283,11 @@ def enclosed(points: Points, triangles: np.ndarray) -> float:
     return float(_sixth(a, b, c).sum())
 
 
+Kept = Callable[[Points], Points]
+
+
 def with_volume(
-    points: Points,
-    triangles: np.ndarray,
-    ways: Points,
-    places: Points,
-    spacing: float,
-    kept: Callable[[Points], Points],
+    points: Points, triangles: np.ndarray, ways: Points, places: Points, spacing: float, kept: Kept
 ) -> Points:
     """Move the points (p, 3) [m] of a surface along ``ways`` (p, 3), unit vectors outwards or 0, so that each body of
     fluid encloses ``spacing``³ for each of its particles at ``places`` (n, 3) [m]; ``kept`` returns points beyond a

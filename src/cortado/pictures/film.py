@@ -22,12 +22,12 @@ from cortado.discretise.shapes import Points
 from cortado.errors import InputError
 from cortado.files.image_encoding import moving_picture
 from cortado.files.terminal import track
-from cortado.pictures.painter import Scale, colours_of, painter_on, stage_of
+from cortado.pictures.painter import Scale, colours_of, stage_of
 from cortado.pictures.plane import PlanePainter, PlaneStage
 from cortado.pictures.stage import Stage, upright
 from cortado.pictures.tracing.space import SpacePainter, State
 from cortado.pictures.tracing.steady import WINDOW
-from cortado.runs.frames import Film, Pace, SolidMotions, posed, sized, solid_motions
+from cortado.runs.frames import Film, Pace, SolidMotions, posed, sized
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.appearance import Moment, Picture, View
 from cortado.scene.emitter_table import emitted_name, outlet_name, samples, waits
@@ -36,7 +36,8 @@ from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 from cortado.version import __version__
 
-Ahead = Callable[[Iterator[Points]], Iterator[Points]]
+Computed = Callable[[], Simulation] | None
+"""Makes the simulation that computes colours which were not recorded."""
 Around = tuple[tuple[int, ...], tuple[int, ...]]
 """Numbers of the frames that a film shows before and after a frame, nearest first."""
 ALONE: Around = (), ()
@@ -65,14 +66,12 @@ class Page:
     def image(self, frame: int) -> Points:
         return self.composed([panel(frame, ALONE) for panel in self.panels])
 
-    def images(
-        self, frames: Sequence[int], ahead: Ahead = iter, begin: int = 0, window: int = WINDOW
-    ) -> Iterator[Points]:
+    def images(self, frames: Sequence[int], begin: int = 0, window: int = WINDOW) -> Iterator[Points]:
         """Yield the pictures of a film's frames from ``begin`` on, each drawn with ``window`` frames before and after
-        it."""
-        shown = range(begin, len(frames))
-        drawn = ahead(panel(frames[n], _around(frames, n, window)) for n in shown for panel in self.panels)
-        return (self.composed(list(islice(drawn, len(self.panels)))) for _ in shown)
+        it, while a thread draws the next."""
+        shown, count = range(begin, len(frames)), len(self.panels)
+        drawn = _ahead(count, (panel(frames[n], _around(frames, n, window)) for n in shown for panel in self.panels))
+        return (self.composed(list(islice(drawn, count))) for _ in shown)
 
 
 def _around(frames: Sequence[int], n: int, window: int) -> Around:
@@ -146,8 +145,7 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
         there = video.frames
         with track(len(shown) - there, "film") as advance:
-            window = 0 if pace.speed is not None and pace.speed < SLOW else WINDOW
-            images = page.images(shown, partial(_ahead, len(page.panels)), there, window)
+            images = page.images(shown, there, 0 if pace.speed < SLOW else WINDOW)
             for image, time in zip(images, pace.times[there:], strict=True):
                 video.add(image, time)
                 advance()
@@ -188,7 +186,8 @@ class ShownRun:
         return stage_of(scene, shown_places(self.scene, self.trajectory), poses)
 
     def panel(self, stage: PlaneStage | Stage, device: object, scale: Scale | None) -> Panel:
-        return FilmedRun(painter_on(stage, device), lambda k: self._state(k, stage, scale))
+        artist = PlanePainter(stage) if isinstance(stage, PlaneStage) else SpacePainter(stage, device)
+        return FilmedRun(artist, lambda k: self._state(k, stage, scale))
 
     @cached_property
     def times(self) -> NDArray[np.float64]:
@@ -208,31 +207,24 @@ class ShownRun:
         if scale is not None and self.values is not None:
             colours = scale.colours(self.values[k])
         fractions = None if frame.mass_fractions is None else frame.mass_fractions[shown]
-        return State(frame.positions[shown], colours[shown], self._pose(k), self._view(k, stage), fractions)
+        pose = posed(self.scene, self._motions, k) if self._motions else None
+        return State(frame.positions[shown], colours[shown], pose, self._view(k, stage), fractions)
 
     @cached_property
     def _motions(self) -> SolidMotions:
-        known = self.trajectory.times
-        return solid_motions(self.scene, self.trajectory.others).at(
-            self.scene, known, np.arange(len(known)), self.times
-        )
-
-    def _pose(self, k: int) -> Scene | None:
-        return posed(self.scene, self._motions, k) if self._motions else None
+        known, motions = self.trajectory.times, SolidMotions.of(self.trajectory.others, self.scene.dimension)
+        return motions.at(self.scene, known, np.arange(len(known)), self.times)
 
     def _view(self, k: int, stage: PlaneStage | Stage) -> View | None:
-        path = (self.scene.picture or Picture()).camera_path
+        scene, path = self.scene, (self.scene.picture or Picture()).camera_path
         if path is None or isinstance(stage, PlaneStage):
             return None
-        return path.view(stage.home_around if path.goes_around else stage.home, self._moment(k))
-
-    def _moment(self, k: int) -> Moment:
-        places = {table.name: table.middle() for table in self.scene.solid}
+        places = {table.name: table.middle() for table in scene.solid}
         places |= {name: motion.positions[k] for name, motion in self._motions.items()}
-        domain = self.scene.domain
-        places = {name: domain.wrapped(place) for name, place in places.items()}
-        up = upright(np.asarray(self.scene.forces.gravity))[1]
-        return Moment(k / max(len(self.trajectory) - 1, 1), float(self.times[k]), up, places)
+        places = {name: scene.domain.wrapped(place) for name, place in places.items()}
+        up = upright(np.asarray(scene.forces.gravity))[1]
+        moment = Moment(k / max(len(self.trajectory) - 1, 1), float(self.times[k]), up, places)
+        return path.view(stage.home_around if path.goes_around else stage.home, moment)
 
 
 def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[np.bool_]:
@@ -275,9 +267,7 @@ def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
     return np.maximum(trajectory.times[:, None] - since, 0.0)
 
 
-def coloured_by(
-    scene: Scene, trajectory: Trajectory, simulation: Callable[[], Simulation] | None = None
-) -> NDArray | None:
+def coloured_by(scene: Scene, trajectory: Trajectory, simulation: Computed = None) -> NDArray | None:
     """Return the values (frames, n) that colour particles in pictures, recorded or computed; None for the colours of
     phases.
 

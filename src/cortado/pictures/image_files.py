@@ -67,7 +67,7 @@ def heart(
 
     Example: ``target = cortado.pictures.heart((128, 128), cup=0.9)  # (128, 128, 3)``
     """
-    return _drawn(_in_heart, resolution, cup, size, (milk, coffee, background))
+    return _drawn(_in_heart, resolution, cup, size, [milk, coffee, background])
 
 
 @public
@@ -86,7 +86,7 @@ def rosetta(
 
     Example: ``target = cortado.pictures.rosetta((128, 128), cup=0.9)  # (128, 128, 3)``
     """
-    return _drawn(_in_rosetta, resolution, cup, size, (milk, coffee, background))
+    return _drawn(_in_rosetta, resolution, cup, size, [milk, coffee, background])
 
 
 @public
@@ -180,7 +180,7 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
 
 
 def _drawn(
-    shape: Shape, resolution: Resolution, cup: float | None, size: float, colours: tuple[Colour, Colour, Colour]
+    shape: Shape, resolution: Resolution, cup: float | None, size: float, colours: tuple[Colour, ...]
 ) -> Picture:
     for name, value in (("cup", 1.0 if cup is None else cup), ("size", size)):
         positive(name, value)

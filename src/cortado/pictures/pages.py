@@ -19,14 +19,13 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cortado.discretise.room import WITHOUT_PERIODS
 from cortado.errors import CortadoError, InputError
 from cortado.files.disk import write_atomically
 from cortado.losses import FinalPositions, Frames, Image, Snapshot
 from cortado.pictures.particle_view import Cloud, particle_view, script, style, thinned
-from cortado.pictures.plots import images, loss_curve, particles
+from cortado.pictures.plots import images, loss_curve, particles, spacing_of
 from cortado.pictures.shown_solids import solid_outline
 from cortado.problem import Problem
 from cortado.runs.frames import Film
@@ -72,12 +71,12 @@ def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> 
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{_safe(title)}</title>
+<title>{escape(title)}</title>
 <style>
 {look}</style>
 </head>
 <body>
-<h1>{_safe(title)}</h1>
+<h1>{escape(title)}</h1>
 {parts}
 {AGAIN}
 {_again(folder)}
@@ -96,7 +95,7 @@ def add_to_report(folder: RunFolder, caption: str, path: Path) -> None:
     page = folder.report.read_text(encoding="utf-8") if folder.report.exists() else ""
     before, again, after = page.partition(AGAIN)
     if again:
-        mark = f"<!-- {_safe(path.name)} -->"
+        mark = f"<!-- {escape(path.name)} -->"
         before = re.sub(f"{re.escape(mark)}.*\n", "", before) if LATER in before else f"{before}{LATER}\n"
         page = f"{before}{mark}{_figure(caption, path)}\n{again}{after}"
         write_atomically(folder.report, page.encode(errors="backslashreplace"))
@@ -120,30 +119,25 @@ def _number(value: Any) -> str:
     return f"{value}" if isinstance(value, int | np.integer | bool | np.bool_) else f"{float(value):.6g}"
 
 
-def _safe(text: object) -> str:
-    return escape(str(text))
-
-
 def _section(section: Section) -> str:
-    parts = [f"<p>{_safe(paragraph)}</p>" for paragraph in section.words]
-    parts += [f'<p class="failed">{_safe(paragraph)}</p>' for paragraph in section.failures]
+    parts = [f"<p>{escape(str(paragraph))}</p>" for paragraph in section.words]
+    parts += [f'<p class="failed">{escape(str(paragraph))}</p>' for paragraph in section.failures]
     parts += [_figure(caption, Path(path)) for caption, path in section.figures]
     parts += [section.view] if section.view else []
-    parts += [_table(section)] if section.rows else []
-    return "\n".join([f"<h2>{_safe(section.title)}</h2>", *parts]) if parts else ""
+    if section.rows:
+        head = "".join(f'<th scope="col">{escape(word)}</th>' for word in section.head)
+        rows = [f'<tr><th scope="row">{escape(str(first))}</th>{_cells(rest)}</tr>' for first, *rest in section.rows]
+        lines = [f"<tr>{head}</tr>" if head else "", *rows]
+        parts.append("\n".join(['<div class="wide"><table>', *lines, "</table></div>"]))
+    return "\n".join([f"<h2>{escape(section.title)}</h2>", *parts]) if parts else ""
 
 
-def _table(section: Section) -> str:
-    head = "".join(f'<th scope="col">{_safe(word)}</th>' for word in section.head)
-    rows = "\n".join(
-        f'<tr><th scope="row">{_safe(first)}</th>{"".join(f"<td>{_safe(written(entry))}</td>" for entry in rest)}</tr>'
-        for first, *rest in section.rows
-    )
-    return f'<div class="wide"><table>\n{f"<tr>{head}</tr>" if head else ""}\n{rows}\n</table></div>'
+def _cells(entries: Sequence[object]) -> str:
+    return "".join(f"<td>{escape(written(entry))}</td>" for entry in entries)
 
 
 def _figure(caption: str, path: Path) -> str:
-    return f"<figure>{_shown(path, caption)}<figcaption>{_safe(caption)}</figcaption></figure>"
+    return f"<figure>{_shown(path, caption)}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
 def _shown(path: Path, words: str, look: str = "") -> str:
@@ -156,8 +150,8 @@ def _shown(path: Path, words: str, look: str = "") -> str:
         raise InputError(f"The picture {path} cannot be read: {problem}.") from problem
     source = f'src="data:{kind};base64,{content}"{look}'
     if kind.startswith("video"):
-        return f'<video controls loop muted playsinline aria-label="{_safe(words)}" {source}></video>'
-    return f'<img alt="{_safe(words)}" {source}>'
+        return f'<video controls loop muted playsinline aria-label="{escape(words)}" {source}></video>'
+    return f'<img alt="{escape(words)}" {source}>'
 
 
 def _again(folder: RunFolder) -> str:
@@ -168,8 +162,8 @@ def _again(folder: RunFolder) -> str:
         return "<p>The command is not known.</p>"
     lines = "\n".join(shlex.join(command) for command in commands)
     return (
-        f"<pre>{_safe(lines)}</pre>\n<p>With --overwrite it takes the place of this run. The folder of the run is "
-        f"{_safe(folder.path)}; scene.json in it is the scene with everything that was replaced.</p>"
+        f"<pre>{escape(lines)}</pre>\n<p>With --overwrite it takes the place of this run. The folder of the run is "
+        f"{escape(str(folder.path))}; scene.json in it is the scene with everything that was replaced.</p>"
     )
 
 
@@ -179,12 +173,11 @@ def _details(label: str, path: Path) -> str:
     text = path.read_text(encoding="utf-8")
     with suppress(ValueError):  # what is not JSON is shown as it stands
         text = json.dumps(json.loads(text), indent=2, ensure_ascii=False)
-    return f"<details><summary>{_safe(label)}</summary><pre>{_safe(text)}</pre></details>"
+    return f"<details><summary>{escape(label)}</summary><pre>{escape(text)}</pre></details>"
 
 
 IN_MOTION = 1_000_000
 """[bytes]"""
-MANY = 2000
 MOST_NUMBERS = 6
 """Greatest number of a parameter's values in the table; for more values their range is shown."""
 HEAD = ("parameter", "unit", "first guess", "found")
@@ -209,7 +202,7 @@ def trajectory_page(run: Trajectory) -> str:
     chosen, stride = thinned(len(run), run.particles, 2 * run.dimension + 1, IN_MOTION)
     thin = [array[chosen, ::stride] for array in (run.positions, run.velocities)]
     cloud = Cloud("run", domain.wrapped(thin[0]), np.linalg.norm(thin[1], axis=2))
-    view = particle_view([cloud], run.times[chosen], _spacing(run.positions[0]), stride=stride)
+    view = particle_view([cloud], run.times[chosen], spacing_of(run.positions[0], 1.0), stride=stride)
     drawn = picture(run, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
     page = f"<!DOCTYPE html><meta charset='utf-8'><style>{style()}</style>{view}{script()}"
     frame = f'<iframe srcdoc="{escape(page)}" style="width: 100%; height: 600px; border: 0"></iframe>'
@@ -279,17 +272,8 @@ def picture(found: object, draw: Callable[[Path], Any]) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    def line(kind: str, cells: Sequence[str]) -> str:
-        written = (f'<{kind} style="text-align: left; padding: 0 1em .2em 0">{escape(cell)}</{kind}>' for cell in cells)
-        return f"<tr>{''.join(written)}</tr>"
-
-    return f"<table>{line('th', head)}{''.join(line('td', row) for row in rows)}</table>"
-
-
-def _spacing(positions: NDArray[Any]) -> float:
-    """Return the typical distance [m] between nearest neighbours among particles (n, d); 1 for a single particle."""
-    from scipy.spatial import KDTree
-
-    if len(positions) < 2:
-        return 1.0
-    return float(np.median(KDTree(positions).query(positions[:MANY], k=2)[0][:, 1])) or 1.0
+    lines = [
+        "".join(f'<{kind} style="text-align: left; padding: 0 1em .2em 0">{escape(cell)}</{kind}>' for cell in cells)
+        for kind, cells in (("th", head), *(("td", row) for row in rows))
+    ]
+    return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"

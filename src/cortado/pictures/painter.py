@@ -48,10 +48,7 @@ def painter(
     scene: Scene, positions: Points | Sequence[Points], device: Any = "cpu", poses: Iterable[Scene] = ()
 ) -> PlanePainter | SpacePainter:
     """Return the painter of a scene; arguments are as in `stage_of`, and ``device`` traces the rays."""
-    return painter_on(stage_of(scene, positions, poses), device)
-
-
-def painter_on(stage: PlaneStage | Stage, device: Any = "cpu") -> PlanePainter | SpacePainter:
+    stage = stage_of(scene, positions, poses)
     return PlanePainter(stage) if isinstance(stage, PlaneStage) else SpacePainter(stage, device)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.discretise.shapes import Points, corners, in_space
-from cortado.files.image_encoding import to_srgb
+from cortado.files.image_encoding import srgb_bytes
 from cortado.pictures.painter import colours_of
 from cortado.pictures.shown_solids import solid_outline
 from cortado.pictures.stage import upright
@@ -81,25 +81,26 @@ def particle_view(
         lines: (k, 2, d) ends of lines [m], such as the edges of a container.
         stride: the clouds contain every ``stride``-th particle (`thinned`).
     """
-    times, dimension = np.asarray(times, dtype=float), clouds[0].positions.shape[2]
+    times, (_, particles, dimension) = np.asarray(times, dtype=float), clouds[0].positions.shape
     ends = np.asarray(lines, dtype=float).reshape(-1, 2, dimension)
     shown = np.concatenate([array.reshape(-1, dimension) for array in (*(cloud.positions for cloud in clouds), ends)])
     lower, upper = np.nanmin(shown, axis=0).astype(float), np.nanmax(shown, axis=0).astype(float)
     middle, half = 0.5 * (lower + upper), np.maximum(0.5 * (upper - lower), 0.5 * spacing)
     fastest = max(float(np.nanmax(cloud.speeds, initial=0.0)) for cloud in clouds) or 1.0
+    plain = np.tile(_PLAIN, (particles, 1))
     drawn = [
         {
             "name": cloud.name,
             "still": cloud.colours is None or np.ndim(cloud.colours) == 2,
             "positions": _base64(np.round((cloud.positions - middle) / half * LARGEST).astype("<i2")),
             "speeds": _base64(np.round(cloud.speeds / fastest * 255).astype(np.uint8)),
-            "colours": _base64(_colours(cloud)),
+            "colours": _base64(srgb_bytes(plain if cloud.colours is None else cloud.colours)),
         }
         for cloud in clouds
     ]
     data = {
         "dimension": dimension,
-        "particles": clouds[0].positions.shape[1],
+        "particles": particles,
         "times": [float(f"{t:.6g}") for t in times],
         "seconds": float(np.clip(len(times) / 20.0, SHORTEST, LONGEST)),
         "half": _space(half).tolist(),
@@ -143,13 +144,6 @@ def _space(vectors: NDArray[Any]) -> NDArray[Any]:
     return np.array([float(f"{number:.6g}") for number in padded.ravel()]).reshape(padded.shape)
 
 
-def _colours(cloud: Cloud) -> NDArray[Any]:
-    """Return sRGB bytes, (n, 3) or (frames, n, 3)."""
-    particles = cloud.positions.shape[1]
-    colours = np.tile(_PLAIN, (particles, 1)) if cloud.colours is None else np.asarray(cloud.colours)
-    return to_srgb(colours.reshape(1, -1, 3)).reshape(colours.shape)
-
-
 def _base64(array: NDArray[Any]) -> str:
     return b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
@@ -181,15 +175,10 @@ def container_outline(scene: Scene) -> Points:
     container, ends = scene.container, scene.container.extent()
     if ends is None:
         return np.zeros((0, 2, scene.dimension))
-    if isinstance(container, CylinderContainer):
-        return _cup(container)
-    places = corners(*ends)
-    pairs = [(a, b) for a in range(len(places)) for b in range(a) if np.count_nonzero(places[a] != places[b]) == 1]
-    return places[np.array(pairs)]
-
-
-def _cup(container: CylinderContainer) -> Points:
-    """Return the lines (k, 2, 3) [m] of a cylinder: two circles, and four lines between them."""
+    if not isinstance(container, CylinderContainer):
+        places = corners(*ends)
+        pairs = [(a, b) for a in range(len(places)) for b in range(a) if np.count_nonzero(places[a] != places[b]) == 1]
+        return places[np.array(pairs)]
     angles = np.linspace(0.0, 2.0 * np.pi, ROUND, endpoint=False)
     axis = INDEX_OF_AXIS[container.axis]
     circle = np.insert(container.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1), axis, 0.0, axis=1)
@@ -201,12 +190,10 @@ def _cup(container: CylinderContainer) -> Points:
 
 
 def _cloud(scene: Scene, name: str, states: list[Any], turn: Points, stride: int) -> Cloud:
-    domain = scene.domain
-    positions = domain.wrapped(np.stack([state.positions[::stride] for state in states])) @ turn.T
+    positions = scene.domain.wrapped(np.stack([state.positions[::stride] for state in states])) @ turn.T
     speeds = np.stack([np.linalg.norm(state.velocities[::stride], axis=1) for state in states])
-    particles = positions.shape[1]
     if len(scene.phase) == 1:
-        return Cloud(name, positions, speeds, colours_of(scene, None, particles))
+        return Cloud(name, positions, speeds, colours_of(scene, None, positions.shape[1]))
     fractions = [None if state.mass_fractions is None else state.mass_fractions[::stride] for state in states]
-    colours = [colours_of(scene, one, particles) for one in fractions]
-    return Cloud(name, positions, speeds, np.stack(colours))
+    colours = np.stack([colours_of(scene, one, positions.shape[1]) for one in fractions])
+    return Cloud(name, positions, speeds, colours)

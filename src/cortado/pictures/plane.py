@@ -84,10 +84,8 @@ class PlaneStage:
         if container is not None:
             lower, upper = (np.asarray(end) for end in container.extent())
         else:
-            paper, solid_ends = (
-                0.0 if any(one.is_tank for one in solids) else spacing,
-                extents_of_solids([scene, *poses]),
-            )
+            paper = 0.0 if any(one.is_tank for one in solids) else spacing
+            solid_ends = extents_of_solids([scene, *poses])
             lower, upper = fluid_extent(thinned(positions), solid_ends)
             lower, upper = union([(lower - paper, upper + paper), *solid_ends])
         return cls(scene.picture or Picture(), container, lower, upper, spacing, solids)

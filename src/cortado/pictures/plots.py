@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cortado.discretise.shapes import Points
 from cortado.errors import InputError
 from cortado.files.disk import write_atomically
-from cortado.files.image_encoding import to_srgb
+from cortado.files.image_encoding import srgb_bytes, to_srgb
 
 PALETTE = ("#3d6b8e", "#c0763b", "#5b8a5a", "#8c5f7d", "#a89a4b", "#6b7a80", "#a8504f", "#4f8f8b")
 """Muted colours that remain distinguishable in print and for most colour-blind readers."""
@@ -206,9 +207,7 @@ def particles(
     return Path(path)
 
 
-def _bounds(
-    sets: list[NDArray[Any]], container: tuple[ArrayLike, ArrayLike] | None
-) -> tuple[NDArray[Any], NDArray[Any]]:
+def _bounds(sets: list[Points], container: tuple[ArrayLike, ArrayLike] | None) -> tuple[Points, Points]:
     """Return lower and upper corner (2,) [m] of the particles and the container, with a margin."""
     corners = [points[np.isfinite(points).all(axis=1), :2] for points in sets]
     if container is not None:
@@ -242,7 +241,7 @@ class _ColourScale:
     def rgb(self, points: NDArray[Any], colours: NDArray[Any] | None) -> NDArray[Any]:
         """Return colours (n, 3) from 0 to 1 of points, from ``colours`` or, if None, from the points' depth."""
         if colours is not None and colours.ndim == 2:
-            return to_srgb(colours[None])[0] / 255.0
+            return srgb_bytes(colours) / 255.0
         return self._map.to_rgba(_depth(points) if colours is None else colours)[:, :3]
 
 
@@ -262,17 +261,18 @@ def _draw_set(axes: Any, points: NDArray[Any], colours: NDArray[Any], title: str
     axes.set_title("\n".join([title, *notes]))
     kept = kept[::every]
     kept = kept[np.argsort(_depth(points)[kept], kind="stable")]
-    size, fill = np.full(len(kept), _spacing(points[kept])), colours[kept]
+    size, fill = np.full(len(kept), spacing_of(points[kept])), colours[kept]
     place = {"offsets": points[kept, :2], "offset_transform": axes.transData, "units": "xy"}
     discs = EllipseCollection(size, size, 0.0 * size, **place, facecolors=fill, edgecolors=0.82 * fill, linewidths=0.25)
     axes.add_collection(discs)
 
 
-def _spacing(points: NDArray[Any]) -> float:
-    """Return the median distance to the nearest neighbour [m], of at most a thousand particles."""
+def spacing_of(points: NDArray[Any], otherwise: float = 0.02) -> float:
+    """Return the median distance to the nearest neighbour [m], of at most a thousand particles; ``otherwise`` for a
+    single particle."""
     from scipy.spatial import cKDTree
 
     if len(points) < 2:
-        return 0.02
+        return otherwise
     chosen = points[:: -(-len(points) // 1000)]
-    return float(np.median(cKDTree(points).query(chosen, k=2)[0][:, 1])) or 0.02
+    return float(np.median(cKDTree(points).query(chosen, k=2)[0][:, 1])) or otherwise

@@ -20,7 +20,7 @@ from cortado.files.disk import as_path
 from cortado.files.image_encoding import ShadedPicture
 from cortado.files.terminal import announce
 from cortado.particles.state import Entry
-from cortado.pictures.film import LEAST_PIXELS, Page, ShownRun, coloured_by, film, lacking
+from cortado.pictures.film import LEAST_PIXELS, Computed, Page, ShownRun, coloured_by, film, lacking
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.pages import Figures
 from cortado.pictures.painter import Scale, side_by_side
@@ -87,15 +87,13 @@ def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | S
     return stage.framed(stage.ends, stage.picture.model_copy(update={"width": free})), scale.beside
 
 
-Units = Mapping[str, str]
+Units, Settings = Mapping[str, str], Mapping[str, Any]
+Given = Scene | str | Path | None
+"""A scene, the path of its file, or None for that of the trajectory."""
 
 
 def shown_run(
-    trajectory: Trajectory,
-    scene: Scene,
-    settings: Mapping[str, Any],
-    units: Units | None = None,
-    simulation: Callable[[], Simulation] | None = None,
+    trajectory: Trajectory, scene: Scene, settings: Settings, units: Units | None = None, simulation: Computed = None
 ) -> ShownRun:
     """Return a run prepared for pictures, with keys of [picture] replaced; ``simulation`` computes unrecorded
     colours."""
@@ -114,7 +112,7 @@ def film_of(run: ShownRun, path: str | Path, device: Any) -> Film:
     return film(Path(as_path("path", path)), run_page(run, device), range(len(run.trajectory)), pace)
 
 
-def simulation_picture(simulation: Simulation, frame: Frame, settings: Mapping[str, Any]) -> ShadedPicture:
+def simulation_picture(simulation: Simulation, frame: Frame, settings: Settings) -> ShadedPicture:
     if not isinstance(frame, Frame):
         raise InputError(f"frame is {shown(frame)}, but must be one frame of a trajectory, such as trajectory[-1].")
     units = _units_of_fields(simulation)
@@ -126,9 +124,7 @@ def simulation_picture(simulation: Simulation, frame: Frame, settings: Mapping[s
     return ShadedPicture.of(run_page(run, simulation.device).image(0))
 
 
-def simulation_film(
-    simulation: Simulation, trajectory: Trajectory, path: str | Path, settings: Mapping[str, Any]
-) -> Film:
+def simulation_film(simulation: Simulation, trajectory: Trajectory, path: str | Path, settings: Settings) -> Film:
     if not isinstance(trajectory, Trajectory):
         raise InputError(f"trajectory is {shown(trajectory)}, but must be one, as simulation.run returns it.")
     units = _units_of_fields(simulation)
@@ -136,9 +132,7 @@ def simulation_film(
     return film_of(run, path, simulation.device)
 
 
-def trajectory_picture(
-    trajectory: Trajectory, k: int, scene: Scene | str | Path | None, device: str, settings: Mapping[str, Any]
-) -> ShadedPicture:
+def trajectory_picture(trajectory: Trajectory, k: int, scene: Given, device: str, settings: Settings) -> ShadedPicture:
     count = len(trajectory)
     if k not in range(-count, count):
         raise InputError(f"k is {shown(k)}, but must be the number of one of {count} frames, such as 0 or -1.")
@@ -146,9 +140,7 @@ def trajectory_picture(
     return ShadedPicture.of(run_page(run, device_of(device)).image(k % count))
 
 
-def trajectory_film(
-    trajectory: Trajectory, path: str | Path, scene: Scene | str | Path | None, device: str, settings: Mapping[str, Any]
-) -> Film:
+def trajectory_film(trajectory: Trajectory, path: str | Path, scene: Given, device: str, settings: Settings) -> Film:
     return film_of(shown_run(trajectory, _scene_of(trajectory, scene), settings), path, device_of(device))
 
 
@@ -158,7 +150,7 @@ def device_of(name: str) -> Any:
     return device_named(name)
 
 
-def _scene_of(trajectory: Trajectory, given: Scene | str | Path | None) -> Scene:
+def _scene_of(trajectory: Trajectory, given: Given) -> Scene:
     found = trajectory.scene if given is None else as_scene(given)
     if found is None:
         raise InputError("The trajectory is from a file, which has no scene: give it, as scene=scene.")
@@ -172,14 +164,15 @@ def _units_of_fields(simulation: Simulation) -> dict[str, str]:
 
 
 def _alone(frame: Frame) -> Trajectory:
-    arrays = {"positions": frame.positions, "velocities": frame.velocities, "mass_fractions": frame.mass_fractions}
     return Trajectory(
         times=np.array([frame.time]),
         steps=np.zeros(1, dtype=int),
+        positions=frame.positions[None],
+        velocities=frame.velocities[None],
         diagnostics={"converged": np.zeros(0, dtype=bool)},
+        mass_fractions=None if frame.mass_fractions is None else frame.mass_fractions[None],
         others={name: values[None] for name, values in frame.others.items()},
         quantities={name: values[None] for name, values in frame.quantities.items()},
-        **{name: None if array is None else array[None] for name, array in arrays.items()},  # type: ignore[arg-type]
     )
 
 
@@ -187,7 +180,7 @@ WIDE = 16.0 / 9.0
 """Ratio of columns to rows for pictures of which a user sets only the number of lines."""
 
 
-def shown_as(scene: Scene, settings: Mapping[str, Any], fields: Collection[str] = ()) -> Scene:
+def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> Scene:
     """Return the scene with keys of [picture] replaced; ``colour`` may also name one of ``fields``. Raise `SceneError`
     for settings that do not fit."""
     given = {} if scene.picture is None else scene.picture.model_dump()
@@ -290,10 +283,8 @@ def gradient_check(certificate: Certificate, path: str | Path) -> Path:
         _growth(growth, certificate)
         _horizon(horizon, min(certificate.horizons, key=lambda one: one.measured, default=None))
         _estimators(estimators, certificate.alignment)
-        verdict = "right" if certificate.right else "WRONG"
-        figure.suptitle(
-            f"The adjoint is {verdict}; {certificate.particles} particles, {certificate.steps} steps", weight="bold"
-        )
+        verdict = f"The adjoint is {'right' if certificate.right else 'WRONG'}"
+        figure.suptitle(f"{verdict}; {certificate.particles} particles, {certificate.steps} steps", weight="bold")
     return Path(path)
 
 

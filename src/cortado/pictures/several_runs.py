@@ -97,25 +97,19 @@ def _trajectories(runs: Any) -> list[Trajectory]:
     return found
 
 
-def shown_alike(
-    scenes: Sequence[Scene], trajectories: Sequence[Trajectory], settings: Mapping[str, Any]
-) -> list[Scene]:
+def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: Mapping[str, Any]) -> list[Scene]:
     """Return the runs' scenes with the first scene's table [picture], after `shown_as`; raise `InputError` for unlike
     runs."""
     if not 0 < len(scenes) <= MOST_PICTURES:
         raise InputError(f"There are {len(scenes)} runs, but 1 to {MOST_PICTURES} can be side by side.")
     if len({scene.dimension for scene in scenes}) > 1:
         raise InputError("Some runs are in 2-D and some in 3-D, but all must have the same dimension.")
-    for scene, run in zip(scenes, trajectories, strict=True):
+    for scene, run in zip(scenes, runs, strict=True):
         if not len(run):
             raise InputError(f"The run of {scene.name} has no frames, but must have one to be shown.")
-    look = {"picture": scenes[0].picture}
-    found = [
-        shown_as(scene.model_copy(update=look), settings, run.others)
-        for scene, run in zip(scenes, trajectories, strict=True)
-    ]
-    missing = lacking(found[0])
-    if missing:
+    alike = [scene.model_copy(update={"picture": scenes[0].picture}) for scene in scenes]
+    found = [shown_as(scene, settings, run.others) for scene, run in zip(alike, runs, strict=True)]
+    if missing := lacking(found[0]):
         raise InputError(missing)
     return found
 

@@ -326,10 +326,3 @@ def _from_edges(points: Points, corners: Numbers, parts: Points, parents: Number
     beyond = parts[:, None] - sides[parents][:, :, :1]
     distances = np.einsum("pkjc,pkc->pkj", beyond, inwards[parents])
     return np.where((cosines_of(points, corners) < SHARP)[parents][..., None], distances, FAR)
-
-
-def turn_in_space(turn: Points) -> Points:
-    """Extend a rotation (d, d) to three dimensions; a 2-D rotation becomes one about z."""
-    found = np.eye(3)
-    found[: len(turn), : len(turn)] = turn
-    return found

@@ -23,6 +23,10 @@ ENOUGH = 1_000_000
 """Number of positions, sampled from all particles and frames, that determine the fluid's extent."""
 
 
+Box = tuple[Points, Points]
+"""Two points (d,) [m], such as lower and upper ends."""
+
+
 def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIODS) -> list[Points]:
     """Return states (m, d) [m] that determine the fluid's extent, within the period, from positions (n, d) or (frames,
     n, d) [m]."""
@@ -43,12 +47,8 @@ def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points
     near = NEAR * float(np.max(upper - lower))
     for state in later:
         low, high = _ends(state, SPILT)
-        found.append(
-            (
-                np.maximum(low - BEYOND * (high - low), state.min(axis=0)),
-                np.minimum(high + BEYOND * (high - low), state.max(axis=0)),
-            )
-        )
+        beyond = BEYOND * (high - low)
+        found.append((np.maximum(low - beyond, state.min(axis=0)), np.minimum(high + beyond, state.max(axis=0))))
         close = state[((state > lower - near) & (state < upper + near)).all(axis=1)]
         found += [_ends(close, DROPS)] if len(close) else []
     return union(found)
@@ -87,12 +87,11 @@ def media_of(scene: Scene, size: float) -> tuple[Points, float]:
     elif transparency > 0.0:
         plain = min(-np.log(transparency) / (SPAN * size), plain)
     media = [(one.scattering, one.absorption) if one else (plain, TINT * plain) for one in liquids]
-    through = [
-        float(np.exp(-SPAN * size * one.scattering) * np.mean(np.array(phase.colour) ** (SPAN * size * one.absorption)))
-        if one
-        else transparency
-        for one, phase in zip(liquids, scene.phase, strict=True)
-    ]
+    through, way = [transparency] * len(liquids), SPAN * size
+    for k, one in enumerate(liquids):
+        if one:
+            left = np.mean(np.array(scene.phase[k].colour) ** (way * one.absorption))
+            through[k] = float(np.exp(-way * one.scattering) * left)
     return np.array(media), float(np.mean(through))
 
 
@@ -331,9 +330,7 @@ def _towards(azimuth: float, elevation: float) -> Points:
     return np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
 
 
-def fitted(
-    lower: Points, upper: Points, elevation: float, picture: Picture, azimuth: float = AZIMUTH
-) -> tuple[Points, Points]:
+def fitted(lower: Points, upper: Points, elevation: float, picture: Picture, azimuth: float = AZIMUTH) -> Box:
     """Return the camera's position and its target point, (3,) each [m], so that a box fills the picture."""
     back, box = _towards(azimuth, elevation), corners(lower, upper)
     half = np.tan(0.5 * np.radians(picture.field_of_view)) / MARGIN

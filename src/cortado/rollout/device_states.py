@@ -22,7 +22,7 @@ from cortado.rollout.run_checks import one_for_each, shapes_of_fields
 from cortado.rollout.scene_parameters import Simulated
 from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.parameters import Axis, Role
-from cortado.scene.restart import Clock, RestartState
+from cortado.scene.restart import RestartState
 
 OfLost = Mapping[int, float]
 """Value of the derivatives of lost scenes by number: 0 if all given derivatives are 0, else NaN."""
@@ -66,8 +66,7 @@ class HostStates:
 
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> Any:
         """Return the state of a rollout after ``steps`` steps as read-only restart states, NaN for lost scenes."""
-        scenes = zip(clocks_after(rollout, steps), rollout.origins, strict=True)
-        found = self.states(state, [RestartState({}, clock, origin) for clock, origin in scenes], rollout.lost)
+        found = self.states(state, scenes_after(rollout, steps), rollout.lost)
         self._simulation.judged_states.update(found)
         return found[0] if self._simulation.batch is None else found
 
@@ -134,14 +133,16 @@ def time_of(what: str, given: Values, state: State) -> np.ndarray:
     return found
 
 
-def clocks_after(rollout: Rollout, steps: int) -> list[Clock]:
-    """Return each scene's clock after ``steps`` steps of a rollout; scenes with the same clock share the new clock."""
-    made: dict[tuple[int, float], Clock] = {}
-    for clock, size in zip(rollout.clocks, rollout.time_steps.tolist(), strict=True):
-        if (id(clock), size) not in made:
-            made[id(clock), size] = clock.after(steps, size)
-    each = zip(rollout.clocks, rollout.time_steps.tolist(), strict=True)
-    return [made[id(clock), size] for clock, size in each]
+def scenes_after(rollout: Rollout, steps: int) -> list[RestartState]:
+    """Return each scene's clock and origin after ``steps`` steps of a rollout, as restart states without fields; scenes
+    with the same clock and origin share one."""
+    made, found = dict[tuple[int, float, int], RestartState](), []
+    for clock, size, origin in zip(rollout.clocks, rollout.time_steps.tolist(), rollout.origins, strict=True):
+        key = id(clock), size, id(origin)
+        if key not in made:
+            made[key] = RestartState({}, clock.after(steps, size), origin)
+        found.append(made[key])
+    return found
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -190,16 +191,11 @@ class DeviceStates(HostStates):
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> DeviceState:
         """Copy the state of a rollout after ``steps`` steps to a `DeviceState`, which shares constant arrays with the
         `DeviceState` at which the rollout has ``begun``."""
-        made: dict[tuple[int, int], RestartState] = {}  # one for all scenes with equal clock and origin
-        keys = []
-        for clock, origin in zip(clocks_after(rollout, steps), rollout.origins, strict=True):
-            keys.append((id(clock), id(origin)))
-            if keys[-1] not in made:
-                made[keys[-1]] = RestartState({}, clock, origin)
-        self._simulation.judged_states.update(made.values())
+        scenes = scenes_after(rollout, steps)
+        self._simulation.judged_states.update(scenes)
         shares = isinstance(begun, DeviceState) and not rollout.lost
         own = _without_lost(dict.fromkeys(rollout.lost, np.nan), state.copy(begun.arrays if shares else None))
-        return DeviceState(own, tuple(made[key] for key in keys))
+        return DeviceState(own, tuple(scenes))
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
         fields = require_fields(what, given, to)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import as_numbers, as_one_number, check_steps
+from cortado.arrays import as_numbers, as_one_number, check_steps, require_names
 from cortado.device.threads import WARP
 from cortado.errors import InputError, OutOfRangeError, shown, warn
 from cortado.particles.state import Parameters, State
@@ -80,9 +80,7 @@ class ParameterSpace:
         return found
 
     def checked_names(self, what: str, names: Iterable[str]) -> list[str]:
-        if isinstance(names, str) or not isinstance(names, Iterable):
-            raise InputError(f"{what} is {shown(names)}, but must be a list of names, such as ['mobility'].")
-        found = list(names)
+        found = require_names(what, names)
         for name in found:
             check_known(name, self._simulation.scene, what, self._known)
         return found
@@ -195,11 +193,7 @@ class ParameterSpace:
         )
 
     def _go_on(
-        self,
-        rollout: Rollout,
-        members: list[Arrays],
-        states: Sequence[RestartState],
-        write: Callable[[State], None],
+        self, rollout: Rollout, members: list[Arrays], states: Sequence[RestartState], write: Callable[[State], None]
     ) -> None:
         rollout.begin_evaluation()
         rollout.clocks = [state.clock for state in states]
@@ -272,12 +266,7 @@ class ParameterSpace:
         return {**found, STATE_TIME: times[0] if self._batch is None else times}
 
     def gradient(
-        self,
-        rollout: Rollout,
-        values: Arrays,
-        state: State,
-        parameters: Parameters,
-        elsewhere: Collection[str] = (),
+        self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters, elsewhere: Collection[str] = ()
     ) -> Arrays:
         """Return the gradient with respect to ``values``, given adjoints of the first ``state`` and the parameters. In
         a batch, arrays have a first axis for the scenes. Names in ``elsewhere`` are left out."""

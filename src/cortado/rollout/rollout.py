@@ -32,7 +32,7 @@ from cortado.rollout.checkpoints import (
 )
 from cortado.rollout.step_sizes import StepSizes
 from cortado.scene.restart import Clock, Origin
-from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepLog, StepTangent
+from cortado.solvers.solver import Counts, Solver, StepLog, StepTangent
 
 Observer = Callable[[int, State], None]
 """Function of a state's number and the state, which later steps overwrite."""
@@ -68,9 +68,9 @@ class AdjointStep:
 
     capturable = True
 
-    def __init__(self, rollout: "Rollout", adjoint: StepAdjoint):
+    def __init__(self, rollout: "Rollout"):
         self.rollout, self.solver, self._parameters = rollout, rollout.solver, rollout.parameters
-        self._adjoint = adjoint
+        self._adjoint = self.solver.adjoint(rollout.steps)
 
     def begin(self) -> None:
         self._adjoint.begin()

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import as_one_number, as_precise_numbers, is_whole
+from cortado.calls import point_in_words
 from cortado.device.precision import Precision
 from cortado.discretise.room import TOLERANCE, Room
 from cortado.discretise.shapes import check_apart, check_crowding, nearest
@@ -44,7 +45,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
         for particle in outside(scene.room, positions[:free], spacing)[:1]:
-            place = place_in_words(positions[particle])
+            place = f"{point_in_words(positions[particle])} m"
             raise InputError(
                 f"parameter initial_positions has particle {particle} at {place}, outside the container or in a solid."
             )
@@ -67,7 +68,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
             places = (path[:, None] + opening).reshape(-1, scene.dimension)
             for step in outside(scene.room, places, spacing)[:1] // len(opening):
                 raise InputError(
-                    f"parameter {name} is at {place_in_words(path[step])} in step {step + 1}, but must be where all "
+                    f"parameter {name} is at {point_in_words(path[step])} m in step {step + 1}, but must be where all "
                     "of the opening is inside the container."
                 )
 
@@ -90,10 +91,6 @@ def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | Non
 def outside(room: Room, points: Any, spacing: float) -> np.ndarray:
     """Return the indices of points (n, d) [m] outside a room."""
     return np.flatnonzero(~room.contains(points, TOLERANCE * spacing))
-
-
-def place_in_words(point: np.ndarray) -> str:
-    return f"({', '.join(f'{x:g}' for x in point)}) m"
 
 
 class FirstPositions:
@@ -280,7 +277,7 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
     free = np.flatnonzero(in_fluid[: simulation.free_particles])
     for index in outside(scene.resting_room, positions[free], spacing)[:1] if held else ():
         particle = free[index]
-        place = place_in_words(positions[particle])
+        place = f"{point_in_words(positions[particle])} m"
         raise InputError(
             f"state positions has particle {particle} at {place}, outside the container of this scene or in a solid."
         )

@@ -24,6 +24,7 @@ from cortado.scene.parameter_values import (
 from cortado.scene.parameters import Axis, Changing, Source
 from cortado.scene.restart import Clock, RestartState
 from cortado.solvers.build import ForceMaker
+from cortado.solvers.solver import Solver
 
 DENSITY = "reference_density"
 """Name of the state field that the first mass fractions and the rest densities determine."""
@@ -41,23 +42,16 @@ class Simulated(Source, Protocol):
     """Restart states that need no further check."""
     batch: int | None
     """Number of scenes in a batch; None for a single scene."""
+    solver: Solver
+    precision: Precision
+    smoothing: SmoothingKernel
+    lattice: Lattice
+    """Constants of the lattice of particles at rest."""
+    free_particles: int
+    """Number of particles that do not wait in an emitter, the first ones."""
 
     @property
     def dimension(self) -> int: ...
-
-    @property
-    def precision(self) -> Precision: ...
-
-    @property
-    def smoothing(self) -> SmoothingKernel: ...
-
-    @property
-    def lattice(self) -> Lattice:
-        """Constants of the lattice of particles at rest."""
-
-    @property
-    def free_particles(self) -> int:
-        """Number of particles that do not wait in an emitter, the first ones."""
 
     @property
     def carried_by(self) -> str | None:

@@ -22,7 +22,6 @@ from cortado.rollout.device_states import (
     Given,
     HostStates,
     States,
-    clocks_after,
     of_lost,
     without_lost,
 )
@@ -32,15 +31,10 @@ from cortado.rollout.rollout import AdjointStep, BackwardStep, Residual, Rollout
 from cortado.rollout.run_checks import check_directions
 from cortado.rollout.scene_parameters import Simulated
 from cortado.scene.parameter_values import Arrays, Values
-from cortado.solvers.solver import Solver
 
 KEPT = 4
 MOST_GROWTH = 10.0
 """Greatest growth of an adjoint without a warning [e-folds]."""
-
-
-class Steppable(Simulated, Protocol):
-    solver: Solver
 
 
 class ReverseEstimator(Protocol):
@@ -84,11 +78,8 @@ class BackwardSteps:
         if require_hash(estimator) not in self._made:
             parts = solver.gradient_memory(self._rollout.log)
             require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
-            self._made[estimator] = (
-                AdjointStep(self._rollout, solver.adjoint(self._rollout.steps))
-                if estimator is None
-                else estimator.derivative(self._rollout)
-            )
+            make = AdjointStep if estimator is None else estimator.derivative
+            self._made[estimator] = make(self._rollout)
         return self._made[estimator]
 
 
@@ -124,7 +115,8 @@ class AdjointGrowth:
     def follow(self, rollout: Rollout, last: State, first: State) -> None:
         """Add a call with adjoints of the ``last`` and the ``first`` state; warn once if the growth exceeds
         `MOST_GROWTH`."""
-        start, end = (clocks_after(rollout, steps)[0].time for steps in (0, rollout.steps))
+        size = float(rollout.time_steps[0])
+        start, end = (rollout.clocks[0].after(steps, size).time for steps in (0, rollout.steps))
         into, out = ((_norm(bar.positions), _norm(bar.velocities)) for bar in (last, first))
         if not (abs(end - self._reached) < 0.5 * (end - start) / rollout.steps and any(self._begun)):
             self._begun, self._ended, self._within, self._steps = into, end, 0.0, 0
@@ -153,7 +145,7 @@ class Stepper:
     """A fixed number of steps of a simulation, as a function of the first state and of parameters. All calls share
     arrays, graphs and kernels."""
 
-    def __init__(self, simulation: Steppable, steps: int):
+    def __init__(self, simulation: Simulated, steps: int):
         """Prepare a rollout of ``steps`` steps, which may be 0."""
         self._simulation, self._space = simulation, ParameterSpace(simulation, steps)
         self._rows = DeviceRows(simulation, self._space)
@@ -212,11 +204,7 @@ class Stepper:
 
     @in_turn
     def step(
-        self,
-        state: Any,
-        parameters: Values | None = None,
-        along: Iterable[str] = (),
-        place: HostStates | None = None,
+        self, state: Any, parameters: Values | None = None, along: Iterable[str] = (), place: HostStates | None = None
     ) -> tuple[Any, StepResidual]:
         """Return the state after the steps, and a residual for `vjp` and `jvp`. Any number of residuals may exist.
 
@@ -409,7 +397,7 @@ class Stepping:
     def stepper(self, steps: int) -> Stepper:
         """Return the `Stepper` for this number of steps; the last few steppers are cached."""
         steppers: dict[int, Stepper] = self.__dict__.setdefault("_steppers", {})
-        found = steppers.pop(steps, None) or Stepper(cast(Steppable, self), check_steps(steps, least=0))
+        found = steppers.pop(steps, None) or Stepper(cast(Simulated, self), check_steps(steps, least=0))
         steppers[steps] = found  # the last one
         while len(steppers) > KEPT:
             steppers.pop(next(iter(steppers)))

@@ -14,7 +14,7 @@ from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 from cortado.runs.particle_sums import LoadSum, NoSum, Summed
 from cortado.runs.quantity_formulas import SIX, Bars, QuantityFormula
-from cortado.runs.sensor import Reading, SensedScene
+from cortado.runs.sensor import Reading, SensedScene, named
 from cortado.scene.motions import Pose, angular_velocity_name, position_name, velocity_name
 from cortado.scene.parameters import load_name
 from cortado.scene.springs import Ends
@@ -92,9 +92,7 @@ class SpringForce(Summed):
 
     def __init__(self, spring: str):
         """Take the name of a ``spring`` in the scene."""
-        if not isinstance(spring, str) or not spring:
-            raise InputError(f"spring is {shown(spring)}, but must be the name of a spring.")
-        self.spring = spring
+        self.spring = named("spring", spring, "spring")
 
     def columns(self, dimension: int) -> dict[str, str]:
         return {"force": "N" if dimension == 3 else "N/m", "length": "m"}
@@ -121,9 +119,7 @@ class BodyMotion(Summed):
 
     def __init__(self, solid: str):
         """Take the name of a ``solid`` of the scene that moves freely."""
-        if not isinstance(solid, str) or not solid:
-            raise InputError(f"solid is {shown(solid)}, but must be the name of a solid.")
-        self.solid = solid
+        self.solid = named("solid", solid, "solid")
 
     def columns(self, dimension: int) -> dict[str, str]:
         axes = "xyz"[:dimension]

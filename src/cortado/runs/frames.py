@@ -20,7 +20,6 @@ from cortado.scene.motions import (
     AXES,
     angular_velocity_name,
     courses,
-    moving,
     position_name,
     rotation_name,
     scale_name,
@@ -48,6 +47,9 @@ SHORT = 1.5
 EARLY = 1e-6
 """Tolerance, in frame intervals, for the test whether the last frame was recorded before it was due."""
 EASY = (5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)
+
+
+Fields = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -91,57 +93,40 @@ def common_rate(each: Iterable[Marks | None]) -> float | None:
 
 
 def frame_writer(
-    path: str | Path,
-    times: NDArray[Any],
-    first: Mapping[str, NDArray[Any]],
-    constants: Mapping[str, NDArray[Any]],
-    steps: int,
-    diagnostics: Mapping[str, NDArray[Any]],
-    origin: Origin | None,
-    quantities: Iterable[str] = (),
-    marks: Marks | None = None,
-    expected: int | None = None,
-    kept: int = 1,
+    path: str | Path, first: Fields, diagnostics: Fields, origin: Origin | None, marks: Marks | None, **layout: Any
 ) -> vtkhdf.TrajectoryWriter:
-    """Open a trajectory file for frames at ``times`` (frames,) [s] with the fields of ``first`` and the named
-    ``quantities``. The other arguments are those of `TrajectoryWriter`."""
+    """Open a trajectory file for frames with the fields of ``first``. ``layout``: the names of ``quantities``, and
+    further arguments of `TrajectoryWriter`."""
+    quantities = layout.pop("quantities")
     particles, dimension = first["positions"].shape[-2:]
     single = first["positions"].dtype == np.float32
     vectors = [name for name in quantities if len(QUANTITIES[name].shape(particles, dimension)) == 2]
     numbers = [name for name in quantities if name not in vectors]
     return vtkhdf.TrajectoryWriter(
         path,
-        times=times,
         particles=particles,
         dimension=dimension,
         precision="float32" if single else "float64",
-        steps=steps,
         scalars=[*fraction_names(first["mass_fractions"].shape[-1] if "mass_fractions" in first else 0), *numbers],
         vectors=vectors,
         others=_others(first),
-        constants=constants,
         diagnostics={name: column.dtype for name, column in diagnostics.items()},
         origin="" if origin is None else origin.to_json(),
         marks=() if marks is None else (marks.start, marks.rate),
-        expected=expected,
-        kept=kept,
+        **layout,
     )
 
 
 def append_frame(
-    writer: vtkhdf.TrajectoryWriter,
-    frame: Mapping[str, NDArray[Any]],
-    step: int,
-    quantities: Mapping[str, NDArray[Any]] | None = None,
-    time: float | None = None,
+    writer: vtkhdf.TrajectoryWriter, frame: Fields, step: int, quantities: Fields, time: float | None = None
 ) -> None:
     """Write the frame after ``step`` steps, with ``time`` [s] if it differs from the time given to `frame_writer`."""
     fractions = frame["mass_fractions"].T if "mass_fractions" in frame else ()
-    scalars = {**dict(zip(fraction_names(len(fractions)), fractions, strict=True)), **(quantities or {})}
+    scalars = {**dict(zip(fraction_names(len(fractions)), fractions, strict=True)), **quantities}
     writer.append(frame["positions"], frame["velocities"], step=step, time=time, others=_others(frame), **scalars)
 
 
-def _others(frame: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _others(frame: Fields) -> dict[str, NDArray[Any]]:
     return {name: frame[name] for name in frame if name not in ("positions", "velocities", "mass_fractions")}
 
 
@@ -155,12 +140,12 @@ class Pace:
 
     frames: tuple[int, ...]
     times: tuple[float, ...]
-    speed: float | None
-    """simulated seconds per second of film [-]; None if times are unknown"""
+    speed: float
+    """simulated seconds per second of film [-]"""
     recorded: int
-    enough: float = 0.0
-    """frames per simulated second [1/s] that give the film `USUAL` frames per second; 0 if times are unknown"""
-    is_asked: bool = False
+    enough: float
+    """frames per simulated second [1/s] that give the film `USUAL` frames per second"""
+    is_asked: bool
     of_search: bool = False
     """True for the frames of a search, whose number is the key ``film_frames`` of [picture]"""
 
@@ -186,19 +171,12 @@ class Pace:
         shown = tuple((times[k] - times[0]) / speed for k in chosen)
         return cls(tuple(chosen), shown, speed, len(times), enough, is_asked)
 
-    @classmethod
-    def unknown(cls, count: int) -> Pace:
-        rate = float(np.clip(count / SHORTEST, SLOWEST, USUAL))
-        return cls(tuple(range(count)), tuple(k / rate for k in range(count)), None, count)
-
     @property
     def frames_per_second(self) -> float:
         return (len(self.frames) - 1) / self.times[-1] if self.times[-1] > 0.0 else USUAL
 
     @property
     def in_words(self) -> str:
-        if self.speed is None:
-            return "step by step"
         return "in real time" if self.speed == 1.0 else f"at {self.speed:g} x"
 
     @property
@@ -207,7 +185,7 @@ class Pace:
 
     @property
     def _more(self) -> str:
-        if self.of_search and self.speed is not None:
+        if self.of_search:
             return f"picture.film_frames={self.enough * self._span + 1.0:.0f}"
         return f"--fps {self.enough:.4g}" if self.enough < 1e3 else f"--fps {self.enough:.0f}"
 
@@ -216,18 +194,15 @@ class Pace:
         kept = f"{counted(len(self.frames), 'frame')}, {self.seconds:.1f} s, {self.in_words}"
         if left_out:
             kept += f"; {left_out} of the {self.recorded} that were recorded are left out"
-        if self.speed is not None and 1 < len(self.frames) == self.recorded and self._lacks:
+        lacks = self.frames_per_second < SMOOTH or self.speed > SHORT * USUAL / self.enough
+        if 1 < len(self.frames) == self.recorded and lacks:
             kept += f", with {self.frames_per_second:.2g} frames a second, as no more were recorded: {self._more} "
             kept += f"records {USUAL:g} for each second of a film of {self.enough * self._span / USUAL:.2g} s"
-        return kept if self.is_asked or self.speed in (None, 1.0) else f"{kept}; picture.film_speed=1 is real time"
+        return kept if self.is_asked or self.speed == 1.0 else f"{kept}; picture.film_speed=1 is real time"
 
     @property
     def _span(self) -> float:
-        return self.times[-1] * (self.speed or 0.0)
-
-    @property
-    def _lacks(self) -> bool:
-        return self.frames_per_second < SMOOTH or (self.speed or 0.0) > SHORT * USUAL / self.enough
+        return self.times[-1] * self.speed
 
 
 @dataclass(frozen=True)
@@ -302,6 +277,17 @@ class SolidMotion:
     scale: float = 1.0
     """size of a solid with prescribed motion relative to its size in the scene"""
 
+    @classmethod
+    def of(cls, name: str, fields: Mapping[str, NDArray[Any]], dimension: int) -> Self:
+        position, begun = (fields[of(name)][:, 0].astype(np.float64) for of in (position_name, rotation_name))
+        if f"{name}.{AXES[0]}" in fields:  # of a body that is free
+            axes = np.stack([fields[f"{name}.{axis}"][:, 0].astype(np.float64) for axis in AXES], axis=-1)
+            velocities, spins = (fields[of(name)][:, 0] for of in (velocity_name, angular_velocity_name))
+            return cls(position, _turned(axes + np.eye(dimension, 3), begun, dimension), velocities, spins)
+        turns = fields[turn_name(name)][:, 0].astype(np.float64)
+        rotations = turns + begun if dimension == 2 else _product(turns, begun)
+        return cls(position, rotations, scale=float([*fields[scale_name(name)][:, 0], 1.0][0]))
+
     def __getitem__(self, frames: slice | NDArray[np.intp]) -> Self:
         velocities, spins = (None if a is None else a[frames] for a in (self.velocities, self.angular_velocities))
         places, turns = self.positions[frames], self.rotations[frames]
@@ -333,12 +319,14 @@ class SolidMotion:
 class SolidMotions(dict[str, SolidMotion]):
     """Motions of solids by name; an unknown name raises `InputError`."""
 
+    @classmethod
+    def of(cls, fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotions:
+        """Return the motions of all solids in recorded fields (frames, 1, ...)."""
+        return cls({name: SolidMotion.of(name, fields, dimension) for name in solids_in(fields)})
+
     def __missing__(self, name: object) -> SolidMotion:
         known = f"moved {', '.join(self)}" if self else "moved none"
         raise InputError(f"solids has no {shown(name)}, as the run {known}.")
-
-    def in_frames(self, frames: slice) -> SolidMotions:
-        return SolidMotions({name: motion[frames] for name, motion in self.items()})
 
     def at(self, scene: Scene, known: NDArray[Any], recorded: NDArray[np.intp], times: NDArray[Any]) -> SolidMotions:
         """Return the motions at ``times`` (k,) [s], each close to the frame ``recorded`` (k,) of frames at ``known``
@@ -353,28 +341,6 @@ class SolidMotions(dict[str, SolidMotion]):
                 if name in tables or motion.velocities is not None
             }
         )
-
-
-def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> SolidMotions:
-    names = (table.name for table in moving(scene.solid) if position_name(table.name) in fields)
-    return SolidMotions({name: _motion(name, fields, scene.dimension) for name in names})
-
-
-def motions_in(fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotions:
-    """Return the motions of all solids in recorded fields (frames, 1, ...)."""
-    return SolidMotions({name: _motion(name, fields, dimension) for name in solids_in(fields)})
-
-
-def _motion(name: str, fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotion:
-    position, begun = (fields[of(name)][:, 0].astype(np.float64) for of in (position_name, rotation_name))
-    if f"{name}.{AXES[0]}" in fields:  # of a body that is free
-        axes = np.stack([fields[f"{name}.{axis}"][:, 0].astype(np.float64) for axis in AXES], axis=-1)
-        moving: dict[str, Any] = {"velocities": fields[velocity_name(name)][:, 0]}
-        moving["angular_velocities"] = fields[angular_velocity_name(name)][:, 0]
-        return SolidMotion(position, _turned(axes + np.eye(dimension, 3), begun, dimension), **moving)
-    turns = fields[turn_name(name)][:, 0].astype(np.float64)
-    rotations = turns + begun if dimension == 2 else _product(turns, begun)
-    return SolidMotion(position, rotations, scale=float([*fields[scale_name(name)][:, 0], 1.0][0]))
 
 
 def _turned(axes: NDArray[Any], begun: NDArray[Any], dimension: int) -> NDArray[Any]:

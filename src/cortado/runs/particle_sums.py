@@ -92,9 +92,10 @@ def ride_of(on: str | None, turns: bool, at: SensedScene) -> Ride | None:
     return ride
 
 
-def square(matrix: NDArray[Any]) -> NDArray[Any]:
+def square(turn: NDArray[Any]) -> NDArray[Any]:
+    """Extend a rotation (d, d) to three dimensions; a 2-D rotation becomes one about z."""
     found = np.eye(3)
-    found[: len(matrix), : len(matrix)] = matrix
+    found[: len(turn), : len(turn)] = turn
     return found
 
 
@@ -104,12 +105,6 @@ def together(*each: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         for name, bar in bars.items():
             found[name] = found[name] + bar if name in found else bar
     return found
-
-
-def named(on: Any) -> str | None:
-    if on is not None and (not isinstance(on, str) or not on):
-        raise InputError(f"on is {shown(on)}, but must be the name of a solid that moves.")
-    return on
 
 
 def axes_of(axes: Any, is_carried: bool) -> Axes:
@@ -128,19 +123,11 @@ LEAST_REACH = 5.0
 MOST_PARTS = 40
 
 
-@dataclass(frozen=True)
-class Weights:
-    """Weights w(q) = (1 - q)^4 (1 + 4 q), 0 for q > 1, where q is distance / reach (Wendland 1995)."""
-
-    values: NDArray[Any]
-    """w"""
-    slopes: NDArray[Any]
-    """w'(q) / q"""
-
-    @classmethod
-    def of(cls, q: NDArray[Any]) -> "Weights":
-        rest = np.clip(1.0 - q, 0.0, None)
-        return cls(rest**4 * (1.0 + 4.0 * q), -20.0 * rest**3)
+def weights_of(q: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return weights w(q) = (1 - q)^4 (1 + 4 q), 0 for q > 1, where q is distance / reach (Wendland 1995), and w'(q) /
+    q."""
+    rest = np.clip(1.0 - q, 0.0, None)
+    return rest**4 * (1.0 + 4.0 * q), -20.0 * rest**3
 
 
 Across = Callable[[NDArray[Any]], NDArray[Any]]
@@ -177,7 +164,9 @@ class Image:
 
     near: NDArray[np.int_]
     ways: NDArray[Any]
-    weights: Weights
+    weights: NDArray[Any]
+    slopes: NDArray[Any]
+    """The second result of `weights_of`."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +192,7 @@ class Seen:
             close = np.flatnonzero(np.linalg.norm(way, axis=1) < widest)
             for shift in shifts:
                 own = way[close] + shift
-                images.append(Image(numbers[close], own, Weights.of(np.linalg.norm(own, axis=1) / reach)))
+                images.append(Image(numbers[close], own, *weights_of(np.linalg.norm(own, axis=1) / reach)))
         return cls(images, len(at["positions"]), len(shifts), reach)
 
     @property
@@ -211,14 +200,14 @@ class Seen:
         """Return the weights (n,) of particles: the mean over parts, summed over images."""
         found = np.zeros(self.particles)
         for image in self.images:
-            found[image.near] += image.weights.values
+            found[image.near] += image.weights
         return found / self.parts
 
     def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
         """Convert the derivative with respect to the weights (n,) to that with respect to the vectors (n, k)."""
         each, found = np.broadcast_to(factors, self.particles), np.zeros((self.particles, self.images[0].ways.shape[1]))
         for image in self.images:
-            found[image.near] += (each[image.near] * image.weights.slopes / self.reach**2)[:, None] * image.ways
+            found[image.near] += (each[image.near] * image.slopes / self.reach**2)[:, None] * image.ways
         return found / self.parts
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cortado.calls import fixed, point_in_words
 from cortado.discretise.shapes import Points, corners, grid, in_space
-from cortado.errors import InputError, shown, warn
+from cortado.errors import InputError, warn
 from cortado.runs.body_sensors import BodyMotion, SpringForce
 from cortado.runs.particle_sums import (
     ACROSS,
@@ -26,14 +26,24 @@ from cortado.runs.particle_sums import (
     axes_of,
     in_the_scene,
     load_bars,
-    named,
     parts_of,
     reach_of,
     ride_of,
     together,
     turned,
 )
-from cortado.runs.sensor import Cut, Reading, SensedScene, Sensor, corner, direction, in_dimension, point, positive
+from cortado.runs.sensor import (
+    Cut,
+    Reading,
+    SensedScene,
+    Sensor,
+    corner,
+    direction,
+    in_dimension,
+    named,
+    point,
+    positive,
+)
 from cortado.runs.wave_gauge import WaveGauge
 from cortado.scene.parameters import load_name
 from cortado.scene.scene import Scene
@@ -54,7 +64,7 @@ class PressureProbe(Summed):
         out. ``on`` names a solid that carries the probe from this initial position."""
         self.position = point("position", position)
         self.radius = None if radius is None else positive("radius", radius)
-        self.on = named(on)
+        self.on = None if on is None else named("on", on, "solid that moves")
 
     def columns(self, dimension: int) -> dict[str, str]:
         return {"pressure": "Pa"}
@@ -151,7 +161,7 @@ class WallForce(LoadSensor):
             raise InputError("lower, upper and about must have the same number of components.")
         if self.lower is not None and self.upper is not None and not (self.lower < self.upper).all():
             raise InputError(f"upper is {self.upper.tolist()}, but must be greater than lower, {self.lower.tolist()}.")
-        self.on = named(on)
+        self.on = None if on is None else named("on", on, "solid that moves")
         self.axes = axes_of(axes, on is not None)
 
     def summed(self, at: SensedScene) -> RegionSum:
@@ -208,9 +218,7 @@ class SolidLoad(LoadSensor):
     def __init__(self, solid: str, axes: Axes = "world"):
         """Take the name of a ``solid`` in the scene. ``axes`` of force and torque are those of the "world", or of the
         "body" of a moving solid, which turn with it."""
-        if not isinstance(solid, str) or not solid:
-            raise InputError(f"solid is {shown(solid)}, but must be the name of a solid.")
-        self.solid, self.axes = solid, axes_of(axes, True)
+        self.solid, self.axes = named("solid", solid, "solid"), axes_of(axes, True)
 
     def summed(self, at: SensedScene) -> LoadSum:
         return LoadSum(load_name(self.solid))
@@ -288,14 +296,9 @@ MOST = 16
 class Prepared(Cut, Protocol):
     """A simulation, as the checks of sensors need it."""
 
-    @property
-    def scene(self) -> Scene: ...
-
-    @property
-    def positions(self) -> Points: ...
-
-    @property
-    def walls(self) -> Points: ...
+    scene: Scene
+    positions: Points
+    walls: Points
 
 
 def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
@@ -319,7 +322,9 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
     if all(there):
         what = {PressureProbe: "is at", WaveGauge: "has its column at", FlowRate: "has its plane through"}[type(sensor)]
         reads = f"its floor, {sensor.floor:g} m" if isinstance(sensor, WaveGauge) else "0"
-        reads += f", or what is within its {key}{_in_metres(scene, place)}"
+        ends = scene.container.extent()
+        is_far = ends is not None and np.abs(place).max() > 10.0 * np.abs(ends).max()
+        reads += f", or what is within its {key}{' (positions are in metres)' if is_far else ''}"
         return f"{what} {point_in_words(place)} m, {' and '.join(dict.fromkeys(filter(None, there)))}: it reads {reads}"
     wide = getattr(sensor, key)
     if wide is not None and wide < 0.5 * spacing:
@@ -412,12 +417,6 @@ def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
     for k in free[is_shut_off(scene, simulation.positions, points[free])]:
         found[k] = "shut off from all fluid by solids"
     return found
-
-
-def _in_metres(scene: Scene, place: Points) -> str:
-    ends = scene.container.extent()
-    far = ends is not None and np.abs(place).max() > 10.0 * np.abs(ends).max()
-    return " (positions are in metres)" if far else ""
 
 
 def _without_walls(simulation: Prepared, sensor: WallForce) -> str | None:

@@ -35,7 +35,6 @@ from cortado.particles.wall_terms import ALL_WALLS
 from cortado.scene.parameters import load_name
 from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.particles import ParticleSolver
-from cortado.sph.density import WallAction
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 SIX = wp.types.vector(6, wp.float64)
@@ -233,24 +232,26 @@ class WallLoads:
     """The forces of particles on the walls of a ``solid``, by number, or on `ALL_WALLS`: (n,) [N]."""
 
     def __init__(self, solver: ParticleSolver):
-        self._solver, self._kernels, self.cell = solver, wall_force_kernels(solver.discretisation), solver.lattice.cell
+        self._kernels, self.cell = wall_force_kernels(solver.discretisation), solver.lattice.cell
         power, scale = float(solver.density_power), self.cell * solver.lattice.volume
         self._numbers = {"power": power, "scale": scale, "cell": self.cell}
         self._push, self._images = solver.wall_push(), solver.image_loads()
-        self._rubs, self._twists = self._actions("wall_action"), self._actions("wall_couple")
+        self._rubs, self._twists = (
+            [action for force in solver.forces if (action := getattr(force, name, None)) is not None]
+            for name in ("wall_action", "wall_couple")
+        )
         names = ("rub", "f", "twist", "by_images", "rub_dot", "f_dot", "twist_dot", "by_images_dot")
         self._vectors = {name: solver.vectors() for name in names}
         self._bars = {name: solver.vectors() for name in ("push_bar", "rub_bar", "by_images_bar")}
 
-    def _actions(self, name: str) -> list[WallAction]:
-        return [action for force in self._solver.forces if (action := getattr(force, name, None)) is not None]
-
-    def forces(self, step: StepContext, p: wp.array, solid: int) -> wp.array:
+    def value(self, step: StepContext, p: Any, solid: int = ALL_WALLS) -> wp.array:
         found, known = self._vectors["f"], self._sums(step, p, solid)
         step.launch(self._kernels.forward, known, self._numbers, f=found)
         return found
 
-    def tangent(self, step: StepContext, p: wp.array, p_dot: wp.array, along: Tangents, solid: int) -> wp.array:
+    def tangent(
+        self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any, solid: int = ALL_WALLS
+    ) -> wp.array:
         rub_dot = self._total("rub_dot", [action.tangent(step, along, solid) for action in self._rubs])
         dots = {"push_dot": self._push.tangent(step, along, solid), "rub_dot": rub_dot, "p_dot": p_dot}
         dots["by_images_dot"] = self._vectors["by_images_dot"]
@@ -260,9 +261,9 @@ class WallLoads:
         step.launch(self._kernels.tangent, known, dots, *along.named, self._numbers, f_dot=found)
         return found
 
-    def adjoint(self, step: StepContext, p: wp.array, f_bar: wp.array, bar: Bars, solid: int) -> None:
+    def adjoint(self, step: StepContext, p: Any, own: wp.array, bar: Bars, solid: int = ALL_WALLS) -> None:
         known, bars = self._sums(step, p, solid), {**self._bars, "p_bar": bar.p}
-        step.launch(self._kernels.adjoint, known, bars, *bar.of.named, self._numbers, f_bar=f_bar)
+        step.launch(self._kernels.adjoint, known, bars, *bar.of.named, self._numbers, f_bar=own)
         self._push.adjoint(step, bar.of, solid, self._bars["push_bar"], bar.v_star)
         if self._images is not None:
             self._images.adjoint(step, bar.of, solid, p, self._bars["by_images_bar"], bar.p)
@@ -298,20 +299,6 @@ class WallLoads:
         return total
 
 
-@dataclass(frozen=True)
-class WallForces:
-    loads: WallLoads
-
-    def value(self, step: StepContext, p: Any) -> wp.array:
-        return self.loads.forces(step, p, ALL_WALLS)
-
-    def tangent(self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any) -> wp.array:
-        return self.loads.tangent(step, p, p_dot, along, ALL_WALLS)
-
-    def adjoint(self, step: StepContext, p: Any, own: wp.array, bar: Bars) -> None:
-        self.loads.adjoint(step, p, own, bar, ALL_WALLS)
-
-
 class SolidLoads:
     """The load on a solid, F = sum_i f_i and T = sum_i r_i x f_i, where r_i points from the solid's middle at the end
     of the step to particle i, or for viscosity as a stress to the surface beneath particle i."""
@@ -339,7 +326,7 @@ class SolidLoads:
         if self._moving is not None:
             named = {"middle": "after", "middle_dot": "after_dot"}
             middles = {name: self._moving.named[of][:, self._solid] for name, of in named.items()}
-        own = {"f": self._loads.forces(step, p, self._solid), "twist": self._loads.twists(step, self._solid)}
+        own = {"f": self._loads.value(step, p, self._solid), "twist": self._loads.twists(step, self._solid)}
         return middles, own, self._given, self._each
 
     def value(self, step: StepContext, p: Any) -> wp.array:
@@ -347,7 +334,7 @@ class SolidLoads:
         return self._sums[0](self._each["load"])
 
     def tangent(self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any) -> wp.array:
-        dots = {"f_dot": self._loads.tangent(step, p, p_dot, along, self._solid)}
+        dots = {"f_dot": self._loads.tangent(step, p, along, p_dot, stress_dot, self._solid)}
         dots["twist_dot"] = self._loads.twists_tangent(step, along, self._solid)
         step.launch(self._kernels.tangent, *along.named, dots, *self._known(step, p))
         return self._sums[0](self._each["load_dot"])
@@ -369,6 +356,6 @@ def formulas(solver: ParticleSolver, circulation_factor: float) -> dict[str, Qua
         "pressure": Pressure(solver),
         "speed": OfParticles(solver, speed, precision.real),
         "vorticity": OfParticles(solver, vorticity, precision.vector, circulation, factor=circulation_factor),
-        "wall_force": WallForces(loads),
+        "wall_force": loads,
         **{load_name(name): SolidLoads(loads, solver, solid) for name, solid in solver.system.solids.items()},
     }

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Protocol, cast
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cortado.device.launching import CapturedGraph
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError
-from cortado.particles.state import Fields, Parameters, State, padded
+from cortado.particles.state import Fields, State, padded
 from cortado.rollout.rollout import Rollout
 from cortado.runs.body_sensors import spring_loads
 from cortado.runs.particle_sums import in_the_scene
@@ -24,8 +24,8 @@ from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver
-from cortado.solvers.solver import Counts, PressureAdjoint, PressureTangent, Solver, WithinBar
-from cortado.sph.parts import Adjoints, StepContext, sort
+from cortado.solvers.solver import Counts, Solver, WithinBar
+from cortado.sph.parts import StepContext, sort
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +87,6 @@ OF_PRESSURE = {STRESS, "wall_force"}
 """Quantities of particles that need the pressure solve of the step; others only need neighbours."""
 
 
-class StepWithin(PressureAdjoint, Protocol):
-    bar: Adjoints
-
-
 def _needs_the_step(name: str) -> bool:
     return name in OF_PRESSURE or is_load(name)
 
@@ -136,11 +132,17 @@ class QuantityEvaluator:
         state_dot, along = solver.new_state(), solver.new_parameters(1)
         state_dot.set(dot)
         along.set(parameters_dot)
-        tangent, *pressures_dot = self._tangent(wanted, state_dot, along)
-        each = {name: self._formulas[name] for name in wanted}
-        return {
-            name: self._shown(name, one.tangent(step, p, tangent.dot, *pressures_dot)) for name, one in each.items()
-        }
+        tangent: Any = ParticleTangent(solver, along) if p is None else solver.tangent(along)
+        p_dot, stress_dot = solver.numbers(), solver.numbers()
+        if p is None:
+            tangent.sort(step, state_dot)
+        else:
+            tangent.step(self._counts, state_dot, self._rollout.parameters)
+            if STRESS in wanted:
+                stress_dot.assign(np.asarray(tangent.stresses(self._rounds)))
+            p_dot.assign(tangent.pressures(self._rounds))
+        found = {name: self._formulas[name].tangent(step, p, tangent.dot, p_dot, stress_dot) for name in wanted}
+        return {name: self._shown(name, own) for name, own in found.items()}
 
     @in_turn
     def adjoint(self, bars: Mapping[str, NDArray], moment: Moment) -> tuple[Arrays, Arrays]:
@@ -150,7 +152,7 @@ class QuantityEvaluator:
             return self._from_stress(bars[STRESS], moment)
         step, p = self._begin(wanted, moment, replay=True)
         solved = any(map(_needs_the_step, wanted))
-        adjoint = self._pressure_adjoint if solved else self._field_adjoint
+        adjoint: Any = self._pressure_adjoint if solved else self._field_adjoint
         adjoint.begin()
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
         own = Bars(replace(adjoint.bar, fields=fields), solver.numbers(), solver.numbers(), solver.vectors())
@@ -159,9 +161,12 @@ class QuantityEvaluator:
         state_bar = solver.new_state()
         if solved:
             within = WithinBar(fields, own.p, own.stress if STRESS in wanted else None, own.v_star)
-            self._pressure_adjoint.from_within(self._counts, within, state_bar, self._rollout.parameters)
+            adjoint.from_within(self._counts, within, state_bar, self._rollout.parameters)
         else:
-            self._from_fields(fields, state_bar)
+            adjoint.density.begin()
+            adjoint.bar.fields.assign(fields)
+            adjoint.mix(step, state_bar)
+            adjoint.sort(step, state_bar, **{f.name: adjoint.carried_bar[f.name] for f in solver.carried_fields})
         return self._found(adjoint, state_bar)
 
     def _from_stress(self, stress_bar: NDArray, moment: Moment) -> tuple[Arrays, Arrays]:
@@ -192,7 +197,7 @@ class QuantityEvaluator:
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
         return numbers(), WithinBar(fields, numbers(), numbers(), solver.vectors()), solver.new_state()
 
-    def _found(self, adjoint: ParticleAdjoint | StepWithin, state_bar: State) -> tuple[Arrays, Arrays]:
+    def _found(self, adjoint: Any, state_bar: State) -> tuple[Arrays, Arrays]:
         parameters, state = adjoint.collect(), state_bar.numpy(self.dimension)
         found = {name: parameters[name].numpy().astype(np.float64) for name in parameters.names}
         return {name: array.astype(np.float64) for name, array in state.items()}, found
@@ -212,8 +217,14 @@ class QuantityEvaluator:
     def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[StepContext, wp.array | None]:
         """Find neighbours, and take the step if a quantity needs it; with ``replay`` prepare derivatives."""
         self._set(moment)
-        solved = any(map(_needs_the_step, names))
-        return self._solve(replay) if solved else (self._look_around(), None)
+        if any(map(_needs_the_step, names)):
+            return self._solve(replay)
+        solver, rollout = self.solver, self._rollout
+        solver.reset()
+        context = solver.sort(rollout.initial, rollout.parameters)
+        while solver.make_room():
+            context = solver.sort(rollout.initial, rollout.parameters)
+        return context, None
 
     def _set(self, moment: Moment) -> None:
         rollout = self._rollout
@@ -222,14 +233,6 @@ class QuantityEvaluator:
         rollout.parameters.set(moment.parameters)
         rollout.substeps = moment.substeps
         self.solver.set_substeps(moment.substeps)
-
-    def _look_around(self) -> StepContext:
-        solver, rollout = self.solver, self._rollout
-        solver.reset()
-        context = solver.sort(rollout.initial, rollout.parameters)
-        while solver.make_room():
-            context = solver.sort(rollout.initial, rollout.parameters)
-        return context
 
     def _solve(self, replay: bool) -> tuple[StepContext, wp.array]:
         """Take the step, and return it with the pressures that particles exert on walls."""
@@ -247,33 +250,6 @@ class QuantityEvaluator:
             solver.replay(rollout.initial, rollout.parameters, self._counts)
         return solver.context(rollout.parameters), pressures
 
-    # ---- derivatives ---------------------------------------------------------------------------------------------
-
-    def _tangent(
-        self, names: Iterable[str], state_dot: State, along: Parameters
-    ) -> tuple[ParticleTangent | PressureTangent, wp.array | None, wp.array | None]:
-        """Return the tangents of sorted particles and, if the step was taken, of the pressures on walls and of a
-        gauge."""
-        solver, parameters = self.solver, self._rollout.parameters
-        if not any(map(_needs_the_step, names)):
-            own = ParticleTangent(solver, along)
-            own.sort(solver.context(parameters), state_dot)
-            return own, None, None
-        whole = cast(PressureTangent, solver.tangent(along))
-        whole.step(self._counts, state_dot, parameters)
-        pushes, stresses = solver.numbers(), solver.numbers()
-        if STRESS in names:
-            stresses.assign(np.asarray(whole.stresses(self._rounds)))
-        pushes.assign(whole.pressures(self._rounds))
-        return whole, pushes, stresses
-
-    def _from_fields(self, fields: Fields, state_bar: State) -> None:
-        adjoint, context = self._field_adjoint, self.solver.context(self._rollout.parameters)
-        adjoint.density.begin()
-        adjoint.bar.fields.assign(fields)
-        adjoint.mix(context, state_bar)
-        adjoint.sort(context, state_bar, **{f.name: adjoint.carried_bar[f.name] for f in self.solver.carried_fields})
-
     @cached_property
     def _rollout(self) -> Rollout:
         return Rollout(self.solver, 1)
@@ -283,8 +259,9 @@ class QuantityEvaluator:
         return ParticleAdjoint(self.solver, 1)
 
     @cached_property
-    def _pressure_adjoint(self) -> "StepWithin":
-        return cast(StepWithin, self.solver.adjoint(1))
+    def _pressure_adjoint(self) -> Any:
+        """Make a `PressureAdjoint` with adjoints ``bar`` within the step."""
+        return self.solver.adjoint(1)
 
     # ---- orders --------------------------------------------------------------------------------------------------
 

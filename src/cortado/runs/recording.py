@@ -16,7 +16,7 @@ from cortado.particles.state import Entry, State, StateSeries
 from cortado.rollout.checkpoints import Beside
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.step_bounds import expected_frames
-from cortado.runs.frames import Marks, solid_motions
+from cortado.runs.frames import Marks, SolidMotions
 from cortado.runs.particle_sums import Summed
 from cortado.runs.quantity_values import QuantityEvaluator
 from cortado.runs.sensor import Readings, SensorLog
@@ -164,7 +164,7 @@ def recorded(
             diagnostics={name: column[at] for name, column in rollout.diagnostics.items()},
             mass_fractions=own.pop("mass_fractions", None),
             others=own,
-            solids=solid_motions(scene, own),
+            solids=SolidMotions.of(own, scene.dimension),
             scene=scene,
             constants={name: array[at[1:]] for name, array in constants.items()},
             substeps=rollout.substeps,

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.arrays import as_numbers, as_one_number, read_only, require_methods, unit
+from cortado.arrays import as_numbers, as_one_number, read_only, require_methods, require_table, unit
 from cortado.errors import DivergedError, InputError, shown
 from cortado.files.disk import name_and_unit, read_columns
 from cortado.scene.discrete_scene import Lattice
@@ -60,6 +60,13 @@ class Sensor(Protocol):
 TIME = "time [s]"
 
 
+def named(what: str, name: Any, of: str) -> str:
+    """Return the name of something ``of`` a scene; raise `InputError` for anything but a text."""
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{what} is {shown(name)}, but must be the name of a {of}.")
+    return name
+
+
 def point(what: str, values: Any) -> NDArray[Any]:
     """Return a finite place or direction (d,); raise `InputError` for anything else."""
     array = corner(what, values)
@@ -103,8 +110,7 @@ def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict
     """Return sensors by name; raise `InputError` for names in ``taken`` and for objects that are no sensors."""
     if given is None:
         return {}
-    if not isinstance(given, Mapping):
-        raise InputError(f"sensors is {shown(given)}, but must be a table of sensors by name, {{'gauge': sensor}}.")
+    require_table("sensors", given, "{'gauge': sensor}")
     for name in given:
         if not isinstance(name, str) or name in taken:
             raise InputError(

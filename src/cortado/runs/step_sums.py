@@ -302,12 +302,7 @@ class ChunkSums:
         return self._total
 
     def _recorded(
-        self,
-        summed: ParticleSum,
-        count: int,
-        first: State,
-        later: StateSeries,
-        kept: Mapping[str, wp.array],
+        self, summed: ParticleSum, count: int, first: State, later: StateSeries, kept: Mapping[str, wp.array]
     ) -> list[Callable[[], None]]:
         """Return launches of the sums, whose arguments are packed only once."""
         rows = count * self._scenes

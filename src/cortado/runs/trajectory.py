@@ -18,16 +18,7 @@ from cortado.files import vtkhdf
 from cortado.files.disk import as_path
 from cortado.files.image_encoding import ShadedPicture
 from cortado.lazy import on_top
-from cortado.runs.frames import (
-    FRACTION,
-    Film,
-    Marks,
-    SolidMotions,
-    append_frame,
-    fraction_names,
-    frame_writer,
-    motions_in,
-)
+from cortado.runs.frames import FRACTION, Film, Marks, SolidMotions, append_frame, fraction_names, frame_writer
 from cortado.runs.sensor import Readings
 from cortado.scene.parameters import QUANTITIES, check_quantity
 from cortado.scene.restart import Clock, Origin, RestartState
@@ -198,7 +189,7 @@ class Trajectory:
         kept: dict[str, Any] = {name: None if array is None else array[frames] for name, array in arrays.items()}
         each = {name: getattr(self, name) for name in ("others", "quantities")}
         kept |= {key: {name: array[frames] for name, array in own.items()} for key, own in each.items()}
-        kept["solids"] = self.solids.in_frames(frames)
+        kept["solids"] = SolidMotions({name: motion[frames] for name, motion in self.solids.items()})
         kept["marks"] = None if self.marks is None else self.marks.chosen(kept["times"], frames.indices(len(self))[2])
         return replace(self, **kept)
 
@@ -257,8 +248,9 @@ class Trajectory:
             wanted = f"must be a VTKHDF file, whose name ends in {' or '.join(SUFFIXES)}"
             raise InputError(f"path is {str(path)!r}, but {wanted}.")
         first = {name: array[0] if len(array) else array for name, array in fields_of(self).items()}
-        known = self.constants, len(self.converged), self.diagnostics, self.origin, self.quantities, self.marks
-        with frame_writer(path, self.times, first, *known) as writer:
+        layout: dict[str, Any] = {"times": self.times, "constants": self.constants, "steps": len(self.converged)}
+        known = first, self.diagnostics, self.origin, self.marks
+        with frame_writer(path, *known, quantities=self.quantities, **layout) as writer:
             writer.append_steps(**self.diagnostics)
             self.write_frames(writer)
 
@@ -343,7 +335,7 @@ class Trajectory:
         for name, array in recorded.items():
             _, *row = QUANTITIES[name].shape(1, arrays["positions"].shape[2])
             recorded[name] = np.ascontiguousarray(array[..., : row[0]]) if row else array
-        solids = motions_in(arrays["others"], arrays["positions"].shape[2])
+        solids = SolidMotions.of(arrays["others"], arrays["positions"].shape[2])
         marks = None if arrays["marks"] is None else Marks(*arrays["marks"])
         more: dict[str, Any] = {"mass_fractions": fractions, "origin": origin, "quantities": recorded, "solids": solids}
         return cls(**{name: arrays[name] for name in names}, **more, marks=marks)

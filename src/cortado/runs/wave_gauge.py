@@ -30,16 +30,15 @@ from cortado.runs.particle_sums import (
     Carrier,
     Summed,
     WeightedSum,
-    Weights,
     axes_of,
-    named,
     parts_of,
     reach_of,
     ride_of,
     square,
     together,
+    weights_of,
 )
-from cortado.runs.sensor import Reading, SensedScene, direction, in_dimension, point, positive
+from cortado.runs.sensor import Reading, SensedScene, direction, in_dimension, named, point, positive
 from cortado.scene.motions import Pose, position_name, scale_name
 from cortado.scene.shape_tables import Container, NoContainer
 from cortado.scene.solids import SolidTable
@@ -107,7 +106,7 @@ class Axis:
         d, count = len(self.foot), int(np.ceil(self.reach / self.step))
         along = np.asarray(self.step * np.arange(-count, count + 1), dtype=np.float64)
         places = grid([along] * (d - 1))
-        weights = Weights.of(np.linalg.norm(places, axis=1) / self.reach).values
+        weights = weights_of(np.linalg.norm(places, axis=1) / self.reach)[0]
         return places[weights > 0.0] @ np.array(self.beside), weights[weights > 0.0] / weights.sum()
 
     def carried(self, carrier: Carrier, turns: bool) -> "Axis":
@@ -303,7 +302,8 @@ class WaveGauge(Summed):
         self.position, self.floor = point("position", position), float(floor)
         self.radius = None if radius is None else positive("radius", radius)
         self.up = direction("up", np.eye(len(self.position))[1] if up is None else up)
-        self.on, self.axes = named(on), axes_of(axes, on is not None)
+        self.on = None if on is None else named("on", on, "solid that moves")
+        self.axes = axes_of(axes, on is not None)
 
     def columns(self, dimension: int) -> dict[str, str]:
         return {"height": "m"}

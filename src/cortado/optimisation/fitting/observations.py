@@ -16,7 +16,7 @@ from cortado.errors import InputError, shown
 from cortado.losses import Snapshot
 from cortado.render import Renderer
 from cortado.render.cameras import Calibration
-from cortado.runs.particle_sums import Weights
+from cortado.runs.particle_sums import weights_of
 from cortado.runs.sensor import Sensor, checked_sensor, value_of
 from cortado.scene.parameter_values import Arrays
 from cortado.simulation import Simulation
@@ -328,7 +328,7 @@ class Tracks:
             for points in (begun, x)
         )
         near = some.sparse_distance_matrix(others, support, output_type="coo_matrix")
-        w = csr_array((Weights.of(near.data / support).values, (near.row, near.col)), shape=(tracers, len(x)))
+        w = csr_array((weights_of(near.data / support)[0], (near.row, near.col)), shape=(tracers, len(x)))
         sums = np.asarray(w.sum(axis=1)).ravel()
         if not (sums > 0.0).all():
             lost = int(np.argmin(sums > 0.0))

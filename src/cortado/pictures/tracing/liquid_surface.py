@@ -3,6 +3,7 @@ particle."""
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from math import inf
 from typing import Any
 
@@ -76,27 +77,15 @@ def spheres(positions: Points, colours: Points, spacing: float) -> Mesh:
 def _sphere(levels: int) -> tuple[Points, np.ndarray]:
     """Make corners (k, 3) and triangles of a unit sphere: an octahedron with each triangle cut into four ``levels``
     times."""
-    corners = [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
-    octants = ((i, 2 + j, 4 + k, (i + j + k) % 2) for i in (0, 1) for j in (0, 1) for k in (0, 1))
-    triangles = [(a, c, b) if turned else (a, b, c) for a, b, c, turned in octants]
+    octants = np.array([np.diag(signs) for signs in product((1.0, -1.0), repeat=3)])
+    triangles = np.array([one if np.linalg.det(one) > 0.0 else one[[0, 2, 1]] for one in octants]) + 0.0  # no -0
     for _ in range(levels):
-        middles: dict[tuple[int, int], int] = {}
-
-        def middle(i: int, j: int, known: dict[tuple[int, int], int] = middles) -> int:
-            key = (min(i, j), max(i, j))
-            if key not in known:
-                known[key] = len(corners)
-                between = np.add(corners[i], corners[j])
-                corners.append(tuple(between / np.linalg.norm(between)))
-            return known[key]
-
-        triangles = [
-            four
-            for a, b, c in triangles
-            for ab, bc, ca in [(middle(a, b), middle(b, c), middle(c, a))]
-            for four in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
-        ]
-    return np.array(corners), np.array(triangles)
+        a, b, c = triangles.transpose(1, 0, 2)
+        ab, bc, ca = ((p + q) / np.linalg.norm(p + q, axis=1)[:, None] for p, q in ((a, b), (b, c), (c, a)))
+        parts = (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
+        triangles = np.concatenate([np.stack(part, axis=1) for part in parts])
+    corners, numbers = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    return corners, numbers.reshape(-1, 3)
 
 
 REACH = 3.0

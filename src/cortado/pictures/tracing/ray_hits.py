@@ -159,9 +159,8 @@ def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before
 
 
 @wp.func
-def box_pane(s: Environment, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32, width: wp.float32, before: Passed):
-    """Add the side of the box that a ray passes at t; o and d are in container axes."""
-    q = o + t * d
+def box_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: Passed):
+    """Add the side of the box that a ray passes at the point q in container axes."""
     axis = wp.int32(0)
     best = FAR
     side = wp.int32(0)
@@ -182,74 +181,42 @@ def box_pane(s: Environment, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float
             off = wp.min(off, wp.min(q[a] - s.glass_lower[a], s.glass_upper[a] - q[a]))
     n = wp.vec3(0.0)
     n[axis] = 1.0
-    return pane(
-        s, world, wp.transpose(s.glass_frame) * n, rim_of(off, width), s.panes[side, axis], s.edge_colour, before
-    )
+    normal = wp.transpose(s.glass_frame) * n
+    return pane(s, d, normal, rim_of(off, width), s.panes[side, axis], s.edge_colour, before)
 
 
 @wp.func
-def box_glass(
-    s: Environment,
-    o: wp.vec3,
-    d: wp.vec3,
-    world: wp.vec3,
-    most: wp.float32,
-    spread: wp.float32,
-    before: Passed,
-):
-    span = wp.vec2(-FAR, FAR)
-    for a in range(3):
-        span = between(s.glass_lower[a], s.glass_upper[a], o[a], d[a], span)
-    enter = span[0]
-    leave = span[1]
-    passed = before
-    if enter < leave:
-        if enter > s.nearest and enter < most:
-            passed = box_pane(s, o, d, world, enter, wp.max(0.006 * s.size, 1.2 * spread * enter), passed)
-        if leave > s.nearest and leave < most:
-            passed = box_pane(s, o, d, world, leave, wp.max(0.006 * s.size, 1.2 * spread * leave), passed)
-    return passed
-
-
-@wp.func
-def tube(s: Environment, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32, width: wp.float32, before: Passed):
-    """Add the side of the cylinder that a ray passes at t; the ends are open."""
-    q = o + t * d
+def tube_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: Passed):
+    """Add the side of the cylinder that a ray passes at the point q in container axes; the ends are open."""
     if q[1] < s.glass_lower[1] or q[1] > s.glass_upper[1]:
         return before
     x = 0.5 * (s.glass_lower[0] + s.glass_upper[0])
     z = 0.5 * (s.glass_lower[2] + s.glass_upper[2])
     n = wp.normalize(wp.vec3(q[0] - x, 0.0, q[2] - z))
     off = wp.min(q[1] - s.glass_lower[1], s.glass_upper[1] - q[1])
-    return pane(
-        s,
-        world,
-        wp.transpose(s.glass_frame) * n,
-        rim_of(off, width),
-        1.0 - wp.float32(s.has_walls),
-        s.edge_colour,
-        before,
-    )
+    normal = wp.transpose(s.glass_frame) * n
+    return pane(s, d, normal, rim_of(off, width), 1.0 - wp.float32(s.has_walls), s.edge_colour, before)
 
 
 @wp.func
-def cylinder_glass(
-    s: Environment,
-    o: wp.vec3,
-    d: wp.vec3,
-    world: wp.vec3,
-    most: wp.float32,
-    spread: wp.float32,
-    before: Passed,
-):
-    span = within_tube(s.glass_lower, s.glass_upper, o, d)
-    t1 = span[0]
-    t2 = span[1]
+def container_glass(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32, before: Passed):
+    own_o = s.glass_frame * o
+    own_d = s.glass_frame * d
+    span = wp.vec2(-FAR, FAR)
+    if s.glass == 2:
+        span = within_tube(s.glass_lower, s.glass_upper, own_o, own_d)
+    else:
+        for a in range(3):
+            span = between(s.glass_lower[a], s.glass_upper[a], own_o[a], own_d[a], span)
     passed = before
-    if t1 > s.nearest and t1 < most:
-        passed = tube(s, o, d, world, t1, wp.max(0.010 * s.size, 1.2 * spread * t1), passed)
-    if t2 > s.nearest and t2 < most:
-        passed = tube(s, o, d, world, t2, wp.max(0.010 * s.size, 1.2 * spread * t2), passed)
+    for k in range(2):
+        t = span[k]
+        if span[0] < span[1] and t > s.nearest and t < most:
+            q = own_o + t * own_d
+            if s.glass == 2:
+                passed = tube_side(s, q, d, wp.max(0.010 * s.size, 1.2 * spread * t), passed)
+            else:
+                passed = box_side(s, q, d, wp.max(0.006 * s.size, 1.2 * spread * t), passed)
     return passed
 
 
@@ -261,12 +228,8 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
         passed = Passed()
         passed.light = wp.vec3(0.0)
         passed.through = 1.0
-        own_o = s.glass_frame * o
-        own_d = s.glass_frame * d
-        if s.glass == 1:
-            passed = box_glass(s, own_o, own_d, d, most, spread, passed)
-        if s.glass == 2:
-            passed = cylinder_glass(s, own_o, own_d, d, most, spread, passed)
+        if s.glass > 0:
+            passed = container_glass(s, o, d, most, spread, passed)
         if has_clear:
             passed = clear_layers(s, o, d, most, spread, passed)
         if s.has_walls > 0:

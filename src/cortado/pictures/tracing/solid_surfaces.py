@@ -16,6 +16,7 @@ from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import ShownSolid, SolidMesh
 from cortado.pictures.stage import Stage
 from cortado.pictures.tracing.backdrop import LitSurface, Solids
+from cortado.pictures.tracing.liquid_surface import Mesh
 from cortado.pictures.tracing.near_particles import Floats, Look, Particles, Vec3s, Vec3s2d, Vec4s2d
 
 NODES = 320
@@ -54,18 +55,9 @@ class DeviceSurface:
         return cls(mesh, found, softened)
 
     @classmethod
-    def on(
-        cls,
-        device: Any,
-        points: Points,
-        triangles: np.ndarray,
-        normals: Points,
-        colours: Points,
-        softened: Soften | None = None,
-    ) -> "DeviceSurface":
-        """Take triangles (t, 3) and points (p, 3) [m]."""
-        corners = wp.array(triangles.ravel(), dtype=wp.int32, device=device)
-        own = [wp.array(one, dtype=wp.vec3, device=device) for one in (points, normals, colours)]
+    def on(cls, device: Any, mesh: Mesh, softened: Soften | None = None) -> "DeviceSurface":
+        corners = wp.array(mesh.triangles.ravel(), dtype=wp.int32, device=device)
+        own = [wp.array(one, dtype=wp.vec3, device=device) for one in (mesh.points, mesh.normals, mesh.colours)]
         return cls.of(own[0], corners, own[1], own[2], softened)
 
 
@@ -173,7 +165,7 @@ class FloorShadow:
     def of_fluid(self, particles: Particles) -> None:
         stage = self._stage
         volumes = wp.full(len(particles), stage.spacing**3, dtype=wp.float32, device=self._device)
-        self._add(particles, volumes, volumes, 0.8 * stage.spacing, tinted=0.4 * stage.transparency)
+        self._add(particles, [volumes, volumes], 0.8 * stage.spacing, tinted=0.4 * stage.transparency)
 
     def of_solid(self, shown: ShownSolid, mesh: SolidMesh) -> None:
         stage = self._stage
@@ -185,17 +177,10 @@ class FloorShadow:
         middle, area = middle[casts], 0.5 * np.cross(b - a, c - a)[casts]
         volumes = 3.0 * stage.spacing * np.abs(np.stack([area @ stage.sun / stage.sun[1], area[:, 1]]))
         parts = Particles.on(self._device, middle, np.tile(shown.colour, (len(middle), 1)))
-        to_lamp, to_sky = (self._array(one) for one in volumes)
-        self._add(parts, to_lamp, to_sky, 0.0, opacity=1.0 - shown.transparency)
+        self._add(parts, [self._array(one) for one in volumes], 0.0, opacity=1.0 - shown.transparency)
 
     def _add(
-        self,
-        parts: Particles,
-        to_lamp: wp.array,
-        to_sky: wp.array,
-        least: float,
-        opacity: float = 1.0,
-        tinted: float = 0.0,
+        self, parts: Particles, volumes: list[wp.array], least: float, opacity: float = 1.0, tinted: float = 0.0
     ) -> None:
         """Add the shadow of particles with volumes (n,) [m3] as lamp and sky see them, at least ``least`` [m] soft.
         ``tinted`` is the additional transmission of light of the object's colour."""
@@ -207,9 +192,9 @@ class FloorShadow:
         bells = [_bell(sigma) for sigma in soft]
         begin, shape = self._reached(parts, slope, max(map(len, bells)))
         seen = {"begin": wp.vec2i(*begin), "corner": wp.vec3(*self.corner), "cell": self.cell}
-        key = self._thickness(parts, to_lamp, bells[0], shape, slope=wp.vec2(*slope), fading=0.0, **seen)
+        key = self._thickness(parts, volumes[0], bells[0], shape, slope=wp.vec2(*slope), fading=0.0, **seen)
         own = {"slope": wp.vec2(0.0, 0.0), "fading": 1.0 / (CLOSE * stage.size)}
-        around = self._thickness(parts, to_sky, bells[1], shape, **own, **seen)
+        around = self._thickness(parts, volumes[1], bells[1], shape, **own, **seen)
         strength = wp.vec2(stage.picture.sun_and_sky.shadow, SKY)
         how = {"strength": strength, "layer": stage.spacing, "opacity": opacity, "tinted": tinted}
         self._launch(darken, key.size, key=key, around=around, **how, begin=seen["begin"], light=self.light)
@@ -272,22 +257,21 @@ class SolidSurfaces:
         present poses."""
         found, surfaces, lit = Solids(), list[DeviceSurface](), [LitSurface(), LitSurface()]
         found.are_cut, placed = int(self._stage.cuts_solids), self._placed(solids)
-        opaque, clear = ([pair for pair in placed if _is_clear(pair[0]) == kind] for kind in (False, True))
-        if opaque:
-            surfaces.append(self._surface(SolidMesh.joined([mesh for _, mesh in opaque]), opaque))
-            lit[0] = surfaces[-1].lit
-            found.opaque = lit[0].mesh
-            mirrors = [np.full(len(own.triangles), one.finish.reflectivity) for one, own in opaque]
-            lit[0].reflectivity = wp.array(np.concatenate(mirrors), dtype=wp.float32, device=self._device)
-        if clear:
-            mesh = SolidMesh.joined([own for _, own in clear])
-            surfaces.append(self._surface(mesh, clear))
-            lit[1] = surfaces[-1].lit
-            found.clear = lit[1].mesh
-            found.has_tank = int(any(one.is_tank for one, _ in clear))
-            left = [np.tile(_left(one), (len(own.triangles), 1)) for one, own in clear]
-            lit[1].left = wp.array(np.concatenate(left), dtype=wp.vec2, device=self._device)
-            lit[1].from_edges = wp.array(mesh.from_edges, dtype=wp.mat33, device=self._device)
+        for k, is_clear in enumerate((False, True)):
+            if not (own := [pair for pair in placed if _is_clear(pair[0]) == is_clear]):
+                continue
+            mesh, counts = SolidMesh.joined([one for _, one in own]), [len(one.triangles) for _, one in own]
+            surfaces.append(self._surface(mesh, own))
+            lit[k] = surfaces[-1].lit
+            if is_clear:
+                found.clear, found.has_tank = lit[k].mesh, int(any(one.is_tank for one, _ in own))
+                left = np.repeat([_left(one) for one, _ in own], counts, axis=0)
+                lit[k].left = wp.array(left, dtype=wp.vec2, device=self._device)
+                lit[k].from_edges = wp.array(mesh.from_edges, dtype=wp.mat33, device=self._device)
+            else:
+                found.opaque = lit[k].mesh
+                mirrors = np.repeat([one.finish.reflectivity for one, _ in own], counts)
+                lit[k].reflectivity = wp.array(mirrors, dtype=wp.float32, device=self._device)
         found.surfaces = wp.array(lit, dtype=LitSurface, device=self._device)
         return found, surfaces
 
@@ -300,7 +284,7 @@ class SolidSurfaces:
         def softened(light: wp.array) -> wp.array:
             return wp.array(mesh.smoothed(light.numpy()), dtype=wp.vec3, device=self._device)
 
-        return DeviceSurface.on(self._device, mesh.points, mesh.triangles, mesh.normals, colours, softened)
+        return DeviceSurface.on(self._device, Mesh(mesh.points, mesh.triangles, mesh.normals, colours), softened)
 
 
 def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:

@@ -5,7 +5,6 @@ gap is visible.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import ShownSolid
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.tracing.backdrop import EDGE, GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
-from cortado.pictures.tracing.liquid_surface import Level, liquid_level, liquid_surface, spheres
+from cortado.pictures.tracing.liquid_surface import Level, Mesh, liquid_level, liquid_surface, spheres
 from cortado.pictures.tracing.near_particles import (
     MODULE,
     Ints,
@@ -271,61 +270,6 @@ class State(NamedTuple):
     """(n, phases) mass fractions; None with one phase"""
 
 
-@dataclass(frozen=True)
-class Scenery:
-    stage: Stage
-    environment: Any
-    surface: DeviceSurface
-    shadow: FloorShadow
-
-
-def scenery(home: Stage, state: State, launch: BandLauncher, steady: Any = None) -> Scenery:
-    """Make the scenery of a state in 3-D; ``steady`` is a `Still` that replaces the state's level and shadow."""
-    stage, s, particles, shadow = _placed(home, state, launch)
-    if steady is None:
-        shadow.of_fluid(particles)
-        return Scenery(stage, s, _surface(stage, s, particles, launch), shadow)
-    shadow.light = steady.light
-    return Scenery(stage, s, _surface(stage, s, particles, launch, (steady.b, steady.blocks)), shadow)
-
-
-def still(home: Stage, state: State, launch: BandLauncher) -> Any:
-    """Return the `Still` of a state in 3-D; None if the fluid is not drawn as a surface."""
-    stage, s, particles, shadow = _placed(home, state, launch)
-    if stage.picture.surface != "liquid" or not len(particles):
-        return None
-    shadow.of_fluid(particles)
-    images = wetting(stage, s, particles, launch)
-    level, near = liquid_level(images, stage.spacing, launch, effort_of(stage.picture).cube)
-    return still_of(level, near, shadow.light, launch)
-
-
-def _placed(home: Stage, state: State, launch: BandLauncher) -> tuple[Stage, Any, Particles, FloorShadow]:
-    stage = home.at(state.pose, state.view)
-    s, shadow = environment_of(stage), FloorShadow(stage, launch)
-    s.shadow_corner, s.shadow_cell = wp.vec3(*shadow.corner), shadow.cell
-    return stage, s, particles_of(stage, state.positions, state.colours, launch, state.fractions), shadow
-
-
-def _surface(
-    stage: Stage, s: Any, particles: Particles, launch: BandLauncher, level: Level | None = None
-) -> DeviceSurface:
-    if not len(particles):  # meshes need a triangle: one too small and too far below the floor to be seen
-        places = stage.lower - 1e3 * stage.size + 1e-6 * stage.size * np.eye(3)
-        return DeviceSurface.on(launch.device, places, np.arange(3), np.eye(3), np.eye(3))
-    if stage.picture.surface == "liquid":
-        cube = effort_of(stage.picture).cube
-        found = liquid_surface(wetting(stage, s, particles, launch), stage.spacing, launch, cube, level)
-        softened = partial(found.softened, launch=launch)
-        surface = DeviceSurface.of(found.points, found.triangles, found.normals, found.colours, softened)
-        surface.lit.media = found.media
-        return surface
-    balls = spheres(particles.places.numpy(), particles.looks.numpy()[:, :3], stage.spacing)
-    surface = DeviceSurface.on(launch.device, balls.points, balls.triangles, balls.normals, balls.colours)
-    surface.lit.media.fill_(wp.vec2(*stage.media[0]))
-    return surface
-
-
 class SpacePainter:
     def __init__(self, stage: Stage, device: Any = "cpu"):
         self.stage, self.device = stage, wp.get_device(device)
@@ -336,46 +280,85 @@ class SpacePainter:
         shading = self._trace, self._illuminates
         self._kernels = *shading, find_contrast, list_marked, turn, cast, cell_kernels(FLOAT32).count
         """One kernel of each module that a picture needs, so that the modules compile in parallel."""
-        effort, is_liquid = effort_of(stage.picture), stage.picture.surface == "liquid"
-        self._lamps = self._rays_to_light(*(effort.lights if is_liquid else SPHERE_LIGHTS))
+        self._effort, is_liquid = effort_of(stage.picture), stage.picture.surface == "liquid"
+        self._lamps = self._rays_to_light(*(self._effort.lights if is_liquid else SPHERE_LIGHTS))
         self._lamps_of_solids = self._rays_to_light(*SOLID_LIGHTS)
         self._pixels = wp.array(in_tiles(stage.picture.width, stage.picture.height), dtype=wp.int32, device=device)
-        self._offsets = [wp.array(one, dtype=wp.vec2, device=device) for one in (MIDDLE, ROTATED_GRID[: effort.again])]
+        offsets = MIDDLE, ROTATED_GRID[: self._effort.again]
+        self._offsets = [wp.array(one, dtype=wp.vec2, device=device) for one in offsets]
 
     def image(self, *state: Any) -> Points:
         with WARP:
             compile_ahead(self, self.device)
-            return self._rays(scenery(self.stage, State(*state), self._launch))
+            return self._rays(*self.scenery(State(*state)))
 
     def still(self, state: State) -> Any:
+        """Return the `Still` of a state; None if the fluid is not drawn as a surface."""
         with WARP:
             compile_ahead(self, self.device)
-            return still(self.stage, state, self._launch)
+            stage, s, particles, shadow = self._placed(state)
+            if stage.picture.surface != "liquid" or not len(particles):
+                return None
+            shadow.of_fluid(particles)
+            images = wetting(stage, s, particles, self._launch)
+            level, near = liquid_level(images, stage.spacing, self._launch, self._effort.cube)
+            return still_of(level, near, shadow.light, self._launch)
 
     def steady_image(self, state: State, own: Any, before: Sequence[Any], after: Sequence[Any]) -> Points:
         """Draw a state as a frame of a film in which fluid at rest does not move; see `steadied`."""
         with WARP:
             steady = steadied(own, before, after, self.stage.spacing, self._launch)
-            return self._rays(scenery(self.stage, state, self._launch, steady))
+            return self._rays(*self.scenery(state, steady))
 
-    def _rays(self, fluid: Scenery) -> Points:
-        stage, seen, s, solids = fluid.stage, fluid.surface, fluid.environment, list[DeviceSurface]()
-        picture = stage.picture
+    def scenery(self, state: State, steady: Any = None) -> tuple[Stage, Any, DeviceSurface, FloorShadow]:
+        """Return the stage of a state, its `Environment`, the fluid's surface and its shadow; ``steady`` is a `Still`
+        that replaces the state's level and shadow."""
+        stage, s, particles, shadow = self._placed(state)
+        if steady is None:
+            shadow.of_fluid(particles)
+            return stage, s, self._surface(stage, s, particles, None), shadow
+        shadow.light = steady.light
+        return stage, s, self._surface(stage, s, particles, (steady.b, steady.blocks)), shadow
+
+    def _placed(self, state: State) -> tuple[Stage, Any, Particles, FloorShadow]:
+        stage = self.stage.at(state.pose, state.view)
+        s, shadow = environment_of(stage), FloorShadow(stage, self._launch)
+        s.shadow_corner, s.shadow_cell = wp.vec3(*shadow.corner), shadow.cell
+        return stage, s, particles_of(stage, state.positions, state.colours, self._launch, state.fractions), shadow
+
+    def _surface(self, stage: Stage, s: Any, particles: Particles, level: Level | None) -> DeviceSurface:
+        if not len(particles):  # meshes need a triangle: one too small and too far below the floor to be seen
+            places = stage.lower - 1e3 * stage.size + 1e-6 * stage.size * np.eye(3)
+            return DeviceSurface.on(self.device, Mesh(places, np.arange(3), np.eye(3), np.eye(3)))
+        if stage.picture.surface == "liquid":
+            images = wetting(stage, s, particles, self._launch)
+            found = liquid_surface(images, stage.spacing, self._launch, self._effort.cube, level)
+            softened = partial(found.softened, launch=self._launch)
+            surface = DeviceSurface.of(found.points, found.triangles, found.normals, found.colours, softened)
+            surface.lit.media = found.media
+            return surface
+        balls = spheres(particles.places.numpy(), particles.looks.numpy()[:, :3], stage.spacing)
+        surface = DeviceSurface.on(self.device, balls)
+        surface.lit.media.fill_(wp.vec2(*stage.media[0]))
+        return surface
+
+    def _rays(self, stage: Stage, s: Any, seen: DeviceSurface, shadow: FloorShadow) -> Points:
+        picture, solids = stage.picture, list[DeviceSurface]()
         seen.lit.reach = 2.0 * self.stage.spacing
         seen.lit.is_flat = int(not picture.shaded)
         if self._solids is not None:
-            self._solids.cast(fluid.shadow, stage.solids)
+            self._solids.cast(shadow, stage.solids)
             s.solids, solids = self._solids.on_device(stage.solids)
         given = {"s": s, "surface": seen.lit}
         self._illuminate(seen, self._lamps, given)
         for one in solids:
             self._illuminate(one, self._lamps_of_solids, given)
         image = wp.empty(picture.width * picture.height, dtype=wp.vec3, device=self.device)
-        given |= {"eye": _eye(stage), "shadow": fluid.shadow.light, "image": image}
+        given |= {"eye": _eye(stage), "shadow": shadow.light, "image": image}
         once, again = self._offsets
         self._launch(self._trace, len(self._pixels), **given, pixels=self._pixels, offsets=once)
         rough = wp.empty(len(image), dtype=wp.int32, device=self.device)
-        how = {"columns": picture.width, "contrast": effort_of(picture).contrast}
+        how = {"columns": picture.width, "contrast": self._effort.contrast}
         self._launch(find_contrast, len(image), image=image, **how, found=rough)
         pixels, _ = marked(rough, self._launch)
         self._launch(self._trace, len(pixels), **given, pixels=pixels, offsets=again)
