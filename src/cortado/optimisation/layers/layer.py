@@ -19,7 +19,7 @@ import warp as wp
 from cortado.calls import counted
 from cortado.errors import CortadoWarning, DivergedError, InputError
 from cortado.particles.state import Entry, State
-from cortado.rollout.device_states import DeviceRows, DeviceState, HostStates, OfLost, clocks_after
+from cortado.rollout.device_states import DeviceRows, DeviceState, HostStates, OfLost, scenes_after
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.run_checks import check_clock, origin_of, shapes_of_fields
@@ -244,7 +244,8 @@ class NamedStates(HostStates):
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> Named:
         """Copy the state of a rollout after ``steps`` steps to named arrays, NaN for lost scenes."""
         fields = self.read(state, dict.fromkeys(rollout.lost, np.nan))
-        return self._with_clocks(fields, clocks_after(rollout, steps), rollout.origins)
+        clocks = [scene.clock for scene in scenes_after(rollout, steps)]
+        return self._with_clocks(fields, clocks, rollout.origins)
 
     def arrays(self, state: DeviceState) -> Named:
         """Copy a state on the device to named arrays."""
