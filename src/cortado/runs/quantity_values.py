@@ -141,8 +141,8 @@ class QuantityEvaluator:
             if STRESS in wanted:
                 stress_dot.assign(np.asarray(tangent.stresses(self._rounds)))
             p_dot.assign(tangent.pressures(self._rounds))
-        found = {name: self._formulas[name].tangent(step, p, tangent.dot, p_dot, stress_dot) for name in wanted}
-        return {name: self._shown(name, own) for name, own in found.items()}
+        given = step, p, tangent.dot, p_dot, stress_dot
+        return {name: self._shown(name, self._formulas[name].tangent(*given)) for name in wanted}
 
     @in_turn
     def adjoint(self, bars: Mapping[str, NDArray], moment: Moment) -> tuple[Arrays, Arrays]:
