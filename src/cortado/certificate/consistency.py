@@ -361,16 +361,8 @@ def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, al
 
     def so_far() -> Consistency:
         differences, sides = np.array(found).reshape(-1, 2, len(losses)).transpose(1, 0, 2)
-        return Consistency(
-            history.sample_steps,
-            losses,
-            adjoint=float(products.sum()),
-            size=float(np.linalg.norm(products)),
-            tangents=tangents,
-            differences=differences,
-            sides=sides,
-            steps=np.array(STEPS[: len(found)]),
-        )
+        adjoint, size, tried = float(products.sum()), float(np.linalg.norm(products)), np.array(STEPS[: len(found)])
+        return Consistency(history.sample_steps, losses, adjoint, size, tangents, differences, sides, tried)
 
     best = np.inf
     for h in STEPS if so_far().disagreement < MODE_TOLERANCE else ():

@@ -179,9 +179,7 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
     return Path(path)
 
 
-def _drawn(
-    shape: Shape, resolution: Resolution, cup: float | None, size: float, colours: tuple[Colour, ...]
-) -> Picture:
+def _drawn(shape: Shape, resolution: Resolution, cup: float | None, size: float, colours: list[Colour]) -> Picture:
     for name, value in (("cup", 1.0 if cup is None else cup), ("size", size)):
         positive(name, value)
     columns, rows = _columns_and_rows(resolution)

@@ -31,7 +31,7 @@ from cortado.problem import Problem
 from cortado.runs.frames import Film
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.parameter_values import UNITS
+from cortado.scene.parameter_values import UNITS, Values
 from cortado.simulation import Simulation
 
 Figures = list[tuple[str, str | Path]]
@@ -213,9 +213,7 @@ def film_page(film: Film) -> str:
     return as_words(film) + _shown(film.path, repr(film), WIDE)
 
 
-def result_page(
-    found: object, message: str, problem: Any, start: Mapping[str, Any], best: Mapping[str, Any], losses: Any
-) -> str:
+def result_page(found: object, message: str, problem: Any, start: Values, best: Values, losses: Any) -> str:
     """Return HTML of the result of a search; for a `Problem` with pictures of the runs with the first and with the best
     parameters, unless they diverge."""
     if hasattr(problem, "coordinates"):

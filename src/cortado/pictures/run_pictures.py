@@ -87,7 +87,8 @@ def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | S
     return stage.framed(stage.ends, stage.picture.model_copy(update={"width": free})), scale.beside
 
 
-Units, Settings = Mapping[str, str], Mapping[str, Any]
+Units = Mapping[str, str]
+Settings = Mapping[str, Any]
 Given = Scene | str | Path | None
 """A scene, the path of its file, or None for that of the trajectory."""
 

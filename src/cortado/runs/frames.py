@@ -50,6 +50,7 @@ EASY = (5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)
 
 
 Fields = Mapping[str, NDArray[Any]]
+Times = Sequence[float] | NDArray
 
 
 @dataclass(frozen=True)
@@ -150,13 +151,7 @@ class Pace:
     """True for the frames of a search, whose number is the key ``film_frames`` of [picture]"""
 
     @classmethod
-    def of(
-        cls,
-        times: Sequence[float] | NDArray,
-        count: int | None = None,
-        speed: float | None = None,
-        rate: float | None = None,
-    ) -> Pace:
+    def of(cls, times: Times, count: int | None = None, speed: float | None = None, rate: float | None = None) -> Pace:
         """Choose the pace for frames at ``times`` [s], at most ``count``. Without ``speed`` the film is in real time,
         unless it would be too short or too long. With the ``rate`` of the recording [1/s] it shows every k-th frame."""
         span = float(times[-1] - times[0])
@@ -225,7 +220,7 @@ class Film:
         return on_top("film_page")(self)
 
 
-def pace_of(times: Sequence[float] | NDArray, picture: Picture, rate: float | None = None) -> Pace:
+def pace_of(times: Times, picture: Picture, rate: float | None = None) -> Pace:
     """Return the pace that [picture] sets for frames at ``times`` [s]; warn if it sets more frames than were
     recorded."""
     asked = picture.film_frames or None
@@ -236,7 +231,7 @@ def pace_of(times: Sequence[float] | NDArray, picture: Picture, rate: float | No
     return Pace.of(times, asked, picture.film_speed, rate)
 
 
-def _whole(times: Sequence[float] | NDArray, rate: float) -> int:
+def _whole(times: Times, rate: float) -> int:
     """Return the number of frames, without a last frame that was recorded before it was due."""
     is_early = len(times) > 2 and (times[-1] - times[-2]) * rate < 1.0 - EARLY
     return len(times) - 1 if is_early else len(times)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from cortado.calls import counted
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Entry, State, StateSeries
-from cortado.rollout.checkpoints import Beside
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.step_bounds import expected_frames
 from cortado.runs.frames import Marks, SolidMotions
@@ -222,16 +221,14 @@ class StepReader:
     """A `ChunkReader` of sensors: it sums over particles on the device; `look` writes readings into ``logs``, one per
     scene."""
 
-    def __init__(
-        self, scene: QuantityEvaluator, rollout: Rollout, sensors: Mapping[str, Summed], logs: Sequence[SensorLog]
-    ):
-        self.sensors, self._scene, self._rollout, self._logs = dict(sensors), scene, rollout, logs
+    def __init__(self, scene: QuantityEvaluator, rollout: Rollout, sensors: dict[str, Summed], logs: list[SensorLog]):
+        self.sensors, self._scene, self._rollout, self._logs = sensors, scene, rollout, logs
         length, layout, first = rollout.longest_chunk, rollout.solver.layout, rollout.initial
         summed = {name: one.summed(scene) for name, one in sensors.items()}
         self._sums = {name: ChunkSums(one, scene, scene.solver, length) for name, one in summed.items()}
         self._needs_the_step = {name for name, one in summed.items() if one.quantity is not None}
         self.quantities = tuple(sorted({one.quantity for one in summed.values() if one.quantity is not None}))
-        self._beside = kept_by_steps(scene, rollout, self.quantities) if self.quantities else None
+        self.beside = kept_by_steps(scene, rollout, self.quantities) if self.quantities else None
         moved = any(table.moves for table in scene.solids)
         self._poses = [f for f in first.fields if f.axis is Axis.SCALAR and not f.is_constant] if moved else []
         options = {"device": "cpu", "pinned": first.positions.device.is_cuda}
@@ -244,14 +241,10 @@ class StepReader:
         self._step = self._count = 0
         """First state of the last chunk, and number of its states that `look` must still read."""
 
-    @property
-    def beside(self) -> Beside | None:
-        return self._beside
-
     def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
         self.look()
         self._step, self._count = step, end - step
-        rows, kept = self._count * (first.batch or 1), {} if self._beside is None else self._beside.kept
+        rows, kept = self._count * (first.batch or 1), {} if self.beside is None else self.beside.kept
         for name, sums in self._sums.items():
             wp.copy(self._found[name], sums.launch(self._count, first, later, kept), count=rows)
         for pose in self._poses:

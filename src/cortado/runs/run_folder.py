@@ -30,22 +30,11 @@ _PACKAGES = ("warp-lang", "numpy", "scipy", "pydantic", "h5py", "matplotlib")
 _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json", "sensors.csv")
 REPLAY_LOG = "replay.log"
 _FOLDERS = ("checkpoint", "figures")
-_PICTURES = (
-    "particles",
-    "measured",
-    "rendered",
-    "density_errors",
-    "loss",
-    "images",
-    "progress",
-    "residuals",
-    "profiles",
-    *NAMES,
-)
+_PLOTS = ("particles", "measured", "rendered", "density_errors", "loss", "images", "progress", "residuals", "profiles")
 _SHADED = ("first", "last", "picture", "found", "search")
 _FILMS = ("run", "estimate", "film", "found", "search")
 FIGURES = (
-    *(f"{name}.png" for name in (*_PICTURES, *_SHADED, *(f"measured_{k}" for k in range(100)))),
+    *(f"{name}.png" for name in (*_PLOTS, *NAMES, *_SHADED, *(f"measured_{k}" for k in range(100)))),
     *(f"{name}.mp4" for name in _FILMS),
 )
 """Names of all files that runs write into the folder of figures; other files in it belong to the user."""
