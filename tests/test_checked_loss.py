@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from bad_scenes import one_sentence
 from cortado.device.precision import FLOAT32, FLOAT64
-from cortado.errors import InputError
 from cortado.losses import FinalPositions, Frames, Recorded, Snapshot, SnapshotAdjoint, fingerprint
 from cortado.losses.run_losses import as_loss
 from cortado.particles.state import POSITIONS, VELOCITIES, Layout, State
@@ -117,10 +117,9 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake, words", MISTAKES.values(), ids=MISTAKES)
 def test_a_mistake_is_a_sentence(mistake, words):
-    with pytest.raises(InputError, match=words) as caught:
+    with one_sentence(words) as caught:
         mistake()
-    sentence = str(caught.value)
-    assert "\n" not in sentence and sentence.endswith(".") and len(sentence) < 300
+    assert len(str(caught.value)) < 300
 
 
 def test_a_function_whose_arguments_cannot_be_told_is_taken():

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from bad_scenes import one_sentence
 from cortado import CortadoWarning, InputError, Problem, Scene, Simulation, losses
 from finite_differences import both_modes, decades, distance
 from scenes import Weighed, box, jet, plane, pour, scene
@@ -206,10 +207,9 @@ MISTAKES = {
 
 @pytest.mark.parametrize("words", MISTAKES)
 def test_a_mistake_is_a_sentence(words):
-    with pytest.raises(InputError) as caught:
+    with one_sentence() as caught:
         problem_of("jet").value(MISTAKES[words])
-    sentence = str(caught.value)
-    assert sentence.startswith(words) and sentence.endswith(".") and "\n" not in sentence
+    assert str(caught.value).startswith(words)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from bad_scenes import one_sentence
 from cortado import Problem, Simulation, evaluate, gradients, losses
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError
 from cortado.gradients import AdjointEstimator, Estimate, Filtered
@@ -833,10 +834,9 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake", MISTAKES.values(), ids=MISTAKES)
 def test_a_mistake_is_a_sentence(chaotic, mistake):
-    with pytest.raises(InputError) as caught:
+    with one_sentence() as caught:
         mistake(chaotic)
-    sentence = str(caught.value)
-    assert "\n" not in sentence and sentence.endswith(".") and len(sentence) < 300
+    assert len(str(caught.value)) < 300
 
 
 def test_a_filter_stays_off_a_users_tape():

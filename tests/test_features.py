@@ -322,6 +322,7 @@ def test_it_is_certified(name):
     ],
 )
 def test_what_has_no_tape_says_so(name, words):
-    problem, point, _, _ = case(name)
+    simulation = FEATURES[name].simulation()
+    problem, point = Problem(simulation, STEPS, Weighed(simulation)), {"gravity": simulation.parameters()["gravity"]}
     with pytest.raises(CortadoError, match=words):
         problem.value_and_gradient(point, gradients.Tape())

@@ -5,6 +5,7 @@ import ast
 import os
 import subprocess
 import sys
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -31,18 +32,21 @@ def modules() -> dict[str, Path]:
     return found
 
 
+@cache
+def import_nodes(source: str) -> list[ast.AST]:
+    return [node for node in ast.walk(ast.parse(source)) if isinstance(node, (ast.Import, ast.ImportFrom))]
+
+
 def imports(source: str, module: str, known: set[str]) -> set[str]:
     """Modules of the package that a module's source imports, by their names within the package."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in import_nodes(source):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
+        else:
             package = ["cortado", *module.split(".")][: -node.level] if node.level else []
             base = ".".join(package + ([node.module] if node.module else []))
             names = [f"{base}.{alias.name}" for alias in node.names]
-        else:
-            continue
         for name in names:
             if name.startswith("cortado."):
                 inner = name.removeprefix("cortado.")
@@ -52,6 +56,7 @@ def imports(source: str, module: str, known: set[str]) -> set[str]:
 
 
 MODULES = modules()
+SOURCES = {module: path.read_text(encoding="utf-8") for module, path in MODULES.items()}
 MOST_PACKAGES = 17
 MOST_LINES = 450
 ON_TOP = ("pictures", "environments", "cli", "__main__", "measured")
@@ -71,13 +76,11 @@ def above(sources: dict[str, str]) -> dict[str, set[str]]:
 
 
 def test_packages_form_a_tree_and_no_file_imports_one_that_imports_it():
-    """No package imports one that imports it, on whatever way."""
-    packages = above({module: path.read_text() for module, path in MODULES.items()})
-    list(TopologicalSorter(packages).static_order())
-    assert len({path.parts[0] for path in (p.relative_to(ROOT) for p in ROOT.glob("*/__init__.py"))}) <= MOST_PACKAGES
-    # On no way, within functions and for types too.
-    sources = {module: path.read_text() for module, path in MODULES.items()}
-    files = {module: imports(source, module, set(sources)) - {module} for module, source in sources.items()}
+    """On no way, within functions and for types too."""
+    list(TopologicalSorter(above(SOURCES)).static_order())
+    assert len(list(ROOT.glob("*/__init__.py"))) <= MOST_PACKAGES
+    known = set(SOURCES)
+    files = {module: imports(source, module, known) - {module} for module, source in SOURCES.items()}
     list(TopologicalSorter(files).static_order())
 
 
@@ -102,7 +105,7 @@ def on_top_of_the_core(sources: dict[str, str]) -> list[tuple[str, str]]:
 
 
 def test_the_core_imports_nothing_on_top_of_it_and_what_it_asks_of_that_is_there():
-    assert not on_top_of_the_core({module: path.read_text() for module, path in MODULES.items()})
+    assert not on_top_of_the_core(SOURCES)
     late = {"problem": "def f():\n    from cortado.pictures.film import film", "pictures.film": ""}
     assert on_top_of_the_core(late) == [("problem", "pictures.film")]
     for name, home in FUNCTIONS.items():
@@ -169,20 +172,18 @@ def test_a_circle_of_modules_is_found(first, second):
 
 def test_nothing_but_the_command_line_imports_the_package_itself():
     """`cortado` has the names of all packages, so that whoever imports it imports them all."""
-    users = {module for module, path in MODULES.items() if "cortado" in imports(path.read_text(), module, set(MODULES))}
+    users = {module for module, source in SOURCES.items() if "cortado" in imports(source, module, set(MODULES))}
     assert {user.split(".")[0] for user in users} <= {"cli", "__main__"}
 
 
-def warp_names(path: Path) -> set[str]:
-    """Names of Warp that a file uses: ``kernel`` for ``wp.kernel`` and for ``from warp import kernel``."""
-    tree = ast.parse(path.read_text())
-    found = {
-        node.attr
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in ("wp", "warp")
-    }
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "warp":
+@cache
+def warp_names(module: str) -> set[str]:
+    """Names of Warp that a module uses: ``kernel`` for ``wp.kernel`` and for ``from warp import kernel``."""
+    found = set()
+    for node in ast.walk(ast.parse(SOURCES[module])):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in ("wp", "warp"):
+            found.add(node.attr)
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "warp":
             found |= {alias.name for alias in node.names}
     return found
 
@@ -193,7 +194,7 @@ LAUNCHES = {"launch", "launch_tiled"}
 @pytest.mark.parametrize("module", sorted(MODULES.keys() - {"device.launching"}))
 def test_kernels_are_launched_by_name(module):
     """`cortado.device.launching` binds arguments by their names and checks them; nobody goes around it."""
-    assert not warp_names(MODULES[module]) & LAUNCHES and "launch" in warp_names(MODULES["device.launching"])
+    assert not warp_names(module) & LAUNCHES and "launch" in warp_names("device.launching")
 
 
 MOST_ARGUMENTS = 14
@@ -204,11 +205,12 @@ LOOPS = {f"particles.{name}" for name in ("pair_sums", "wall_terms", "neighbours
 
 @pytest.mark.parametrize("module", sorted(MODULES))
 def test_kernels_can_be_read(module):
-    text = MODULES[module].read_text()
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(ast.parse(SOURCES[module])):
         if isinstance(node, ast.FunctionDef) and any("wp.kernel" in ast.unparse(one) for one in node.decorator_list):
             assert len(node.args.args) <= MOST_ARGUMENTS, f"{node.name} takes too many arguments: bundle some"
-    assert module in LOOPS or "s.fluid_count[" not in text, "sums over neighbours are made: cortado.particles.pair_sums"
+    assert module in LOOPS or "s.fluid_count[" not in SOURCES[module], (
+        "sums over neighbours are made: cortado.particles.pair_sums"
+    )
 
 
 HEAVY = ("warp", "matplotlib", "scipy", "jax", "torch")
@@ -234,9 +236,7 @@ def test_the_discretisation_is_without_warp(module):
 
 def test_no_file_has_more_than_one_topic():
     """By its length; the longest ones hold one."""
-    lengths = {name: len(path.read_text(encoding="utf-8").splitlines()) for name, path in MODULES.items()}
-    long = {name: n for name, n in lengths.items() if n > MOST_LINES}
-    assert not long
+    assert [name for name, source in SOURCES.items() if len(source.splitlines()) > MOST_LINES] == []
 
 
 TESTS = Path(__file__).parent

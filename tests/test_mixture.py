@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from bad_scenes import one_sentence
 from cortado import InputError, Problem, Simulation, Trajectory, gradients, losses
 from cortado.scene.parameter_values import reference_density
 from cortado.sph.free_energy import FreeEnergy
@@ -273,11 +274,9 @@ MISTAKES = {
 @pytest.mark.parametrize("words", MISTAKES)
 def test_a_mistake_is_a_sentence(words):
     problem = case("two layers")[0]
-    with pytest.raises(InputError) as caught:
+    with one_sentence() as caught:
         problem.value(MISTAKES[words])
-    sentence = str(caught.value)
-    assert words in sentence
-    assert "\n" not in sentence and sentence.endswith(".") and len(sentence) < 300
+    assert words in str(caught.value) and len(str(caught.value)) < 300
 
 
 def test_frames_that_do_not_exist_are_a_sentence():

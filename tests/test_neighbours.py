@@ -18,6 +18,7 @@ from cortado.particles.moving_walls import WallArrays
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout
+from test_cells import cells_of
 
 SUPPORT = 0.1
 REACH = (1 + SKIN) * SUPPORT
@@ -154,7 +155,7 @@ def check(positions: np.ndarray, period: Any = 0.0, walls: np.ndarray | None = N
 
 def check_lists(found: Found, positions: np.ndarray, precision: Precision) -> None:
     """Neighbours stand in the list as their cells are visited: layer by layer, row by row, along x."""
-    cells, shape = cells_of(positions, found.grid, precision), np.array(found.grid.shape)
+    cells, shape = cells_of(padded(positions), found.grid, precision, 1), np.array(found.grid.shape)
     c = np.stack([cells % shape[0], cells // shape[0] % shape[1], cells // (shape[0] * shape[1])], axis=1)
     around = [range(-1 if n > 2 else 0, 2 if n > 1 else 1) for n in shape]
     steps = [np.array(step[::-1]) for step in product(*around[::-1])]
@@ -165,17 +166,9 @@ def check_lists(found: Found, positions: np.ndarray, precision: Precision) -> No
         assert keys == sorted(keys), f"the list of particle {i} is in another order"
 
 
-def cells_of(positions: np.ndarray, grid: Grid, precision: Precision) -> np.ndarray:
-    """(n,) the cell of each particle."""
-    real = precision.numpy
-    s = (padded(positions).astype(real) - grid.origin.astype(real)) * (1.0 / grid.cell).astype(real)
-    c = np.floor(s).astype(np.int64) % np.array(grid.shape)
-    return (c[:, 2] * grid.shape[1] + c[:, 1]) * grid.shape[0] + c[:, 0]
-
-
 def check_order(found: Found, positions: np.ndarray, precision: Precision) -> None:
     """Cells in ascending order, and within a cell the order that was given."""
-    cells = cells_of(positions, found.grid, precision)
+    cells = cells_of(padded(positions), found.grid, precision, 1)
     np.testing.assert_array_equal(found.order, np.argsort(cells, kind="stable"))
 
 

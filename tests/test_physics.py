@@ -1,7 +1,7 @@
-"""Laws that hold exactly, such as momentum; and properties of any scene, on examples that Hypothesis draws."""
+"""Laws that hold exactly, such as momentum; and properties of any scene, on examples that Hypothesis draws. Batches,
+runs that go on and launches in ranges: tests/test_features.py, test_restart.py and test_ranges.py."""
 
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,8 @@ from scipy.spatial import cKDTree
 
 from benchmarks.bench.scene import dam_break
 from cortado import CortadoWarning, DivergedError, Problem, Scene, Simulation, losses
-from cortado.losses import CentreOfMass, FinalPositions, Frames
+from cortado.losses import FinalPositions
 from scenes import Weighed, jet, plane, plane_of_three, scene, splash
-from test_ranges import set_parts
 
 FREE = {"container": {"shape": "none"}}
 
@@ -159,14 +158,13 @@ seeds = st.integers(0, 2**31)
 names = st.sampled_from(list(SCENES))
 
 
-def examples(number: int) -> settings:
-    """The same in each run. None is made smaller where it fails: most of it is the seed of random numbers."""
-    return settings(max_examples=number, deadline=None, database=None, derandomize=True, phases=[Phase.generate])
+examples = settings(max_examples=8, deadline=None, database=None, derandomize=True, phases=[Phase.generate])
+"""The same in each run. None is made smaller where it fails: most of it is the seed of random numbers."""
 
 
 @cache
-def simulation(name: str, batch: int | None = None) -> Simulation:
-    return Simulation(SCENES[name](), precision="float64", batch=batch)
+def simulation(name: str) -> Simulation:
+    return Simulation(SCENES[name](), precision="float64")
 
 
 def random_point(name: str, seed: int, steps: int = STEPS) -> dict[str, Any]:
@@ -183,62 +181,13 @@ def random_point(name: str, seed: int, steps: int = STEPS) -> dict[str, Any]:
     }
 
 
-def bits(arrays: dict[str, Any]) -> dict[str, bytes]:
-    return {name: np.asarray(array).tobytes() for name, array in arrays.items()}
-
-
-def evaluation(problem: Problem, point: dict[str, Any]) -> dict[str, bytes]:
-    """Bits of the loss and of its gradient."""
-    loss, gradient = problem.value_and_gradient(point)
-    assert all(np.any(bar) for bar in gradient.values())
-    return bits({"loss": loss, **gradient})
-
-
-@examples(8)
-@given(name=names, seed=seeds, members=st.integers(1, 4))
-def test_a_batch_has_the_bits_of_its_scenes_one_by_one(name, seed, members):
-    points = [random_point(name, seed + k) for k in range(members)]
-    loss = Frames({STEPS: FinalPositions(simulation(name).positions), 3: CentreOfMass([0.1, 0.1])})
-    single = Problem(simulation(name), STEPS, loss)
-    together = Problem(simulation(name, members), STEPS, loss)
-    losses, gradient = together.value_and_gradient({key: np.stack([p[key] for p in points]) for key in points[0]})
-    for k, point in enumerate(points):
-        found = bits({"loss": losses[k], **{key: bar[k] for key, bar in gradient.items()}})
-        assert found == evaluation(single, point)
-
-
-@examples(8)
-@given(name=names, seed=seeds, cuts=st.sets(st.integers(1, STEPS - 1), min_size=1, max_size=3))
-def test_a_run_stops_at_any_step_and_goes_on_with_the_same_bits(name, seed, cuts):
-    made, point = simulation(name), random_point(name, seed)
-    whole, gravity = made.run(STEPS, point), point.pop("gravity")
-    state = made.state({**point, "gravity": gravity[0]})
-    start = ("initial_positions", "initial_velocities")
-    constants = {key: value for key, value in point.items() if key not in start}
-    for first, last in pairwise([0, *sorted(cuts), STEPS]):
-        state = made.run(last - first, {**constants, "gravity": gravity[first:last]}, state=state).last_state
-        wanted = whole[: last + 1].last_state
-        assert state.clock == wanted.clock and bits(dict(state.fields)) == bits(dict(wanted.fields))
-
-
-@examples(8)
+@examples
 @given(name=names, seed=seeds, budget=st.integers(0, 60_000), steps=st.integers(1, 12))
 def test_any_memory_budget_gives_the_same_bits(name, seed, budget, steps):
     made, point = simulation(name), random_point(name, seed, steps)
-    roomy, frugal = (Problem(made, steps, Weighed(made), size) for size in (2**30, budget))
-    assert evaluation(frugal, point) == evaluation(roomy, point)
-
-
-@examples(8)
-@given(name=names, seed=seeds, cores=st.integers(2, 6), rounds=st.integers(1, 3))
-def test_any_cut_into_ranges_gives_the_same_bits(name, seed, cores, rounds):
-    made, point = simulation(name), random_point(name, seed)
-    found = []
-    for workers, parts in ((1, 1), (cores, cores * rounds)):
-        with pytest.MonkeyPatch.context() as patch:
-            set_parts(patch, workers, parts, made.particles)
-            found.append(evaluation(Problem(Simulation(made.scene, precision="float64"), STEPS, Weighed(made)), point))
-    assert found[0] == found[1]
+    roomy, frugal = (Problem(made, steps, Weighed(made), size).value_and_gradient(point) for size in (2**30, budget))
+    assert frugal[0] == roomy[0] and all(np.any(bar) for bar in roomy[1].values())
+    assert all(frugal[1][key].tobytes() == bar.tobytes() for key, bar in roomy[1].items())
 
 
 def turned(vectors: Any, quarters: int) -> np.ndarray:
@@ -259,7 +208,7 @@ def moved_scene(scene: Scene, quarters: int, shift: np.ndarray) -> Scene:
     return Scene(**tables)
 
 
-@examples(8)
+@examples
 @given(
     name=st.sampled_from(["one fluid", "mixture"]),
     seed=seeds,

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import cortado
+from bad_scenes import one_sentence
 from cortado import CortadoWarning, InputError, Problem, Scene, Simulation, gradients, losses
 from cortado.rollout.checkpoints import checkpoint_interval
 from cortado.sph.free_energy import MISCIBLE
@@ -146,10 +147,9 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake", MISTAKES.values(), ids=MISTAKES)
 def test_a_mistake_is_a_sentence(problem, mistake):
-    with pytest.raises(InputError) as caught:
+    with one_sentence() as caught:
         mistake(problem)
-    sentence = str(caught.value)
-    assert "\n" not in sentence and sentence.endswith(".") and len(sentence) < 300
+    assert len(str(caught.value)) < 300
 
 
 class Wrong(losses.FinalPositions):

@@ -547,7 +547,7 @@ def test_walls_that_close_to_less_than_a_spacing_are_the_cause_that_is_named():
 
 def test_derivatives_go_through_steps_that_were_taken_again():
     """Reverse, forward and as differences of runs whose steps are held at the lengths that were taken in the end."""
-    made = wedge(0.012, discretisation={"spacing": 0.03, "kernel": "cubic_spline"})  # whose derivatives others have too
+    made = wedge(0.012)
     chosen, fixed = (Simulation(one, precision="float64") for one in (made, made.replaced("solver.time_step=0.001")))
     whole, steps = chosen.run(70), 6
     sizes = sizes_of(whole)

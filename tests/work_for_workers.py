@@ -5,6 +5,11 @@ import time
 
 import numpy as np
 
+from compiling_notice import FLAGS, compile_fast
+
+compile_fast(FLAGS)
+"""So that kernels of workers are those of the tests."""
+
 
 class FarFromHome:
     """A loss as users write them."""

@@ -1,10 +1,8 @@
-"""Films of mud, a Herschel-Bulkley fluid, that flow down slopes without slip, and what its law is found to be from
-them."""
+"""Films of mud, a Herschel-Bulkley fluid, that flow down slopes without slip."""
 
 import numpy as np
 
-from cortado import Problem, Simulation
-from cortado.losses import CentreOfMass
+from cortado import Simulation
 from projected_flows import C2, PROJECTION, box, simulated
 
 GRAVITY = 9.81
@@ -51,34 +49,6 @@ def observed(deep: int, law: dict[str, float], slopes: tuple[float, ...] = SLOPE
         run = simulation.run(steps, law, record_every=steps)
         found.append(speeds(run.velocities[-1], simulation.positions[:, 1]))
     return np.concatenate(found)
-
-
-def sensitivities(deep: int, law: dict[str, float]) -> np.ndarray:
-    """(2 slopes, 3) derivatives of the logarithms of what is observed by those of the numbers of the law."""
-    rows = []
-    for slope in SLOPES:
-        simulation, steps = film(slope, deep)
-        problem, heights = Problem(simulation, steps, CentreOfMass(np.zeros(2))), simulation.positions[:, 1]
-        columns = []
-        for name, value in law.items():
-            tangents = []
-            end = problem.tangents(
-                law, {name: value}, lambda _, dot, to=tangents: to.append(dot.numpy(2)["velocities"]), [steps]
-            )
-            columns.append(speeds(tangents[-1], heights) / speeds(end[steps].velocities, heights))
-        rows.append(np.array(columns).T)
-    return np.concatenate(rows)
-
-
-def found_law(deep: int, target: np.ndarray, start: dict[str, float]) -> dict[str, float]:
-    """By Gauss and Newton from films so many particles deep; derivatives are taken in the first and the third step."""
-    law = dict(start)
-    for k in range(7):
-        if k in (0, 2):
-            slopes = sensitivities(deep, law)
-        change = np.linalg.lstsq(slopes, np.log(target / observed(deep, law)), rcond=None)[0]
-        law = {name: law[name] * float(np.exp(by)) for name, by in zip(law, np.clip(change, -0.4, 0.4), strict=True)}
-    return law
 
 
 def steady_speeds(slope: float) -> np.ndarray:

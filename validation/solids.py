@@ -17,22 +17,14 @@ from measured_rows import Measure
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from loads import LOADS
+from moving_bodies import added_mass, heeled_box, rolling_under_oil, settling_ball, swinging_box
 from piston_waves import piston
 
-from baffles import held, sloshed
+from baffles import held
 from cortado import Scene, Simulation
-from floating_bodies import (
-    added_mass,
-    disc_in_a_round_tank,
-    floating_box,
-    heeled_box,
-    rolling_under_oil,
-    settling_ball,
-    settling_disc,
-    stopping_cylinder,
-    swinging_box,
-)
+from floating_bodies import disc_in_a_round_tank, floating_box, settling_disc, stopping_cylinder
 from held_water import MESHES, cup_turned, meshes, stirred
+from scenes import box, pool
 
 DATA = Path(__file__).parents[1] / "tests" / "data"
 LATE = 0.8
@@ -96,6 +88,36 @@ def disc(density: float, across: int, iterations: int) -> np.ndarray:
     """How much faster a disc in the middle of a full round tank gets in each of six steps, over theory."""
     with TemporaryDirectory() as folder:
         return disc_in_a_round_tank(density, f"{folder}/rings.npy", 0.3 / across, 6, iterations=iterations)
+
+
+LENGTH, DEPTH, HEIGHT = 1.2, 0.4, 0.24
+"""Of a tank, of its water, and of a baffle in its middle [m]."""
+
+
+def sloshed(thickness, spacing, duration=6.0):
+    """Water in a tank with a baffle of a thickness [m], or a sheet where it is 0, that begins in its first mode: the
+    rate at which the greatest distances of its middle from the tank's fall [1/s], and the period [s]."""
+    middle, wave = 0.5 * LENGTH, np.pi / LENGTH
+    ends = [middle - 0.5 * thickness, -0.1], [middle + 0.5 * thickness, HEIGHT]
+    sheet = {"shape": "sheet", "corners": [[middle, -0.1], [middle, HEIGHT]]}
+    baffle = {"name": "baffle", **(sheet if thickness == 0.0 else box(*ends))}
+    scene = pool(
+        [LENGTH, DEPTH],
+        [LENGTH, 0.8],
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
+        solid=[baffle],
+        discretisation={"spacing": spacing},
+        solver={"kind": "projection", "time_step": 0.1 * spacing},
+    )
+    simulation = Simulation(scene, precision="float64")
+    x, y = simulation.positions.T
+    moving = np.stack([np.sin(wave * x) * np.cosh(wave * y), -np.cos(wave * x) * np.sinh(wave * y)], axis=1)
+    first = {"initial_velocities": 0.2 * moving / np.cosh(wave * DEPTH)}
+    run = simulation.run(round(duration / scene.solver.time_step), first, record_every=5)
+    away = np.abs(run.positions[:, :, 0].mean(axis=1) - middle)
+    peaks = 1 + np.flatnonzero((away[1:-1] >= away[:-2]) & (away[1:-1] > away[2:]) & (away[1:-1] > 3e-4))
+    rate = -np.polyfit(run.times[peaks], np.log(away[peaks]), 1)[0]
+    return float(rate), float(2.0 * np.diff(run.times[peaks]).mean())
 
 
 def cases(device: str) -> dict[str, Callable[[], object]]:
