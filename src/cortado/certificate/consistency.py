@@ -59,16 +59,13 @@ def in_float64(problem: Problem) -> Problem:
     single = problem.simulation
     if single.precision == FLOAT64:
         return problem
-    double = single.in_precision("float64")
-    loss: Any = problem.loss
-    if isinstance(loss, Frames):
-        loss = Frames({step: _loss_in_float64(one, single) for step, one in loss.losses.items()})
-    else:
-        loss = _loss_in_float64(loss, single)
-    return Problem(double, problem.steps, loss, 2 * problem.memory_budget)
+    loss = _loss_in_float64(problem.loss, single)
+    return Problem(single.in_precision("float64"), problem.steps, loss, 2 * problem.memory_budget)
 
 
 def _loss_in_float64(loss: Any, single: Simulation) -> Any:
+    if isinstance(loss, Frames):
+        return Frames({step: _loss_in_float64(one, single) for step, one in loss.losses.items()})
     if type(loss) in ANY_PRECISION:
         return loss
     if type(loss) is Image and isinstance(loss.renderer, Renderer):

@@ -42,15 +42,13 @@ def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
     return folder
 
 
-def _write_series(
-    run: Exported, folder: Path, advance: Advance, ending: str, content: Callable[[Any], str | bytes]
-) -> list[str]:
-    """Write the files of each frame, whose bytes ``content`` returns, and return entries for a ParaView collection."""
+def _write_series(run: Exported, folder: Path, advance: Advance, ending: str, text: Callable[[Any], Any]) -> list[str]:
+    """Write the files of each frame, whose text or bytes ``text`` returns; return entries for a ParaView collection."""
     entries = []
     for number, frame in enumerate(run.frames(run.series)):
         for part, (of, (name, what)) in enumerate(_files(run, number, frame, ending).items()):
             if not (folder / name).exists():
-                write_atomically(folder / name, content(what))
+                write_atomically(folder / name, text(what))
             where = f'timestep="{frame.time!r}" part="{part}" name="{of}" file="{name}"'
             entries.append(f"    <DataSet {where}/>")
         advance()

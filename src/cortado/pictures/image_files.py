@@ -60,8 +60,7 @@ def heart(
     Args:
         resolution: columns and rows of pixels, or one number for both.
         cup: radius of a round cup in the middle, relative to half of the shorter side of the picture; outside the cup
-            is
-            the background. None: coffee everywhere.
+            is the background. None: coffee everywhere.
         size: size of the shape, relative to the cup or, without a cup, to the shorter side of the picture.
         milk, coffee, background: red, green and blue, linear, from 0 to 1.
 

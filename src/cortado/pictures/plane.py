@@ -142,7 +142,9 @@ class PlaneStage:
     @cached_property
     def behind(self) -> Points:
         """Draw the background (rows, columns, 3) of the fluid: paper with shadows, and the inside of a container."""
-        paper = self._paper()
+        (x, y), middle, half = self.pixels, self._middle, 0.5 * self.pixel * self.picture.width
+        away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
+        paper = np.asarray(self.picture.sun_and_sky.background) * (1.12 - 0.20 * away)[..., None]
         if self.container is not None or self._tanks:
             outside = paper * (1.0 - self._shadow() * (1.0 - self._room))[..., None]
             paper = outside + (1.0 - paper) * (0.40 * self._room)[..., None]
@@ -194,12 +196,6 @@ class PlaneStage:
 
     def _covered(self, distance: Points) -> Points:
         return np.clip(0.5 - distance / self.pixel, 0.0, 1.0)
-
-    def _paper(self) -> Points:
-        x, y = self.pixels
-        middle, half = self._middle, 0.5 * self.pixel * self.picture.width
-        away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
-        return np.asarray(self.picture.sun_and_sky.background) * (1.12 - 0.20 * away)[..., None]
 
     @cached_property
     def _room(self) -> Points:

@@ -21,23 +21,12 @@ PALETTE = ("#3d6b8e", "#c0763b", "#5b8a5a", "#8c5f7d", "#a89a4b", "#6b7a80", "#a
 """Muted colours that remain distinguishable in print and for most colour-blind readers."""
 INK, FAINT = "#2b2a28", "#8a857c"
 DASHED: dict[str, Any] = {"linestyle": (0, (5, 4)), "linewidth": 1.2}
-STYLE = {
-    "font.size": 11,
-    "axes.titlesize": 12,
-    "axes.edgecolor": FAINT,
-    "axes.labelcolor": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#ece8e1",
-    "text.color": INK,
-    "xtick.color": FAINT,
-    "ytick.color": FAINT,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "lines.linewidth": 1.8,
-    "legend.frameon": False,
+STYLE: dict[str, Any] = {
+    **dict.fromkeys(("axes.labelcolor", "text.color", "xtick.labelcolor", "ytick.labelcolor"), INK),
+    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), FAINT),
+    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
+    **dict.fromkeys(("axes.grid", "axes.axisbelow"), True),
+    **{"font.size": 11, "axes.titlesize": 12, "lines.linewidth": 1.8, "grid.color": "#ece8e1"},
 }
 
 
@@ -170,8 +159,7 @@ def particles(
     Args:
         positions: one (n, d) [m] for each panel.
         colours: for each panel (n,) numbers, drawn with one scale (speed, density), or (n, 3) linear colours from 0 to
-            1;
-            None shades by depth.
+            1; None shades by depth.
         colour_label: label of the colour scale, with its unit.
         container: lower and upper corner (d,) [m], outlined.
         lines: for each panel (k, 2, d) ends of lines [m], drawn over the particles, such as outlines of solids.

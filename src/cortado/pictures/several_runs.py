@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from math import ceil, log10
 from pathlib import Path
 from typing import Any
@@ -132,7 +132,11 @@ def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tu
     off = max(frames.off for frames in shown)
     if off > SAME * interval_of(times):
         notes.append(f"each run shows its recorded frame nearest in time, at most {off:.2g} s away")
-    composed = partial(_composed, across, scale)
+
+    def composed(images: list[Points]) -> Points:
+        page = side_by_side(images, across)
+        return page if scale is None else scale.beside(page)
+
     told_apart = " ".join([*(run.fingerprint for run in runs), *names])
     return Page(panels, composed, told_apart, "; ".join(notes)), times
 
@@ -143,11 +147,6 @@ def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
         return labelled(panel(int(shown.nearest[k]), (before, after)), name, shown.time_in_words(k))
 
     return drawn
-
-
-def _composed(across: int, scale: Scale | None, images: list[Points]) -> Points:
-    page = side_by_side(images, across)
-    return page if scale is None else scale.beside(page)
 
 
 SAME = 0.01

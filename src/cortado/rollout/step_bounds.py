@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, inf, log
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -129,19 +130,6 @@ class Pull:
     greatest: float
     """Greatest length of a step [s]."""
 
-    @classmethod
-    def of(cls, scene: Scene, courses: Mapping[str, Changing], greatest: float) -> "dict[str, Pull]":
-        """Return a `Pull` for the courses of gravity and tilt, by a phrase such as "the scheduled gravity"."""
-        upright: dict[str, Callable[[NDArray], NDArray]] = {
-            "gravity": np.asarray,
-            "tilt": Tilt(scene.forces.gravity).gravity,
-        }
-        return {
-            f"the scheduled {name}": cls(scene, one, upright[name], greatest)
-            for name, one in courses.items()
-            if name in upright and isinstance(one, Knots)
-        }
-
     def longest(self, time: float) -> float:
         """Return the longest step [s] that may begin at a time [s], before gravity becomes too strong."""
         ways = np.linspace(0.0, self.greatest, 9)
@@ -153,9 +141,12 @@ class Pull:
 
 def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) -> dict[str, Travel | Pull]:
     """Return the bounds on steps by speed along paths and by scheduled gravity, with a phrase as name."""
-    courses = parameters.courses(values)
+    courses, greatest = parameters.courses(values), greatest_step(scene, values)
+    upright: dict[str, Any] = {"gravity": np.asarray, "tilt": Tilt(scene.forces.gravity).gravity}
+    pulls = {name: one for name, one in courses.items() if name in upright and isinstance(one, Knots)}
     travel = Travel.of(scene, values, moved_by(scene, values, courses).values())
-    return {"the speed along paths": travel, **Pull.of(scene, courses, greatest_step(scene, values))}
+    own = {f"the scheduled {name}": Pull(scene, one, upright[name], greatest) for name, one in pulls.items()}
+    return {"the speed along paths": travel, **own}
 
 
 def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]) -> None:

@@ -87,26 +87,13 @@ class Compressions:
 
     def measure(self, state: State) -> None:
         """Record the compression added by the step before ``state``; kernel launches only."""
-        solver = self._solver
-        repaired = solver.repaired[0]
-        solver.launch(
-            self._compare,
-            particles=solver.layout.particles,
-            first_waiting=solver.system.waiting,
-            order=solver.search.order,
-            n=solver.fields["n"],
-            excess=repaired["excess"],
-            x_free=repaired["x_now"],
-            x=state.positions,
-            added=self._each,
-        )
-        solver.launch(
-            self._record,
-            greatest=self._greatest(self._each),
-            step=solver.step_number,
-            added=self._added,
-            threads=solver.layout.members,
-        )
+        solver, members = self._solver, self._solver.layout.members
+        numbers = {"particles": solver.layout.particles, "first_waiting": solver.system.waiting}
+        now = {"order": solver.search.order, "n": solver.fields["n"], "x": state.positions}
+        repaired = {"excess": solver.repaired[0]["excess"], "x_free": solver.repaired[0]["x_now"]}
+        solver.launch(self._compare, numbers, now, repaired, added=self._each)
+        greatest = {"greatest": self._greatest(self._each), "step": solver.step_number}
+        solver.launch(self._record, greatest, added=self._added, threads=members)
 
     def read(self, first: int, last: int) -> NDArray[np.float64]:
         """Return the added compressions (last - first, members) [-] of steps ``first`` to ``last``."""
@@ -280,23 +267,13 @@ class ChosenSteps(StepSizes):
         self._choose(state)
 
     def _choose(self, state: State) -> None:
-        launch = self._solver.launch
-        launch(self._speeds, v=state.velocities, squares=self._squares)
-        launch(
-            self._choice,
-            length=self._length,
-            least=LEAST,
-            growth=GROWTH,
-            greatest=self._greatest(self._squares),
-            bounds=self._bounds,
-            first=self._first,
-            step=self._solver.step_number,
-            times=self._times,
-            sizes=self._sizes,
-            longest=self._longest,
-            time_step=self._parameters["time_step"],
-            threads=self._solver.layout.members,
-        )
+        solver = self._solver
+        solver.launch(self._speeds, v=state.velocities, squares=self._squares)
+        limits = {"length": self._length, "least": LEAST, "growth": GROWTH, "bounds": self._bounds}
+        known = {"first": self._first, "greatest": self._greatest(self._squares), "step": solver.step_number}
+        found = {"times": self._times, "sizes": self._sizes, "longest": self._longest}
+        time_step = self._parameters["time_step"]
+        solver.launch(self._choice, limits, known, found, time_step=time_step, threads=solver.layout.members)
 
     def seek(self, step: int) -> None:
         wp.copy(self._parameters["time_step"], self._sizes[step])

@@ -27,6 +27,8 @@ from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import Counts, Solver, WithinBar
 from cortado.sph.parts import StepContext, sort
 
+Given = Mapping[str, NDArray]
+
 
 @dataclass(frozen=True, eq=False)
 class Moment:
@@ -77,7 +79,7 @@ class Moment:
     def adjoint(self, bars: Mapping[str, NDArray]) -> tuple[Arrays, Arrays]:
         return self.evaluator().adjoint(bars, self)
 
-    def tangents(self, names: list[str], dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]) -> Arrays:
+    def tangents(self, names: list[str], dot: Given, parameters_dot: Given) -> Arrays:
         """Return tangents of quantities along tangents of the state's fields and of the step's parameters."""
         return self.evaluator().tangents(names, self, dot, parameters_dot)
 
@@ -124,9 +126,7 @@ class QuantityEvaluator:
         return {name: self._shown(name, self._formulas[name].value(step, p)) for name in wanted}
 
     @in_turn
-    def tangents(
-        self, names: Iterable[str], moment: Moment, dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]
-    ) -> Arrays:
+    def tangents(self, names: Iterable[str], moment: Moment, dot: Given, parameters_dot: Given) -> Arrays:
         wanted, solver = self._checked(names), self.solver
         step, p = self._begin(wanted, moment, replay=True)
         state_dot, along = solver.new_state(), solver.new_parameters(1)
@@ -212,8 +212,6 @@ class QuantityEvaluator:
                 raise InputError(f"{name!r} is of the solid {name.removesuffix(LOAD)!r}, but the scene has {solids}.")
         return wanted
 
-    # ---- the step ------------------------------------------------------------------------------------------------
-
     def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[StepContext, wp.array | None]:
         """Find neighbours, and take the step if a quantity needs it; with ``replay`` prepare derivatives."""
         self._set(moment)
@@ -262,8 +260,6 @@ class QuantityEvaluator:
     def _pressure_adjoint(self) -> Any:
         """Make a `PressureAdjoint` with adjoints ``bar`` within the step."""
         return self.solver.adjoint(1)
-
-    # ---- orders --------------------------------------------------------------------------------------------------
 
     @property
     def _order(self) -> NDArray:

@@ -234,8 +234,7 @@ class Trajectory:
         Raise `InputError` if there is no frame."""
         if not len(self):
             raise InputError("The trajectory has no frame, but must have one to continue from.")
-        last = {**{name: array[-1] for name, array in fields_of(self).items()}, **self.constants}
-        own = {name: array.copy() for name, array in last.items()}
+        own = {name: array.copy() for name, array in {**fields_of(self[-1]), **self.constants}.items()}
         taken = self.diagnostics.get("time_steps", np.zeros(0))[: int(self.steps[-1]) - (self.begun or 0)]
         size = float(taken[-1]) if len(taken) else 0.0
         return RestartState(own, Clock(int(self.steps[-1]), float(self.times[-1]), size), self.origin)
@@ -256,10 +255,8 @@ class Trajectory:
 
     def write_frames(self, writer: vtkhdf.TrajectoryWriter) -> None:
         """Write all frames with the ``writer`` of a file that has room for them."""
-        for k, step in enumerate(self.steps):
-            recorded = {name: array[k] for name, array in self.quantities.items()}
-            frame = {name: array[k] for name, array in fields_of(self).items()}
-            append_frame(writer, frame, int(step), recorded, float(self.times[k]))
+        for frame, step in zip(self, self.steps, strict=True):
+            append_frame(writer, fields_of(frame), int(step), frame.quantities, frame.time)
 
     def export(self, folder: str | PathLike[str], to: str, scene: Scene | str | PathLike[str] | None = None) -> Path:
         """Export the fluid's surface and particles, coloured as in pictures, and the solids to other programs: see

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from cortado.calls import counted
 from cortado.device.cells import CellSort
@@ -26,6 +27,7 @@ MODULE = kernel_module("liquid")
 MODULE.options["max_unroll"] = 2  # compiles in half the time
 Look = wp.types.vector(5, wp.float32)
 """Red, green and blue, linear from 0 to 1, then scattering and absorption [1/m]."""
+Looks = wp.array(dtype=Look)
 OPAQUE = (1e6, 0.0)
 """Scattering and absorption [1/m] of opaque fluid."""
 PARTS = 4096
@@ -50,9 +52,7 @@ class Particles:
     """(n,) of `Look`"""
 
     @classmethod
-    def on(
-        cls, device: Any, places: Points, colours: Points, media: Points | tuple[float, float] = OPAQUE
-    ) -> "Particles":
+    def on(cls, device: Any, places: Points, colours: Points, media: ArrayLike = OPAQUE) -> "Particles":
         """Copy NumPy arrays (n, 3), with ``media`` (n, 2) or (2,): scattering and absorption [1/m]. Raise
         `ComputationError` for positions that are not finite."""
         finite = np.isfinite(places)
@@ -68,13 +68,6 @@ class Particles:
 
     def __len__(self) -> int:
         return len(self.places)
-
-    def and_images(self, places: Points, of: np.ndarray) -> "Particles":
-        """Return the particles followed by others at ``places`` (m, 3) [m], which look like the particles ``of``
-        (m,)."""
-        looks = np.concatenate([self.looks.numpy(), self.looks.numpy()[of]])
-        both = np.concatenate([self.places.numpy(), places])
-        return Particles.on(self.places.device, both, looks[:, :3], looks[:, 3:])
 
     def ends(self, launch: BandLauncher) -> tuple[Points, Points]:
         """(3,) [m] each."""
@@ -129,7 +122,7 @@ class NearParticles:
     """(cells + 1,) number of the first particle of each cell"""
     places: Vec3s
     """(n,) [m]"""
-    looks: wp.array(dtype=Look)
+    looks: Looks
     """(n,)"""
     volumes: Floats
     """(n,), such that bumps times volumes add up to about 1 within fluid; an isolated particle has volume 1"""
@@ -188,14 +181,7 @@ count_near = sum_near(one, wp.float32)
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def sort_particles(
-    first: wp.int32,
-    order: Ints,
-    given: Vec3s,
-    given_looks: wp.array(dtype=Look),
-    places: Vec3s,
-    looks: wp.array(dtype=Look),
-):
+def sort_particles(first: wp.int32, order: Ints, given: Vec3s, given_looks: Looks, places: Vec3s, looks: Looks):
     i = first + wp.tid()
     places[i] = given[order[i]]
     looks[i] = given_looks[order[i]]

@@ -17,7 +17,7 @@ from cortado.pictures.shown_solids import ShownSolid, SolidMesh
 from cortado.pictures.stage import Stage
 from cortado.pictures.tracing.backdrop import LitSurface, Solids
 from cortado.pictures.tracing.liquid_surface import Mesh
-from cortado.pictures.tracing.near_particles import Floats, Look, Particles, Vec3s, Vec3s2d, Vec4s2d
+from cortado.pictures.tracing.near_particles import Floats, Looks, Particles, Vec3s, Vec3s2d, Vec4s2d
 
 NODES = 320
 """Number of nodes along either side of the floor that may lie in shadow."""
@@ -78,7 +78,7 @@ typed = TypesByName(
     {
         wp.int32: "first across",
         Vec3s: "places",
-        wp.array(dtype=Look): "looks",
+        Looks: "looks",
         Floats: "volumes weights",
         wp.vec3: "corner",
         wp.vec2: "slope strength",
@@ -165,7 +165,7 @@ class FloorShadow:
     def of_fluid(self, particles: Particles) -> None:
         stage = self._stage
         volumes = wp.full(len(particles), stage.spacing**3, dtype=wp.float32, device=self._device)
-        self._add(particles, [volumes, volumes], 0.8 * stage.spacing, tinted=0.4 * stage.transparency)
+        self._add(particles, [volumes, volumes], 0.8 * stage.spacing, 1.0, 0.4 * stage.transparency)
 
     def of_solid(self, shown: ShownSolid, mesh: SolidMesh) -> None:
         stage = self._stage
@@ -177,11 +177,9 @@ class FloorShadow:
         middle, area = middle[casts], 0.5 * np.cross(b - a, c - a)[casts]
         volumes = 3.0 * stage.spacing * np.abs(np.stack([area @ stage.sun / stage.sun[1], area[:, 1]]))
         parts = Particles.on(self._device, middle, np.tile(shown.colour, (len(middle), 1)))
-        self._add(parts, [self._array(one) for one in volumes], 0.0, opacity=1.0 - shown.transparency)
+        self._add(parts, [self._array(one) for one in volumes], 0.0, 1.0 - shown.transparency, 0.0)
 
-    def _add(
-        self, parts: Particles, volumes: list[wp.array], least: float, opacity: float = 1.0, tinted: float = 0.0
-    ) -> None:
+    def _add(self, parts: Particles, volumes: list[wp.array], least: float, opacity: float, tinted: float) -> None:
         """Add the shadow of particles with volumes (n,) [m3] as lamp and sky see them, at least ``least`` [m] soft.
         ``tinted`` is the additional transmission of light of the object's colour."""
         if not len(parts):
@@ -210,13 +208,11 @@ class FloorShadow:
         rows, columns = (last - first + 2).tolist()
         return first.tolist(), (rows, columns)
 
-    def _thickness(
-        self, parts: Particles, volumes: wp.array, bell: Points, shape: tuple[int, int], **where: Any
-    ) -> Any:
+    def _thickness(self, parts: Particles, volumes: wp.array, bell: Points, shape: tuple[int, int], **at: Any) -> Any:
         """Return thicknesses as vec4, which `cast` adds up at nodes of this shape, blurred by a bell."""
         sharp = wp.zeros(shape, dtype=wp.vec4, device=self._device)
         given = {"places": parts.places, "looks": parts.looks, "volumes": volumes}
-        launch_once(cast, len(volumes), self._device, **given, **where, thickness=sharp)
+        launch_once(cast, len(volumes), self._device, **given, **at, thickness=sharp)
         weights, other = self._array(bell), wp.empty_like(sharp)
         self._launch(blur, sharp.size, across=0, weights=weights, sharp=sharp, found=other)
         self._launch(blur, sharp.size, across=1, weights=weights, sharp=other, found=sharp)

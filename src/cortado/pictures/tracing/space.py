@@ -61,25 +61,23 @@ SAME_SIDE = 0.8
 """Greatest cosine between the normals of two sides of a corner."""
 
 
-def mirrored(
-    points: Points, solids: Sequence[ShownSolid], touching: float, spacing: float
-) -> tuple[Points, np.ndarray]:
+def mirrored(points: Points, solids: Sequence[ShownSolid], near: float, spacing: float) -> tuple[Points, np.ndarray]:
     """Return mirror images (m, d) [m] of points (n, d) [m] behind solids, and the point of each, (m,).
 
-    A point closer to a solid than ``touching`` [m] has an image behind each touched side, and behind the corner between
+    A point closer to a solid than ``near`` [m] has an image behind each touched side, and behind the corner between
     two touched sides. Images that a thin solid would not hide are closer to the surface or left out.
     """
     dimension = points.shape[1]
     images, of = [np.zeros((0, dimension))], [np.zeros(0, dtype=int)]
     for shown in solids:
         distances = shown.solid.distance(points)
-        near = np.flatnonzero((distances > 0.0) & (distances < touching))
-        ways = _ways(points[near], shown, touching, spacing)
+        touching = np.flatnonzero((distances > 0.0) & (distances < near))
+        ways = _ways(points[touching], shown, near, spacing)
         for count in range(1, dimension + 1):
             for chosen in combinations(ways, count):
                 there = np.all([way.any(axis=1) for way in chosen], axis=0)
-                images.append((points[near] + np.sum(chosen, axis=0))[there])
-                of.append(near[there])
+                images.append((points[touching] + np.sum(chosen, axis=0))[there])
+                of.append(touching[there])
     return np.concatenate(images), np.concatenate(of)
 
 
@@ -208,7 +206,9 @@ def wetting(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) ->
     if stage.solids:
         placed = particles.places.numpy().astype(np.float64)
         images, of = mirrored(placed, stage.solids, TOUCHING_SOLID * stage.spacing, stage.spacing)
-        particles = particles.and_images(images, of)
+        looks = np.concatenate([particles.looks.numpy(), particles.looks.numpy()[of]])
+        both = np.concatenate([particles.places.numpy(), images])
+        particles = Particles.on(launch.device, both, looks[:, :3], looks[:, 3:])
     if not stage.cuts:
         return particles
     own, given = {"s": s, "spacing": stage.spacing}, {"places": particles.places, "looks": particles.looks}
