@@ -88,6 +88,11 @@ class Ensemble:
         position_noise = self.position_noise * problem.simulation.scene.discretisation.spacing
         return Sampler(values, spreads, start, position_noise, np.random.default_rng([self.seed, draw]))
 
+    def evaluated(self, problem: Differentiable, points: Iterable[Point], observe: Observer | None) -> list[Estimate]:
+        """Return estimates at points, in order; ``observe`` needs the states and keeps the runs in this process."""
+        executor = self.executor if observe is None else InProcess()
+        return evaluated(problem, points, executor, observe)
+
     def require_memory(self, runs: int, numbers: int) -> None:
         """Raise `InputError` unless memory suffices for the results of ``runs`` runs with ``numbers`` numbers each."""
         require({f"{runs:,} runs of {self.samples:,} samples": runs * (_RUN + 8.0 * numbers)}, "take fewer samples")
@@ -224,7 +229,7 @@ class RandomizedSmoothing(Ensemble):
                     yield ensemble.sample(r * q, displacement)
                     yield ensemble.sample(-r * q, displacement)
 
-        at_them, *runs = evaluated(problem, points(), self.executor)
+        at_them, *runs = self.evaluated(problem, points(), None)
         kept = remaining(runs, len(directions), "differences")
         found = np.zeros((self.samples, numbers))
         for k in np.flatnonzero(kept):
@@ -279,7 +284,7 @@ class EnsembleMean(Ensemble):
                 yield ensemble.sample(u, displacement, self.estimator)
                 yield ensemble.sample(-u, -displacement, self.estimator)
 
-        at_them, *samples = evaluated(problem, points(), self.executor, observe)
+        at_them, *samples = self.evaluated(problem, points(), observe)
         kept = np.repeat(remaining(samples, self.samples // 2, "antithetic pairs"), 2)
         checked = [checked_estimate(samples[k], ensemble.values) for k in np.flatnonzero(kept)]
         numbers = np.array([joined(one.gradient, ensemble.values) for one in checked])
@@ -377,7 +382,7 @@ class Guided(Ensemble):
                     yield ensemble.sample(r * part, displacement)
                     yield ensemble.sample(-r * part, displacement)
 
-        runs = evaluated(problem, points(), self.executor)
+        runs = self.evaluated(problem, points(), None)
         kept = remaining(runs, self.differences, "samples of the differences")
         pairs = np.array([one.loss for one in runs]).reshape(self.differences, len(parts), 2)[kept]
         slopes = (pairs[..., 0] - pairs[..., 1]) / (2.0 * np.array(reach))

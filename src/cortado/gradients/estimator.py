@@ -11,7 +11,7 @@ import numpy as np
 from cortado.arrays import as_numbers, as_one_number, require_methods
 from cortado.calls import counted, sized
 from cortado.errors import DivergedError, InputError, OutOfRangeError, shown
-from cortado.executors import Executor, InProcess, OnResult
+from cortado.executors import Executor, OnResult
 from cortado.particles.state import Parameters, State
 from cortado.rollout.rollout import BackwardStep, Observer, Rollout
 from cortado.scene.parameter_values import Arrays, Values
@@ -276,10 +276,8 @@ def evaluated(
     observe: Observer | None = None,
     on_result: OnResult | None = None,
 ) -> list[Estimate]:
-    """Compute estimates at points by an executor, many in one launch, and return them in order; ``observe`` needs the
-    states and keeps the runs in this process."""
+    """Compute estimates at points by an executor, many in one launch, and return them in order."""
     evaluation, firsts = Evaluation(problem, observe), [0]
-    executor = executor if observe is None else InProcess()
 
     def groups() -> Iterator[Group]:
         for group in evaluation.groups(points, executor.threads):

@@ -12,7 +12,7 @@ from cortado.device.launching import Named
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
-from cortado.runs.particle_sums import LoadSum, NoSum, Summed
+from cortado.runs.particle_sums import LoadSum, Summed
 from cortado.runs.quantity_formulas import SIX, Bars, QuantityFormula
 from cortado.runs.sensor import Reading, SensedScene, named
 from cortado.scene.motions import Pose, angular_velocity_name, position_name, velocity_name
@@ -128,12 +128,12 @@ class BodyMotion(Summed):
         found |= {f"velocity_{axis}": "m/s" for axis in axes}
         return found | {f"angular_velocity{turn}": "rad/s" for turn in turns}
 
-    def summed(self, at: SensedScene) -> NoSum:
+    def summed(self, at: SensedScene) -> LoadSum:
         free = [table.name for table in at.solids if table.motion == "free"]
         if self.solid not in free:
             wanted = f"the name of a free body, of {shown(free)}" if free else "of a scene with free bodies"
             raise InputError(f"solid is {shown(self.solid)}, but must be {wanted}.")
-        return NoSum()
+        return LoadSum()
 
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
         pose = self._pose(at)

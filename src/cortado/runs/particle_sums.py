@@ -311,24 +311,18 @@ class RegionSum:
 
 @dataclass(frozen=True)
 class LoadSum:
-    quantity: str
+    """A load, or 0 for a sensor that reads only the motion of solids."""
+
+    quantity: str | None = None
 
     def on_host(self, at: Reading) -> NDArray[Any]:
+        if self.quantity is None:
+            return np.zeros(6)
         load, d = at[self.quantity], at.dimension
         return np.concatenate([in_space(load[:d]), load[d:] if d == 3 else np.pad(load[d:], (2, 0))])
 
 
-@dataclass(frozen=True)
-class NoSum:
-    """The sum 0, for a sensor that reads only the motion of solids."""
-
-    quantity: None = None
-
-    def on_host(self, at: Reading) -> NDArray[Any]:
-        return np.zeros(6)
-
-
-ParticleSum = WeightedSum | RegionSum | LoadSum | NoSum
+ParticleSum = WeightedSum | RegionSum | LoadSum
 """A sum over particles (6,), with the name of the ``quantity`` that it reads; None for fields of the state alone."""
 
 

@@ -18,7 +18,7 @@ from cortado.discretise.room import Domain
 from cortado.discretise.shapes import in_space
 from cortado.errors import InputError
 from cortado.particles.state import Parameters, State, StateSeries
-from cortado.runs.particle_sums import LoadSum, NoSum, ParticleSum, RegionSum, Ride, WeightedSum, square
+from cortado.runs.particle_sums import LoadSum, ParticleSum, RegionSum, Ride, WeightedSum, square
 from cortado.runs.quantity_formulas import SIX, QuantityFormula
 from cortado.runs.sensor import SensedScene
 from cortado.scene.motions import AXES
@@ -291,9 +291,7 @@ class ChunkSums:
     def launch(self, count: int, first: State, later: StateSeries, kept: Mapping[str, wp.array]) -> wp.array:
         """Launch the sums over the initial states of ``count`` steps, and return them (at least count * scenes,)."""
         if isinstance(self._summed, LoadSum):
-            return kept[self._summed.quantity]
-        if isinstance(self._summed, NoSum):
-            return self._total
+            return self._total if self._summed.quantity is None else kept[self._summed.quantity]
         key = count, first.positions.ptr
         if key not in self._launches:
             self._launches[key] = self._recorded(self._summed, count, first, later, kept)
