@@ -177,3 +177,11 @@ def test_as_many_steps_of_other_lengths_may_end_at_the_same_time(capsys):
     state = compared(capsys, "one", "halved")["last_state"]
     assert state["compared_at_s"] == pytest.approx(0.0084) and state["fields"]["positions"]["greatest"] > 0.0
     assert "last state at 0.0084 s: positions apart by" in said(capsys, "one", "halved")
+
+
+def test_a_run_that_lacks_its_last_frame_differs_by_it_alone(capsys):
+    path = Path("other/trajectory.vtkhdf")
+    Trajectory.load(path)[:-1].save(path)
+    found = compared(capsys, "one", "other")
+    assert found["equal"] is False and not found["result"] and not found["metrics"]
+    assert found["last_state"]["compared_at_s"] == pytest.approx(0.0063)

@@ -177,8 +177,9 @@ def test_positions_have_bounds_from_zero_on():
     walls = one_run(made, Sample(table(), 0)).arrays["position"][0, made.particles :]
     assert walls.min() > 0.0 and (walls.max(axis=0) < size).all()
     with pytest.raises(InputError, match=r"Particle 1 is 0.2 m below the bounds .* along axis 0 in frame 0"):
-        datasets._ends(np.array([[[0.1, 0.1], [-0.2, 0.1]]]))
-    assert datasets._ends(np.array([[[0.1, 2.0], [0.2, 0.1]]])) == {"upper": [0.2, 2.0]}
+        datasets._statistics(np.zeros((1, 2, 2)), np.array([[[0.1, 0.1], [-0.2, 0.1]]]), periods)
+    found = datasets._statistics(np.zeros((1, 2, 2)), np.array([[[0.1, 2.0], [0.2, 0.1]]]), periods)
+    assert found["upper"] == [0.2, 2.0]
 
 
 def test_particles_that_would_jump_are_refused():
@@ -200,7 +201,7 @@ def test_what_crosses_a_period_moves_the_shorter_way():
     np.testing.assert_allclose(places[:, 0, 0], [1.4, 1.6, 0.0], atol=1e-15)
     np.testing.assert_array_equal(places[:, 0, 1], positions[:, 0, 1])
     for one in (positions, places):
-        found = datasets._statistics(one, periods)
+        found = datasets._statistics(one, places, periods)
         np.testing.assert_allclose(found["vel"][1], [0.6, 0.3], atol=1e-12)
         np.testing.assert_allclose(found["acc"][1], [0.2, 0.1], atol=1e-12)
 

@@ -210,7 +210,7 @@ def test_every_limit_is_one_of_those_of_the_time_step():
 def test_energies_are_those_of_the_particles(make):
     simulation = cortado.Simulation(make(), precision="float64")
     rollout = simulation.rollout(3)
-    summary = RunSummary(simulation, rollout, rollout.forward(keep=False), 0.3)
+    summary = RunSummary(simulation, rollout, rollout.forward(keep=False), 0.3, {})
     trajectory, scene = simulation.run(3), simulation.scene
     masses = simulation.lattice.cell * trajectory.constants["reference_density"]
     kinetic = 0.5 * (masses * (trajectory.velocities[-1] ** 2).sum(axis=1)).sum()
@@ -233,7 +233,9 @@ def test_densities_are_those_of_the_rest_lattice():
     simulation = cortado.Simulation(scene, precision="float64")
     rollout = simulation.rollout(2)
     last = rollout.forward(keep=False)
-    assert RunSummary(simulation, rollout, last, 1.0).densities == pytest.approx([800.0 * (1.0 - SLACK)] * 2, rel=1e-9)
+    assert RunSummary(simulation, rollout, last, 1.0, {}).densities == pytest.approx(
+        [800.0 * (1.0 - SLACK)] * 2, rel=1e-9
+    )
     at = last.numpy(2)["positions"]
     at[7] += 0.02
     last.set({"positions": at})
@@ -249,7 +251,7 @@ def test_densities_leave_out_what_waits_in_an_emitter():
     last = rollout.forward(keep=False)
     rest = simulation.scene.phase[0].rest_density
     assert simulation.solver.densities(last, rollout.parameters).max() > 1.5 * rest
-    assert RunSummary(simulation, rollout, last, 1.0).densities[1] < 1.1 * rest
+    assert RunSummary(simulation, rollout, last, 1.0, {}).densities[1] < 1.1 * rest
 
 
 def test_densities_at_the_end_are_those_beside_solids_where_they_are_then():
@@ -261,7 +263,7 @@ def test_densities_at_the_end_are_those_beside_solids_where_they_are_then():
     simulation = cortado.Simulation(pool([0.8, 0.4], [0.8, 0.8], **tables))
     steps = 60
     rollout = simulation.rollout(steps)
-    found = RunSummary(simulation, rollout, rollout.forward(keep=False), 1.0).densities
+    found = RunSummary(simulation, rollout, rollout.forward(keep=False), 1.0, {}).densities
     wanted = simulation.run(steps, record_every=steps, record=["density"])[-1]["density"]
     assert found == pytest.approx((wanted.min(), wanted.max()), rel=1e-6)
 

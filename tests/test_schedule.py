@@ -175,7 +175,7 @@ def test_a_run_says_whether_gravity_changed(last, turned):
     course = {"times": [0.0, 0.01], "values": [[0.0, -9.81], [0.0, last]]}
     simulation = Simulation(plane(schedule={"gravity": course}))
     rollout = simulation.rollout(steps=10)
-    summary = RunSummary(simulation, rollout, rollout.forward(), 1.0)
+    summary = RunSummary(simulation, rollout, rollout.forward(), 1.0, {})
     assert ("in the gravity of that time" in str(summary)) is turned
 
 

@@ -433,7 +433,7 @@ def test_a_time_of_more_steps_than_can_be_counted_is_refused(step):
     ],
 )
 def test_describe_says_which_limit_decides_the_first_step(cortado_command, tmp_path, monkeypatch, words, limit, size):
-    monkeypatch.setattr("cortado.cli.describe.MOST", 4)  # to time more of them takes long
+    monkeypatch.setattr("cortado.cli.describe.MOST_STEPS", 4)  # to time more of them takes long
     (tmp_path / "scene.toml").write_text(SCENE)
     sets = [word for one in words for word in ("--set", one)]
     code, out, _ = cortado_command("describe", tmp_path / "scene.toml", *sets)

@@ -72,26 +72,18 @@ _MODULES = (
     "render",
     "sensors",
 )
-_HOMES = {
-    "ComputationError": "errors",
-    "CortadoError": "errors",
-    "CortadoWarning": "errors",
-    "DivergedError": "errors",
-    "Fit": "optimisation.fitting.fit",
-    "InputError": "errors",
-    "Problem": "problem",
-    "Scene": "scene.scene",
-    "SceneError": "errors",
-    "Simulation": "simulation",
-    "Trajectory": "runs.trajectory",
-    "certify": "certificate",
-    "evaluate": "optimisation.optimise",
-    "film_side_by_side": "pictures.several_runs",
-    "fit": "optimisation.fitting.fit",
-    "load_scene": "scene.scene",
-    "optimise": "optimisation.optimise",
-    "optimize": "optimisation.optimise",
+_NAMES = {
+    "certificate": "certify",
+    "errors": "ComputationError CortadoError CortadoWarning DivergedError InputError SceneError",
+    "optimisation.fitting.fit": "Fit fit",
+    "optimisation.optimise": "evaluate optimise optimize",
+    "pictures.several_runs": "film_side_by_side",
+    "problem": "Problem",
+    "runs.trajectory": "Trajectory",
+    "scene.scene": "Scene load_scene",
+    "simulation": "Simulation",
 }
+_HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
 __all__ = [*_MODULES, *_HOMES]
 
 if not TYPE_CHECKING:  # which would take any name for one of the package

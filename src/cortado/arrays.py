@@ -92,8 +92,7 @@ def require_at_most(what: str, value: Any, most: int) -> None:
 
 
 def whole_number(what: str, value: Any, least: int) -> int:
-    """Return a whole number, such as 3 or 3.0, as an int of at least ``least``; raise `InputError` for anything
-    else."""
+    """Return a whole number, such as 3 or 3.0, as an int of at least ``least``; raise `InputError` otherwise."""
     whole = is_whole(value) or (isinstance(value, (float, np.floating)) and value.is_integer())
     if not whole or value < least:
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")

@@ -242,8 +242,7 @@ class _Map:
         self._sent[self._calls.submit(call, payload, item, key=key)] = number, item
 
     def _count_workers(self, interval: float) -> None:
-        """Count workers, at most once per interval [s]; raise `ComputationError` without a scheduler, or too long
-        without workers."""
+        """Count workers, at most once per interval [s]; raise `ComputationError` if there are none for too long."""
         now = time.monotonic()
         if now - self._counted < interval:
             return
@@ -264,7 +263,12 @@ class _Map:
                 return self._send(self._payload, number, item)
             self._results[number] = answer.result()
         except Exception as error:
-            return self._fail(number, error)
+            if self._failed is None or number < self._failed[0]:
+                self._failed = number, error
+            for later in [one for one, (other, _) in self._sent.items() if other > self._failed[0]]:
+                del self._sent[later]
+                later.cancel()
+            return
         if self._on_result is not None:
             self._on_result(number, self._results[number])
 
@@ -283,13 +287,6 @@ class _Map:
             raise ComputationError(f"Item {number} could not be computed by a worker: {in_words(error)}.") from error
         assert isinstance(answer, (Answer, Lacking))
         return answer
-
-    def _fail(self, number: int, error: BaseException) -> None:
-        if self._failed is None or number < self._failed[0]:
-            self._failed = number, error
-        for future in [future for future, (other, _) in self._sent.items() if other > self._failed[0]]:
-            del self._sent[future]
-            future.cancel()
 
 
 def _distributed() -> Any:

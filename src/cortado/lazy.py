@@ -32,19 +32,13 @@ def getter(package: str, homes: "Mapping[str, str] | None" = None) -> "Callable[
     return found
 
 
-FUNCTIONS = {
-    "export": "pictures.export_formats",
-    "film_page": "pictures.pages",
-    "fit_page": "optimisation.fitting.figures",
-    "labelled": "pictures.export_formats",
-    "result_page": "pictures.pages",
-    "simulation_film": "pictures.run_pictures",
-    "simulation_page": "pictures.pages",
-    "simulation_picture": "pictures.run_pictures",
-    "trajectory_film": "pictures.run_pictures",
-    "trajectory_page": "pictures.pages",
-    "trajectory_picture": "pictures.run_pictures",
+_NAMES = {
+    "optimisation.fitting.figures": "fit_page",
+    "pictures.export_formats": "export labelled",
+    "pictures.pages": "film_page result_page simulation_page trajectory_page",
+    "pictures.run_pictures": "simulation_film simulation_picture trajectory_film trajectory_picture",
 }
+FUNCTIONS = {name: home for home, names in _NAMES.items() for name in names.split()}
 
 
 def on_top(name: str) -> "Any":

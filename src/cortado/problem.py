@@ -38,8 +38,7 @@ from cortado.sph.function_text import code_words
 __all__ = ["NAMES", "UNITS", "Problem"]
 
 SPARSE = 8
-"""Quantities are read during the run if the loss needs at least one state in so many; else repeating their steps costs
-less."""
+"""Quantities are read during the run if one state in so many is needed; else repeating steps costs less."""
 KEPT = 2
 
 
@@ -395,21 +394,16 @@ class Problem:
 
         self._space.begin(self._rollout, values, varied, self._states)
         observe(0, self._rollout.initial)
-        reader = self._reader(wanted)
+        each_step = {k: name for k, name in self._losses.quantities(self.simulation.evaluator).items() if k in wanted}
+        each_step.pop(self.steps, None)  # no step is behind it
+        reader = None
+        if each_step and len(each_step) * SPARSE >= self.steps:
+            reader = QuantityReader(self.simulation.evaluator(), self._rollout, each_step)
         self._rollout.forward(observe, keep, reader=reader)
         for step, found in () if reader is None else reader.found.items():
             moment_of(ends[step]).know(found)
             moment_of(ends[step]).counts.extend([self._rollout.log.seek(step)] if single else [])
         return ends
-
-    def _reader(self, wanted: set[int]) -> QuantityReader | None:
-        """Return a reader of the loss's quantities during the run; None if the loss needs so few that steps are
-        repeated."""
-        each = {k: name for k, name in self._losses.quantities(self.simulation.evaluator).items() if k in wanted}
-        each.pop(self.steps, None)  # no step is behind it
-        if len(each) * SPARSE < self.steps or not each:
-            return None
-        return QuantityReader(self.simulation.evaluator(), self._rollout, each)
 
     @property
     def _going(self) -> list[int] | None:

@@ -39,25 +39,15 @@ from cortado.scene.parameters import check_readable
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import OWN
-from cortado.solvers.build import (
-    ForceMaker,
-    SolverMaker,
-    SolverSetting,
-    built,
-    called,
-    check_own,
-    checked_makers,
-    checked_solver,
-    first_capacity,
-    forces_named,
-    known_of,
-    solver_named,
-)
+from cortado.solvers import build
 from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy, stable_substeps
 from cortado.watching import Watch
 
 WORTH = {"cpu": 16_000, "cuda": 1_000_000}
+Controls = Mapping[str, Any] | None
+Start = RestartState | Sequence[RestartState]
+"""A state to begin from, or one for each scene of a batch."""
 
 
 @public
@@ -83,8 +73,8 @@ class Simulation(Stepping):
         precision: str = "float32",
         free_energy: FreeEnergy | None = None,
         batch: int | None = None,
-        forces: Sequence[ForceMaker] = (),
-        solver: SolverMaker | None = None,
+        forces: Sequence[build.ForceMaker] = (),
+        solver: build.SolverMaker | None = None,
         lanes: int | None = None,
     ):
         """Prepare ``scene``, a `Scene` or the path of its file. ``device``: "cpu" or "cuda:0", as in Warp.
@@ -101,18 +91,18 @@ class Simulation(Stepping):
         if free_energy is not None and len(scene.phase) == 1:
             raise InputError("free_energy is given, but must be left out, as the scene has only one phase.")
         self.scene = scene
-        self._given = checked_makers(forces), None if solver is None else checked_solver(solver)
-        self.forces = (*forces_named(scene), *self._given[0])
+        self._given = build.checked_makers(forces), None if solver is None else build.checked_solver(solver)
+        self.forces = (*build.forces_named(scene), *self._given[0])
         """Makers of the forces that are not part of Cortado: of packages named in the scene, and user-defined ones."""
-        self._maker = self._given[1] or solver_named(scene.solver)
+        self._maker = self._given[1] or build.solver_named(scene.solver)
         self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
         """Maker of a solver that is not one of Cortado's, or None."""
-        self._called, self._lanes = called(scene.solver, self._given[1]), checked_lanes(lanes)
-        self.known = known_of(self.forces, self._maker, scene)
+        self._called, self._lanes = build.called(scene.solver, self._given[1]), checked_lanes(lanes)
+        self.known = build.known_of(self.forces, self._maker, scene)
         self.device = device_named(device)
         self.precision = precision_named(precision)
         discrete = discretise(scene)
-        room = first_capacity(scene.discretisation.support, scene.dimension)
+        room = build.first_capacity(scene.discretisation.support, scene.dimension)
         counts = (self.batch or 1) * len(discrete.fluid.positions), len(discrete.walls.positions)
         parts = simulation_parts(*counts, room, self.precision.bytes)
         smaller = "" if self.batch is None else "a smaller batch, "
@@ -123,7 +113,7 @@ class Simulation(Stepping):
         self.mass_fractions = np.eye(len(scene.phase))[discrete.fluid.phase]
         """First mass fractions (n, phases) [-]."""
         self.particles = len(self.positions)
-        check_own(self.known, self)
+        build.check_own(self.known, self)
         self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
         self.smoothing = discrete.kernel
         self.walls, self.wall_solids = discrete.walls.positions, discrete.walls.solid
@@ -134,7 +124,7 @@ class Simulation(Stepping):
         self.free_particles = discrete.fluid.emitted.start
         """Number of particles outside nozzles at the start, which come first in arrays."""
         own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
-        self.solver: Solver = built(self._maker, SolverSetting(*own, self._called, self._lanes))
+        self.solver: Solver = build.built(self._maker, build.SolverSetting(*own, self._called, self._lanes))
         self.initial = self.solver.new_state()
         self.judged_states: WeakSet[RestartState] = WeakSet()
         """States that were checked once and cannot change."""
@@ -176,9 +166,9 @@ class Simulation(Stepping):
     def run(
         self,
         steps: int | None = None,
-        controls: Mapping[str, Any] | None = None,
+        controls: Controls = None,
         record_every: int = 1,
-        state: RestartState | Sequence[RestartState] | None = None,
+        state: Start | None = None,
         record: Sequence[str] = (),
         sensors: Mapping[str, Sensor] | None = None,
         time: float | None = None,
@@ -262,11 +252,7 @@ class Simulation(Stepping):
 
     @in_turn
     def rollout(
-        self,
-        steps: int | None = None,
-        controls: Mapping[str, Any] | None = None,
-        state: RestartState | Sequence[RestartState] | None = None,
-        time: float | None = None,
+        self, steps: int | None = None, controls: Controls = None, state: Start | None = None, time: float | None = None
     ) -> Rollout:
         """Return a rollout ready to run forward from the scene's first state, or from ``state``, over ``steps`` steps
         or a ``time`` [s]; ``controls`` are as in `run`."""
@@ -274,13 +260,7 @@ class Simulation(Stepping):
         self._begin(rollout, controls, state, time)
         return rollout
 
-    def _begin(
-        self,
-        rollout: Rollout,
-        controls: Mapping[str, Any] | None,
-        state: RestartState | Sequence[RestartState] | None,
-        time: float | None,
-    ) -> None:
+    def _begin(self, rollout: Rollout, controls: Controls, state: Start | None, time: float | None) -> None:
         space, given = ParameterSpace(self, rollout.steps), {} if controls is None else controls
         values = space.checked(given)
         states = one_for_each(state, self.batch)
@@ -288,12 +268,7 @@ class Simulation(Stepping):
         space.begin(rollout, values, states=states)
         end_after(rollout, time)
 
-    def quantity(
-        self,
-        name: str,
-        of: RestartState | Sequence[RestartState] | Trajectory | None = None,
-        controls: Mapping[str, Any] | None = None,
-    ) -> np.ndarray:
+    def quantity(self, name: str, of: Start | Trajectory | None = None, controls: Controls = None) -> np.ndarray:
         """Return a quantity of the particles: "density" [kg/m3], "pressure" [Pa], "speed" [m/s], "vorticity" [1/s],
         "wall_force" [N]; see `docs/sensors.md`. Fields of the state work too, such as one of a user-defined solver, and
         the load on a solid, such as "rotor.load".
@@ -316,12 +291,15 @@ class Simulation(Stepping):
         if not isinstance(of, Trajectory):
             return self._quantity(name, of, controls)
         given = {key: value for key, value in (controls or {}).items() if key not in self.known.state}
-        return np.array(
-            [self._quantity(name, of[: k + 1].last_state, _controls_at(given, of, k)) for k in range(len(of))]
-        )
+        rows = {key: value for key, value in given.items() if key in OVER_TIME and np.ndim(value) == 2}
+        found = []
+        for k, step in enumerate((of.steps - of.steps[0]).tolist()):
+            now = {key: value[min(step, len(value) - 1)] for key, value in rows.items()}
+            found.append(self._quantity(name, of[: k + 1].last_state, given | now))
+        return np.array(found)
 
     @in_turn
-    def _quantity(self, name: str, state: Any, controls: Mapping[str, Any] | None) -> np.ndarray:
+    def _quantity(self, name: str, state: Any, controls: Controls) -> np.ndarray:
         rollout = self.rollout(1, controls, state)
         if name in rollout.initial.names:
             return rollout.initial.numpy(self.dimension, only=[name])[name].astype(np.float64)
@@ -385,7 +363,7 @@ class Simulation(Stepping):
     def room(self, steps: int, checkpoints: float) -> int:
         """Return how many runs of ``steps`` steps one launch should compute: they fit half of the free memory, with at
         most ``checkpoints`` bytes of stored states in total."""
-        neighbours, real = first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
+        neighbours, real = build.first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
         own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
         states = real * self.numbers_in_frame(3) * 2 * max(isqrt(steps), 1)
         fitting = within(np.inf, self.device) // own
@@ -407,12 +385,6 @@ class Simulation(Stepping):
             return 0
         numbers = (float(time_step), float(mobility), float(interface_width), rest_density)
         return stable_substeps(self.scene, self.free_energy, *numbers)
-
-
-def _controls_at(given: dict[str, Any], trajectory: Trajectory, frame: int) -> dict[str, Any]:
-    step = int(trajectory.steps[frame] - trajectory.steps[0])
-    rows = {name: value for name, value in given.items() if name in OVER_TIME and np.ndim(value) == 2}
-    return given | {name: value[min(step, len(value) - 1)] for name, value in rows.items()}
 
 
 @unwarned()

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache, partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from cortado.errors import DivergedError, InputError
 from cortado.losses.loss import Snapshot, SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.rollout import Observer, Rollout
-from cortado.rollout.scene_parameters import Simulated
 from cortado.runs.probes import SENSORS, sensors_of, warn_of_places
 from cortado.runs.quantity_values import Moment, QuantityEvaluator
 from cortado.runs.recording import StepReader, Waiting
@@ -21,37 +20,24 @@ from cortado.scene.parameter_values import Arrays
 from cortado.scene.parameters import QUANTITIES, check_quantity
 
 
-class Watched(Simulated, Protocol):
-    walls: NDArray
-
-    def evaluator(self) -> QuantityEvaluator: ...
-
-    def rollout(self, steps: int, controls: Mapping[str, Any] | None, state: Any) -> Rollout: ...
-
-    def in_precision(self, precision: str) -> Any: ...
-
-    def batch_of(self, size: int) -> Any: ...
-
-
 class Watch:
     """An observer of one rollout, which records quantities and reads sensors. User-defined sensors and quantities use
     the arrays of a second solver of the scene."""
 
     def __init__(
-        self,
-        simulation: Watched,
-        rollout: Rollout,
-        record: Iterable[str] = (),
-        sensors: Mapping[str, Sensor] | None = None,
+        self, simulation: Any, rollout: Rollout, record: Iterable[str] = (), sensors: Mapping[str, Sensor] | None = None
     ):
-        """Raise `InputError` for unknown quantities, and for a batch with user-defined sensors."""
+        """Watch a rollout of a `Simulation`, which imports this module. Raise `InputError` for unknown quantities, and
+        for a batch with user-defined sensors."""
         if sensors is not None:
             require_table("sensors", sensors, "{'probe': cortado.sensors.PressureProbe([0.1, 0.1])}")
 
         @cache
         def evaluator() -> QuantityEvaluator:
             own, batch = simulation, simulation.batch
-            return (own.in_precision(own.precision.name) if batch is None else own.batch_of(batch)).evaluator()
+            made = own.in_precision(own.precision.name) if batch is None else own.batch_of(batch)
+            found: QuantityEvaluator = made.evaluator()
+            return found
 
         known = sensors_of(simulation.scene) | dict(sensors or {})
         warn_of_places(simulation, known)
@@ -73,10 +59,7 @@ class Watch:
         self._waiting: Any = None
 
     def run(
-        self,
-        is_frame: Callable[[int], bool],
-        record: Observer,
-        observe: Callable[[int], object] | None = None,
+        self, is_frame: Callable[[int], bool], record: Observer, observe: Callable[[int], object] | None = None
     ) -> State:
         """Run the rollout forward and return its last state. ``record`` receives frames, and ``observe`` the number of
         each state. States computed before a `DivergedError` or an interrupt are still read."""

@@ -82,8 +82,7 @@ class Program:
         return self.app.cli(prog=self.name, description=self.description, args=arguments, config=config)
 
     def completion_script(self, shell: str) -> str:
-        """Return the completion script for a shell, as tyro prints it; in bash, file names are completed where no
-        command or option fits."""
+        """Return the completion script of a shell; bash completes file names where no command or option fits."""
         box = io.StringIO()
         with redirect_stdout(box), suppress(SystemExit):
             self.parsed(["--tyro-print-completion", shell])
@@ -173,8 +172,7 @@ def require_one_of_both(resume: bool, overwrite: bool) -> None:
 
 
 def steps_or_time(steps: int | None, time: float | None) -> int | None:
-    """Return the number of steps, by default `STEPS`, or None if a time [s] is set; raise `InputError` if both are
-    set."""
+    """Return the number of steps, by default `STEPS`, or None with a time [s]; raise `InputError` for both."""
     if time is None:
         return STEPS if steps is None else steps
     if steps is not None:

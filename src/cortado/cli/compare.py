@@ -17,7 +17,7 @@ from cortado.errors import InputError, shown, warn
 from cortado.pictures.film import is_out
 from cortado.pictures.run_pictures import beside_measured
 from cortado.runs.run_folder import RunFolder, differences, read_json
-from cortado.runs.sensor import MeasuredColumn, measured_beside, summary
+from cortado.runs.sensor import measured_beside, summary
 from cortado.runs.trajectory import Trajectory
 
 IGNORED = ("command", "started", "resumed", "settings", "kind")
@@ -25,8 +25,6 @@ IGNORED = ("command", "started", "resumed", "settings", "kind")
 SAME_TIME = 1e-9
 """Relative difference below which two times count as equal: sums of different step lengths have round-off."""
 FIELD_UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
-
-
 SPACING, TIME_STEP = "discretisation.spacing", "solver.time_step"
 SIZE_UNITS = {SPACING: "m", TIME_STEP: "s"}
 LEAST_RUNS = 3
@@ -36,18 +34,14 @@ SAME_MASS = 0.005
 
 def compare_runs(first: Path, second: Path, as_json: bool) -> str:
     """Return what is equal and what differs in two runs, as text or as JSON."""
-    found = _compared(RunFolder.open(first), RunFolder.open(second))
-    return json.dumps(found, indent=2) if as_json else _in_words(found)
-
-
-def _compared(one: RunFolder, other: RunFolder) -> dict[str, Any]:
+    one, other = RunFolder.open(first), RunFolder.open(second)
     here, there, *scenes = (
         _table(read_json(path)) if path.exists() else {}
         for path in (one.environment, other.environment, one.scene, other.scene)
     )
     environments = [{key: value for key, value in noted.items() if key not in IGNORED} for noted in (here, there)]
     settings = [{"kind": noted.get("kind"), **_table(noted.get("settings"))} for noted in (here, there)]
-    unlike = partial(differences, missing="missing")
+    unlike, state = partial(differences, missing="missing"), _last_states(one, other)
     found: dict[str, Any] = {
         "runs": [str(one.path), str(other.path)],
         "scene": unlike(*scenes),
@@ -55,20 +49,21 @@ def _compared(one: RunFolder, other: RunFolder) -> dict[str, Any]:
         "environment": unlike(*environments),
         "result": unlike(one.read_result() or {}, other.read_result() or {}),
         "metrics": _other_steps(settings, scenes) or _metrics(one, other),
-        "last_state": _last_states(one, other),
+        "last_state": state,
     }
-    return {"equal": _is_equal(found), **found}
-
-
-def _is_equal(found: Mapping[str, Any]) -> bool:
-    state = found["last_state"]
     same_state = state is None or (
         "unlike" not in state
-        and _at_one_time(*state["times_s"])
+        and bool(_at_one_time(*state["times_s"]))
         and not any(field["greatest"] for field in state["fields"].values())
     )
-    same = not any(found[part] for part in ("scene", "settings", "result")) and not found["metrics"]
-    return same and same_state
+    equal = same_state and not any(found[part] for part in ("scene", "settings", "result", "metrics"))
+    if as_json:
+        return json.dumps({"equal": equal, **found}, indent=2)
+    lines = [f"first: {one.path}", f"second: {other.path}"]
+    lines += [_part("scene", found["scene"]), _part("settings", found["settings"])]
+    lines += [_state(state), _metric_line(found["metrics"])]
+    lines += [_part("result", found["result"]), _part("environment", found["environment"])]
+    return "\n".join([*lines, f"The two runs {'are equal' if equal else 'differ'}."])
 
 
 def _table(value: Any) -> dict[str, Any]:
@@ -86,26 +81,23 @@ def _other_steps(settings: list[dict[str, Any]], scenes: list[dict[str, Any]]) -
 
 
 def _metrics(one: RunFolder, other: RunFolder) -> dict[str, Any]:
-    """Return the number of the first line of metrics that differs, and each metric's greatest difference over all
-    lines."""
+    """Return the number of the first line that differs, and the greatest difference of each metric over all lines."""
     rows, others = one.read_metrics(), other.read_metrics()
     found: dict[str, Any] = {} if len(rows) == len(others) else {"lines": [len(rows), len(others)]}
-    differ = [k for k, (row, twin) in enumerate(zip(rows, others, strict=False)) if row != twin]
-    if differ:
-        found["first_different_line"] = differ[0] + 1
+    pairs = [(k, row, twin) for k, (row, twin) in enumerate(zip(rows, others, strict=False)) if row != twin]
+    if pairs:
+        found["first_different_line"] = pairs[0][0] + 1
         names = [name for name, value in rows[0].items() if isinstance(value, (int, float)) and name in others[0]]
-        pairs = [(rows[k], others[k]) for k in differ]
         found["greatest_difference"] = {
-            name: max(abs(row[name] - twin[name]) for row, twin in pairs if name in row and name in twin)
+            name: max(abs(row[name] - twin[name]) for _, row, twin in pairs if name in row and name in twin)
             for name in names
-            if any(row.get(name) != twin.get(name) for row, twin in pairs)
+            if any(row.get(name) != twin.get(name) for _, row, twin in pairs)
         }
     return found
 
 
 def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
-    """Compare positions, velocities and mass fractions in the last frames of equal time; None if a run has no
-    frames."""
+    """Compare the fields of the last frames of equal time; None if a run has no frames."""
     if not (one.trajectory.exists() and other.trajectory.exists()):
         return None
     runs = [Trajectory.load(folder.trajectory) for folder in (one, other)]
@@ -114,10 +106,12 @@ def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
     frames = [run[-1] for run in runs]
     found: dict[str, Any] = {"times_s": [frame.time for frame in frames]}
     if not _at_one_time(*found["times_s"]):
-        pair = _last_at_one_time(*(run.times for run in runs))
-        if pair is None:
+        times, others = (run.times for run in runs)
+        pairs = ((k, int(np.abs(others - times[k]).argmin())) for k in range(len(times) - 1, 0, -1))
+        same = next(((k, near) for k, near in pairs if near and _at_one_time(times[k], others[near])), None)
+        if same is None:  # but perhaps the first frames
             return {**found, "unlike": "these are different times, and no frames are at the same time", "fields": {}}
-        frames = [run[k] for run, k in zip(runs, pair, strict=True)]
+        frames = [run[k] for run, k in zip(runs, same, strict=True)]
     found["compared_at_s"] = frames[0].time
     shapes = [frame.positions.shape for frame in frames]
     if shapes[0] != shapes[1]:
@@ -140,26 +134,6 @@ def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
 def _at_one_time(one: Any, other: Any) -> Any:
     """Test whether times [s] are equal except for round-off, element by element for arrays."""
     return np.isclose(one, other, rtol=SAME_TIME, atol=0.0)
-
-
-def _last_at_one_time(one: np.ndarray, other: np.ndarray) -> tuple[int, int] | None:
-    """Return the numbers of each run's frame at the last time, after the first frames, that both runs share; times are
-    (frames,) [s]."""
-    if len(one) < 2 or len(other) < 2:
-        return None
-    after = np.clip(np.searchsorted(other, one), 1, len(other) - 1)
-    near = np.where(np.abs(other[after - 1] - one) < np.abs(other[after] - one), after - 1, after)
-    same = [k for k in range(1, len(one)) if near[k] and _at_one_time(one[k], other[near[k]])]
-    return (same[-1], int(near[same[-1]])) if same else None
-
-
-def _in_words(found: Mapping[str, Any]) -> str:
-    lines = [f"first: {found['runs'][0]}", f"second: {found['runs'][1]}"]
-    lines += [_part("scene", found["scene"]), _part("settings", found["settings"])]
-    lines += [_state(found["last_state"]), _metric_line(found["metrics"])]
-    lines += [_part("result", found["result"]), _part("environment", found["environment"])]
-    lines.append("The two runs are equal." if found["equal"] else "The two runs differ.")
-    return "\n".join(lines)
 
 
 def _part(name: str, differences: Mapping[str, list[Any]]) -> str:
@@ -213,23 +187,20 @@ def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
     if as_json:
         each = {one.name: {"unit": one.unit, "points": len(one.times), **one.errors} for one in found}
         return json.dumps({"run": str(folder.path), "data": str(data), "plot": str(plot), "errors": each}, indent=2)
-    return "\n".join([*map(_line, found), f"The plot is {plot}."])
-
-
-def _line(one: MeasuredColumn) -> str:
-    errors, unit = one.errors, one.unit
-    left_out = f", {one.left_out} more are outside of the run" if one.left_out else ""
-    return (
-        f"{one.name}: simulated less measured {errors['root_mean_square']:.3g} {unit} (root mean square), mean "
-        f"{errors['mean']:.3g} {unit}, at most {errors['greatest']:.3g} {unit} at {errors['greatest_at_s']:g} s; "
-        f"{len(one.times)} points{left_out}"
-    )
+    lines = []
+    for one in found:
+        errors, unit = one.errors, one.unit
+        lines.append(
+            f"{one.name}: simulated less measured {errors['root_mean_square']:.3g} {unit} (root mean square), mean "
+            f"{errors['mean']:.3g} {unit}, at most {errors['greatest']:.3g} {unit} at {errors['greatest_at_s']:g} s; "
+            f"{len(one.times)} points{f', {one.left_out} more are outside of the run' if one.left_out else ''}"
+        )
+    return "\n".join([*lines, f"The plot is {plot}."])
 
 
 class Resolved:
     def __init__(self, folder: RunFolder, quantities: Sequence[OwnQuantity]):
-        """Read a run and compute the user's ``quantities``; raise `InputError` for a run that failed or has not
-        ended."""
+        """Read a run and compute the user's ``quantities``; raise `InputError` if it failed or has not ended."""
         result = folder.read_result()
         if result is None or result["failures"] or "energy" not in result or not folder.trajectory.exists():
             raise InputError(f"{folder.path} is no run that has ended well, but each RUN must be one.")
@@ -280,36 +251,22 @@ def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_jso
                 f"{coarse.path} ends at {coarse.end:g} s and {fine.path} at {fine.end:g} s, but all runs must end at "
                 "the same time: choose a --time that is a multiple of every time step."
             )
-    _warn_of_masses(runs)
-    rows = []
-    for name, (unit, _) in runs[0].numbers.items():
-        values = [run.numbers[name][1] for run in runs]
-        found = Extrapolation.of(sizes, values)
-        rows.append({"name": name, "unit": unit, "values": values, **vars(found)})
-    others = [
-        other for other in (SPACING, TIME_STEP) if other != key and runs[0].scene["solver"]["time_step"] != "auto"
-    ]
-    told = {other: [run.size(other) for run in runs] for other in others}
-    table = {
-        "by": key,
-        "end_s": runs[-1].end,
-        "runs": [str(run.path) for run in runs],
-        key: sizes,
-        **told,
-        "rows": rows,
-    }
-    return json.dumps(table, indent=2) if as_json else _convergence_in_words(table)
-
-
-def _warn_of_masses(runs: Sequence[Resolved]) -> None:
-    """Warn if runs differ in their mass of fluid, because an order of convergence does not describe that difference."""
     least, most = (choose(runs, key=lambda run: run.mass) for choose in (min, max))
-    if most.mass > (1.0 + SAME_MASS) * least.mass:
+    if most.mass > (1.0 + SAME_MASS) * least.mass:  # an order of convergence does not describe that difference
         warn(
             f"the runs do not have the same fluid: {least.mass:.4g} kg with a spacing of {least.size(SPACING):g} m, "
             f"{most.mass:.4g} kg with {most.size(SPACING):g} m. Choose spacings that divide the sizes of all bodies of "
             "fluid."
         )
+    rows = []
+    for name, (unit, _) in runs[0].numbers.items():
+        values = [run.numbers[name][1] for run in runs]
+        rows.append({"name": name, "unit": unit, "values": values, **vars(Extrapolation.of(sizes, values))})
+    is_auto = runs[0].scene["solver"]["time_step"] == "auto"
+    told = {other: [run.size(other) for run in runs] for other in SIZE_UNITS if other != key and not is_auto}
+    paths = [str(run.path) for run in runs]
+    table = {"by": key, "end_s": runs[-1].end, "runs": paths, key: sizes, **told, "rows": rows}
+    return json.dumps(table, indent=2) if as_json else _convergence_in_words(table)
 
 
 def _varied(runs: Sequence[Resolved]) -> str:

@@ -3,7 +3,7 @@
 import json
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -33,8 +33,7 @@ from cortado.simulation import Simulation
 from cortado.version import __version__
 
 ASKED = "dataset.json"
-"""File with the settings of a data set; only a command with equal settings, except the number of runs, may continue
-it."""
+"""File with the settings of a data set, without the number of runs; a command with other settings is refused."""
 MOST_RUNS = 100_000
 
 
@@ -78,7 +77,13 @@ def make_dataset(
     table = _table(file, overrides)
     of_scene = [one for one in overrides if one not in overrides_of(overrides, ("dataset",))]
     member = Member(file.absolute(), tuple(of_scene), table, out.absolute(), device, precision)
-    split = table.split(_checked_runs(runs, table))
+    least = 1 + (table.valid > 0.0) + (table.test > 0.0)
+    if not least <= runs <= MOST_RUNS or not (split := table.split(runs))["train"]:
+        parts = ["train", *(["validate"] if table.valid else []), *(["test"] if table.test else [])]
+        purposes = " and ".join(f"one to {part}" for part in parts)
+        found = f"--runs is {runs:,}, but must be from {least} to {MOST_RUNS:,}: {purposes} at least"
+        advice = "; dataset.valid = 0 and dataset.test = 0 leave the others out" if least > 1 else ""
+        raise InputError(f"{found}{advice}.")
     asked = _asked(member)
     if out.suffix in (".h5", ".hdf5"):
         raise InputError(f"--out is {out}, but must be a folder, for the files train.h5, valid.h5 and test.h5.")
@@ -97,12 +102,13 @@ def make_dataset(
             return f"{said}; the same command goes on with the rest"
 
         told: dict[int, list[str]] = {}
-        failed: list[int] = []
+        failed = 0
 
         def note(k: int, result: tuple[bool, list[str]]) -> None:
+            nonlocal failed
             there, told[left[k]] = result
-            failed.extend([left[k]] * (not there))
-            advance(failed=len(failed))
+            failed += not there
+            advance(failed=failed)
 
         with (
             (where if left else HERE).executor(device, len(left)) as executor,
@@ -114,7 +120,8 @@ def make_dataset(
             content = _put_together(member, split, runs)
     for path, why in folder.damaged.items():
         warn(f"{path} was damaged ({why}) and has been made anew; {counted(len(left), 'run')} had to be computed.")
-    _warn(told, {int(one): why for one, why in content["failed"].items() if one not in known}, runs)
+    new = {int(number): why for number, why in content["failed"].items() if number not in known}
+    _warn({number: sentences[0] for number, sentences in told.items() if sentences}, new, runs)
     if not left and not folder.damaged:
         return f"The data set in {member.out} is complete already: {_sizes(content)}."
     grown = f"; its first {before} runs are as they were" if 0 < before < runs and not folder.damaged else ""
@@ -132,8 +139,7 @@ def _saying(kept: Callable[[], str]) -> Iterator[None]:
 
 
 def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int) -> dict[str, Any]:
-    """Write the files of the data set from its finished runs, and return the metadata; raise `ComputationError` if a
-    purpose has no run."""
+    """Write the files of the data set and return the metadata; raise `ComputationError` if a purpose has no run."""
     folder = DatasetFolder(member.out)
     there = {purpose: [number for number in own if number in folder.runs] for purpose, own in split.items()}
     for purpose, numbers in split.items():
@@ -158,20 +164,8 @@ def _table(file: Path, overrides: list[str]) -> DatasetTable:
         raise error.in_file(str(file)) from None
 
 
-def _checked_runs(runs: int, table: DatasetTable) -> int:
-    least = 1 + (table.valid > 0.0) + (table.test > 0.0)
-    if not least <= runs <= MOST_RUNS or not table.split(runs)["train"]:
-        parts = ["train", *(["validate"] if table.valid else []), *(["test"] if table.test else [])]
-        purposes = " and ".join(f"one to {part}" for part in parts)
-        found = f"--runs is {runs:,}, but must be from {least} to {MOST_RUNS:,}: {purposes} at least"
-        advice = "; dataset.valid = 0 and dataset.test = 0 leave the others out" if least > 1 else ""
-        raise InputError(f"{found}{advice}.")
-    return runs
-
-
 def _asked(member: Member) -> dict[str, Any]:
-    """Return the settings of a data set, and read its first scene and the scenes at the ends of ranges to find mistakes
-    early."""
+    """Return the settings of a data set; read its first scene and those at the ends of ranges to find mistakes."""
     table = member.table
     with unwarned():
         ends = [[f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()] for end in (0, 1)]
@@ -181,8 +175,10 @@ def _asked(member: Member) -> dict[str, Any]:
             bounds_of(one.lasting(steps=table.steps))
         for k, key in enumerate(table.vary):
             others = [*ends[0][:k], *ends[0][k + 1 :]]
-            if ends[0][k] != ends[1][k] and _are_one(member, [*others, ends[0][k]], [*others, ends[1][k]]):
-                raise InputError(f"vary has {key}, which has no effect on what is computed.")
+            with suppress(SceneError):  # of an end that is invalid with the lower ends of the others
+                made = {load_scene(member.file, [*member.overrides, *others, end[k]]).computed_json() for end in ends}
+                if ends[0][k] != ends[1][k] and len(made) == 1:
+                    raise InputError(f"vary has {key}, which has no effect on what is computed.")
     for key in table.vary:
         if key in ("solver.time_step", "dimension", "discretisation.spacing") or key.startswith("container."):
             raise InputError(f"vary has {key}, which must be the same in all runs of a data set.")
@@ -194,15 +190,6 @@ def _asked(member: Member) -> dict[str, Any]:
     for named, key in files_named(asked["scene"]):  # such as meshes
         named[f"{key} content"] = sha256(Path(named[key]).read_bytes()).hexdigest()
     return {**asked, "--precision": member.precision, "cortado": __version__}
-
-
-def _are_one(member: Member, *overrides: list[str]) -> bool:
-    """Test whether two sets of overrides give scenes with equal results; False if one of the scenes is invalid."""
-    try:
-        scenes = [load_scene(member.file, [*member.overrides, *some]).computed_json() for some in overrides]
-    except SceneError:
-        return False
-    return scenes[0] == scenes[1]
 
 
 def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
@@ -230,13 +217,8 @@ def _sizes(content: Mapping[str, Any]) -> str:
     return f"{counted(content['sequence_length_train'], 'frame')} each, {runs}".replace("to valid", "to validate")
 
 
-def _warn(told: Mapping[int, list[str]], failures: Mapping[int, str], runs: int) -> None:
-    warned = {number: sentences for number, sentences in told.items() if sentences}
-    if warned:
-        first = min(warned)
-        came = f"{len(warned)} of {counted(runs, 'run')} came with a warning."
-        warn(f"{came} The first is run {first}: {warned[first][0]}")
-    if failures:
-        first = min(failures)
-        said = f"{len(failures)} of {counted(runs, 'run')} failed and are left out. The first is run {first}: "
-        warn(f"{said}{failures[first]}")
+def _warn(warned: Mapping[int, str], failures: Mapping[int, str], runs: int) -> None:
+    for found, what in ((warned, "came with a warning"), (failures, "failed and are left out")):
+        if found:
+            first = min(found)
+            warn(f"{len(found)} of {counted(runs, 'run')} {what}. The first is run {first}: {found[first]}")

@@ -36,7 +36,7 @@ from cortado.runs.frames import Pace
 from cortado.runs.recording import FrameChoice
 from cortado.scene.appearance import Picture
 from cortado.scene.emitter_table import EmitterTable
-from cortado.scene.scene import Scene, load_scene, overrides_of, read_toml
+from cortado.scene.scene import load_scene, overrides_of, read_toml
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
@@ -55,8 +55,7 @@ HEADS, PER_PARTICLE, PER_STEP = 28e3, 24.0, 50.0
 
 
 def measured_speed(simulation: Simulation) -> tuple[int, float]:
-    """Return the number of timed first steps, and the time of one step [s]; raise `DivergedError` if the scene
-    diverges."""
+    """Return the number of timed steps and the time of one [s]; raise `DivergedError` if the scene diverges."""
     steps = FIRST_STEPS
     while True:
         rollout = simulation.rollout(steps)
@@ -156,45 +155,55 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
     scene = simulation.scene
     of_phase = Counter(np.argmax(simulation.mass_fractions, axis=1).tolist())
     (size, limits, chosen_by), ends = _time_step(simulation), scene.container.extent()
-    masses = simulation.masses
+    masses, spacing = simulation.masses, scene.discretisation.spacing
+    columns = [emitter.particles(spacing) for emitter in scene.emitter]  # what they hold in reserve is not to be seen
+    fluid = np.concatenate([simulation.positions[: simulation.free_particles], *columns])
+    viscosity, limit = str(scene.forces.viscosity), viscous_limit(scene, {})
+    if viscosity == "stress" and math.isfinite(limit):
+        when = "implicit, at the end of a step" if is_implicit(scene) else "explicit, at the start of a step"
+        viscosity = f"stress, {when}; an explicit one bears steps of {limit:.3g} s"
     found: dict[str, Any] = {
         "name": scene.name,
         "dimension": scene.dimension,
         "particles": simulation.particles,
         "particles_of_phase": {phase.name: of_phase[k] for k, phase in enumerate(scene.phase)},
         "particles_in_emitter": simulation.particles - simulation.free_particles,
-        "emitters": [of_emitter(emitter, scene.discretisation.spacing) for emitter in scene.emitter],
+        "emitters": [of_emitter(emitter, spacing) for emitter in scene.emitter],
         "wall_particles": len(simulation.walls),
-        "fluid_size_m": _fluid_size(simulation),
+        "fluid_size_m": (np.ptp(fluid, axis=0) + spacing).tolist(),
         "container_size_m": None if ends is None else (ends[1] - ends[0]).tolist(),
         "mass_of_phase_kg": masses.given,
         "mass_asked_of_phase_kg": masses.asked,
         "mass_in_words": [masses.off.get(name, f"{mass:.3g} kg of {name}") for name, mass in masses.given.items()],
         "gravity_m_s2": list(scene.forces.gravity),
-        "spacing_m": scene.discretisation.spacing,
+        "spacing_m": spacing,
         "time_step_s": size,
         "time_step_chosen_by": chosen_by,
         "time_step_limits_s": {name: limit if math.isfinite(limit) else None for name, limit in limits.items()},
-        "viscosity": _viscosity(scene),
+        "viscosity": viscosity,
         "scheduled_until_s": {name: course.times[-1] for name, course in scene.schedule.courses.items()},
         "device": str(simulation.device),
         "precision": simulation.precision.name,
+        **length.for_machines(),
+        "memory_bytes": None,
+        "gradient_memory_bytes": None,
     }
-    steps = length.steps
-    return {**found, **length.for_machines(), **_memory(simulation, steps), **_expected(simulation, steps)}
-
-
-def _fluid_size(simulation: Simulation) -> list[float]:
-    """Return the fluid's size (d,) [m], with particles queued in emitters but without the emitters' reserves."""
-    scene, spacing = simulation.scene, simulation.scene.discretisation.spacing
-    columns = [emitter.particles(spacing) for emitter in scene.emitter]
-    shown = np.concatenate([simulation.positions[: simulation.free_particles], *columns])
-    return (np.ptp(shown, axis=0) + spacing).tolist()
+    if isinstance(simulation.solver, ParticleSolver):
+        rollout = Rollout(simulation.solver, 1)
+        forward, backward = estimated_bytes(simulation, rollout)
+        own = sum(step_parts(length.steps, simulation.precision.bytes).values())
+        checkpoints = min(length.steps * sum(array.capacity for array in rollout.initial.arrays()), MEMORY_BUDGET)
+        found |= {"memory_bytes": forward + own, "gradient_memory_bytes": backward + own + checkpoints}
+    try:
+        measured, seconds = measured_speed(simulation)
+    except DivergedError as error:
+        return {**found, "diverged": str(error)}
+    taken = {"milliseconds_per_step": 1e3 * seconds, "measured_steps": measured}
+    return {**found, **taken, "expected_seconds": length.steps * seconds, "sensors": len(scene.sensor)}
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
-    """Return the time step [s], its limits [s] by name, and the name of the limit that sets the first step (None if
-    fixed)."""
+    """Return the time step [s], its limits [s] by name, and the limit that sets the first step (None if fixed)."""
     scene = simulation.scene
     if scene.solver.time_step != "auto":
         return scene.solver.time_step, stability_limits(scene), None
@@ -208,44 +217,8 @@ def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | N
     return size, limits, min(limits, key=lambda name: limits[name])
 
 
-def _viscosity(scene: Scene) -> str:
-    """Describe the form of the viscous force, and why it acts at the start or the end of a step."""
-    form, limit = scene.forces.viscosity, viscous_limit(scene, {})
-    if form != "stress" or not math.isfinite(limit):
-        return str(form)
-    when = "implicit, at the end of a step" if is_implicit(scene) else "explicit, at the start of a step"
-    return f"stress, {when}; an explicit one bears steps of {limit:.3g} s"
-
-
-def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
-    """Return how long a number of steps will take, or the error if the scene diverges in its first steps."""
-    try:
-        measured, seconds = measured_speed(simulation)
-    except DivergedError as error:
-        return {"diverged": str(error)}
-    return {
-        "milliseconds_per_step": 1e3 * seconds,
-        "measured_steps": measured,
-        "expected_seconds": steps * seconds,
-        "sensors": len(simulation.scene.sensor),
-    }
-
-
-def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
-    """Return the estimated memory [bytes] of a run, and of a gradient."""
-    real = simulation.precision.bytes
-    if not isinstance(simulation.solver, ParticleSolver):
-        return {"memory_bytes": None, "gradient_memory_bytes": None}
-    rollout = Rollout(simulation.solver, 1)
-    forward, backward = estimated_bytes(simulation, rollout)
-    own = sum(step_parts(steps, real).values())
-    checkpoints = min(steps * sum(array.capacity for array in rollout.initial.arrays()), MEMORY_BUDGET)
-    return {"memory_bytes": forward + own, "gradient_memory_bytes": backward + own + checkpoints}
-
-
 def of_emitter(emitter: EmitterTable, spacing: float) -> dict[str, Any]:
-    """Return when an emitter is empty (None if never), its drains, its speed, and the areas of its particles' cells and
-    of its opening."""
+    """Return when an emitter is empty (None if never), its drains, its speed, and the areas of cells and opening."""
     dry, areas = emitter.dry_after(spacing), {"area": emitter.area(spacing), "area_asked": emitter.asked_area()}
     known = {"name": emitter.name, "fed_by": list(emitter.fed_by), "speed_m_s": emitter.speed(spacing), **areas}
     return {**known, "runs_dry_at_s": dry if math.isfinite(dry) else None}
@@ -280,6 +253,12 @@ def estimated_bytes(simulation: Simulation, rollout: Rollout) -> tuple[float, fl
 
 
 def _as_text(found: dict[str, Any], length: RunLength) -> str:
+    fluid, held = (
+        " x ".join(f"{side:.3g}" for side in found[key] or ()) for key in ("fluid_size_m", "container_size_m")
+    )
+    masses, gravity = ", ".join(found["mass_in_words"]), point_in_words(found["gravity_m_s2"])
+    layer = " in a layer of 1 m" if found["dimension"] == 2 else ""
+    container = f", in a container of {held} m" if held else ""
     phases = ", ".join(f"{count} {name}" for name, count in found["particles_of_phase"].items())
     waiting = f", {found['particles_in_emitter']} of them in emitters" if found["particles_in_emitter"] else ""
     limits = {name: limit for name, limit in found["time_step_limits_s"].items() if limit is not None}
@@ -287,12 +266,13 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
     by_name = ", ".join(f"{name} {limit:.3g}" for name, limit in sorted(limits.items(), key=lambda item: item[1]))
     beyond = " (beyond it: the run may diverge)" if found["time_step_s"] > least * (1.0 + 1e-9) else ""
     chosen = found["time_step_chosen_by"]
-    run, gradient = (_bytes(found[f"{name}memory_bytes"]) for name in ("", "gradient_"))
+    run, backward = (_bytes(found[f"{name}memory_bytes"]) for name in ("", "gradient_"))
     allowed = f"stable up to about {least:.3g} s{beyond}; limits: {by_name}" if limits else "nothing limits it"
     rows = [
         ("particles", f"{found['particles']} of fluid ({phases}{waiting}), {found['wall_particles']} of walls"),
         ("spacing", f"{found['spacing_m']:g} m, in {found['dimension']}-D"),
-        ("size", _size(found)),
+        # lengths and masses, in which a wrong unit is easy to see
+        ("size", f"fluid in {fluid} m{container}; {masses}{layer}; gravity {gravity} m/s2"),
         (
             "time step",
             f"chosen before each step: the first is {found['time_step_s']:.3g} s, by {chosen}; limits: {by_name}"
@@ -300,10 +280,16 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
             else f"{found['time_step_s']:g} s; {allowed}",
         ),
         ("viscosity", found["viscosity"]),
-        *(emitter_row(one, found["dimension"], length) for one in found["emitters"]),
-        ("memory", f"{run} for a run, {gradient} for a gradient, beside Python and Warp themselves"),
+        *(("emitter", _emitter(one, found["dimension"], length)) for one in found["emitters"]),
+        ("memory", f"{run} for a run, {backward} for a gradient, beside Python and Warp themselves"),
         ("time", _time(found, length)),
-        ("trajectory", _trajectory(length)),
+        (
+            "trajectory",
+            "unknown, as nobody knows what time so many chosen steps simulate; --time says it"
+            if length.frames is None
+            else f"{_bytes(length.trajectory)} on disk, {counted(length.frames, 'frame')}; --fps or --record-every says"
+            " how many",
+        ),
         ("film", _film(length, found.get("picture_seconds"), found.get("quick_picture_seconds"))),
     ]
     courses = [f"{name} changes until {last:g} s" for name, last in found["scheduled_until_s"].items()]
@@ -313,30 +299,19 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
     return "\n".join([found["name"], *(f"{label:<12}{text}" for label, text in rows)])
 
 
-def emitter_row(found: dict[str, Any], dimension: int, length: RunLength) -> tuple[str, str]:
-    """Return a table row with an emitter's speed and the time when it is empty."""
+def _emitter(found: dict[str, Any], dimension: int, length: RunLength) -> str:
+    """Describe an emitter's speed and the time when it is empty."""
     given, asked, dry = found["area"], found["area_asked"], found["runs_dry_at_s"]
-    speed = f"fluid comes out of {found['name']} at {found['speed_m_s']:.3g} m/s"
+    lasts = "never runs dry" if dry is None else f"has fluid for {dry:.4g} s"
+    if found["fed_by"]:
+        lasts = f"{' and '.join(found['fed_by'])} feed it"
+    elif dry is not None and length.time is not None and dry < length.time * (1.0 - SAME):
+        lasts = f"runs dry at {dry:.4g} s, before the end of the run at {length.time:g} s"
+    said = f"{lasts}; fluid comes out of {found['name']} at {found['speed_m_s']:.3g} m/s"
     if abs(given - asked) > EXCESS * asked:
         unit = "m" if dimension == 2 else "m2"
-        speed += f", through {given:.3g} {unit} of cells, where an opening of {asked:.3g} {unit} was asked for"
-    if found["fed_by"]:
-        return "emitter", f"{' and '.join(found['fed_by'])} feed it; {speed}"
-    if dry is None or length.time is None or dry >= length.time * (1.0 - SAME):
-        return "emitter", f"{'never runs dry' if dry is None else f'has fluid for {dry:.4g} s'}; {speed}"
-    return "emitter", f"runs dry at {dry:.4g} s, before the end of the run at {length.time:g} s; {speed}"
-
-
-def _size(found: dict[str, Any]) -> str:
-    """Describe lengths and masses, in which a wrong unit is easy to see."""
-    fluid, held = (
-        " x ".join(f"{length:.3g}" for length in found[key] or ()) for key in ("fluid_size_m", "container_size_m")
-    )
-    masses = ", ".join(found["mass_in_words"])
-    layer = " in a layer of 1 m" if found["dimension"] == 2 else ""
-    container = f", in a container of {held} m" if held else ""
-    gravity = point_in_words(found["gravity_m_s2"])
-    return f"fluid in {fluid} m{container}; {masses}{layer}; gravity {gravity} m/s2"
+        said += f", through {given:.3g} {unit} of cells, where an opening of {asked:.3g} {unit} was asked for"
+    return said
 
 
 def _time(found: dict[str, Any], length: RunLength) -> str:
@@ -350,14 +325,6 @@ def _time(found: dict[str, Any], length: RunLength) -> str:
         f"{found['milliseconds_per_step']:.3g} ms a step on {found['device']} in {found['precision']}, {read}without "
         f"what is recorded (mean of the first {found['measured_steps']} steps; {slower}); "
         f"{length.in_words}: {_duration(found['expected_seconds'])}"
-    )
-
-
-def _trajectory(length: RunLength) -> str:
-    if length.frames is None:
-        return "unknown, as nobody knows what time so many chosen steps simulate; --time says it"
-    return (
-        f"{_bytes(length.trajectory)} on disk, {counted(length.frames, 'frame')}; --fps or --record-every says how many"
     )
 
 
@@ -407,7 +374,13 @@ def check_scene(
         raise InputError(f"--loss is {shown(loss)}, but must be one of {', '.join(LOSSES)}.")
     scene = load_scene(scene_file, overrides).lasting(steps=check_steps(steps))
     simulation = Simulation(scene, device, "float64")
-    problem = Problem(simulation, steps, _loss(loss, simulation))
+    measure: Loss = FinalPositions(simulation.positions)  # of how far the fluid has moved from its initial state
+    if loss == "centre-of-mass":
+        measure = CentreOfMass(simulation.positions.mean(axis=0))
+    elif loss == "image":
+        renderer = simulation.renderer()
+        measure = Image(renderer, renderer.render(simulation.initial))
+    problem = Problem(simulation, steps, measure)
     if out is not None:
         make_folder(out)
     certificate = certify(problem, parameters, perturbation, seed)
@@ -423,13 +396,3 @@ def check_scene(
         tell(text)
         raise ComputationError(f"The adjoint is wrong for: {', '.join(certificate.wrong)}.")
     return text
-
-
-def _loss(name: str, simulation: Simulation) -> Loss:
-    """Return the loss with this name: a measure of how far the fluid has moved from its initial state."""
-    if name == "positions":
-        return FinalPositions(simulation.positions)
-    if name == "centre-of-mass":
-        return CentreOfMass(simulation.positions.mean(axis=0))
-    renderer = simulation.renderer()
-    return Image(renderer, renderer.render(simulation.initial))

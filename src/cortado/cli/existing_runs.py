@@ -6,6 +6,7 @@ import json
 import os
 import runpy
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,19 +39,15 @@ def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
         raise InputError("RUN is missing, but must be the folder of a run, or of a sweep.")
     found: list[RunFolder] = []
     for folder in folders:
-        inner, order = sorted(one.parent for one in folder.glob("*/environment.json")), folders_in(folder)
+        inner, order = sorted(one.parent for one in folder.glob("*/environment.json")), list[str]()
+        with (
+            suppress(OSError, ValueError, KeyError, csv.Error),
+            open(folder / SWEEP, newline="", encoding="utf-8") as file,
+        ):
+            order = [row["folder"] for row in csv.DictReader(file)]
         inner.sort(key=lambda one: order.index(one.name) if one.name in order else len(order))
         found += [RunFolder.open(one) for one in inner or [folder]]
     return found
-
-
-def folders_in(folder: Path) -> list[str]:
-    """Return the folder names in the table of a sweep, in its order; an empty list if the table cannot be read."""
-    try:
-        with open(folder / SWEEP, newline="", encoding="utf-8") as file:
-            return [row["folder"] for row in csv.DictReader(file)]
-    except (OSError, ValueError, KeyError, csv.Error):
-        return []
 
 
 class OwnQuantity:
@@ -70,8 +67,7 @@ class OwnQuantity:
         self.where, self.name, self._function = where, name, function
 
     def __call__(self, trajectory: Trajectory) -> float:
-        """Return the function's number for a trajectory; raise `InputError` if the function fails or returns no
-        number."""
+        """Return the number of a trajectory; raise `InputError` if the function fails or returns no number."""
         try:
             found = self._function(trajectory)
             value = np.asarray(found, dtype=np.float64)
@@ -117,8 +113,7 @@ def draw_runs(
     device_name: str,
     settings: Mapping[str, Any],
 ) -> str:
-    """Draw one recorded frame, or a film of all frames, of one run or of several side by side; return a sentence that
-    names the file."""
+    """Draw a frame, or a film, of one run or of several side by side; return a sentence that names the file."""
     folders, device = named_runs(runs), device_of(device_name)
     look = scene_of_run(folders[0], overrides)
     others = [scene_of_run(folder, []) for folder in folders[1:]]

@@ -1,15 +1,17 @@
 """The results of ``cortado optimise`` and how well they meet the task's goals: as sentences, report and JSON."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cortado.calls import counted
+from cortado.image_losses import psnr
 from cortado.optimisation.optimise import Result
-from cortado.optimisation.solved_task import KnotValues, TaskFigures, component_names
+from cortado.optimisation.solved_task import TaskFigures, component_names, knot_values
 from cortado.optimisation.task_files import Setup, Task, task_in_words
 from cortado.pictures.pages import MOST_NUMBERS, Section, written
 from cortado.pictures.particle_view import scene_view
@@ -17,10 +19,12 @@ from cortado.scene.scene import scene_in_words
 
 Rows = list[tuple[object, ...]]
 
+LITTLE = 2.0
+"""Factor by which a search must reduce the loss to count as successful."""
+LONG = 100
+"""Number of steps from which on chaotic, useless gradients may explain an unsuccessful search."""
 MOST_ERROR = 0.3
 """Greatest relative error with which a parameter still counts as found."""
-
-
 MOST_IN_RESULT = 1000
 """Greatest size of a parameter whose estimate is written to result.json; larger ones are only in the checkpoint."""
 VIEWED = 60
@@ -34,8 +38,7 @@ class Verdict:
     reduction: float
     """Loss at the start / best loss; infinite if the best loss is 0."""
     errors: dict[str, float]
-    """For each parameter the relative L2 distance of the estimate from the true value, or the absolute distance from
-    0."""
+    """For each parameter the relative L2 distance of the estimate from the true value, or that from 0."""
     psnr: float | None
     """Peak signal-to-noise ratio of the last image [dB]; None if the task compares positions."""
     failures: list[str]
@@ -86,70 +89,6 @@ def distance(estimate: ArrayLike, true: ArrayLike) -> float:
     return float(np.linalg.norm(estimate - true) / (np.linalg.norm(true) or 1.0))
 
 
-def worst_in_words(made: Setup, name: str, estimate: np.ndarray, error: float) -> str:
-    """Describe the worst of a parameter's few numbers, if its error exceeds twice the parameter's error."""
-    true, names = made.true_parameter(name), component_names(made.task, name, estimate)
-    if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):
-        return ""
-    errors = [distance(*pair) for pair in zip(np.ravel(estimate), np.ravel(true), strict=True)]
-    worst = int(np.argmax(errors))
-    return f" ({names[worst]}: {100 * errors[worst]:.2g}%)" if errors[worst] > 2.0 * error else ""
-
-
-def found_lines(made: Setup, estimate: Mapping[str, np.ndarray], knots: Mapping[str, KnotValues]) -> list[str]:
-    """Return a line for each parameter, or for each of its knots; parameters with very many numbers have no line."""
-    lines = []
-    for name, value in estimate.items():
-        if name in knots:
-            own = knots[name]
-            trues = [None] * len(own.times) if own.true is None else own.true
-            found = zip((_at(name, time) for time in own.times), own.estimate, trues, strict=True)
-        elif np.size(value) <= MOST_NUMBERS:
-            found = zip([_words(name)], [value], [made.true_parameter(name)], strict=True)
-        else:
-            continue
-        for label, one, true in found:
-            unit = f" {made.task.known[name].unit}".rstrip()
-            hidden = "" if true is None else f"; true {written(true)}{unit}"
-            lines.append(f"  {label}: {written(one)}{unit}{hidden}")
-    return lines
-
-
-def found_rows(
-    made: Setup, estimate: Mapping[str, np.ndarray], knots: Mapping[str, KnotValues], errors: Mapping[str, float]
-) -> Rows:
-    """Return table rows (parameter, unit, first guess, found, hidden, error): one for each number searched, each knot,
-    and each parameter with very many numbers."""
-    rows: Rows = []
-    start = made.search.parameters(made.start)
-    for name, value in estimate.items():
-        unit, true = made.task.known[name].unit, made.true_parameter(name)
-        if name in knots:
-            own = knots[name]
-            for k, time in enumerate(own.times):
-                hidden, error = "", ""
-                if own.true is not None:
-                    hidden, error = written(own.true[k]), f"{distance(own.estimate[k], own.true[k]):.3%}"
-                rows.append((_at(name, time), unit, own.start[k], own.estimate[k], hidden, error))
-            continue
-        known = [np.asarray(start[name]), np.asarray(value), *([] if true is None else [true])]
-        error = f"{errors[name]:.3%}" if name in errors else ""
-        columns = np.broadcast_arrays(*known)
-        names = component_names(made.task, name, columns[0])
-        if len(names) != columns[0].size or len(names) > MOST_NUMBERS:
-            rows.append((_words(name), unit, *known[:2], "" if true is None else true, error))
-            continue
-        for k, label in enumerate(names):
-            numbers = [column.ravel()[k] for column in columns]
-            off = [""] if true is None else [f"{distance(*numbers[1:]):.3%}"]
-            rows.append((label, unit, *numbers, *([] if true is not None else [""]), *off))
-    return rows
-
-
-def _at(name: str, time: float) -> str:
-    return f"{_words(name)} at {time:.4g} s"
-
-
 def _words(name: str) -> str:
     return name.replace("_", " ")
 
@@ -159,74 +98,165 @@ def asked(made: Setup) -> Section:
     return Section("What was asked", [*task_in_words(made.task), f"The scene: {scene}"])
 
 
-def sections(
-    made: Setup,
-    estimate: dict[str, np.ndarray],
-    result: Result,
-    verdict: Verdict,
-    told: list[str],
-    figures: TaskFigures,
-    rows: Rows,
-) -> list[Section]:
-    """Return the sections of the report of a search; ``told`` has sentences about the found parameters."""
-    head = ("", "unit", "first guess", "found", "hidden", "error")
-    return [
-        asked(made),
-        Section("What was found", told, verdict.failures, figures.found),
-        Section("In numbers", head=head, rows=rows),
-        Section("To turn and to play", view=_view(made, estimate)),
-        Section("Before, found and target", figures=figures.compared),
-        Section("Found against hidden", figures=figures.parameters),
-        Section("The search", [result.message], figures=figures.search, rows=_rows(made, result, verdict)),
-    ]
+class Solved:
+    """A search that has ended, judged by its task, as sentences, report and JSON."""
 
+    def __init__(self, made: Setup, result: Result):
+        self.made, self.result, self.estimate = made, result, made.search.parameters(result.parameters)
+        noise = None
+        if made.renderer is not None:
+            last, target = max(made.targets.items())
+            noise = psnr(made.image(made.problem.states(self.estimate, [last])[last]), target)
+        first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
+        self.verdict = judge(made.task, result, self.estimate, noise, first)
+        self.knots = knot_values(made, result.parameters, self.estimate)
 
-def _view(made: Setup, estimate: dict[str, np.ndarray]) -> str:
-    """Return HTML that animates the found run, and the target if it is a run."""
-    steps = np.unique(np.linspace(0, made.problem.steps, VIEWED).astype(int)).tolist()
-    runs = {"found": estimate}
-    if made.task.problem.picture is None:
-        runs["target"] = made.task.true_parameters
-    states = {name: made.problem.states(parameters, steps) for name, parameters in runs.items()}
-    shown = {name: [found[step] for step in steps] for name, found in states.items()}
-    return scene_view(made.task.scene, shown, np.array(steps) * made.task.scene.solver.time_step)
+    @property
+    def summary(self) -> str:
+        made, result, verdict = self.made, self.result, self.verdict
+        reached = [f"{name} is {found_in_words(e)}{self._worst(name, e)}" for name, e in verdict.errors.items()]
+        if verdict.psnr is not None:
+            reached.append(f"the image is matched to {verdict.psnr:.3g} dB")
+        fell = f"fell {verdict.reduction:.3g} times" if result.loss > 0.0 else f"went from {verdict.first:.3g} to 0"
+        unit = "" if made.renderer else " m²"
+        refused = f" and {result.refused} more that were refused" if result.refused else ""
+        left_out = f", {counted(result.left_out, 'run')} of ensembles left out" if result.left_out else ""
+        ends = f", from {verdict.first:.3g}{unit} to {result.loss:.3g}{unit}" if result.loss > 0.0 else unit
+        text = f"The loss {fell}{ends} in {len(result.history)} evaluations{refused}{left_out}"
+        return f"{'; '.join([text, *reached])}."
 
+    def _worst(self, name: str, error: float) -> str:
+        """Describe the worst of a parameter's few numbers, if its error exceeds twice the parameter's error."""
+        estimate, true = self.estimate[name], self.made.true_parameter(name)
+        names = component_names(self.made.task, name, estimate)
+        if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):
+            return ""
+        errors = [distance(*pair) for pair in zip(np.ravel(estimate), np.ravel(true), strict=True)]
+        worst = int(np.argmax(errors))
+        return f" ({names[worst]}: {100 * errors[worst]:.2g}%)" if errors[worst] > 2.0 * error else ""
 
-def _rows(made: Setup, result: Result, verdict: Verdict) -> Rows:
-    rows: Rows = [
-        ("particles", made.problem.simulation.particles, ""),
-        ("steps", made.problem.steps, ""),
-        ("gradients", repr(made.task.optimise.gradient.estimator()), ""),
-        ("evaluations", len(result.history), ""),
-        ("refused", result.refused, ""),
-        ("runs of ensembles left out", result.left_out, ""),
-        ("first loss", f"{verdict.first:.4g}", "" if made.renderer else "m²"),
-        ("best loss", f"{result.loss:.4g}", "" if made.renderer else "m²"),
-        ("loss reduction", f"{verdict.reduction:.4g}", "times"),
-    ]
-    if verdict.psnr is not None:
-        rows.append(("image, PSNR", f"{verdict.psnr:.4g}", "dB"))
-    return rows
+    @property
+    def advice(self) -> list[str]:
+        """Advice after too small a reduction, wrong gradients, a wrong local minimum, or an end on a bound."""
+        made, result, task, steps = self.made, self.result, self.made.task, self.made.task.problem.steps
+        found = []
+        for name, (lower, upper) in made.bounds.items():
+            least = np.asarray(-np.inf if lower is None else lower)
+            most = np.asarray(np.inf if upper is None else upper)
+            if ((result.parameters[name] <= least) | (result.parameters[name] >= most)).any():
+                found.append(f"The search of {name} ended on its bounds: what is best may lie beyond them.")
+        hardly, is_exact = self.verdict.reduction < LITTLE, task.optimise.gradient.name == "exact"
+        search = 'optimise.optimiser = "line_search"'
+        disagrees = "The gradient disagrees with what steps of the search did"
+        if is_exact and (result.misled or (hardly and steps >= LONG)):
+            found.append(
+                f"{disagrees if result.misled else 'The loss hardly fell'}. Over {steps} steps the exact gradient may "
+                "mean nothing: cortado gradients check says up to which step it is of use. Beyond it set "
+                f'optimise.gradient.name = "adjoint_viscosity" and {search}.'
+            )
+        elif result.misled:
+            found.append(f"{disagrees}: set {search}, or begin elsewhere.")
+        elif hardly:
+            other = "small" if result.refused else "large, or as small"
+            found.append(f"The loss hardly fell: try an optimise.learning_rate that is 10 times as {other}.")
+        elif result.stays or max(self.verdict.errors.values(), default=0.0) > MOST_ERROR:
+            more = ", fewer steps" + (" or more frames" if made.renderer else "")
+            found.append(f"If the search is in a wrong valley, try another start{more}, or set {search}.")
+        return found
 
+    def _at_knots(self, name: str) -> Iterator[tuple[str, Any, Any, Any]]:
+        """Yield label, first guess, found and hidden value (or None) of each knot of a parameter."""
+        own = self.knots[name]
+        for k, time in enumerate(own.times):
+            true = None if own.true is None else own.true[k]
+            yield f"{_words(name)} at {time:.4g} s", own.start[k], own.estimate[k], true
 
-def for_machines(
-    result: Result, estimate: Mapping[str, np.ndarray], verdict: Verdict, knots: Mapping[str, KnotValues]
-) -> dict[str, Any]:
-    """Return the results of a search by name, for result.json."""
-    found: dict[str, Any] = {
-        "evaluations": len(result.history),
-        "refused": result.refused,
-        "left_out": result.left_out,
-        "first_loss": verdict.first,
-        "loss": result.loss,
-        "loss_reduction": verdict.reduction,
-        "parameter_error": verdict.errors,
-        "parameters": {name: value for name, value in estimate.items() if np.size(value) <= MOST_IN_RESULT},
-        "knots": {name: one.for_machines() for name, one in knots.items()},
-        "converged": result.converged,
-        "message": result.message,
-        "misled": result.misled,
-        "stays": result.stays,
-        "failures": verdict.failures,
-    }
-    return found if verdict.psnr is None else {**found, "psnr": verdict.psnr}
+    @property
+    def lines(self) -> list[str]:
+        """A line for each parameter, or for each of its knots; parameters with very many numbers have no line."""
+        lines = []
+        for name, value in self.estimate.items():
+            found: Iterable[Any] = [(_words(name), None, value, self.made.true_parameter(name))]
+            if name in self.knots:
+                found = self._at_knots(name)
+            elif np.size(value) > MOST_NUMBERS:
+                continue
+            unit = f" {self.made.task.known[name].unit}".rstrip()
+            for label, _, one, true in found:
+                hidden = "" if true is None else f"; true {written(true)}{unit}"
+                lines.append(f"  {label}: {written(one)}{unit}{hidden}")
+        return lines
+
+    @property
+    def rows(self) -> Rows:
+        """Table rows (parameter, unit, first guess, found, hidden, error): one for each number searched, each knot, and
+        each parameter with very many numbers."""
+        rows, errors, start = Rows(), self.verdict.errors, self.made.search.parameters(self.made.start)
+        for name, value in self.estimate.items():
+            unit, true = self.made.task.known[name].unit, self.made.true_parameter(name)
+            if name in self.knots:
+                for label, first, found, hidden in self._at_knots(name):
+                    known = ("", "") if hidden is None else (written(hidden), f"{distance(found, hidden):.3%}")
+                    rows.append((label, unit, first, found, *known))
+                continue
+            columns = np.broadcast_arrays(start[name], value, *([] if true is None else [true]))
+            names = component_names(self.made.task, name, columns[0])
+            if len(names) != columns[0].size or len(names) > MOST_NUMBERS:
+                error = f"{errors[name]:.3%}" if name in errors else ""
+                whole = np.asarray(start[name]), np.asarray(value), "" if true is None else true
+                rows.append((_words(name), unit, *whole, error))
+                continue
+            for label, first, found, *hidden in zip(names, *map(np.ravel, columns), strict=True):
+                known = (*hidden, f"{distance(found, *hidden):.3%}") if hidden else ("", "")
+                rows.append((label, unit, first, found, *known))
+        return rows
+
+    def sections(self, figures: TaskFigures) -> list[Section]:
+        """Return the sections of the report."""
+        made, result, verdict, task = self.made, self.result, self.verdict, self.made.task
+        steps, unit = made.problem.steps, "" if made.renderer else "m²"
+        viewed = np.unique(np.linspace(0, steps, VIEWED).astype(int)).tolist()
+        runs = {"found": self.estimate, **({"target": task.true_parameters} if task.problem.picture is None else {})}
+        states = {name: made.problem.states(parameters, viewed) for name, parameters in runs.items()}
+        shown = {name: [found[step] for step in viewed] for name, found in states.items()}
+        effort: Rows = [
+            ("particles", made.problem.simulation.particles, ""),
+            ("steps", steps, ""),
+            ("gradients", repr(task.optimise.gradient.estimator()), ""),
+            ("evaluations", len(result.history), ""),
+            ("refused", result.refused, ""),
+            ("runs of ensembles left out", result.left_out, ""),
+            ("first loss", f"{verdict.first:.4g}", unit),
+            ("best loss", f"{result.loss:.4g}", unit),
+            ("loss reduction", f"{verdict.reduction:.4g}", "times"),
+            *([] if verdict.psnr is None else [("image, PSNR", f"{verdict.psnr:.4g}", "dB")]),
+        ]
+        view = scene_view(task.scene, shown, np.array(viewed) * task.scene.solver.time_step)
+        head = ("", "unit", "first guess", "found", "hidden", "error")
+        return [
+            asked(made),
+            Section("What was found", [self.summary, *self.advice], verdict.failures, figures.found),
+            Section("In numbers", head=head, rows=self.rows),
+            Section("To turn and to play", view=view),
+            Section("Before, found and target", figures=figures.compared),
+            Section("Found against hidden", figures=figures.parameters),
+            Section("The search", [result.message], figures=figures.search, rows=effort),
+        ]
+
+    def for_machines(self) -> dict[str, Any]:
+        """Return the results by name, for result.json."""
+        result, verdict, small = self.result, self.verdict, MOST_IN_RESULT
+        return {
+            "evaluations": len(result.history),
+            "refused": result.refused,
+            "left_out": result.left_out,
+            "first_loss": verdict.first,
+            "loss": result.loss,
+            "loss_reduction": verdict.reduction,
+            "parameter_error": verdict.errors,
+            "parameters": {name: value for name, value in self.estimate.items() if np.size(value) <= small},
+            "knots": {name: one.for_machines() for name, one in self.knots.items()},
+            **{name: getattr(result, name) for name in ("converged", "message", "misled", "stays")},
+            "failures": verdict.failures,
+            **({} if verdict.psnr is None else {"psnr": verdict.psnr}),
+        }

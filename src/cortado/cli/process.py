@@ -6,7 +6,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
 from difflib import get_close_matches
 from errno import EMFILE, ENFILE, ENOMEM
@@ -129,29 +129,19 @@ def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado")
 _MEMORY = (os.strerror(ENOMEM), "failed to map segment")
 _FILES = (os.strerror(EMFILE), os.strerror(ENFILE))
 _THREADS = ("can't start new thread",)
-"""Texts in messages that reveal a shortage: the dynamic linker raises an `ImportError`, or an `OSError` without a
-number."""
+"""Texts that reveal a shortage: the dynamic linker raises an `ImportError`, or an `OSError` without a number."""
 
 
-def shortage(error: BaseException) -> str | None:
-    """Return a sentence for an error caused by a lack of memory, files or threads, directly or through its causes; None
-    for other errors."""
-    for cause in _causes(error):
-        if isinstance(cause, MemoryError) or _says(cause, _MEMORY):
-            what = f" ({cause})" if str(cause) else ""
-            return f"Memory ran out{what}; take a larger spacing, or record fewer frames with --record-every."
-        if _says(cause, _FILES):
-            return f"Too many files are open ({cause}); allow this process more of them (ulimit -n 1024)."
-        if _says(cause, _THREADS):
-            return "No more threads can be started; allow this process more of them (ulimit -u) or more memory."
-    return None
-
-
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
+def shortage(error: BaseException | None) -> str | None:
+    """Return a sentence for a lack of memory, files or threads among the causes of an error; None for others."""
     while error is not None:
-        yield error
+        said = str(error) if isinstance(error, OSError | ImportError | RuntimeError) else ""
+        if isinstance(error, MemoryError) or any(word in said for word in _MEMORY):
+            what = f" ({error})" if str(error) else ""
+            return f"Memory ran out{what}; take a larger spacing, or record fewer frames with --record-every."
+        if any(word in said for word in _FILES):
+            return f"Too many files are open ({error}); allow this process more of them (ulimit -n 1024)."
+        if any(word in said for word in _THREADS):
+            return "No more threads can be started; allow this process more of them (ulimit -u) or more memory."
         error = error.__cause__ or error.__context__
-
-
-def _says(error: BaseException, words: tuple[str, ...]) -> bool:
-    return isinstance(error, OSError | ImportError | RuntimeError) and any(word in str(error) for word in words)
+    return None

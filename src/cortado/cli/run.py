@@ -1,5 +1,4 @@
-"""``cortado run``: run a scene forward and write its folder while it runs, so that a stopped or killed run can be
-resumed."""
+"""``cortado run``: run a scene and write its folder meanwhile, so that a stopped or killed run can be resumed."""
 
 import time
 from collections.abc import Sequence
@@ -32,8 +31,7 @@ from cortado.simulation import Simulation
 from cortado.watching import Watch
 
 OFTEN, SHARE = 5.0, 20.0
-"""Notes on steps are written every `OFTEN` seconds, or less often if writing would take more than 1 / `SHARE` of the
-time."""
+"""Notes are written every `OFTEN` seconds, or less often if that took more than 1 / `SHARE` of the time."""
 
 
 @dataclass(frozen=True)
@@ -58,15 +56,18 @@ class RunRequest:
     command: Sequence[str] = ()
     report: bool = True
 
-    def settings(self, simulation: Simulation, rollout: Rollout, state: RestartState | None) -> dict[str, Any]:
+    def settings(self, rollout: Rollout, state: RestartState | None) -> dict[str, Any]:
         """Return the settings that must be unchanged when the run is resumed."""
-        in_time = bool(np.isfinite(rollout.step_sizes.end))
-        asked = run_settings(rollout.steps, self.precision, self.frames)
-        return {
-            **({**asked, "steps": None, "time": self.time} if in_time else asked),
-            **({"record": sorted(self.record)} if self.record else {}),
-            **({"state": _checksum(state)} if state is not None else {}),
-        }
+        found = run_settings(rollout.steps, self.precision, self.frames)
+        if np.isfinite(rollout.step_sizes.end):
+            found |= {"steps": None, "time": self.time}
+        if self.record:
+            found["record"] = sorted(self.record)
+        if state is not None:
+            told = repr((state.clock.steps, state.clock.time, state.clock.time_step)).encode()
+            content = told + b"".join(state[name].tobytes() for name in sorted(state.fields))
+            found["state"] = sha256(content).hexdigest()[:16]
+        return found
 
 
 def run_settings(steps: int, precision: str, frames: FrameChoice) -> dict[str, Any]:
@@ -104,8 +105,7 @@ class RunRecording:
         return step
 
     def run(self) -> State:
-        """Take the steps and return the last state. If the run diverges, write everything before and raise
-        `DivergedError`."""
+        """Take the steps and return the last state. Write everything before a `DivergedError`."""
         rollout, steps = self.rollout, self.rollout.steps
         times, first = self.frames.announced(rollout), self.simulation.frame(rollout.initial)
         constants, origin, start = self.simulation.constants(rollout), rollout.origins[0], rollout.clocks[0].time
@@ -181,7 +181,13 @@ class Notes:
 
 def run_scene(scene_file: Path, asked: RunRequest) -> str:
     """Run a scene, write its folder, and return a sentence that names the results."""
-    state = None if asked.state is None else _last_state(asked.state)
+    state = None
+    if (path := asked.state) is not None:
+        file = RunFolder.open(path, ", but --state must be the folder of one").trajectory if path.is_dir() else path
+        earlier = Trajectory.load(file)
+        if not len(earlier):
+            raise InputError(f"{file} holds no frame, but --state must be a trajectory to go on from.")
+        state = earlier.last_state
     scene = load_scene(scene_file, asked.overrides)
     scene = scene.lasting(asked.time, asked.steps) if state is None else scene.going_on(state)
     simulation = Simulation(scene, asked.device, asked.precision)
@@ -189,41 +195,27 @@ def run_scene(scene_file: Path, asked: RunRequest) -> str:
     numbers = simulation.numbers_in_frame(components=3)  # as in the file
     frames = frame_parts(asked.frames.expected(rollout), numbers, simulation.precision.bytes)
     require(frames, "take a larger --record-every or fewer steps")
-    watch, settings = Watch(simulation, rollout, asked.record), asked.settings(simulation, rollout, state)
-    noted: dict[str, Any] = {"device": str(simulation.device), "settings": settings}
+    watch, given = Watch(simulation, rollout, asked.record), (asked.out, scene.to_json(), asked.command)
+    noted: dict[str, Any] = {"device": str(simulation.device), "settings": asked.settings(rollout, state)}
+
+    def kept() -> str:
+        there = folder.trajectory.exists()
+        return f"the frames so far are in {folder.trajectory}; --resume goes on with them" if there else ""
+
     with locked(asked.out):
         if asked.resume:
-            folder = RunFolder.resume(asked.out, scene.to_json(), asked.command, **noted)
+            folder = RunFolder.resume(*given, **noted)
         else:
-            folder = RunFolder.create(asked.out, scene.to_json(), asked.command, overwrite=asked.overwrite, **noted)
+            folder = RunFolder.create(*given, overwrite=asked.overwrite, **noted)
         recording = RunRecording(simulation, rollout, folder, asked.frames, watch)
         begun = recording.go_on() if asked.resume else 0
         if asked.resume:
             announce(f"It goes on after step {begun}." if begun else "No step of it is known: it begins anew.")
-        with keeping(lambda: _kept(folder)):
+        with keeping(kept):
             _compute(recording, asked)
     for told in trouble(rollout, scene):
         warn(told)
     return f"The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
-
-
-def _kept(folder: RunFolder) -> str:
-    there = folder.trajectory.exists()
-    return f"the frames so far are in {folder.trajectory}; --resume goes on with them" if there else ""
-
-
-def _last_state(path: Path) -> RestartState:
-    """Return the last state of a trajectory file or of the run in a folder; raise `InputError` if there is none."""
-    file = RunFolder.open(path, ", but --state must be the folder of one").trajectory if path.is_dir() else path
-    found = Trajectory.load(file)
-    if not len(found):
-        raise InputError(f"{file} holds no frame, but --state must be a trajectory to go on from.")
-    return found.last_state
-
-
-def _checksum(state: RestartState) -> str:
-    told = repr((state.clock.steps, state.clock.time, state.clock.time_step)).encode()
-    return sha256(told + b"".join(state[name].tobytes() for name in sorted(state.fields))).hexdigest()[:16]
 
 
 def _compute(recording: RunRecording, asked: RunRequest) -> None:

@@ -39,8 +39,7 @@ from cortado.solvers.particles import ParticleSolver
 
 @dataclass(frozen=True)
 class Energy:
-    """Energies of the fluid [J], in 2-D of a layer 1 m thick, without particles that wait in emitters or were taken by
-    drains."""
+    """Energies of the fluid [J], in 2-D of a layer 1 m thick, without particles in emitters and drains."""
 
     kinetic: float
     potential: float
@@ -69,17 +68,11 @@ class Energy:
 
 class RunSummary:
     def __init__(
-        self,
-        simulation: Simulation,
-        rollout: Rollout,
-        last: State,
-        seconds: float,
-        readings: Mapping[str, Readings] | None = None,
+        self, simulation: Simulation, rollout: Rollout, last: State, seconds: float, readings: Mapping[str, Readings]
     ):
-        """Summarise a run from its ``last`` state, the ``seconds`` of computing in this process, and sensor readings by
-        name."""
+        """Summarise a run from its ``last`` state, the ``seconds`` in this process, and sensor readings by name."""
         solver, taken, gravity = rollout.solver, rollout.taken, rollout.parameters["gravity"].numpy()
-        self.steps, self.seconds, self.readings = taken, seconds, readings or {}
+        self.steps, self.seconds, self.readings = taken, seconds, readings
         self.computed = taken - rollout.progress.step  # without the steps of an earlier process
         self.time = simulated(rollout)
         self.sizes = sizes_in_words(rollout)
@@ -92,12 +85,15 @@ class RunSummary:
         if isinstance(solver, ParticleSolver):
             found = solver.densities(last, rollout.parameters, taken - 1)[_out(simulation, last)]
             self.densities = float(found.min()), float(found.max())
-        self.balance = (
-            Balance.of(simulation.scene, *map(_others, (rollout.initial, last))) if simulation.scene.drain else None
-        )
-        self.spilt = _spilt(simulation, last)
-        self.particles = simulation.free_particles
-        self.masses = simulation.masses
+        scene, free = simulation.scene, simulation.free_particles
+        self.balance = Balance.of(scene, *map(_others, (rollout.initial, last))) if scene.drain else None
+        self.spilt = 0
+        """Number of particles outside an open cup, without those that began in an emitter."""
+        if np.isfinite(scene.container.region(simulation.dimension).rim):
+            positions = last.numpy(simulation.dimension, only=["positions"])["positions"]
+            outside = ~scene.container.contains(positions[:free], TOLERANCE * scene.discretisation.spacing)
+            self.spilt = int((outside & _out(simulation, last)[:free]).sum())
+        self.particles, self.masses = free, simulation.masses
 
     @property
     def milliseconds(self) -> float:
@@ -109,18 +105,14 @@ class RunSummary:
 
     def for_machines(self) -> dict[str, Any]:
         """Return by name the numbers that are the same in every repetition of the run."""
-        energies = {"first": vars(self.first), "last": vars(self.last)}
         least, greatest = self.densities or (None, None)
-        sensors = {"sensors": summary(self.readings)} if self.readings else {}
-        masses = {"given": self.masses.given, "asked": self.masses.asked}
-        balance = {} if self.balance is None else {"balance": self.balance.for_machines()}
         return {
-            "energy": energies,
-            "mass": masses,
+            "energy": {"first": vars(self.first), "last": vars(self.last)},
+            "mass": {"given": self.masses.given, "asked": self.masses.asked},
             "density": {"least": least, "greatest": greatest},
             "spilt": self.spilt,
-            **balance,
-            **sensors,
+            **({} if self.balance is None else {"balance": self.balance.for_machines()}),
+            **({"sensors": summary(self.readings)} if self.readings else {}),
         }
 
     def rows(self) -> list[tuple[object, ...]]:
@@ -178,16 +170,6 @@ def _others(state: State) -> dict[str, NDArray[Any]]:
     return {name: state[name].numpy() for name in state.names if name.endswith(OF_OPENINGS)}
 
 
-def _spilt(simulation: Simulation, state: State) -> int:
-    """Return how many particles are outside an open cup, without particles that began in an emitter."""
-    scene, container, free = simulation.scene, simulation.scene.container, simulation.free_particles
-    if not np.isfinite(container.region(simulation.dimension).rim):
-        return 0
-    positions = state.numpy(simulation.dimension, only=["positions"])["positions"]
-    outside = ~container.contains(positions[:free], TOLERANCE * scene.discretisation.spacing)
-    return int((outside & _out(simulation, state)[:free]).sum())
-
-
 def simulated(rollout: Rollout) -> float:
     clock, size = rollout.clocks[0], float(rollout.time_steps[0])
     return clock.after(rollout.taken, size).time - clock.time
@@ -208,13 +190,19 @@ def write_run_report(
     pictures: bool,
     read: Mapping[str, Readings] | None = None,
 ) -> None:
-    """Write the report of a run, with shaded ``pictures`` if wanted. ``told`` has the results; ``read`` has sensor
-    readings."""
-    scene, trajectory = simulation.scene, Trajectory.load(folder.trajectory)
-    asked = Section("What was asked", _asked(simulation, rollout))
+    """Write the report of a run, with shaded ``pictures`` if wanted, the results ``told`` and sensors ``read``."""
+    scene, trajectory, step = simulation.scene, Trajectory.load(folder.trajectory), float(rollout.time_steps[0])
+    length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
+    if scene.solver.chooses:
+        length = f"{rollout.taken} steps of {sizes_in_words(rollout)}, {simulated(rollout):.4g} s of fluid"
+    wall = f" Walls are made of {len(simulation.walls)} particles." if len(simulation.walls) else ""
+    substeps = f" Each step has {rollout.substeps} substeps of diffusion." if rollout.substeps else ""
+    where, dry = f"{simulation.precision.name} on {simulation.device}", dry_sentence(scene, rollout)
+    question = f"How does the fluid move? The scene: {scene_in_words(scene, simulation.particles)}"
+    lasts = [f"{dry[0].upper()}{dry[1:]}"] if dry else []
+    asked = Section("What was asked", [question, f"{length}, in {where}.{wall}{substeps}", *lasts])
     view = Section("To turn and to play", view=scene_view(scene, {scene.name: list(trajectory)}, trajectory.times))
     figures, solver = _figures(simulation, trajectory, folder.figures), _solver(rollout, trajectory, scene, folder)
-
     sensors: list[Section] = []
     if read:
         told_of = f"The sensors of the scene, read in every step; the numbers are in {folder.sensors.name}."
@@ -272,21 +260,6 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
     return figures
 
 
-def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
-    scene = simulation.scene
-    step = float(rollout.time_steps[0])
-    length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
-    if scene.solver.chooses:
-        length = f"{rollout.taken} steps of {sizes_in_words(rollout)}, {simulated(rollout):.4g} s of fluid"
-    wall = f" Walls are made of {len(simulation.walls)} particles." if len(simulation.walls) else ""
-    substeps = f" Each step has {rollout.substeps} substeps of diffusion." if rollout.substeps else ""
-    where = f"{simulation.precision.name} on {simulation.device}"
-    question = f"How does the fluid move? The scene: {scene_in_words(scene, simulation.particles)}"
-    dry = dry_sentence(scene, rollout)
-    told = [f"{dry[0].upper()}{dry[1:]}"] if dry else []
-    return [question, f"{length}, in {where}.{wall}{substeps}", *told]
-
-
 def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunFolder) -> Section:
     figures: Figures = []
     if len(trajectory.converged) and "density_errors" in trajectory.diagnostics and scene.forces.pressure:
@@ -297,9 +270,9 @@ def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunF
     if not len(converged):
         return Section("The solver", figures=figures)
     every = "The pressure converged in every step."
-    told = [every if converged.all() else not_converged_sentence(converged, scene)]
+    told = every if converged.all() else not_converged_sentence(converged, scene)
     torn = divergence_sentence(rollout.diagnostics, scene)
-    return Section("The solver", [*told, torn] if torn else told, figures=figures)
+    return Section("The solver", [told, *([torn] if torn else [])], figures=figures)
 
 
 @dataclass(frozen=True)

@@ -316,8 +316,7 @@ TEMPLATES = Path(__file__).with_name("templates")
 """The folder of the templates: scenes whose first line says what the scene is and how to run it."""
 IN_3D = "_3d"
 SCENE_FILE, SCENE_NAME = "SCENE.toml", 'name = "SCENE"'
-"""The file name in a template's first line, and the line with the scene's name; both are replaced by the new file's
-name."""
+"""File name in the first line, and line with the name, of a template; the name of the new file replaces both."""
 ALL = "all"
 DATA = (".csv", ".mp4")
 """Suffixes of data files of an example; their names begin with the example's name: example_ANY.csv."""
@@ -328,8 +327,7 @@ def templates() -> list[str]:
 
 
 def new_scene(path: Path, template: str, dimension: int | None) -> str:
-    """Write a scene, and beside it the schema that editors use to complete and check scenes; existing files are not
-    replaced."""
+    """Write a scene, and beside it the schema with which editors check it; existing files are not replaced."""
     if template not in templates():
         raise InputError(f"--template is {shown(template)}, but must be one of {', '.join(templates())}.")
     if dimension is not None and template != DAM:
@@ -359,36 +357,27 @@ def scene_text(file: Path, template: str) -> tuple[str, str]:
 
 
 def list_examples(names: list[str], folder: Path) -> str:
-    """List the examples, one per line, or copy the named examples into a folder, which is created if missing."""
+    """List the examples, one per line, or copy the named examples, with the files that they read, into a folder, which
+    is created if missing. If one of the files exists already, nothing is copied."""
     found = {path.stem: path for path in sorted(examples_folder().iterdir()) if path.suffix in (".toml", ".py")}
     if not found:
         raise InputError(f"{examples_folder()} holds no examples: install Cortado again.")
     if not names:
         return "\n".join([*map(_line, found.values()), "", "cortado examples --copy NAME copies one here, or all."])
-    return _copied([found[name] for name in _chosen(names, list(found))], folder)
-
-
-def _chosen(names: list[str], known: list[str]) -> list[str]:
     plain = [name.removesuffix(".toml").removesuffix(".py") for name in names]
     for name, given in zip(plain, names, strict=True):
-        if name not in (*known, ALL):
-            raise InputError(f"--copy is {shown(given)}, but must be {ALL} or one of {', '.join(known)}.")
-    return known if ALL in plain else list(dict.fromkeys(plain))
-
-
-def _copied(sources: list[Path], folder: Path) -> str:
-    """Copy examples with the files that they read. If one of the files exists already, nothing is copied."""
-    examples = [folder / source.name for source in sources]
-    beside = (path for source in sources for path in sorted(source.parent.glob(f"{source.stem}_*")))
-    sources = [*sources, *(path for path in beside if path.suffix in DATA)]
-    targets = [folder / source.name for source in sources]
+        if name not in (*found, ALL):
+            raise InputError(f"--copy is {shown(given)}, but must be {ALL} or one of {', '.join(found)}.")
+    examples = [found[name] for name in (found if ALL in plain else dict.fromkeys(plain))]
+    beside = (path for source in examples for path in sorted(source.parent.glob(f"{source.stem}_*")))
+    targets = {folder / source.name: source for source in (*examples, *(one for one in beside if one.suffix in DATA))}
     for target in targets:
         if is_taken(target):
             raise InputError(f"{target} is already there; choose another folder with --to, or remove it.")
     make_folder(folder)
-    for source, target in zip(sources, targets, strict=True):
+    for target, source in targets.items():
         write_atomically(target, source.read_bytes())
-    return "" if is_quiet() else "\n".join(f"{example}: {_command(example)}" for example in examples)
+    return "" if is_quiet() else "\n".join(f"{folder / one.name}: {_command(folder / one.name)}" for one in examples)
 
 
 def _command(path: Path) -> str:

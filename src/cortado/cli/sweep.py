@@ -23,14 +23,12 @@ from cortado.errors import ComputationError, CortadoError, CortadoWarning, Input
 from cortado.files.disk import locked, write_atomically
 from cortado.files.terminal import Interrupted, keeping, track, untracked
 from cortado.optimisation.task_files import load_task
-from cortado.runs.recording import FrameChoice
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.scene import load_scene, read_toml
 
 MOST_COMBINATIONS = 100_000
 """Greatest number of combinations of a sweep; a larger number is taken for a mistake."""
 _LONGEST_NAME = 120
-_PAIRS = {"[": "]", "{": "}"}
 _PLAIN = re.compile(r"[A-Za-z0-9_=,.+-]+")
 """Folder names that need no quotes in a shell."""
 
@@ -95,20 +93,14 @@ def _values(options: Sequence[str], name: str) -> dict[str, list[str]]:
 
 def _split(text: str) -> list[str]:
     """Split a text at its commas, except commas within brackets or quotes."""
-    parts, closing, quote = [""], [], ""
-    for letter in text:
-        if quote:
-            quote = "" if letter == quote else quote
-        elif letter in "\"'":
-            quote = letter
-        elif letter in _PAIRS:
-            closing.append(_PAIRS[letter])
-        elif closing and letter == closing[-1]:
-            closing.pop()
-        elif letter == "," and not closing:
-            parts.append("")
-            continue
-        parts[-1] += letter
+    parts, is_open = list[str](), False
+    for piece in text.split(","):
+        if is_open:
+            parts[-1] += f",{piece}"
+        else:
+            parts.append(piece)
+        bare = re.sub(r"\"[^\"]*\"|'[^']*'", "", parts[-1])  # without texts in quotes
+        is_open = any(bare.count(begin) > bare.count(end) for begin, end in ("[]", "{}")) or bool({*"\"'"} & {*bare})
     return parts
 
 
@@ -117,13 +109,12 @@ MOST_NUMBERS = 12
 
 
 def write_table(folder: Path, combinations: Sequence[Combination], results: Mapping[int, Mapping[str, Any]]) -> None:
-    """Write the table of folders, values, states, results and failures; ``results`` has contents of result.json by
-    number."""
+    """Write the table of folders, values and ``results``, the contents of result.json by number."""
     rows = [
         {
             "folder": combinations[number].name,
             **dict(combinations[number].values),
-            "status": "failed" if failed(result) else "done",
+            "status": "failed" if result["failures"] else "done",
             **_flat({name: value for name, value in result.items() if name != "failures"}),
             "failures": " ".join(result["failures"]),
         }
@@ -135,10 +126,6 @@ def write_table(folder: Path, combinations: Sequence[Combination], results: Mapp
     writer.writeheader()
     writer.writerows(rows)
     write_atomically(folder / SWEEP, text.getvalue())
-
-
-def failed(result: Mapping[str, Any]) -> bool:
-    return bool(result["failures"])
 
 
 def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
@@ -169,6 +156,7 @@ class Member:
     device: str
     precision: str
     frames: FrameOptions
+    """Which frames are recorded; without options about a hundred."""
     report: bool
 
     def __call__(self, combination: Combination) -> dict[str, Any]:
@@ -191,7 +179,7 @@ class Member:
             scene, kind, settings = task.scene, "optimise", search_settings(task, self.precision)
         else:
             scene, kind, steps = load_scene(self.file, overrides), "run", self.steps(combination)
-            settings = run_settings(steps, self.precision, self._frames(steps))
+            settings = run_settings(steps, self.precision, self.frames.choice(max(steps // 100, 1)))
         folder = self._folder(combination)
         if folder is None:
             return None
@@ -220,7 +208,14 @@ class Member:
                     command = ["cortado", "optimise", *words]
                     optimise_task(self.file, out, overrides, self.device, self.precision, begun, False, command)
                 else:
-                    run_scene(self.file, self._request(combination, begun, words))
+                    steps = self.steps(combination)
+                    frames = self.frames.choice(max(steps // 100, 1))
+                    ((name, value),) = frames.settings.items()
+                    command = ["cortado", "run", *words, "--steps", str(steps)]
+                    command += [f"--{name.replace('_', '-')}", str(value)]
+                    asked = steps, None, overrides, self.device, self.precision, frames
+                    asked_more: Any = {"resume": begun, "command": command, "report": self.report}
+                    run_scene(self.file, RunRequest(out, *asked, **asked_more))
         except Interrupted as stop:  # what is kept of one combination says less than the sweep does
             raise Interrupted(stop.args[0]) from None
         except CortadoError as error:
@@ -229,20 +224,6 @@ class Member:
         folder = self._folder(combination)
         assert folder is not None
         return folder.read_result() or {"failures": ["It left no result."]}
-
-    def _request(self, combination: Combination, begun: bool, words: list[str]) -> RunRequest:
-        steps = self.steps(combination)
-        frames = self._frames(steps)
-        ((name, value),) = frames.settings.items()
-        command = ["cortado", "run", *words, "--steps", str(steps), f"--{name.replace('_', '-')}", str(value)]
-        asked = combination.overrides, self.device, self.precision, frames
-        return RunRequest(
-            self.out / combination.name, steps, None, *asked, resume=begun, command=command, report=self.report
-        )
-
-    def _frames(self, steps: int) -> FrameChoice:
-        """Return the choice of frames; without options about a hundred."""
-        return self.frames.choice(max(steps // 100, 1))
 
 
 def run_sweep(
@@ -260,12 +241,17 @@ def run_sweep(
 ) -> str:
     """Compute the missing combinations of a sweep; return a sentence that names the table. Raise `ComputationError` if
     some combinations failed."""
-    chosen = combinations(options, zipped)
-    duration = _duration(file, chosen, steps, time)
-    of_scenes = {"no-pictures": not pictures, "record-every": frames.record_every, "fps": frames.fps}
-    for name, value in of_scenes.items():
-        if duration is None and value:
-            raise InputError(f"--{name} is given, but must be left out of a sweep of a task.")
+    chosen, duration = combinations(options, zipped), time
+    if "optimise" in read_toml(file):  # a task
+        for name, number in (("steps", steps), ("time", time)):
+            if number is not None:
+                raise InputError(f"--{name} is given, but must be left out, as the task says problem.steps.")
+        of_scenes = {"no-pictures": not pictures, "record-every": frames.record_every, "fps": frames.fps}
+        for name, value in of_scenes.items():
+            if value:
+                raise InputError(f"--{name} is given, but must be left out of a sweep of a task.")
+    elif (number := steps_or_time(steps, time)) is not None:
+        duration = check_steps(number) * min(_time_step(file, one) for one in chosen)
     member = Member(file.absolute(), duration, out.absolute(), device, precision, frames, pictures)
     with unwarned():  # warnings are printed when a combination runs; mistakes are found before computing
         read = {number: member.finished(one) for number, one in enumerate(chosen)}
@@ -276,10 +262,13 @@ def run_sweep(
     def kept() -> str:
         return f"{len(done)} of {len(chosen)} are finished, in {out.absolute()}; the same command goes on with the rest"
 
+    def failed() -> list[int]:
+        return [number for number in sorted(done) if done[number]["failures"]]
+
     def note(number: int, result: dict[str, Any]) -> None:
         done[left[number]] = result
         write_table(out, chosen, done)
-        advance(failed=sum(map(failed, done.values())))
+        advance(failed=len(failed()))
 
     with (
         (where if left else HERE).executor(device, len(left)) as executor,
@@ -289,31 +278,14 @@ def run_sweep(
     ):
         write_table(out, chosen, done)
         executor.map(member, [chosen[number] for number in left], note)
-    failures = sum(map(failed, done.values()))
-    _warn_of_times(member, [chosen[number] for number in done if not failed(done[number])])
+    failures = failed()
+    _warn_of_times(member, [chosen[number] for number in done if number not in failures])
     all_of_them = f"Of {counted(len(chosen), 'combination')}{f', {there} of them there already,' if there else ''}"
     table = f"table is {out.absolute() / SWEEP}, beside a folder for each."
     if failures:
-        first = next(number for number in sorted(done) if failed(done[number]))
-        why = " ".join(done[first]["failures"])
-        raise ComputationError(
-            f"{all_of_them} {failures} failed, the first of them {chosen[first].name}: {why} The {table}"
-        )
+        first = f"the first of them {chosen[failures[0]].name}: {' '.join(done[failures[0]]['failures'])}"
+        raise ComputationError(f"{all_of_them} {len(failures)} failed, {first} The {table}")
     return f"{all_of_them} none failed; the {table}"
-
-
-def _duration(file: Path, chosen: list[Combination], steps: int | None, time: float | None) -> float | None:
-    """Return the simulated time of a scene [s], or None for a task, a file with the table [optimise]."""
-    if "optimise" in read_toml(file):
-        for name, value in (("steps", steps), ("time", time)):
-            if value is not None:
-                raise InputError(f"--{name} is given, but must be left out, as the task says problem.steps.")
-        return None
-    steps = steps_or_time(steps, time)
-    if steps is None:
-        return time
-    number = check_steps(steps)
-    return number * min(_time_step(file, one) for one in chosen)
 
 
 def _time_step(file: Path, combination: Combination) -> float:
@@ -327,10 +299,9 @@ def _warn_of_times(member: Member, done: list[Combination]) -> None:
     duration = member.duration
     if duration is None or not done:
         return
-    ends = [member.steps(one) * _time_step(member.file, one) for one in done]
-    off = max(ends, key=lambda end: abs(end - duration))
+    ends = {one.name: member.steps(one) * _time_step(member.file, one) for one in done}
+    last, off = max(ends.items(), key=lambda pair: abs(pair[1] - duration))
     if abs(off - duration) > SAME_TIME * duration:
-        last = done[ends.index(off)].name
         warn(
             f"not all combinations end at {duration:g} s, which is no whole number of their time steps: {last} "
             f"ends at {off:g} s. Choose a --time that is a multiple of every time step."

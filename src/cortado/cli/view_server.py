@@ -53,39 +53,6 @@ _silent = logging.getLogger(__name__)
 _silent.disabled = True
 
 
-class Door:
-    """Admits only requests that know the token in the window's address."""
-
-    def __init__(self) -> None:
-        self._token = token_hex(16)
-
-    def address(self, port: int) -> str:
-        return f"http://{HOST}:{port}/{self._token}/"
-
-    def before(self, answer: Answer | None) -> Answer:
-        """Wrap ``answer`` so that requests without the token are refused."""
-
-        def guarded(connection: ServerConnection, request: Request) -> Response | None:
-            token, _, rest = request.path.removeprefix("/").partition("?")[0].partition("/")
-            own = compare_digest(token.encode(errors="replace"), self._token.encode())
-            if not (own and _is_from_here(request, connection.local_address[1])):
-                return connection.respond(HTTPStatus.FORBIDDEN, ADVICE)
-            response = answer(connection, Request(f"/{rest}", request.headers)) if answer else None
-            if response is not None:
-                response.headers.update(HEADERS)
-            return response
-
-        return guarded
-
-
-def _is_from_here(request: Request, port: int) -> bool:
-    """Test whether a request uses one of this machine's host names, and comes from a page at that name or from no
-    page."""
-    hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-    own = [f"{name}:{port}" for name in NAMES] + (list(NAMES) if port == 80 else [])  # browsers leave out 80
-    return len(hosts) == 1 and hosts[0] in own and origins in ([], [f"http://{hosts[0]}"])
-
-
 class CameraMessage(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
     wxyz: tuple[Number, Number, Number, Number]
     position: Direction
@@ -121,7 +88,7 @@ class GuardedServer:
     """A guarded viser server on this machine; if ``port`` is taken, it uses one of the next ports."""
 
     def __init__(self, port: int, label: str):
-        self._door, self._guarded = Door(), False
+        self._token, self._guarded = token_hex(16), False
         with redirect_stdout(StringIO()), _serving(self._serve):  # it draws a box
             self.viser: Any = viser.ViserServer(HOST, port, label, verbose=False)
         if not self._guarded:
@@ -132,7 +99,7 @@ class GuardedServer:
 
     @property
     def address(self) -> str:
-        return self._door.address(self.viser.get_port())
+        return f"http://{HOST}:{self.viser.get_port()}/{self._token}/"
 
     def close(self) -> None:
         with redirect_stdout(StringIO()):
@@ -141,13 +108,27 @@ class GuardedServer:
     def _serve(self, serve: Callable[..., Any], *where: Any, process_request: Any = None, **options: Any) -> Any:
         self._guarded = True
         own = {
-            "process_request": self._door.before(process_request),
+            "process_request": partial(self._answer, process_request),
             "create_connection": partial(Hearing, controls=self._control),
             "max_size": LONGEST_MESSAGE,
             "close_timeout": FAREWELL,
             "logger": _silent,
         }
         return serve(*where, **options | own)
+
+    def _answer(self, answer: Answer | None, connection: ServerConnection, request: Request) -> Response | None:
+        """Answer a request, or refuse one without the token, with another host name, or from another page."""
+        token, _, rest = request.path.removeprefix("/").partition("?")[0].partition("/")
+        own, port = compare_digest(token.encode(errors="replace"), self._token.encode()), connection.local_address[1]
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        names = [f"{name}:{port}" for name in NAMES] + (list(NAMES) if port == 80 else [])  # browsers leave out 80
+        is_from_here = len(hosts) == 1 and hosts[0] in names and origins in ([], [f"http://{hosts[0]}"])
+        if not (own and is_from_here):
+            return connection.respond(HTTPStatus.FORBIDDEN, ADVICE)
+        response = answer(connection, Request(f"/{rest}", request.headers)) if answer else None
+        if response is not None:
+            response.headers.update(HEADERS)
+        return response
 
     def _control(self, name: str) -> Any:
         # viser has no public way from the id in a message to its control
@@ -192,13 +173,9 @@ def _can_be(said: Update, controls: Controls) -> bool:
         case viser.GuiDropdownHandle():
             return isinstance(value, str) and value in control.options
         case viser.GuiSliderHandle():
-            return _is_between(control, value)
+            if isinstance(value, bool) or not isinstance(value, type(control.value) | int):
+                return False
+            # the page rounds to the digits shown
+            slack = 0.5 * 10.0**-control.precision if isinstance(control.value, float) else 0
+            return math.isfinite(value) and control.min - slack <= value <= control.max + slack
     return False
-
-
-def _is_between(slider: Any, value: Any) -> bool:
-    """Test whether a number is within a slider's ends, allowing for the page's rounding to the digits shown."""
-    if isinstance(value, bool) or not isinstance(value, type(slider.value) | int):
-        return False
-    slack = 0.5 * 10.0**-slider.precision if isinstance(slider.value, float) else 0
-    return math.isfinite(value) and slider.min - slack <= value <= slider.max + slack

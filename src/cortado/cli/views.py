@@ -22,7 +22,6 @@ from cortado.pictures.painter import colours_of
 from cortado.pictures.particle_view import container_outline, outline
 from cortado.pictures.shown_solids import ShownSolid, own_faces, own_lines, shown_solids
 from cortado.pictures.stage import upright
-from cortado.rollout.rollout import Rollout
 from cortado.runs.frames import SolidMotions, posed, sized
 from cortado.runs.particle_sums import square
 from cortado.runs.run_folder import RunFolder
@@ -145,8 +144,7 @@ class Window:
         return np.asarray(in_space(np.asarray(points, np.float32) @ self._turn.T.astype(np.float32)))
 
     def _draw_solid(self, name: str, solid: ShownSolid) -> Any:
-        """Draw the edges of a solid, and in 3-D its faces unless it is a tank; return viser's frame, which has the
-        solid's pose."""
+        """Draw edges of a solid, and in 3-D faces unless it is a tank; return viser's frame, which has its pose."""
         pose = {"position": self._space(solid.position), "wxyz": _quaternion(self._turn @ solid.turn)}
         frame = self.server.scene.add_frame(name, show_axes=False, **pose)
         self.server.scene.add_line_segments(f"{name}/edges", in_space(np.float32(own_lines(solid))), LINES, **THIN)
@@ -159,8 +157,7 @@ class Window:
         return frame
 
     def look_at(self, positions: Points) -> None:
-        """Place the camera so that the container and solids fill the window, or else the particles at
-        ``positions`` (n, d) [m]."""
+        """Place the camera to show container and solids, or else the particles at ``positions`` (n, d) [m]."""
         lines = self._space(outline(self.scene)).reshape(-1, 3)
         points = lines if len(lines) else self._space(positions)
         lower, upper = points.min(axis=0), points.max(axis=0)
@@ -196,13 +193,18 @@ def quantities_of(
 ) -> dict[str, Quantity]:
     """Return functions, by name, for quantities of particles with velocities (n, d) [m/s] in a state under
     ``controls``. Computing any of them except the speed may raise `InputError`."""
-    return {
-        "speed": lambda: np.linalg.norm(velocities, axis=1),
-        "density": lambda: densities(simulation().rollout(1, controls, state)),
-        "pressure": lambda: simulation().quantity("pressure", state, controls),
-        "vorticity": lambda: sizes_of(simulation().quantity("vorticity", state, controls)),
-        "wall_force": lambda: sizes_of(simulation().quantity("wall_force", state, controls)),
-    }
+
+    def density() -> np.ndarray:
+        rollout = simulation().rollout(1, controls, state)
+        if not isinstance(rollout.solver, ParticleSolver):
+            raise InputError("The solver of this scene has no densities of particles to show.")
+        return rollout.solver.densities(rollout.initial, rollout.parameters)
+
+    def quantity(name: str) -> np.ndarray:
+        return sizes_of(simulation().quantity(name, state, controls))
+
+    others = {name: partial(quantity, name) for name in ("pressure", "vorticity", "wall_force")}
+    return {"speed": partial(sizes_of, velocities), "density": density, **others}
 
 
 def own_fields(fields: Mapping[str, np.ndarray], particles: int) -> dict[str, Quantity]:
@@ -213,14 +215,6 @@ def own_fields(fields: Mapping[str, np.ndarray], particles: int) -> dict[str, Qu
 def sizes_of(values: np.ndarray) -> np.ndarray:
     """Return numbers (n,) unchanged, or the lengths of vectors (n, k)."""
     return values if values.ndim == 1 else np.linalg.norm(values, axis=-1)
-
-
-def densities(rollout: Rollout) -> np.ndarray:
-    """Return the densities (n,) [kg/m3] of the first state of a rollout."""
-    solver = rollout.solver
-    if not isinstance(solver, ParticleSolver):
-        raise InputError("The solver of this scene has no densities of particles to show.")
-    return solver.densities(rollout.initial, rollout.parameters)
 
 
 STRIDE = 1.0 / 100.0
@@ -287,7 +281,8 @@ class LiveView:
         self.running = gui.add_checkbox("Run", True)
         reset = gui.add_button("Begin again")
         self._told = gui.add_markdown("")
-        self.gravity = self._sliders("Gravity", "m/s²", scene.forces.gravity, self._most_gravity())
+        most = np.full(scene.dimension, LEAN * (float(np.linalg.norm(scene.forces.gravity)) or 9.81))
+        self.gravity = self._sliders("Gravity", "m/s²", scene.forces.gravity, (-most, most))
         self.nozzles = {
             emitter.name: self._sliders(emitter.name.capitalize(), "m", emitter.outlet, self._reach(emitter))
             for emitter in scene.emitter
@@ -333,7 +328,7 @@ class LiveView:
         self._told.content = f"t = {state.clock.time:.4g} s"
         particles = self.simulation.particles
         colours = colours_of(self.simulation.scene, state.fields.get("mass_fractions"), particles)
-        controls = {"gravity": self._gravity()}
+        controls = {"gravity": np.array([slider.value for slider in self.gravity])}
         controls |= {path_name(name): outlet for name, outlet in self._outlets.items()}
         quantities = quantities_of(state["velocities"], lambda: self.simulation, state, controls)
         quantities |= own_fields(state.fields, particles)
@@ -341,13 +336,9 @@ class LiveView:
         self.window.place_solids(posed(scene, SolidMotions.of(fields, scene.dimension), 0))
         self.window.show(state["positions"], colours, is_out(scene, state.fields, particles), quantities)
 
-    def _gravity(self) -> np.ndarray:
-        return np.array([slider.value for slider in self.gravity])
-
     def _controls(self) -> dict[str, np.ndarray]:
-        """Return the controls of the next steps: gravity, and each nozzle's straight path to the place set by its
-        sliders."""
-        controls = {"gravity": self._gravity()}
+        """Return the controls of the next steps: gravity, and each nozzle's straight path to its sliders' place."""
+        controls = {"gravity": np.array([slider.value for slider in self.gravity])}
         share = np.arange(1, self.steps + 1)[:, None] / self.steps
         for name, sliders in self.nozzles.items():
             wished = np.array([slider.value for slider in sliders])
@@ -357,17 +348,12 @@ class LiveView:
 
     def _sliders(self, title: str, unit: str, values: Any, ends: Any) -> list[Any]:
         """``ends`` (2, d)."""
-        gui, found = self.window.server.gui, []
-        for axis, value, least, greatest in zip("xyz", values, *ends, strict=False):
-            step = float(f"{(greatest - least) / 200.0:.1g}")
-            slider = gui.add_slider(f"{title} {axis} [{unit}]", float(least), float(greatest), step, float(value))
-            found.append(slider)
+        found = []
+        for axis, value, *ends_of_axis in zip("xyz", values, *ends, strict=False):
+            least, greatest = map(float, ends_of_axis)
+            step, label = float(f"{(greatest - least) / 200.0:.1g}"), f"{title} {axis} [{unit}]"
+            found.append(self.window.server.gui.add_slider(label, least, greatest, step, float(value)))
         return found
-
-    def _most_gravity(self) -> np.ndarray:
-        gravity = np.array(self.simulation.scene.forces.gravity)
-        most = LEAN * (float(np.linalg.norm(gravity)) or 9.81) * np.ones(len(gravity))
-        return np.stack([-most, most])
 
     def _reach(self, emitter: EmitterTable) -> np.ndarray:
         """Return the ends (2, d) of a nozzle's range [m]: above the container, at about the nozzle's present height."""

@@ -26,8 +26,7 @@ def box(lower: Sequence[float], upper: Sequence[float], **others: Any) -> dict[s
 
 
 def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Actuator, Actuator]:
-    """Return the actuators of a solid that moves along x, up to ``fastest`` [m/s], and turns about z, up to ``turning``
-    [rad/s]."""
+    """Return the actuators of a solid that moves along x and turns about z: greatest velocities [m/s], [rad/s]."""
     still, plane = (0.0,) * dimension, dimension == 2
     turn: Any = {"rest": (0.0,), "axes": (0,)} if plane else {"rest": still, "axes": (2,)}
     return (

@@ -1,6 +1,6 @@
-"""Gymnasium environments: a single one, and a batch of one task in one launch. `Twin` is an episode as a differentiable
-function of its actions."""
+"""Gymnasium environments: one, and a batch in one launch. `Twin` is an episode as a differentiable function."""
 
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,7 +16,7 @@ from cortado.errors import InputError, LibraryMissingError, shown
 from cortado.files.image_encoding import to_srgb
 from cortado.gradients import GradientEstimator
 from cortado.losses import Frames
-from cortado.optimisation.transforms import Affine, FixedParameters, Transformed
+from cortado.optimisation.transforms import FixedParameters, Transformed
 from cortado.problem import Problem
 from cortado.runs.sensor import Sensor
 from cortado.runs.trajectory import Frame
@@ -80,38 +80,32 @@ class Twin:
         from cortado.jax import value
         from cortado.optimisation.layers.with_jax import jnp
 
-        def contracted(one: Affine, u: Any) -> Any:
-            return jnp.asarray(one.base, u.dtype) + jnp.tensordot(jnp.asarray(one.matrix, u.dtype), u, 2)
-
-        loss = value(self.problem, gradient)
-        return lambda actions: loss(self._parameters(self._shaped(jnp.asarray(actions)).clip(-1.0, 1.0), contracted))
+        loss = self._of_actions(value(self.problem, gradient), lambda a, u: jnp.asarray(a, u.dtype), jnp.tensordot)
+        return lambda actions: loss(jnp.asarray(actions))
 
     def in_torch(self, gradient: GradientEstimator | None = None) -> Any:
         """Return the loss as a function of a PyTorch tensor (actions, a): see `cortado.torch.value`."""
         from cortado.optimisation.layers.with_torch import torch
         from cortado.torch import value
 
-        def contracted(one: Affine, u: Any) -> Any:
-            return u.new_tensor(one.base) + torch.tensordot(u.new_tensor(one.matrix), u, 2)
+        return self._of_actions(value(self.problem, gradient), lambda a, u: u.new_tensor(a), torch.tensordot)
 
-        loss = value(self.problem, gradient)
-        return lambda actions: loss(self._parameters(self._shaped(actions).clamp(-1.0, 1.0), contracted))
+    def _of_actions(self, loss: Any, like: Any, tensordot: Any) -> Any:
+        """Return a ``loss`` as a function of actions, by ``tensordot`` of a library; ``like`` makes its arrays."""
 
-    def _shaped(self, actions: Any) -> Any:
-        shape = getattr(actions, "shape", None)
-        if shape is None or tuple(shape) != self.shape:
-            found = f"is {shown(actions)}" if shape is None else f"has shape {tuple(shape)}"
-            raise InputError(f"actions {found}, but must be an array {self.shape}.")
-        return actions
+        def of_actions(actions: Any) -> Any:
+            shape = getattr(actions, "shape", None)
+            if shape is None or tuple(shape) != self.shape:
+                found = f"is {shown(actions)}" if shape is None else f"has shape {tuple(shape)}"
+                raise InputError(f"actions {found}, but must be an array {self.shape}.")
+            u, parameters, first = actions.clip(-1.0, 1.0), dict[str, Any](self._start), 0
+            for one in self._actuators:
+                last, affine = first + len(one.axes), self.coordinates[one.parameter]
+                own = tensordot(like(affine.matrix, u), u[:, first:last], 2)
+                parameters[one.parameter], first = like(affine.base, u) + own, last
+            return loss(parameters)
 
-    def _parameters(self, u: Any, contracted: Any) -> dict[str, Any]:
-        """Return the scene's parameters for actions of JAX or PyTorch; ``contracted`` applies an affine map."""
-        found, first = dict[str, Any](self._start), 0
-        for one in self._actuators:
-            last = first + len(one.axes)
-            found[one.parameter] = contracted(self.coordinates[one.parameter], u[:, first:last])
-            first = last
-        return found
+        return of_actions
 
 
 try:
@@ -124,7 +118,6 @@ except ModuleNotFoundError as error:
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
 WIDTH, HEIGHT = 320, 200
-BEFORE = "before the first one"
 Observation = NDArray[np.float32]
 Info = dict[str, Any]
 
@@ -149,14 +142,11 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         default) or "large". ``particles``: number of observed particles. ``sensors``, by name, are observed too; see
         `cortado.sensors`. ``device`` and ``precision`` are as in `Simulation`; ``render_mode`` is None or
         "rgb_array"."""
-        self.render_mode = checked_render_mode(render_mode)
-        self.scenes = Scenes(task_of(task, size), 1, device, precision, particles, sensors)
+        settings = size, device, precision, particles, sensors, render_mode
+        self._envs = FluidVectorEnv(task, 1, *settings, AutoresetMode.DISABLED)
+        self.scenes, self.render_mode = self._envs.scenes, self._envs.render_mode
         self.observation_space, actions = spaces(self.scenes)
-        self.action_space, self._shape = actions, actions.shape
-        self._over, self._counts = BEFORE, False
-        """Reason why no step is possible, if any; and whether the environment counts steps itself, because Gymnasium's
-        wrapper does not know the step number of a restored episode."""
-        self._closed = False
+        self.action_space, self._shape, self._begun = actions, actions.shape, False
 
     @property
     def layout(self) -> dict[str, slice]:
@@ -166,15 +156,14 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
         """Begin an episode; equal seeds give equal bits. ``options={"state": state}`` goes back to a saved state, as
         `restore` does, and resets wrappers that count steps. Raises `InputError` for other options."""
-        self._require_open("reset")
-        if (state := saved_option(options, seed)) is not None:
+        if not self._envs.closed and (state := saved_option(options, seed)) is not None:
             return self.restore(state), {}
         super().reset(seed=seed)
-        self._counts = self.spec is None
-        self.scenes.begin({0: self.scenes.drawn(self.np_random)})
-        self._over = ""
-        self._observation = self.scenes.observed()[0]
-        return self._observation.copy(), {}
+        self._envs._generators = [self.np_random]
+        self._envs._horizon = self.scenes.task.horizon if self.spec is None else sys.maxsize  # else a wrapper counts
+        seen, info = self._envs.reset()
+        self._begun = True
+        return seen[0], info
 
     def step(self, action: NDArray) -> tuple[Observation, float, bool, bool, Info]:
         """Advance the episode by one action, clipped to -1 to 1. An episode is truncated after the task's number of
@@ -184,20 +173,18 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         Raises `InputError` for an action of a wrong shape or with numbers that are not finite, and if no episode is in
         progress.
         """
-        if self._over:
-            raise InputError(f"step is called {self._over}, but must come after reset().")
+        if self._envs.closed or self._envs._over.any():
+            when = "after the end of an episode" if self._begun else "before the first one"
+            when = "after close()" if self._envs.closed else when
+            raise InputError(f"step is called {when}, but must come after reset().")
         actions = checked_actions("action", action, self._shape)
-        rewards, lost = self.scenes.step(actions[None])
-        if not lost:
-            self._observation = self.scenes.observed()[0]
-        truncated = not lost and self._counts and bool(self.scenes.step_number[0] >= self.scenes.task.horizon)
-        self._over = "after the end of an episode" if lost or truncated else ""
-        info = {"diverged": lost[0]} if lost else {}
-        return self._observation.copy(), float(rewards[0]), bool(lost), truncated, info
+        seen, rewards, lost, truncated, infos = self._envs.step(actions[None])
+        info = {"diverged": infos["diverged"][0]} if lost[0] else {}
+        return seen[0], float(rewards[0]), bool(lost[0]), bool(truncated[0]), info
 
     def close(self) -> None:
         """Close the environment, which can then begin no episode."""
-        self._closed, self._over = True, "after close()"
+        self._envs.close()
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture (rows, columns, 3) of the scene."""
@@ -206,30 +193,22 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
     def save(self) -> EnvState:
         """Return the state of the episode and of the random generator. `restore` accepts it any number of times, also
         in other environments of the same task. Raises `InputError` before the first `reset`."""
-        self._require_open("save")
-        if self._over == BEFORE:
+        if not self._begun and not self._envs.closed:
             raise InputError("save is called before the first reset(), but must come after it.")
-        random = self.np_random.bit_generator.state
-        return self.scenes.save(np.array([bool(self._over)]), self._observation[None], [random])
+        return self._envs.save()
 
     def restore(self, state: EnvState) -> Observation:
         """Go back to a saved state and return its observation. Raises `InputError` for a state of another task, batch
         or scene."""
-        self._require_open("restore")
-        self.scenes.restore(state)
-        self.np_random.bit_generator.state = state.generators[0]
-        self._over, self._counts = "after the end of an episode" if state.over[0] else "", True
-        self._observation = state.observations[0].copy()
-        return self._observation.copy()
+        self._envs._generators = [self.np_random]
+        seen: Observation = self._envs.restore(state)[0]
+        self._begun, self._envs._horizon = True, self.scenes.task.horizon  # a wrapper does not know its step number
+        return seen
 
     def twin(self, actions: int | None = None, state: EnvState | None = None) -> Twin:
         """Return a differentiable copy of the current episode, from its start or from a saved ``state``, over
         ``actions`` actions, by default all that remain."""
         return Twin(self.scenes, 0, actions, state)
-
-    def _require_open(self, what: str) -> None:
-        if self._closed:
-            raise InputError(f"{what} is called after close(), but must come before it.")
 
 
 class FluidVectorEnv(VectorEnv):

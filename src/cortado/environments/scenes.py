@@ -86,7 +86,7 @@ class EnvState:
             raise InputError(f"numbers are {shown(numbers)}, but must be one or more from 0 to {len(self) - 1}.")
         return replace(
             self,
-            kind=self.kind.replace(_scenes_in_words(len(self)), _scenes_in_words(len(chosen)), 1),
+            kind=self.kind.replace(counted(len(self), "scene"), counted(len(chosen), "scene"), 1),
             fields={name: _picked(array, chosen, len(self)) for name, array in self.fields.items()},
             clocks=tuple(self.clocks[b] for b in chosen),
             step_number=self.step_number[chosen],
@@ -105,10 +105,6 @@ class EnvState:
     def __getstate__(self) -> dict[str, Any]:
         fields = {name: a if isinstance(a, np.ndarray) else a.numpy() for name, a in self.fields.items()}
         return {**vars(self), "fields": fields}
-
-
-def _scenes_in_words(scenes: int) -> str:
-    return counted(scenes, "scene")
 
 
 @WARP
@@ -164,17 +160,15 @@ class SideBySide:
             scenes = state.scenes[first:last]
             self._simulations[k].judged_states.update(scenes)
             own = {name: row[first:last] for name, row in rows.items()}
-            found[k] = self.steppers[k].follow(DeviceState(_cut(state.arrays, first, last), scenes), own)
+            whole, arrays = state.arrays, {}
+            for name in whole.names:
+                size = len(whole[name]) // len(state.scenes)
+                arrays[name] = whole[name][first * size : last * size]
+            part = State(whole.fields, arrays, last - first)
+            found[k] = self.steppers[k].follow(DeviceState(part, scenes), own)
 
         in_parallel(take, range(len(self.steppers)), min(usable_cores(), MOST_CORES, len(self.steppers)))
         return _together(state.arrays, [found[k] for k in range(len(self.steppers))])
-
-
-def _cut(arrays: State, first: int, last: int) -> State:
-    assert arrays.batch is not None
-    sizes = {name: len(arrays[name]) // arrays.batch for name in arrays.names}
-    own = {name: arrays[name][first * size : last * size] for name, size in sizes.items()}
-    return State(arrays.fields, own, last - first)
 
 
 @WARP
@@ -238,7 +232,7 @@ class Scenes:
     def kind(self) -> str:
         seen = counted(max(one.stop for one in self.layout.values()), "observed number")
         of = f"the task {self.task.name}, {self.task.size}, in {self.simulation.precision.name} with {seen}"
-        return f"{_scenes_in_words(len(self))} of {of}"
+        return f"{counted(len(self), 'scene')} of {of}"
 
     @cached_property
     def single(self) -> Simulation:
@@ -262,17 +256,15 @@ class Scenes:
             generators=tuple(generators),
         )
 
-    def require(self, saved: EnvState) -> None:
+    @WARP
+    def taken(self, saved: EnvState) -> DeviceState:
+        """Return the states that were saved; raise `InputError` for those of another task, batch or scene."""
         if not isinstance(saved, EnvState):
             raise InputError(f"state is {shown(saved)}, but must be a state that an environment has saved.")
         own = self.simulation.scene
         if saved.kind != self.kind or (saved.scene is not own and saved.scene != own):
             other = saved.kind if saved.kind != self.kind else f"another scene than that of {self.kind}"
             raise InputError(f"state is of {other}, but must be of {self.kind}, with the same scene.")
-
-    @WARP
-    def taken(self, saved: EnvState) -> DeviceState:
-        self.require(saved)
         arrays = self._first.arrays.copy()
         for name in arrays.names:
             arrays[name].assign(saved.fields[name])

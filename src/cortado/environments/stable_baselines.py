@@ -76,8 +76,7 @@ class StableBaselinesVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Advance all episodes by the stored actions; return observations, rewards, flags of ended episodes, and
-        infos."""
+        """Advance all episodes by the stored actions; return observations, rewards, ended episodes, and infos."""
         if self._actions is None:
             raise InputError("step_wait is called without actions, but must come after step_async(actions).")
         actions, self._actions = self._actions, None

@@ -35,8 +35,7 @@ class Actuator(ABC):
 
     @abstractmethod
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
-        """Return the driven components (..., a) after one simulation step, given their values ``q`` and the
-        ``command``."""
+        """Return the driven components (..., a) one simulation step after ``q``, given the ``command``."""
 
     def at_rest(self, members: int) -> NDArray:
         """Return the driven components and the commands before any action, (members, 2, a)."""

@@ -151,21 +151,16 @@ class Share(OverParticles):
     def _arguments(self, at: StepEnd) -> dict[str, Any]:
         lower, upper = (_vectors(at, corners) for corners in self._boxes(at.goal))
         if self._solid is None:
-            fixed = _vectors(at, np.zeros((at.scenes, 3))), _reals(at, np.zeros(at.scenes))
+            place, turn = _vectors(at, np.zeros((at.scenes, 3))), _reals(at, np.zeros(at.scenes))
         else:
-            fixed = at.state[position_name(self._solid)], self._turn(at)
-        found = {"width": self._width, "lower": lower, "upper": upper, **at.period}
-        return {**found, "place": fixed[0], "turn": fixed[1]}
-
-    def _turn(self, at: StepEnd) -> wp.array:
-        """Return the angle (scenes,) of the solid about z; raise `InputError` if it turns about another axis."""
-        turn = at.state[turn_name(self._solid or "")]
-        if turn.dtype is precision_of(at.state).real:
-            return turn
-        found = turn.numpy()
-        if found[:, :2].any():
-            raise InputError(f"{self._solid} is turned by {shown(found[0].tolist())}, but must turn about z alone.")
-        return _reals(at, found[:, 2])
+            place, turn = at.state[position_name(self._solid)], at.state[turn_name(self._solid)]
+            if turn.dtype is not precision_of(at.state).real:  # in 3-D
+                turns = turn.numpy()
+                if turns[:, :2].any():
+                    found = f"{self._solid} is turned by {shown(turns[0].tolist())}"
+                    raise InputError(f"{found}, but must turn about z alone.")
+                turn = _reals(at, turns[:, 2])
+        return {"width": self._width, "lower": lower, "upper": upper, **at.period, "place": place, "turn": turn}
 
 
 class Spread(OverParticles):

@@ -106,7 +106,13 @@ class DatasetFolder:
     def assemble(self, split: Mapping[str, Sequence[int]]) -> None:
         """Write each purpose's file that does not contain exactly the runs in ``split``. All new files are complete
         before an old file is replaced. Raise `ComputationError` and change nothing if the disk is full."""
-        stale = {purpose: numbers for purpose, numbers in split.items() if not self._has(purpose, numbers)}
+        stale = {}
+        for purpose, numbers in split.items():
+            path = self.path(purpose)
+            there = {number: run.group for number, run in self.runs.items() if run.file == path}
+            known = {number: f"{k:05d}" for k, number in enumerate(numbers)}
+            if not path.exists() or path in self.damaged or there != known:
+                stale[purpose] = numbers
         sources = {self.runs[number].file for numbers in stale.values() for number in numbers}
         temporaries = {self.path(purpose): unfinished(self.path(purpose)) for purpose in stale}
         with sentences(self.out):
@@ -124,12 +130,6 @@ class DatasetFolder:
             finally:
                 for temporary in temporaries.values():
                     temporary.unlink(missing_ok=True)
-
-    def _has(self, purpose: str, numbers: Sequence[int]) -> bool:
-        path = self.path(purpose)
-        there = {number: run.group for number, run in self.runs.items() if run.file == path}
-        whole = path.exists() and path not in self.damaged
-        return whole and there == {number: f"{k:05d}" for k, number in enumerate(numbers)}
 
     def _copy(self, runs: Sequence[FinishedRun], path: Path, temporary: Path) -> None:
         import h5py
@@ -161,7 +161,13 @@ def metadata(
     beyond = np.max([one["upper"] for one in every], axis=0)
     upper = np.where((beyond < size) | (periods > 0.0), size, beyond + scene.discretisation.spacing)
     time_step = scene.solver.fixed_time_step("a data set")
-    moments = {f"{name}_{what}": value for name in ("vel", "acc") for what, value in _moments(train, name).items()}
+    moments = dict[str, list[float]]()
+    for name in ("vel", "acc"):
+        counts, sums, squares = (np.sum([np.asarray(one[name][k]) for one in train], axis=0) for k in range(3))
+        mean = sums / np.maximum(counts, 1)
+        std = np.sqrt(np.maximum(squares / np.maximum(counts, 1) - mean**2, 0.0))
+        # below the threshold [m] of LagrangeBench it is 1, as it becomes a divisor
+        moments |= {f"{name}_mean": mean.tolist(), f"{name}_std": np.where(std < 1e-7, 1.0, std).tolist()}
     gravity = {} if "forces.gravity" in table.vary else {"g_ext": list(scene.forces.gravity)}
     return {
         "case": scene.name,
@@ -185,11 +191,3 @@ def metadata(
         **{f"num_trajs_{purpose}": len(numbers) for purpose, numbers in split.items()},
         **moments,
     }
-
-
-def _moments(train: Sequence[Mapping[str, Any]], name: str) -> dict[str, list[float]]:
-    """Return the mean and the standard deviation (d,) over training runs, 1 for a deviation of 0, a later divisor."""
-    counts, sums, squares = (np.sum([np.asarray(one[name][k]) for one in train], axis=0) for k in range(3))
-    mean = sums / np.maximum(counts, 1)
-    std = np.sqrt(np.maximum(squares / np.maximum(counts, 1) - mean**2, 0.0))
-    return {"mean": mean.tolist(), "std": np.where(std < 1e-7, 1.0, std).tolist()}  # threshold [m] of LagrangeBench

@@ -1,6 +1,7 @@
 """Data sets of runs with varied scenes, for learned simulators: the table [dataset], random values, and arrays."""
 
 import json
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -194,7 +195,7 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
     }
     for name, motion in trajectory.solids.items():
         arrays |= {f"solids/{name}/position": motion.positions - origin, f"solids/{name}/rotation": motion.rotations}
-    statistics = {**_statistics(positions, periods), **_ends(places), "particles": every.shape[1]}
+    statistics = {**_statistics(positions, places, periods), "particles": every.shape[1]}
     return OneRun(arrays | _tangents(simulation, sample, start), statistics)
 
 
@@ -234,26 +235,22 @@ def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: i
     return places, kinds
 
 
-def _ends(places: np.ndarray) -> dict[str, list[float]]:
-    """Return the upper ends (d,) [m] of positions relative to the bounds; raise `InputError` if one is negative."""
+def _statistics(positions: np.ndarray, places: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
+    """Return statistics of first and second differences of positions (frames, n, d), by nearest periodic images, and
+    the upper ends (d,) [m] of places relative to the bounds; raise `InputError` if one is below them."""
     if places.min() < 0.0:
         frame, particle, axis = np.unravel_index(places.argmin(), places.shape)
         raise InputError(
             f"Particle {particle} is {-places.min():.3g} m below the bounds of the data set along axis {axis} in frame "
             f"{frame}, but must be within: they begin {MARGIN} spacings outside of the container."
         )
-    return {"upper": places.max(axis=(0, 1)).tolist()}
-
-
-def _statistics(positions: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
-    """Return statistics of first and second differences of positions (frames, n, d), by nearest periodic images."""
     moved = np.diff(positions, axis=0)
-    moved -= periods * np.round(moved / np.where(periods > 0.0, periods, 1.0))
-    found: dict[str, Any] = {}
+    moved -= periods * np.round(moved / np.where(periods > 0.0, periods, 1.0))  # to the nearest periodic image
+    statistics: dict[str, Any] = {}
     for name, values in (("vel", moved), ("acc", np.diff(moved, axis=0))):
         rows = values.reshape(-1, positions.shape[2])
-        found[name] = [len(rows), rows.sum(axis=0).tolist(), (rows**2).sum(axis=0).tolist()]
-    return found
+        statistics[name] = [len(rows), rows.sum(axis=0).tolist(), (rows**2).sum(axis=0).tolist()]
+    return {**statistics, "upper": places.max(axis=(0, 1)).tolist()}
 
 
 def _tangents(simulation: Simulation, sample: Sample, start: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -264,9 +261,7 @@ def _tangents(simulation: Simulation, sample: Sample, start: dict[str, np.ndarra
     sizes = tuple(float(np.max(BY_NAME[name].change(simulation, first[name]))) for name in FIRST)
     problem = Problem(simulation, table.steps, FinalPositions(simulation.positions))
     frames = range(0, table.steps + 1, table.write_every) if table.tangent_frames == "all" else [table.steps]
-    found: dict[str, list[Any]] = {
-        name: [] for name in ("position", "velocity", "position_direction", "velocity_direction")
-    }
+    found = defaultdict[str, list[Any]](list)
     for which in range(table.tangents):
         direction = sample.direction(which, simulation.positions.shape, (sizes[0], sizes[1]))
         dots: dict[int, Any] = {}

@@ -1,5 +1,4 @@
-"""The problem of a search as a function of the optimiser's vector, and a test if gradients predict changes of the
-loss."""
+"""The problem of a search as a function of a vector, and a test if gradients predict changes of the loss."""
 
 import math
 import warnings
@@ -33,8 +32,7 @@ FELT = 0.01
 ROUND_OFF = 1e-5
 """Predictions below this part of the greatest loss are not tested, because float32 losses are not precise enough."""
 MISLED, FEW = 0.25, 2
-"""A search is misled if at least this fraction of the tested steps, and at least this number, contradict their
-gradients."""
+"""A search is misled if this fraction of the tested steps, and this number, contradict their gradients."""
 LEAST = 8
 """Least number of evaluations of a search whose loss has stopped falling."""
 
@@ -44,22 +42,6 @@ class Optimisable(Protocol):
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
         """Return the loss and its gradient, arrays by parameter name in the parameters' shapes."""
-
-
-def loss_and_gradient(returned: Any) -> tuple[Any, Mapping[str, Any]]:
-    """Return a result unchanged if it consists of a loss and a gradient by name; raise `InputError` otherwise."""
-    pair = isinstance(returned, (tuple, list)) and len(returned) == 2
-    if pair and isinstance(returned[1], Mapping):
-        return returned[0], returned[1]
-    found = returned
-    if pair:
-        found = Words(f"a loss and a gradient of type {type(returned[1]).__name__}")
-    elif isinstance(returned, (tuple, list)):
-        found = Words(f"a {type(returned).__name__} of {len(returned)}")
-    raise InputError(
-        f"What is optimised returned {shown(found)}, but must return two things: the loss, a number, and its gradient, "
-        "a dictionary with an array for each parameter by its name."
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,9 +126,12 @@ class Promises:
         stopped = len(self.losses) >= LEAST and before - best < FELT * abs(best)
         return best > FELT * self.losses[0] and (converged or stopped)
 
-    def doubt(self, estimator: object, optimiser: object, converged: bool, is_run: bool, held: str = "") -> "Doubt":
-        """Judge a search. ``estimator``: None for the problem's gradient; ``converged``: the optimiser's test was met;
-        ``is_run``: the loss is of a simulation's run; ``held``: sentence of `held`."""
+    def doubt(
+        self, estimator: object, optimiser: object, converged: bool, is_run: bool, held: str
+    ) -> tuple[bool, bool, str]:
+        """Return if a search was misled, if its loss stays, and sentences of doubt with advice. ``estimator``: None for
+        the problem's gradient; ``converged``: the optimiser's test was met; ``is_run``: the loss is of a simulation's
+        run; ``held``: sentence of `held`."""
         by_direction, is_exact = isinstance(optimiser, LineSearch), estimator is None or isinstance(estimator, Exact)
         misled, stays = self.misled and (is_exact or not by_direction), not held and self.stays(converged)
         to_try = ["another start"]
@@ -156,7 +141,7 @@ class Promises:
             said += " less than a tenth of what it promised, or by more than ten times as much."
             if is_run and is_exact:
                 said += " certify says up to which step of the run it is of use; beyond that, search with the gradient"
-                return Doubt(misled, stays, f"{said} AdjointViscosity() and the optimiser LineSearch, or elsewhere.")
+                return misled, stays, f"{said} AdjointViscosity() and the optimiser LineSearch, or elsewhere."
             to_try += [] if is_run else ["differences, to check it"]
         elif stays:
             said = f" The loss has stayed at {min(self.losses) / self.losses[0]:.0%} of the first one, maybe in a wrong"
@@ -165,36 +150,11 @@ class Promises:
             if is_run and is_exact:
                 pair = "the gradient AdjointViscosity() with the optimiser LineSearch"
                 said += f" Try {', or '.join(to_try)}; or {pair}, where certify says that the exact one is of no use."
-                return Doubt(misled, stays, said)
+                return misled, stays, said
         else:
-            return Doubt(misled, stays, held)
+            return misled, stays, held
         to_try += [] if by_direction else ["the optimiser LineSearch, which steps over dents"]
-        return Doubt(misled, stays, f"{said} Try {', or '.join(to_try)}.")
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """The verdict on a search; ``words``: sentences of doubt with advice, empty without doubts."""
-
-    misled: bool
-    stays: bool
-    words: str
-
-
-@dataclass
-class CountedEnsemble:
-    """An `Ensemble` for a search, which counts the runs that averages leave out, and warns only the first time."""
-
-    ensemble: Any
-    left_out: int = 0
-
-    def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        with warnings.catch_warnings():
-            if self.left_out:
-                warnings.simplefilter("ignore", LeftOutWarning)
-            found = self.ensemble.estimate(problem, parameters, observe)
-        self.left_out += found.left_out
-        return found
+        return misled, stays, f"{said} Try {', or '.join(to_try)}."
 
 
 @dataclass
@@ -213,46 +173,48 @@ class Evaluator:
     promises: Promises = field(default_factory=Promises)
     logged: int = 0
 
-    def __post_init__(self) -> None:
-        if isinstance(self.estimator, Ensemble):
-            self.estimator = CountedEnsemble(self.estimator)
+    left_out: int = 0
+    """Number of runs that averages of an ensemble left out."""
 
-    @property
-    def left_out(self) -> int:
-        return self.estimator.left_out if isinstance(self.estimator, CountedEnsemble) else 0
+    def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
+        """Estimate as the ensemble does, count the runs that its averages leave out, and warn only the first time."""
+        with warnings.catch_warnings():
+            if self.left_out:
+                warnings.simplefilter("ignore", LeftOutWarning)
+            found: Estimate = self.estimator.estimate(problem, parameters, observe)
+        self.left_out += found.left_out
+        return found
 
     def count_update(self) -> None:
         self.updates += 1
 
     def __call__(self, vector: Vector) -> tuple[float, Vector]:
         """Return the loss and its gradient (size,) at a vector (size,)."""
-        if self.logged < len(self.log):
-            return self._noted(self._replay(vector), replayed=True)
-        return self._noted(self._kept(self._compute(vector)), replayed=False)
+        found = self._next(vector, self._compute)
+        assert found is not None
+        return found
 
     def attempt(self, vector: Vector) -> tuple[float, Vector] | None:
-        """Return loss and gradient at a vector; if the run fails, return None, and log an infinite loss and gradient
-        0."""
-        replayed = self.logged < len(self.log)
-        if replayed:
-            evaluation = self._replay(vector)
-        else:
+        """Return loss and gradient at a vector, or None if the run fails, with an infinite loss in the log."""
+
+        def computed(vector: Vector) -> LoggedEvaluation:
             try:
-                evaluation = self._kept(self._computed(vector))
+                return self._computed(vector)
             except REFUSED:
-                evaluation = self._kept(LoggedEvaluation(vector.copy(), math.inf, np.zeros_like(vector)))
-        if math.isfinite(evaluation.loss):
-            return self._noted(evaluation, replayed)
-        self.logged += 1
-        self.refused += 1
-        return None
+                return LoggedEvaluation(vector.copy(), math.inf, np.zeros_like(vector))
 
-    def _kept(self, evaluation: LoggedEvaluation) -> LoggedEvaluation:
-        self.log.append(evaluation)
-        return evaluation
+        return self._next(vector, computed)
 
-    def _noted(self, evaluation: LoggedEvaluation, replayed: bool) -> tuple[float, Vector]:
+    def _next(self, vector: Vector, compute: Callable[[Vector], LoggedEvaluation]) -> tuple[float, Vector] | None:
+        """Replay or compute the next evaluation, and note it in the history unless its loss is infinite."""
+        replayed = self.logged < len(self.log)
+        evaluation = self._replay(vector) if replayed else compute(vector)
+        if not replayed:
+            self.log.append(evaluation)
         self.logged += 1
+        if not math.isfinite(evaluation.loss):
+            self.refused += 1
+            return None
         record = Record(
             iteration=len(self.history),
             updates=self.updates,
@@ -296,11 +258,22 @@ class Evaluator:
         return [loss if math.isfinite(loss) else math.inf for loss in (*known, *found)]
 
     def _evaluated(self, parameters: dict[str, Any]) -> tuple[Any, Mapping[str, Any]]:
-        return loss_and_gradient(self.problem.value_and_gradient(parameters, gradient=self.estimator))
+        """Return loss and gradient; raise `InputError` if the problem returns anything else."""
+        estimator = self if isinstance(self.estimator, Ensemble) else self.estimator
+        found: Any = self.problem.value_and_gradient(parameters, gradient=estimator)
+        if isinstance(found, tuple | list):
+            pair, kind = len(found) == 2, type(found).__name__
+            if pair and isinstance(found[1], Mapping):
+                return found[0], found[1]
+            words = f"a loss and a gradient of type {type(found[1]).__name__}" if pair else f"a {kind} of {len(found)}"
+            found = Words(words)
+        raise InputError(
+            f"What is optimised returned {shown(found)}, but must return two things: the loss, a number, and its "
+            "gradient, a dictionary with an array for each parameter by its name."
+        )
 
     def _replay(self, vector: Vector, ahead: int = 0) -> LoggedEvaluation:
-        """Return the next logged evaluation, or an entry further ``ahead``; raise `InputError` if its vector
-        differs."""
+        """Return the next logged evaluation, or one ``ahead`` of it; raise `InputError` if its vector differs."""
         evaluation = self.log.read(self.logged + ahead)
         changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
         if changed.any():
@@ -327,27 +300,19 @@ class Evaluator:
         except DivergedError as error:
             if not self.history:
                 raise
-            raise error.with_advice(self._shorter(error.advice, vector)) from error
+            best = min(self.history, key=lambda record: record.loss)
+            told = [f"{error.advice}, a smaller learning rate or scale, or bounds on the parameters"]
+            least = f"the least loss before is {best.loss:.4g}"
+            if vector.size <= 6:  # else the sentence is too long
+                told.append(f"the search had come to {_in_words(self.layout.unravel(vector))}")
+                least = f"{least} at {_in_words(best.parameters)}"
+            raise error.with_advice("; ".join([*told, least])) from error
 
     def _computed(self, vector: Vector) -> LoggedEvaluation:
+        """Evaluate the problem; raise an error for a gradient of other names or shapes, and if anything is not
+        finite."""
         loss, gradients = self._evaluated(self.layout.unravel(vector))
-        evaluation = LoggedEvaluation(
-            vector.copy(), as_one_number("The problem's loss", loss), self._ravelled(gradients)
-        )
-        self._require_finite(evaluation)
-        return evaluation
-
-    def _shorter(self, advice: str, vector: Vector) -> str:
-        best = min(self.history, key=lambda record: record.loss)
-        told = [f"{advice}, a smaller learning rate or scale, or bounds on the parameters"]
-        least = f"the least loss before is {best.loss:.4g}"
-        if vector.size <= 6:  # else the sentence is too long
-            told.append(f"the search had come to {_in_words(self.layout.unravel(vector))}")
-            least = f"{least} at {_in_words(best.parameters)}"
-        return "; ".join([*told, least])
-
-    def _ravelled(self, gradients: Mapping[str, Any]) -> Vector:
-        """Check names and shapes of a gradient, and return it as a vector (size,)."""
+        loss = as_one_number("The problem's loss", loss)
         wanted = dict(zip(self.layout.names, self.layout.shapes, strict=True))
         found = {name: np.shape(gradient) for name, gradient in gradients.items()}
         if found != wanted:
@@ -355,19 +320,13 @@ class Evaluator:
                 f"The problem gave gradients of shapes {found} for parameters of shapes {wanted}; a gradient "
                 "has the names and the shapes of the parameters."
             )
-        return self.layout.ravel({name: as_numbers(f"The gradient of '{name}'", gradients[name]) for name in wanted})
-
-    def _require_finite(self, evaluation: LoggedEvaluation) -> None:
-        broken = ~(np.abs(evaluation.gradient) <= GREATEST_GRADIENT)
-        if math.isfinite(evaluation.loss) and not broken.any():
-            return
-        if math.isfinite(evaluation.loss):
-            what = (
-                f"the gradient with respect to {self._names_of(broken)} is not finite or beyond {GREATEST_GRADIENT:g}"
-            )
-        else:
-            names = self._names_of(np.ones_like(broken))
-            what = f"the loss is {evaluation.loss} as a function of {names}"
+        gradient = self.layout.ravel({n: as_numbers(f"The gradient of '{n}'", gradients[n]) for n in wanted})
+        broken = ~(np.abs(gradient) <= GREATEST_GRADIENT)
+        if math.isfinite(loss) and not broken.any():
+            return LoggedEvaluation(vector.copy(), loss, gradient)
+        what = f"the gradient with respect to {self._names_of(broken)} is not finite or beyond {GREATEST_GRADIENT:g}"
+        if not math.isfinite(loss):
+            what = f"the loss is {loss} as a function of {self._names_of(np.ones_like(broken))}"
         if not self.history:
             raise ComputationError(
                 f"At the start {what}; begin elsewhere, look at the loss, or take a shorter horizon."

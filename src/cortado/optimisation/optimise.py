@@ -86,8 +86,7 @@ class Result:
     message: str
     """Sentence about the end of the search."""
     converged: bool
-    """True if the optimiser's convergence test was met and the gradient agreed with the steps; only L-BFGS has a
-    test."""
+    """True if the optimiser's convergence test was met and the gradient agreed with the steps; only L-BFGS has one."""
     refused: int = 0
     """Number of refused steps, which are not in the history: the run after the step diverged, or a parameter was out of
     range."""
@@ -132,47 +131,40 @@ def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
     return found
 
 
-def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayout) -> tuple[Vector, Vector]:
-    """Return lower and upper bounds (size,); raise `InputError` for bounds that do not match the parameters."""
+def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], start: Mapping[str, Vector]) -> tuple[Any, Any]:
+    """Return lower and upper bounds by name, infinite without a bound; raise `InputError` for bounds that do not match
+    the parameters, or exclude the start."""
     if not isinstance(bounds, Mapping):
         raise InputError(f"bounds is {shown(bounds)}, but must be a table, such as {{'gravity': (lower, upper)}}.")
-    unknown = sorted(set(bounds) - set(layout.names), key=str)
-    if unknown:
+    if unknown := sorted(set(bounds) - set(start), key=str):
         raise InputError(
             f"Bounds are given for {', '.join(map(repr, unknown))}, which the start does not name; the "
-            f"optimised parameters are {', '.join(map(repr, layout.names))}."
+            f"optimised parameters are {', '.join(map(repr, start))}."
         )
-    shapes = dict(zip(layout.names, layout.shapes, strict=True))
-    sides = {name: _checked_pair(name, bounds.get(name, (None, None)), shapes[name]) for name in shapes}
-    lower, upper = (layout.ravel({name: pair[k] for name, pair in sides.items()}) for k in range(2))
-    return lower, upper
-
-
-def _checked_pair(name: str, pair: tuple[Any, Any], shape: tuple[int, ...]) -> tuple[Vector, Vector]:
-    """Return the lower and upper bound of a parameter in its shape, infinite without a bound."""
-    try:
-        lower, upper = pair
-        low = as_numbers(f"The lower bound of '{name}'", -np.inf if lower is None else lower)
-        high = as_numbers(f"The upper bound of '{name}'", np.inf if upper is None else upper)
-        low, high = np.broadcast_to(low, shape), np.broadcast_to(high, shape)
-    except (TypeError, ValueError):
-        raise InputError(
-            f"The bounds of '{name}' must be (lower, upper), each None, a number or an array of shape "
-            f"{shape}, not {pair!r}."
-        ) from None
-    if not (low <= high).all():
-        raise InputError(f"The lower bound of '{name}' must not exceed the upper one; neither may be NaN.")
-    return low, high
-
-
-def require_within(vector: Vector, lower: Vector, upper: Vector, layout: ParameterLayout) -> None:
-    outside = layout.unravel(((vector < lower) | (vector > upper)).astype(np.float64))
-    for name, marks in outside.items():
-        if marks.any():
+    least, most = dict[str, Vector](), dict[str, Vector]()
+    for name, value in start.items():
+        pair = bounds.get(name, (None, None))
+        try:
+            lower, upper = pair
+            low = as_numbers(f"The lower bound of '{name}'", -np.inf if lower is None else lower)
+            high = as_numbers(f"The upper bound of '{name}'", np.inf if upper is None else upper)
+            low, high = np.broadcast_to(low, value.shape), np.broadcast_to(high, value.shape)
+        except (TypeError, ValueError):
             raise InputError(
-                f"The start of '{name}' is outside of its bounds in {int(marks.sum())} of {marks.size} "
+                f"The bounds of '{name}' must be (lower, upper), each None, a number or an array of shape "
+                f"{value.shape}, not {pair!r}."
+            ) from None
+        if not (low <= high).all():
+            raise InputError(f"The lower bound of '{name}' must not exceed the upper one; neither may be NaN.")
+        least[name], most[name] = low, high
+    for name, value in start.items():
+        outside = (value < least[name]) | (value > most[name])
+        if outside.any():
+            raise InputError(
+                f"The start of '{name}' is outside of its bounds in {int(outside.sum())} of {outside.size} "
                 "components; start within the bounds, or widen them."
             )
+    return least, most
 
 
 @public
@@ -279,8 +271,7 @@ def optimise(
     values = checked_start(start)
     layout = ParameterLayout.of(values)
     vector = layout.ravel(values)
-    lower, upper = checked_bounds({} if bounds is None else bounds, layout)
-    require_within(vector, lower, upper, layout)
+    lower, upper = map(layout.ravel, checked_bounds({} if bounds is None else bounds, values))
     algorithm.check(layout)
     if not is_whole(iterations) or not 1 <= iterations <= MOST_ITERATIONS:
         wanted = f"an integer of at least 1 and at most {MOST_ITERATIONS:,}"
@@ -295,22 +286,16 @@ def optimise(
     own_log = MemoryLog() if checkpoint is None else ReplayLog(checkpoint, layout, identity, resume)
     with closing(own_log) as log:
         evaluator = Evaluator(differentiable, gradient, layout, start, log, on_iteration)
-        search = Search(
-            evaluate=evaluator,
-            attempt=evaluator.attempt,
-            losses=evaluator.losses,
-            layout=layout,
-            start=vector,
-            lower=lower,
-            upper=upper,
-            iterations=iterations,
-            updated=evaluator.count_update,
-        )
+        functions = evaluator, evaluator.attempt, evaluator.losses
+        search = Search(*functions, layout, vector, lower, upper, iterations, evaluator.count_update)
         outcome = algorithm.minimise(search)
+    why = ["refused " + counted(evaluator.refused, "step")] * bool(evaluator.refused)
+    why += [f"left {counted(evaluator.left_out, 'run')} out of its averages"] * bool(evaluator.left_out)
+    lost = f" It {' and '.join(why)}, as runs diverged or parameters were out of their range." if why else ""
     best, is_run = min(evaluator.history, key=lambda record: record.loss), hasattr(problem, "simulation")
     held = evaluator.promises.held(lower, upper, layout)
-    doubt = evaluator.promises.doubt(gradient, algorithm, outcome.converged, is_run, held)
-    ended = outcome.message.replace(" converged ", " ended ") if doubt.misled else outcome.message
+    misled, stays, doubts = evaluator.promises.doubt(gradient, algorithm, outcome.converged, is_run, held)
+    ended = outcome.message.replace(" converged ", " ended ") if misled else outcome.message
     return Result(
         parameters={name: a.copy() if isinstance(a, np.ndarray) else a for name, a in best.parameters.items()},
         loss=best.loss,
@@ -320,10 +305,10 @@ def optimise(
         evaluations=len(evaluator.history),
         refused=evaluator.refused,
         left_out=evaluator.left_out,
-        message=ended + doubt.words + _without_runs_in_words(evaluator.refused, evaluator.left_out),
-        converged=outcome.converged and not doubt.misled,
-        misled=doubt.misled,
-        stays=doubt.stays,
+        message=ended + doubts + lost,
+        converged=outcome.converged and not misled,
+        misled=misled,
+        stays=stays,
         problem=problem if is_run else None,
     )
 
@@ -334,10 +319,3 @@ optimize = optimise
 
 def _description(setting: object) -> str:
     return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(setting))
-
-
-def _without_runs_in_words(refused: int, left_out: int) -> str:
-    """Return the last sentence of a search's message, about refused steps and left-out runs."""
-    why = ["refused " + counted(refused, "step")] * bool(refused)
-    why += [f"left {counted(left_out, 'run')} out of its averages"] * bool(left_out)
-    return f" It {' and '.join(why)}, as runs diverged or parameters were out of their range." if why else ""

@@ -207,7 +207,7 @@ class LBFGS:
             np.zeros_like(search.start),
             jac=True,
             method="L-BFGS-B",
-            bounds=_scaled_bounds(search, scale),
+            bounds=np.column_stack([(end - search.start) / scale for end in (search.lower, search.upper)]),
             callback=updated,
             options={
                 "maxcor": self.memory,
@@ -218,8 +218,17 @@ class LBFGS:
             },
         )
         left = _greatest_projected(search, physical(found.x), found.jac, np.ones_like(scale))
-        ended = _lbfgs_in_words(found.status, found.nit, left)
-        return Outcome(physical(found.x), found.status == 0 and left < SMALL, ended)
+        share = f"the gradient is {left:.2g} of the first one"
+        if found.status == 1:
+            ended = f"made all its {found.nit} iterations without converging: {share}. More may lower the loss."
+        elif left < SMALL:
+            how = "converged" if found.status == 0 else "stopped at an optimum to rounding"
+            ended = f"{how} after {found.nit} iterations: {share}."
+        else:
+            why = "the loss has stopped falling" if found.status == 0 else "no step along its direction lowers the loss"
+            ended = f"stopped after {found.nit} iterations, as {why}, but {share}: the loss is too rough for it, so"
+            ended += " try LineSearch from here."
+        return Outcome(physical(found.x), found.status == 0 and left < SMALL, f"L-BFGS {ended}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,30 +243,6 @@ class _Trial:
         """Return a substitute loss and gradient at y, whose run diverged: values of the parabola f + s t - 2 s t^2 from
         this point (t = 0, loss f, slope s < 0) to y (t = 1)."""
         return self.loss - float(self.gradient @ (y - self.y)), -3.0 * self.gradient
-
-
-def _lbfgs_in_words(status: int, iterations: int, left: float) -> str:
-    """Describe the end of L-BFGS, from scipy's ``status`` and the size ``left`` of the last gradient relative to the
-    first."""
-    share = f"the gradient is {left:.2g} of the first one"
-    if status == 1:
-        return f"L-BFGS made all its {iterations} iterations without converging: {share}. More may lower the loss."
-    if left < SMALL:
-        how = "converged" if status == 0 else "stopped at an optimum to rounding"
-        return f"L-BFGS {how} after {iterations} iterations: {share}."
-    why = "the loss has stopped falling" if status == 0 else "no step along its direction lowers the loss"
-    return (
-        f"L-BFGS stopped after {iterations} iterations, as {why}, but {share}: the loss is too rough for it, so try "
-        "LineSearch from here."
-    )
-
-
-def _scaled_bounds(search: Search, scale: Vector) -> list[tuple[float, float]] | None:
-    """Return bounds on (x - start) / scale for scipy; None if no component has a bound."""
-    if np.isinf(search.lower).all() and np.isinf(search.upper).all():
-        return None
-    lower, upper = (search.lower - search.start) / scale, (search.upper - search.start) / scale
-    return list(zip(lower.tolist(), upper.tolist(), strict=True))
 
 
 def _greatest_projected(search: Search, x: Vector, gradient: Vector, scale: Vector) -> float:
@@ -348,7 +333,16 @@ BY_NAME: dict[str, Any] = {"adam": Adam, "gradient_descent": GradientDescent, "l
 def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
     """Return an optimiser from a name and settings, or the given optimiser; raise `InputError` for anything else."""
     if isinstance(optimiser, str):
-        return _named(optimiser, settings)
+        if optimiser not in BY_NAME:
+            wanted = f"one of {quoted(BY_NAME)}, or an object"
+            raise InputError(f"The optimiser is {shown(optimiser)}, but must be {wanted}.")
+        known = {field.name: field.default is MISSING for field in fields(BY_NAME[optimiser])}
+        if unknown := sorted(set(settings) - set(known)):
+            raise InputError(f"{quoted(unknown)} is no setting of '{optimiser}', whose settings are {quoted(known)}.")
+        if missing := [setting for setting, needed in known.items() if needed and setting not in settings]:
+            raise InputError(f"'{optimiser}' needs {quoted(missing)}; its settings are {quoted(known)}.")
+        made: Optimiser = BY_NAME[optimiser](**settings)
+        return made
     if isinstance(optimiser, type) or not isinstance(optimiser, Optimiser):
         raise InputError(
             f"The optimiser must be an object such as cortado.optimisers.Adam(learning_rate=0.1), or one of "
@@ -360,19 +354,6 @@ def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
             "object has its own."
         )
     return optimiser
-
-
-def _named(name: str, settings: Mapping[str, Any]) -> Optimiser:
-    if name not in BY_NAME:
-        raise InputError(f"The optimiser is {shown(name)}, but must be one of {quoted(BY_NAME)}, or an object.")
-    known = {field.name: field.default is MISSING for field in fields(BY_NAME[name])}
-    unknown = sorted(set(settings) - set(known))
-    if unknown:
-        raise InputError(f"{quoted(unknown)} is no setting of '{name}', whose settings are {quoted(known)}.")
-    missing = [setting for setting, needed in known.items() if needed and setting not in settings]
-    if missing:
-        raise InputError(f"'{name}' needs {quoted(missing)}; its settings are {quoted(known)}.")
-    return BY_NAME[name](**settings)
 
 
 __dir__ = face(globals())

@@ -7,7 +7,6 @@ need locks, which file systems of clusters may lack.
 
 import json
 import os
-import struct
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -105,31 +104,30 @@ class ReplayLog:
         Raise `InputError` if the folder contains evaluations and ``resume`` is false, if ``settings`` differ, or if a
         record before the last one is damaged.
         """
-        self._layout = layout
-        self._path = Path(folder) / REPLAY_LOG
-        self._record_size = 8 + 8 * (1 + 2 * layout.size) + 4
+        path, self._size, self._record_size = Path(folder) / REPLAY_LOG, layout.size, 8 + 8 * (1 + 2 * layout.size) + 4
+        self._path, self.fate = path, f"are in '{path}'"
         shapes = [list(shape) for shape in layout.shapes]
         header = {"format": FORMAT, "names": list(layout.names), "shapes": shapes, **settings}
-        if self._path.exists() and not self._path.is_file():
-            raise InputError(f"'{self._path}' is no regular file; give another checkpoint folder.")
-        if not resume:
-            _require_unused(self._path)
-        if not resume or not self._path.exists():
-            with sentences(self._path.parent):
-                self._path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(self._path, json.dumps(header) + "\n")
-        with sentences(self._path):
-            self._file: BinaryIO = open(self._path, "r+b", buffering=0)  # noqa: SIM115 closed by close()
+        if path.exists() and not path.is_file():
+            raise InputError(f"'{path}' is no regular file; give another checkpoint folder.")
+        if not resume and path.exists() and len(path.read_bytes().splitlines()) > 1:
+            raise InputError(
+                f"'{path}' already holds the evaluations of an optimisation; go on with it by resume=True, or "
+                "give another checkpoint folder."
+            )
+        if not resume or not path.exists():
+            with sentences(path.parent):
+                path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, json.dumps(header) + "\n")
+        with sentences(path):
+            self._file: BinaryIO = open(path, "r+b", buffering=0)  # noqa: SIM115 closed by close()
         try:
-            self._first_record = _check_header(self._file, header, self._path)
+            _check_header(self._file, header, path)
+            self._first_record = self._file.tell()
             self._count = self._count_complete()
         except BaseException:
             self._file.close()
             raise
-
-    @property
-    def fate(self) -> str:
-        return f"are in '{self._path}'"
 
     def __len__(self) -> int:
         return self._count
@@ -137,16 +135,15 @@ class ReplayLog:
     def read(self, index: int) -> LoggedEvaluation:
         self._file.seek(self._first_record + index * self._record_size)
         values = np.frombuffer(self._file.read(self._record_size)[8:-4], dtype="<f8").astype(np.float64)
-        size = self._layout.size
-        return LoggedEvaluation(values[1 : 1 + size], float(values[0]), values[1 + size :])
+        return LoggedEvaluation(values[1 : 1 + self._size], float(values[0]), values[1 + self._size :])
 
     def append(self, evaluation: LoggedEvaluation) -> None:
         """Write an evaluation to the disk; raise `ComputationError` if writing fails."""
         values = np.concatenate([[evaluation.loss], evaluation.parameters, evaluation.gradient])
-        content = struct.pack("<Q", self._count) + values.astype("<f8").tobytes()
+        content = self._count.to_bytes(8, "little") + values.astype("<f8").tobytes()
         try:
             self._file.seek(self._first_record + self._count * self._record_size)
-            write_fully(self._file, content + struct.pack("<I", zlib.crc32(content)))
+            write_fully(self._file, content + zlib.crc32(content).to_bytes(4, "little"))
             os.fsync(self._file.fileno())
         except OSError as problem:
             raise ComputationError(
@@ -160,10 +157,12 @@ class ReplayLog:
 
     def _count_complete(self) -> int:
         """Count the complete records; raise `InputError` if a record before the last one is damaged."""
-        end = self._file.seek(0, os.SEEK_END)
-        records, complete = (end - self._first_record) // self._record_size, 0
+        records, complete = (self._file.seek(0, os.SEEK_END) - self._first_record) // self._record_size, 0
         self._file.seek(self._first_record)
-        while _is_complete(self._file.read(self._record_size), complete, self._record_size):
+        while len(record := self._file.read(self._record_size)) == self._record_size:
+            index, checksum = (int.from_bytes(part, "little") for part in (record[:8], record[-4:]))
+            if index != complete or checksum != zlib.crc32(record[:-4]):
+                break
             complete += 1
         if complete < records - 1:
             raise InputError(
@@ -176,21 +175,8 @@ class ReplayLog:
 Log = MemoryLog | ReplayLog
 
 
-def _require_unused(path: Path) -> None:
-    if not path.exists():
-        return
-    with open(path, "rb") as file:
-        file.readline()
-        used = bool(file.read(1))
-    if used:
-        raise InputError(
-            f"'{path}' already holds the evaluations of an optimisation; go on with it by resume=True, or "
-            "give another checkpoint folder."
-        )
-
-
-def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
-    """Compare the first line of a log with ``header``; return the position of the first record [byte]."""
+def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> None:
+    """Read the first line of a log; raise `InputError`, naming the parts between semicolons that differ."""
     try:
         found = parsed_json(file.readline(2**20))  # a damaged file may have no line end
     except ValueError:
@@ -199,30 +185,15 @@ def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
         raise InputError(f"'{path}' is no replay log ('{FORMAT}'); give another checkpoint folder.")
     for key, wanted in header.items():
         if found.get(key) != wanted:
-            former, given = _differing(
-                *(one if isinstance(one, str) else json.dumps(one) for one in (found.get(key), wanted))
-            )
+            texts = (one if isinstance(one, str) else json.dumps(one) for one in (found.get(key), wanted))
+            former, given = (text.split("; ") for text in texts)
+            if len(former) == len(given):
+                differing = [pair for pair in zip(former, given, strict=True) if pair[0] != pair[1]]
+                former, given = ([pair[k] for pair in differing] for k in range(2))
             raise InputError(
-                f"'{path}' cannot be resumed, because it was begun with {key} = {former} and "
-                f"is now given {key} = {given}; give the former, or another checkpoint folder."
+                f"'{path}' cannot be resumed, because it was begun with {key} = {'; '.join(former)} and "
+                f"is now given {key} = {'; '.join(given)}; give the former, or another checkpoint folder."
             )
-    return file.tell()
-
-
-def _differing(former: str, given: str) -> tuple[str, str]:
-    """Return the semicolon-separated parts in which two texts differ; both texts if their numbers of parts differ."""
-    formers, givens = former.split("; "), given.split("; ")
-    if len(formers) != len(givens):
-        return former, given
-    parts = [pair for pair in zip(formers, givens, strict=True) if pair[0] != pair[1]]
-    return "; ".join(one for one, _ in parts), "; ".join(other for _, other in parts)
-
-
-def _is_complete(record: bytes, index: int, size: int) -> bool:
-    if len(record) < size:
-        return False
-    content, (checksum,) = record[:-4], struct.unpack("<I", record[-4:])
-    return struct.unpack("<Q", content[:8])[0] == index and zlib.crc32(content) == checksum
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,29 +3,20 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial, singledispatch
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cortado.device.modules import compile_meanwhile
 from cortado.errors import InputError, SceneError
 from cortado.files.terminal import announce
 from cortado.losses import Snapshot
+from cortado.optimisation import task_tables as tables
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.observations import Observation, SensorSeries, Tracks, Video
 from cortado.optimisation.optimise import Result
 from cortado.optimisation.task_files import GIVEN, Setup, Task, read_tables
-from cortado.optimisation.task_tables import (
-    FitTable,
-    FitTables,
-    MeasuredTable,
-    ProblemTable,
-    SensorSeriesTable,
-    TracksTable,
-    VideoTable,
-)
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.pictures.film import FilmedRun, Page, film, is_out, those
 from cortado.pictures.image_files import open_picture, read_frames, resized, warn_of_cropping, write_picture
@@ -94,53 +85,42 @@ def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndar
             if true is not None:
                 rank = made.task.known[name].rank
                 course = np.broadcast_to(true, (bijector.steps, *np.shape(true)[np.ndim(true) - rank :]))
-                true = _without_round_off(bijector.coordinate(course))
+                true = bijector.coordinate(course)
+                if largest := np.abs(true).max():  # without round-off, and without -0
+                    true = np.round(true, 11 - int(np.floor(np.log10(largest)))) + 0.0
             times = (bijector.places + made.task.known[name].moment) * step
             found[name] = KnotValues(times, made.start[name], coordinates[name], true)
     return found
 
 
-def _without_round_off(values: np.ndarray) -> np.ndarray:
-    largest = np.abs(values).max()
-    return np.round(values, 11 - int(np.floor(np.log10(largest)))) + 0.0 if largest > 0.0 else values  # no -0
-
-
 def task_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
+    scene, simulation, found = made.task.scene, made.problem.simulation, TaskFigures()
     losses = [record.loss for record in result.history]
     label = "loss [m²]" if made.renderer is None else "loss"
-    figures = TaskFigures(search=[("The loss.", loss_curve(losses, folder / "loss.png", label=label))])
-    if made.renderer is None:
-        figures += TaskFigures(compared=[_particles(made, result, folder)])
-    else:
-        figures += _images(made, result, folder)
-    for name in result.parameters:
-        figures += TaskFigures(parameters=_parameter(made, result, name, folder))
-    return figures
-
-
-def _particles(made: Setup, result: Result, folder: Path) -> tuple[str, Path]:
-    scene, simulation = made.task.scene, made.problem.simulation
-    before, after = (made.problem.end(made.search.parameters(u)).positions for u in (made.start, result.parameters))
-    shown = [before, after, made.targets[made.problem.steps]]
-    several = len(scene.phase) > 1
-    colours = [colours_of(scene, simulation.mass_fractions, simulation.particles)] * len(shown) if several else None
-    ends, lines = scene.container.extent(), [solid_outline(scene)] * len(shown)
-    path = particles(shown, TITLES, folder / "particles.png", colours=colours, container=ends, lines=lines)
-    return "Where the fluid ends: with the first guess, as found, and the target.", path
-
-
-def _images(made: Setup, result: Result, folder: Path) -> TaskFigures:
+    found.search.append(("The loss.", loss_curve(losses, folder / "loss.png", label=label)))
     last, target = max(made.targets.items())
 
-    def image(u: dict[str, np.ndarray]) -> np.ndarray:
-        return made.image(made.problem.states(made.search.parameters(u), [last])[last])
+    def end(u: dict[str, np.ndarray]) -> Snapshot:
+        return made.problem.states(made.search.parameters(u), [last])[last]
 
-    path = images([image(made.start), image(result.parameters), target], TITLES, folder / "images.png")
-    compared: Figures = [("The last image: with the first guess, as found, and the target.", path)]
-    evaluations = np.unique(np.linspace(0, len(result.history) - 1, IMAGES).astype(int))
-    shown = [image(result.history[k].parameters) for k in evaluations]
-    path = images(shown, [f"evaluation {k}" for k in evaluations], folder / "progress.png")
-    return TaskFigures(compared=compared, search=[("The last image during the optimisation.", path)])
+    if made.renderer is None:
+        shown = [*(end(u).positions for u in (made.start, result.parameters)), target]
+        several = len(scene.phase) > 1
+        colours = [colours_of(scene, simulation.mass_fractions, simulation.particles)] * len(shown) if several else None
+        ends, lines = scene.container.extent(), [solid_outline(scene)] * len(shown)
+        path = particles(shown, TITLES, folder / "particles.png", colours=colours, container=ends, lines=lines)
+        found.compared.append(("Where the fluid ends: with the first guess, as found, and the target.", path))
+    else:
+        shown = [*(made.image(end(u)) for u in (made.start, result.parameters)), target]
+        path = images(shown, TITLES, folder / "images.png")
+        found.compared.append(("The last image: with the first guess, as found, and the target.", path))
+        evaluations = np.unique(np.linspace(0, len(result.history) - 1, IMAGES).astype(int))
+        shown = [made.image(end(result.history[k].parameters)) for k in evaluations]
+        path = images(shown, [f"evaluation {k}" for k in evaluations], folder / "progress.png")
+        found.search.append(("The last image during the optimisation.", path))
+    for name in result.parameters:
+        found.parameters.extend(_parameter(made, result, name, folder))
+    return found
 
 
 def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
@@ -180,12 +160,6 @@ def component_names(task: Task, name: str, value: np.ndarray) -> list[str]:
     if name == "colours":
         return [f"{hue} of {phase.name}" for phase in scene.phase for hue in ("red", "green", "blue")]
     return [f"{label} {k}" for k in range(count)]
-
-
-def begin_shaded(made: Setup) -> None:
-    simulation = made.problem.simulation
-    artist = painter(made.task.scene, simulation.positions, simulation.device)
-    compile_meanwhile(artist, simulation.device)
 
 
 def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
@@ -240,14 +214,14 @@ def _state(made: Setup, run: Run, step: int) -> State:
 
 
 class ExperimentTables(Table):
-    problem: ProblemTable
+    problem: tables.ProblemTable
 
 
 @dataclass(frozen=True)
 class MeasuredScene:
     file: str
     scene: Scene
-    problem: ProblemTable
+    problem: tables.ProblemTable
 
     def experiment(self, device: str, precision: str) -> Experiment:
         """Make the experiment on a device; raise `InputError` or `SceneError` for unsuitable or unreadable data."""
@@ -265,7 +239,7 @@ class MeasuredScene:
 @dataclass(frozen=True)
 class FitTask:
     experiments: tuple[MeasuredScene, ...]
-    fit: FitTable
+    fit: tables.FitTable
 
     @property
     def scene(self) -> Scene:
@@ -280,37 +254,34 @@ def load_fit(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Fit
         raise SceneError(file, "fit", MISSING, "a table; a task with [optimise] is solved by cortado optimise")
     if "optimise" in data:
         raise SceneError(file, "optimise", GIVEN, "left out of a fit, whose search [fit] describes")
-    first, tables = _read(data, file, FitTables)
-    others = [_also(Path(file).parent / name) for name in first.problem.also]
-    return FitTask((first, *others), tables.fit)
-
-
-def _also(path: Path) -> MeasuredScene:
-    """Read a further experiment from its file; a table [fit] in this file is ignored."""
-    found, _ = _read(read_toml(path), os.fspath(path), ExperimentTables)
-    if found.problem.also:
-        also, wanted = list(found.problem.also), "left out, as another file names this one"
-        raise SceneError(found.file, "problem.also", also, wanted)
-    return found
+    first, read = _read(data, file, tables.FitTables)
+    others = []
+    for name in first.problem.also:  # in which a table [fit] is ignored
+        path = os.fspath(Path(file).parent / name)
+        other, _ = _read(read_toml(path), path, ExperimentTables)
+        if other.problem.also:
+            wanted = "left out, as another file names this one"
+            raise SceneError(path, "problem.also", list(other.problem.also), wanted)
+        others.append(other)
+    return FitTask((first, *others), read.fit)
 
 
 def _read(data: dict[str, Any], file: str, model: type[Table]) -> tuple[MeasuredScene, Any]:
     scene = scene_from_dict(data, file)
-    _, tables = read_tables(data, scene, file, model)
-    if not tables.problem.measured:
+    _, found = read_tables(data, scene, file, model)
+    if not found.problem.measured:
         raise SceneError(file, "problem.measured", MISSING, "a list of tables, each written [[problem.measured]]")
-    return MeasuredScene(file, scene.lasting(steps=tables.problem.steps), tables.problem), tables
+    return MeasuredScene(file, scene.lasting(steps=found.problem.steps), found.problem), found
 
 
-@singledispatch
-def observation(table: MeasuredTable, simulation: Simulation, folder: Path, last: float) -> Observation:
-    """Make the observation of a table, up to the ``last`` time of the run [s], from files in ``folder``; raise
-    `InputError`."""
-    raise NotImplementedError(type(table))
+def observation(table: tables.AnyMeasured, simulation: Simulation, folder: Path, last: float) -> Observation:
+    """Make the observation of a table, up to the ``last`` time of the run [s]; raise `InputError`."""
+    kinds: dict[str, Any] = {"video": _video, "sensor": _series, "tracks": _tracks}
+    made: Observation = kinds[table.kind](table, simulation, folder, last)
+    return made
 
 
-@observation.register
-def _(table: VideoTable, simulation: Simulation, folder: Path, last: float) -> Observation:
+def _video(table: tables.VideoTable, simulation: Simulation, folder: Path, last: float) -> Observation:
     renderer = simulation.renderer()
     rows, columns, _ = renderer.shape
     times, frames = read_frames(folder / table.file, (columns, rows), table.crop, table.frame_rate, table.every)
@@ -324,8 +295,7 @@ def _(table: VideoTable, simulation: Simulation, folder: Path, last: float) -> O
     return Video(renderer, times[chosen], frames[chosen], mask, table.noise, table.calibrate, table.start)
 
 
-@observation.register
-def _(table: SensorSeriesTable, simulation: Simulation, folder: Path, last: float) -> Observation:
+def _series(table: tables.SensorSeriesTable, simulation: Simulation, folder: Path, last: float) -> Observation:
     sensors = sensors_of(simulation.scene)
     if table.sensor not in sensors:
         raise InputError(f"sensor is {table.sensor!r}, but must be one of {', '.join(sensors) or 'the [[sensor]]s'}.")
@@ -347,11 +317,12 @@ def _(table: SensorSeriesTable, simulation: Simulation, folder: Path, last: floa
     return SensorSeries(sensor, times[chosen], values[chosen], simulation.dimension, names, table.noise, *clock)
 
 
-@observation.register
-def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> Observation:
+def _tracks(table: tables.TracksTable, simulation: Simulation, folder: Path, last: float) -> Observation:
     path, axes = folder / table.file, ["x", "y", "z"][: simulation.dimension]
     data = _with(measured_columns(path, dict.fromkeys(axes, "m")), ("time", "tracer", *axes), path)
-    times, when = _instants(data["time"] + table.start, 1e-9 * max(last, 1e-300))
+    each, which = np.unique(data["time"] + table.start, return_inverse=True)
+    begins = np.diff(each, prepend=-np.inf) > 1e-9 * max(last, 1e-300)
+    times, when = each[begins], np.cumsum(begins)[which] - 1
     tracers, who = np.unique(data["tracer"], return_inverse=True)
     once, often = np.unique(np.stack([when, who]), axis=1, return_counts=True)
     if (often > 1).any():
@@ -368,12 +339,6 @@ def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> 
     chosen = _within(times, last) & (times > 0.0)
     clock = table.calibrate, table.start
     return Tracks(simulation, places[begin], times[chosen] - table.start, places[chosen], table.noise, *clock)
-
-
-def _instants(times: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
-    each, which = np.unique(times, return_inverse=True)
-    begins = np.diff(each, prepend=-np.inf) > apart
-    return each[begins], np.cumsum(begins)[which] - 1
 
 
 def _within(times: np.ndarray, last: float) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Read, describe and set up a task of ``cortado optimise``: a scene with the tables [problem] and [optimise]."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -230,23 +230,19 @@ def task_in_words(task: Task) -> list[str]:
         f"The search goes by {algorithm} with a learning rate of {settings.learning_rate:g}, "
         f"for {counted(settings.iterations, 'iteration')} at most{knots}."
     )
-    return [question, f"{how}{_asked(task)}"]
-
-
-def _listed(names: object) -> str:
-    words = [name.replace("_", " ") for name in names]  # type: ignore[attr-defined]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
-
-
-def _asked(task: Task) -> str:
-    check = task.optimise.check
+    check = settings.check
     words = {
         "loss_reduction": f"a loss {check.loss_reduction:g} times smaller than at the start",
         "parameter_error": f"parameters within {100 * check.parameter_error:g}% of the hidden ones",
         "psnr": f"an image within {check.psnr:g} dB of the target",
     }
     asked = [sentence for name, sentence in words.items() if name in check.model_fields_set]
-    return f" It is asked for {', '.join(asked[:-1])}{' and ' * (len(asked) > 1)}{asked[-1]}." if asked else ""
+    return [question, f"{how} It is asked for {_listed(asked)}." if asked else how]
+
+
+def _listed(words: Iterable[str]) -> str:
+    *others, last = (word.replace("_", " ") for word in words)
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 @dataclass(frozen=True)
@@ -259,6 +255,7 @@ class Setup:
     """One search for each entry of the extinction schedule, in the same coordinates."""
     start: Arrays
     bounds: dict[str, tuple[Any, Any]]
+    """Bounds of coordinates by name, of knots or logarithms; not negative parameters have the lower bound 0."""
     renderer: Renderer | None
     """Renderer of the compared pictures; None if positions are compared."""
     targets: dict[int, np.ndarray]
@@ -280,8 +277,14 @@ def setup(task: Task, device: str, precision: str) -> Setup:
     """Set up a task on a device; raise `InputError` for a picture that cannot be read."""
     simulation = Simulation(task.scene, device, precision)
     start = {name: _start(name, value, simulation) for name, value in task.start.items()}
-    found, searches = _coordinates(task, start), []
-    for factor in task.optimise.extinction_schedule:
+    settings, searches = task.optimise, []
+    found: dict[str, Bijector] = {name: Logarithm() for name in settings.logarithmic}
+    for name, value in start.items():
+        if name == "mass_fractions":
+            found[name] = Softmax()
+        elif task.known.has_rows(name, value) and settings.knots is not None:
+            found[name] = TimeInterpolation(task.problem.steps, settings.knots)
+    for factor in settings.extinction_schedule:
         renderer = scene_renderer(simulation, factor) if task.problem.loss == "image" else None
         targets = _targets(task, simulation, renderer)
         losses: dict[int, Loss] = {
@@ -290,7 +293,12 @@ def setup(task: Task, device: str, precision: str) -> Setup:
         }
         problem = Problem(simulation, task.problem.steps, Frames(losses))
         searches.append(Transformed(problem, found))
-    bounds = _bounds(task)
+    with_zero = [name for name in task.start if task.known[name].range is Range.NOT_NEGATIVE]
+    free = [name for name in with_zero if name not in settings.logarithmic]
+    bounds: dict[str, tuple[Any, Any]] = dict.fromkeys(free, (0.0, None))
+    for name, (lower, upper) in (settings.bounds or {}).items():
+        is_log = name in settings.logarithmic
+        bounds[name] = (np.log(lower), np.log(upper)) if is_log else (lower, upper)
     coordinates = searches[-1].coordinate(start)
     for name, (lower, upper) in bounds.items():
         coordinates[name] = np.clip(coordinates[name], lower, upper)  # what is random, or a little outside by round-off
@@ -298,10 +306,18 @@ def setup(task: Task, device: str, precision: str) -> Setup:
 
 
 def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> dict[int, np.ndarray]:
-    steps = task.problem.compared
-    if task.problem.picture is not None:
+    steps, name, scene = task.problem.compared, task.problem.picture, task.scene
+    if name is not None:
         assert renderer is not None
-        return {steps[-1]: _picture(task, renderer)}
+        rows, columns, _ = renderer.shape
+        if name not in DRAWN:
+            return {steps[-1]: read_picture(task.folder / name, (columns, rows))}
+        colours = [phase.colour for phase in scene.phase]  # the last phase draws on the first one
+        background = scene.render.background if scene.render else (1.0, 1.0, 1.0)
+        under = colours[0] if len(colours) > 1 else background
+        cup = 1.0 if isinstance(scene.container, CylinderContainer) else None
+        options: dict[str, Any] = {"milk": colours[-1], "coffee": under, "background": background}
+        return {steps[-1]: DRAWN[name]((columns, rows), cup=cup, **options)}
     nothing = FinalPositions(simulation.positions)
     try:
         ends = Problem(simulation, task.problem.steps, nothing).states(task.true_parameters, steps)
@@ -317,21 +333,6 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
 
 def _image(renderer: Renderer, end: Snapshot) -> np.ndarray:
     return renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
-
-
-def _picture(task: Task, renderer: Renderer) -> np.ndarray:
-    """Read the picture of a task; draw "heart" and "rosetta" with the colour of the last phase on the first one."""
-    name, scene = task.problem.picture, task.scene
-    assert name is not None
-    rows, columns, _ = renderer.shape
-    if name not in DRAWN:
-        return read_picture(task.folder / name, (columns, rows))
-    colours = [phase.colour for phase in scene.phase]
-    background = scene.render.background if scene.render else (1.0, 1.0, 1.0)
-    under = colours[0] if len(colours) > 1 else background
-    cup = 1.0 if isinstance(scene.container, CylinderContainer) else None
-    options: dict[str, Any] = {"milk": colours[-1], "coffee": under, "background": background}
-    return DRAWN[name]((columns, rows), cup=cup, **options)
 
 
 def _start(name: str, value: Any, simulation: Simulation) -> np.ndarray:
@@ -350,24 +351,3 @@ def _start(name: str, value: Any, simulation: Simulation) -> np.ndarray:
     while (outside := ~container.contains(x, 0.0)).any():  # in the corners around a cylinder
         x[outside] = random.uniform(lower, upper, x[outside].shape)
     return x
-
-
-def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
-    found: dict[str, Bijector] = {name: Logarithm() for name in task.optimise.logarithmic}
-    for name, value in start.items():
-        if name == "mass_fractions":
-            found[name] = Softmax()
-        elif task.known.has_rows(name, value) and task.optimise.knots is not None:
-            found[name] = TimeInterpolation(task.problem.steps, task.optimise.knots)
-    return found
-
-
-def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
-    """Return bounds of coordinates by name, of knots or logarithms; not negative parameters have the lower bound 0."""
-    with_zero = [name for name in task.start if task.known[name].range is Range.NOT_NEGATIVE]
-    free = [name for name in with_zero if name not in task.optimise.logarithmic]
-    found: dict[str, tuple[Any, Any]] = dict.fromkeys(free, (0.0, None))
-    for name, (lower, upper) in (task.optimise.bounds or {}).items():
-        is_log = name in task.optimise.logarithmic
-        found[name] = (np.log(lower), np.log(upper)) if is_log else (lower, upper)
-    return found

@@ -1,7 +1,7 @@
 """The tables [problem], [optimise] and [fit] of a task, and the JSON schema of scene, task and data set files."""
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from itertools import pairwise
@@ -45,26 +45,23 @@ def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> d
     """Convert values to arrays by parameter name; parameters in `CAN_BE_RANDOM` may instead be one of ``words``."""
     if not isinstance(values, Mapping) or not values:
         raise field_error((), Words("empty") if values == {} else values, wanted(VALUES))
-    found = {}
-    names = _names(info)
-    for name, value in _flat(values, names).items():
+    names, flat = _names(info), dict[str, Any]()
+    for name, value in values.items():  # {"drag": {"k": 2.0}} is {"drag.k": 2.0}
+        deeper = isinstance(value, Mapping) and any(known.startswith(f"{name}.") for known in names)
+        flat |= {f"{name}.{key}": entry for key, entry in value.items()} if deeper else {name: value}
+    for name, value in flat.items():
         if name not in names:
             raise field_error((name,), Words("unknown"), _offered(info))
-        is_word = name in CAN_BE_RANDOM and isinstance(value, str) and value in words
-        found[name] = value if is_word else _array(name, value)
-    return found
+        if not (name in CAN_BE_RANDOM and isinstance(value, str) and value in words):
+            try:
+                flat[name] = np.array(value if _is_numeric(value) else "no number", dtype=np.float64)
+            except ValueError:
+                finite = "made of finite numbers: one, a list of them, or a list of lists of one length"
+                raise field_error((name,), value, finite) from None
+    return flat
 
 
-def _flat(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Flatten nested tables of dotted parameter names: {"drag": {"k": 2.0}} becomes {"drag.k": 2.0}."""
-    found = {}
-    for name, value in values.items():
-        deeper = isinstance(value, Mapping) and any(known.startswith(f"{name}.") for known in names)
-        found.update({f"{name}.{key}": entry for key, entry in value.items()} if deeper else {name: value})
-    return found
-
-
-def _names(info: ValidationInfo) -> Collection[str]:
+def _names(info: ValidationInfo) -> tuple[str, ...]:
     return (*NAMES, *(info.context or {}).get("names", ()))
 
 
@@ -77,14 +74,6 @@ def _known(name: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo)
     if info.context and name not in _names(info):
         raise field_error((), name, _offered(info))
     return name if info.context else check(name)
-
-
-def _array(name: str, value: Any) -> Any:
-    with suppress(ValueError):
-        if _is_numeric(value):
-            return np.array(value, dtype=np.float64)
-    finite = "made of finite numbers: one, a list of them, or a list of lists of one length"
-    raise field_error((name,), value, finite)
 
 
 def _is_numeric(value: Any) -> bool:

@@ -4,9 +4,10 @@ A transform p(u) maps unconstrained coordinates u to a valid parameter: fraction
 values over time between knots.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
@@ -60,10 +61,11 @@ class Softmax:
     """The transform p_k = exp(u_k) / sum_l exp(u_l) of each row to fractions (n, phases) that add up to 1."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
-        return softmax(_fractions("coordinates", u), axis=1)
+        return softmax(_shaped("coordinates", u, lambda shape: len(shape) == 2, "a row for each particle"), axis=1)
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        u = np.log(np.maximum(_fractions("fractions", parameter), SMALLEST))
+        fractions = _shaped("fractions", parameter, lambda shape: len(shape) == 2, "a row for each particle")
+        u = np.log(np.maximum(fractions, SMALLEST))
         return u - u.mean(axis=1, keepdims=True)
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
@@ -93,10 +95,12 @@ class TimeInterpolation:
         return np.maximum(1.0 - np.abs(places[:, None] - np.arange(self.knots)), 0.0)
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
-        return self._weights @ _rows("knots", u, self.knots)
+        return self._weights @ _shaped("knots", u, lambda shape: shape[:1] == (self.knots,), f"{self.knots} rows")
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        return np.linalg.lstsq(self._weights, _rows("values over time", parameter, self.steps), rcond=None)[0]
+        rows = f"{self.steps} rows"
+        values = _shaped("values over time", parameter, lambda shape: shape[:1] == (self.steps,), rows)
+        return np.linalg.lstsq(self._weights, values, rcond=None)[0]
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
         return self._weights.T @ bar
@@ -118,11 +122,12 @@ class Affine:
         return f"Affine({sha256(self.base.tobytes() + self.matrix.tobytes()).hexdigest()[:16]})"
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
-        return self.base + np.tensordot(self.matrix, _shaped("coordinates", u, self._shape), len(self._shape))
+        coordinates = _shaped("coordinates", u, self._shape.__eq__, self._shape)
+        return self.base + np.tensordot(self.matrix, coordinates, len(self._shape))
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
         """Return the least-norm u for which p(u) is nearest to ``parameter``."""
-        offset = _shaped("values", parameter, self.base.shape) - self.base
+        offset = _shaped("values", parameter, self.base.shape.__eq__, self.base.shape) - self.base
         matrix = self.matrix.reshape(self.base.size, -1)
         return np.linalg.lstsq(matrix, offset.ravel(), rcond=None)[0].reshape(self._shape)
 
@@ -163,8 +168,7 @@ class Transformed(OtherParameters):
     """A problem as a function of coordinates of some parameters, and of all other parameters unchanged."""
 
     def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
-        """Store a ``problem`` and bijectors ``coordinates`` by parameter name; raise `InputError` for a parameter that
-        the scene does not have."""
+        """Store a ``problem`` and bijectors ``coordinates`` by name; raise `InputError` for unknown parameters."""
         require_methods("problem", problem, ("value", "forward_pass"), "a cortado.Problem")
         require_table("coordinates", coordinates, "{'viscosity': Logarithm()}")
         for name, bijector in coordinates.items():
@@ -172,7 +176,10 @@ class Transformed(OtherParameters):
             wanted = "an object such as Logarithm()"
             require_methods(f"the coordinate of {name}", bijector, ("parameter", "coordinate", "adjoint"), wanted)
         self.problem, self.coordinates = problem, FixedDict(coordinates)
-        self.simulation = problem.simulation
+        self.simulation: Any = problem.simulation
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Transformed, (self.problem, self.coordinates)
 
     @property
     def fingerprint(self) -> str:
@@ -232,24 +239,10 @@ class TransformedPass:
         return gradient | by_coordinates(self._coordinates, self._u, gradient)
 
 
-def _shaped(what: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _shaped(what: str, value: Any, fits: Callable[[tuple[int, ...]], bool], wanted: object) -> np.ndarray:
     array = as_numbers(what, value)
-    if array.shape != shape:
-        raise InputError(f"{what} have shape {array.shape}, but must have {shape}.")
-    return array
-
-
-def _rows(what: str, value: Any, rows: int) -> np.ndarray:
-    array = as_numbers(what, value)
-    if not array.ndim or len(array) != rows:
-        raise InputError(f"{what} have shape {array.shape}, but must have {rows} rows.")
-    return array
-
-
-def _fractions(what: str, value: Any) -> np.ndarray:
-    array = as_numbers(what, value)
-    if array.ndim != 2:
-        raise InputError(f"{what} have shape {array.shape}, but must have a row for each particle.")
+    if not fits(array.shape):
+        raise InputError(f"{what} have shape {array.shape}, but must have {wanted}.")
     return array
 
 
@@ -263,8 +256,11 @@ class FixedParameters(OtherParameters):
 
     def __init__(self, problem: Problem, fixed: Arrays):
         """Store a problem and ``fixed`` parameters by name, including ``initial_positions`` (n, d) [m]."""
-        self.problem, self._fixed = problem, fixed
-        self.simulation = _Simulation(problem, fixed["initial_positions"])
+        self.problem, self._fixed, of = problem, fixed, problem.simulation
+        self.simulation = SimpleNamespace(
+            batch=None, scene=of.scene, positions=fixed["initial_positions"], precision=of.precision, known=of.known
+        )
+        """The attributes of a simulation that ensembles use, with fixed first positions."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FixedParameters, (self.problem, self._fixed)
@@ -278,17 +274,3 @@ class FixedParameters(OtherParameters):
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
         return self.problem.forward_pass(self.parameters(parameters))
-
-
-class _Simulation:
-    """The attributes of a simulation that ensembles use, with fixed first positions."""
-
-    batch = None
-
-    def __init__(self, problem: Problem, initial_positions: Any):
-        self._problem = problem
-        self.scene, self.positions = problem.simulation.scene, initial_positions
-        self.precision, self.known = problem.simulation.precision, problem.simulation.known
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _Simulation, (self._problem, self.positions)

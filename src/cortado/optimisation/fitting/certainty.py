@@ -193,8 +193,14 @@ class Certainty:
             scores.append(score)
             parts.append(FittedPart(part, weight, r, spread(r), score.samples, frames))
         covariance: Any = N_inverse @ sum(score.B for score in scores) @ N_inverse
-        freedom = np.array([_freedom(scores, N_inverse, unit) for unit in np.eye(len(at.u))])
-        return cls(N, covariance, freedom, tuple(scores), tuple(parts))
+        freedom = []
+        for unit in np.eye(len(at.u)):  # of a variance that is a sum over parts (Welch 1947)
+            a = N_inverse @ unit
+            variances = np.array([a @ score.B @ a for score in scores])
+            each = np.array([score.degrees_of_freedom(N_inverse, unit) for score in scores])
+            welch = variances.sum() ** 2 / (variances**2 / each).sum() if variances.any() else each.min()
+            freedom.append(float(welch))
+        return cls(N, covariance, np.array(freedom), tuple(scores), tuple(parts))
 
 
 def noise_of(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> list[Weighting]:
@@ -204,8 +210,12 @@ def noise_of(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> l
     for part, r, J, weight in zip(problem.parts, at.residuals, at.jacobians, weights, strict=True):
         times, size = part.observation.times, part.observation.noise or spread(r) or weight.scale
         time = correlation_time(weight.of(J, times), weight.of(r, times), N_inverse, times)
-        own = Weighting(size, time)
-        found.append(Weighting(size * np.sqrt(_inflation(own.of(J, times), own.of(r, times))), time))
+        J, r = Weighting(size, time).of(J, times), Weighting(size, time).of(r, times)
+        # the ratio of the score's variance to that for independent residuals in a frame
+        independent = np.einsum("fmp,fmp->p", J, J) * np.mean(r**2)
+        pooled, has = np.einsum("fmp,hm->fhp", J, r, optimize=True), independent > 0.0
+        ratios = (pooled**2).sum(axis=(0, 1))[has] / len(r) / independent[has]
+        found.append(Weighting(size * np.sqrt(float(np.mean(ratios)) if has.any() else 1.0), time))
     return found
 
 
@@ -243,19 +253,3 @@ def spread(r: np.ndarray) -> float:
     """Return the root mean square of the residuals, without the residuals 0 of ignored numbers."""
     count = np.count_nonzero(r)
     return float(np.sqrt((r**2).sum() / max(count, 1)))
-
-
-def _inflation(J: np.ndarray, r: np.ndarray) -> float:
-    """Return the ratio of the score's variance to the variance for independent residuals in a frame."""
-    counted = np.einsum("fmp,fmp->p", J, J) * np.mean(r**2)
-    pooled = np.einsum("fmp,hm->fhp", J, r, optimize=True)
-    has = counted > 0.0
-    return float(np.mean((pooled**2).sum(axis=(0, 1))[has] / len(r) / counted[has])) if has.any() else 1.0
-
-
-def _freedom(scores: Sequence[ScoreCovariance], N_inverse: np.ndarray, direction: np.ndarray) -> float:
-    """Return the degrees of freedom of a variance that is a sum over parts (Welch 1947)."""
-    a = N_inverse @ direction
-    variances = np.array([a @ score.B @ a for score in scores])
-    each = np.array([score.degrees_of_freedom(N_inverse, direction) for score in scores])
-    return float(variances.sum() ** 2 / (variances**2 / each).sum()) if variances.any() else float(each.min())

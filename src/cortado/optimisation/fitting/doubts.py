@@ -63,7 +63,19 @@ def doubts_of(
     if not is_exact:
         found += _halves(problem, at, weights, certainty.scores)
         found += [*_trends(problem, at, weights), *_clocks(problem, at, weights)]
-    return (*found, *_at_bounds(problem, at), *_vague(problem, at, certainty))
+    coordinates, bars = problem.coordinates, np.sqrt(np.diag(certainty.covariance))
+    for which, ends in zip(("lower", "upper"), coordinates.bounds, strict=True):
+        for label, u, end, value in zip(problem.labels, at.u, ends, coordinates.numbers(at.u), strict=True):
+            if np.isfinite(end) and abs(u - end) <= 1e-6 * max(abs(end), 1.0):
+                found.append(
+                    f"{label} is {value:.4g}, its {which} bound: what was measured asks for a value beyond it, and its "
+                    "error bar tells nothing."
+                )
+    for label, bar in zip(problem.labels, np.where(coordinates.by_logarithm, bars, 0.0), strict=True):
+        if bar > 1.0:
+            factor = np.exp(min(bar, 20.0))
+            found.append(f"What was measured hardly tells {label}: one standard error is a factor of {factor:.2g}.")
+    return tuple(found)
 
 
 def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]:
@@ -78,33 +90,10 @@ def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]
     return max(quiet, 0.002 * float(np.nanmax(np.abs(measured)))), moving  # half a step of 8 bits
 
 
-def _at_bounds(problem: LeastSquares, at: Linearised) -> list[str]:
-    found = []
-    for which, ends in zip(("lower", "upper"), problem.coordinates.bounds, strict=True):
-        for label, u, end, value in zip(problem.labels, at.u, ends, problem.coordinates.numbers(at.u), strict=True):
-            if np.isfinite(end) and abs(u - end) <= 1e-6 * max(abs(end), 1.0):
-                found.append(
-                    f"{label} is {value:.4g}, its {which} bound: what was measured asks for a value beyond it, and its "
-                    "error bar tells nothing."
-                )
-    return found
-
-
-def _vague(problem: LeastSquares, at: Linearised, certainty: Certainty) -> list[str]:
-    coordinates = problem.coordinates
-    bars = np.where(coordinates.by_logarithm, np.sqrt(np.diag(certainty.covariance)), 0.0)
-    return [
-        f"What was measured hardly tells {label}: one standard error is a factor of {np.exp(min(bar, 20.0)):.2g}."
-        for label, bar in zip(coordinates.labels, bars, strict=True)
-        if bar > 1.0
-    ]
-
-
 def _halves(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], scores: Sequence[ScoreCovariance]
 ) -> list[str]:
-    """Return sentences about parameters for which a Gauss-Newton step by half of the frames differs from the other
-    half's."""
+    """Return sentences about parameters of which the two halves of the frames tell different Gauss-Newton steps."""
     size, steps, variances = len(at.u), [], []
     white, slopes = (weighted(problem.parts, weights, own) for own in (at.residuals, at.jacobians))
     for half in (0, 1):
@@ -166,7 +155,10 @@ def explained(
     sizes, V = left.u[-count:], found.covariance[-count:, -count:]
     statistic = float(sizes @ np.linalg.pinv(V) @ sizes) / count
     least = fisher.isf(1e-3, count, found.degrees_of_freedom[-count:].min())
-    if not is_doubted and (statistic <= least or _fades_slowly(wide, weights)):
+    gaps = [float(np.median(np.diff(part.observation.times))) for part in wide.parts]
+    each = [(one.correlation_time, gap) for one, gap in zip(weights, gaps, strict=True)]
+    fades_slowly = any(time and np.exp(-gap / time) > 0.6 for time, gap in each)
+    if not is_doubted and (statistic <= least or fades_slowly):
         return None
     share = 1.0 - problem.sum_of_squares(left.residuals, weights) / problem.sum_of_squares(before.residuals, weights)
     return None if share < (0.5 if is_doubted else 0.05) else Explained(sizes, share)
@@ -200,12 +192,6 @@ def _step(wide: Widened, before: Linearised, weights: Sequence[Weighting]) -> Li
     score: np.ndarray = sum(np.einsum("fmp,fm->p", J, r) for J, r in zip(slopes, white, strict=True))
     u = -N_inverse @ score
     return replace(before, u=u, residuals=[r + J @ u for r, J in zip(before.residuals, before.jacobians, strict=True)])
-
-
-def _fades_slowly(wide: Widened, weights: Sequence[Weighting]) -> bool:
-    gaps = [float(np.median(np.diff(part.observation.times))) for part in wide.parts]
-    each = zip(weights, gaps, strict=True)
-    return any(one.correlation_time and np.exp(-gap / one.correlation_time) > 0.6 for one, gap in each)
 
 
 def _nothing(problem: LeastSquares, count: int) -> list[np.ndarray]:

@@ -1,7 +1,7 @@
 """The class `Experiment`: a simulation together with measurements."""
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -117,11 +117,19 @@ class Experiment:
         frames = self._frames(parameters)
         wanted = self._wanted(frames)
         problem = self._problem(values, wanted)
-        ends, dots = self._along(problem, wanted, values, [moved for moved in moves if moved])
+        dimension, steps = self.simulation.dimension, set(wanted)
+        tangents = [dict[int, Arrays]() for _ in moves]
+
+        def observe(kept: dict[int, Arrays], step: int, dot: State) -> None:
+            if step in steps:
+                kept[step] = {name: a.astype(np.float64) for name, a in dot.numpy(dimension).items()}
+
+        each = [(moved, partial(observe, kept)) for moved, kept in zip(moves, tangents, strict=True) if moved]
+        ends = problem.several_tangents(values, each, wanted)
         # states do not change if only an observation's parameters change, such as a camera's
-        still = {step: end.state.like().numpy(self.simulation.dimension) for step, end in ends.items()}
+        still = {step: end.state.like().numpy(dimension) for step, end in ends.items()}
         found = dict[str, np.ndarray]()
-        along = [(one, moved, next(dots) if moved else still) for one, moved in zip(directions, moves, strict=True)]
+        along = [(one, moved, kept or still) for one, moved, kept in zip(directions, moves, tangents, strict=True)]
 
         def direction(name: str, step: int, given: Values, moved: Values, dots: Mapping[int, Arrays]) -> Direction:
             at, dot = ends[step], dots[step]
@@ -174,18 +182,6 @@ class Experiment:
                     simulation = simulation.replaced(f"forces.viscous_solve={'implicit' if key[0] else 'explicit'}")
             self._problems[key] = Problem(simulation, steps, own.loss, state=own.state)
         return self._problems[key]
-
-    def _along(
-        self, problem: Problem, steps: Sequence[int], values: Values, moves: Sequence[Values]
-    ) -> tuple[dict[int, Any], Iterator[dict[int, Arrays]]]:
-        wanted, dimension, dots = set(steps), self.simulation.dimension, [dict[int, Arrays]() for _ in moves]
-
-        def observe(kept: dict[int, Arrays], step: int, dot: State) -> None:
-            if step in wanted:
-                kept[step] = {name: a.astype(np.float64) for name, a in dot.numpy(dimension).items()}
-
-        each = zip(moves, (partial(observe, kept) for kept in dots), strict=True)
-        return problem.several_tangents(values, each, steps), iter(dots)
 
     def _read(
         self, ends: Mapping[int, Snapshot], frames: Mapping[str, Frames], parameters: Values

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cortado.optimisation.fitting.certainty import FittedPart
 from cortado.optimisation.fitting.fit import NOISE_ALONE, Fit, Profile, unit_of, with_error
 from cortado.optimisation.fitting.observations import Video
 from cortado.pictures.pages import Figures, picture, table
@@ -20,24 +19,20 @@ def residual_figure(fitted: Fit, path: Path) -> Figures:
     with drawing(path, height=1.4 + 2.3 * len(fitted.parts)) as figure:
         rows = figure.subplots(len(fitted.parts), 1, squeeze=False)[:, 0]
         for axes, part in zip(rows, fitted.parts, strict=True):
-            _residuals(axes, part)
+            times, r = part.part.observation.times, part.residuals
+            if r.shape[1] <= 4:
+                for k, series in enumerate(r.T):
+                    axes.plot(times, series, marker="o", markersize=3, color=PALETTE[k % len(PALETTE)])
+            else:
+                size = np.sqrt((r**2).mean(axis=1))
+                axes.plot(times, size, marker="o", color=PALETTE[0], label="root mean square")
+                axes.plot(times, r.mean(axis=1), marker="o", color=PALETTE[1], label="mean")
+                axes.legend(loc="upper left")
+            axes.axhline(0.0, color=FAINT, linewidth=1.0)
+            axes.set(title=part.label, ylabel=f"residual [{part.part.observation.unit}]")
         rows[-1].set_xlabel("time [s]")
     words = "Residuals, predicted less measured: noise scatters around 0; what stays on one side is the model's error."
     return [(words, path)]
-
-
-def _residuals(axes: object, part: FittedPart) -> None:
-    times, r = part.part.observation.times, part.residuals
-    plot = axes.plot  # type: ignore[attr-defined]
-    if r.shape[1] <= 4:
-        for k, series in enumerate(r.T):
-            plot(times, series, marker="o", markersize=3, color=PALETTE[k % len(PALETTE)])
-    else:
-        plot(times, np.sqrt((r**2).mean(axis=1)), marker="o", color=PALETTE[0], label="root mean square")
-        plot(times, r.mean(axis=1), marker="o", color=PALETTE[1], label="mean")
-        axes.legend(loc="upper left")  # type: ignore[attr-defined]
-    axes.axhline(0.0, color=FAINT, linewidth=1.0)  # type: ignore[attr-defined]
-    axes.set(title=part.label, ylabel=f"residual [{part.part.observation.unit}]")  # type: ignore[attr-defined]
 
 
 def profile_figure(profiles: Sequence[Profile], path: Path) -> Figures:
@@ -84,17 +79,11 @@ def video_figures(fitted: Fit, folder: Path) -> Figures:
 
 
 def fit_page(fitted: Fit) -> str:
-    rows = [
-        (
-            one.label.replace("_", " "),
-            unit_of(one.label) or "-",
-            f"{one.start:.4g}",
-            with_error(one.value, one.error),
-            f"{one.lower:.4g}",
-            f"{one.upper:.4g}",
-        )
-        for one in fitted.numbers()
-    ]
+    rows = []
+    for one in fitted.numbers():
+        label, unit = one.label.replace("_", " "), unit_of(one.label) or "-"
+        start, lower, upper = (f"{number:.4g}" for number in (one.start, one.lower, one.upper))
+        rows.append((label, unit, start, with_error(one.value, one.error), lower, upper))
     words = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*fitted.cautions, NOISE_ALONE))
     head = ("parameter", "unit", "start", "found", "95 %, from", "to")
     return table(head, rows) + words + picture(fitted, lambda path: residual_figure(fitted, path))

@@ -340,7 +340,20 @@ def fit(
     problem = LeastSquares(each, coordinates, on_trial)
     found = _from(problem, coordinates.start, iterations)
     if starts != 1 and (starts is not None or found.in_doubt):
-        found = _best(problem, found, iterations, starts)
+        tried = list(found.tried)
+        for other_start in other_starts(problem, 3 if starts is None else starts - 1):
+            try:
+                other = _from(problem, other_start, iterations)
+            except (ComputationError, DivergedError):
+                continue
+            tried += other.tried
+            if other.tried[0].misfit < min(one.misfit for one in found.tried):
+                found = other
+            if starts is None and not (found.in_doubt and elsewhere(found, tried)):
+                break  # a fit without doubts, or all have the same end
+        doubts = (*found.doubts, *other_valleys(found, tried))
+        spent = replace(found, runs=problem.runs, tangents=problem.tangents, refused=problem.refused)
+        found = replace(spent, tried=tuple(tried), doubts=doubts)
     if not found.doubts:
         return found
     assert found.at is not None
@@ -376,25 +389,6 @@ def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
         problem=problem,
         at=at,
     )
-
-
-def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None) -> Fit:
-    """Return the fit with the least residuals among ``found`` and fits from other starts. With ``starts`` None, stop
-    after a fit without doubts, or if all fits have the same end."""
-    tried = list(found.tried)
-    for start in other_starts(problem, 3 if starts is None else starts - 1):
-        try:
-            other = _from(problem, start, iterations)
-        except (ComputationError, DivergedError):
-            continue
-        tried += other.tried
-        if other.tried[0].misfit < min(one.misfit for one in found.tried):
-            found = other
-        if starts is None and not (found.in_doubt and elsewhere(found, tried)):
-            break
-    doubts = (*found.doubts, *other_valleys(found, tried))
-    counted = replace(found, runs=problem.runs, tangents=problem.tangents, refused=problem.refused)
-    return replace(counted, tried=tuple(tried), doubts=doubts)
 
 
 def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:

@@ -103,11 +103,7 @@ def search(
 
 
 def next_point(
-    problem: LeastSquares,
-    at: Linearised,
-    weights: Sequence[Weighting],
-    damping: float = 0.0,
-    fixed: Sequence[int] = (),
+    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], damping: float = 0.0, fixed: Sequence[int] = ()
 ) -> tuple[np.ndarray, float]:
     """Minimise the linear model's sum of squares within the bounds; return the point (free,) and the decrease."""
     from scipy.optimize import lsq_linear
@@ -200,8 +196,7 @@ def _differences(
 
 
 def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Linearised]:
-    """Return a list of the point at ``shift`` within the bounds, with the present Jacobian; empty if its run
-    diverges."""
+    """Return the point at ``shift`` within the bounds, with the present Jacobian; nothing if its run diverges."""
     point = np.clip(at.u + shift, *problem.coordinates.bounds)
     try:
         return [Linearised(point, problem.residuals(point), at.jacobians)] if (point != at.u).any() else []
@@ -218,12 +213,19 @@ def misfit(problem: LeastSquares, residuals: list[np.ndarray]) -> float:
 def other_starts(problem: LeastSquares, count: int) -> list[np.ndarray]:
     """Return at most ``count`` points (free,) of a Sobol sequence, best first. The sequence covers the bounds, and two
     decades to both sides of positive numbers without bounds; other numbers keep their start."""
+    from scipy.stats import qmc
+
     start, (lower, upper) = problem.coordinates.start, problem.coordinates.bounds
     reach = np.where(problem.coordinates.by_logarithm, np.log(100.0), 0.0)
     lower = np.where(np.isfinite(lower), lower, start - reach)
     upper = np.where(np.isfinite(upper), upper, start + reach)
-    found, chosen = [], list[np.ndarray]()
-    for point in lower + (upper - lower) * _sequence(upper > lower):
+    searched, found, chosen = upper > lower, [], list[np.ndarray]()
+    if not (dimensions := int(searched.sum())):
+        return []
+    power = int(np.ceil(np.log2(min(8 * dimensions, 64))))
+    shares = np.zeros((2**power, len(searched)))
+    shares[:, searched] = qmc.Sobol(dimensions, scramble=False).random_base2(power) + 0.5 ** (power + 1)
+    for point in lower + (upper - lower) * shares:
         try:
             found.append((misfit(problem, problem.residuals(point)), point))
         except DivergedError:
@@ -233,16 +235,3 @@ def other_starts(problem: LeastSquares, count: int) -> list[np.ndarray]:
         if len(chosen) < count and all(one.max() > 0.2 for one in away):
             chosen.append(point)
     return chosen
-
-
-def _sequence(searched: np.ndarray) -> np.ndarray:
-    """Return points (points, free) from 0 to 1 of a Sobol sequence over the ``searched`` numbers."""
-    from scipy.stats import qmc
-
-    dimensions = int(searched.sum())
-    if not dimensions:
-        return np.zeros((0, len(searched)))
-    power = int(np.ceil(np.log2(min(8 * dimensions, 64))))
-    points = np.zeros((2**power, len(searched)))
-    points[:, searched] = qmc.Sobol(dimensions, scramble=False).random_base2(power) + 0.5 ** (power + 1)
-    return points

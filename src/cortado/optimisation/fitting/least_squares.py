@@ -128,8 +128,7 @@ class Coordinates:
         return {n: whole[ends[k] : ends[k + 1]].reshape(self.shapes[k]) for k, n in enumerate(self.names)}
 
     def directions(self, u: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Return the derivative of the parameters with respect to each coordinate, without parameters of derivative
-        0."""
+        """Return the derivative of the parameters with respect to each coordinate, without those that are 0."""
         found, slopes = [], self.slopes(u)
         for k, place in enumerate(np.flatnonzero(self.free)):
             whole = np.zeros(len(self.at_start))
@@ -207,10 +206,7 @@ def weighted(parts: Sequence[Part], weights: Sequence[Weighting], values: Sequen
 
 class LeastSquares:
     def __init__(
-        self,
-        experiments: Sequence[Experiment],
-        coordinates: Coordinates,
-        on_trial: Callable[[], None] | None = None,
+        self, experiments: Sequence[Experiment], coordinates: Coordinates, on_trial: Callable[[], None] | None = None
     ):
         self.experiments, self.coordinates = tuple(experiments), coordinates
         self._on_trial = on_trial

@@ -119,21 +119,16 @@ class Frames:
         return (1.0 - shares) * before + shares * np.array(after)
 
 
-def clock_of(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray]:
+def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict[str, np.ndarray]:
+    """Return the parameter of a calibrated clock; raise `InputError` if it must be ``alone`` and is not."""
+    for name in calibrate if alone else ():
+        if name != CLOCK:
+            raise InputError(f"calibrate has {shown(name)}, but must be made of {CLOCK}.")
     return {CLOCK: np.array(as_one_number("clock", start))} if CLOCK in calibrate else {}
 
 
-def only_a_clock(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray]:
-    """Return the parameter of a calibrated clock; raise `InputError` if anything else is calibrated."""
-    for name in calibrate:
-        if name != CLOCK:
-            raise InputError(f"calibrate has {shown(name)}, but must be made of {CLOCK}.")
-    return clock_of(calibrate, start)
-
-
 def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Return times plus ``clock`` [s], numbers and noise of an observation; raise `InputError` for unsuitable
-    arrays."""
+    """Return times plus ``clock`` [s], numbers and noise; raise `InputError` for unsuitable arrays."""
     moments = read_only("times", as_numbers("times", times) + as_one_number("clock", clock))
     values = read_only("measured", measured)
     if moments.ndim != 1 or len(moments) < LEAST_FRAMES:
@@ -192,7 +187,7 @@ class Video:
         seen = pictures[:, inside].reshape(len(pictures), -1)
         self.times, self.measured, self.noise = checked(times, seen, noise, clock)
         self.calibration = Calibration(renderer.view, tuple(name for name in calibrate if name != CLOCK))
-        self._clock = clock_of(calibrate, clock)
+        self._clock = clock_of(calibrate, clock, alone=False)
         self._seen: dict[str, tuple[bytes, Renderer]] = {}
 
     @property
@@ -252,7 +247,7 @@ class SensorSeries:
         units, NaN to ignore one, at ``times`` (frames,) [s] after the start of the run. ``dimension``: of the scene.
         ``columns``: names of the k measured columns, by default all. ``noise``: standard deviation, if known. ``clock``
         [s] is added to the times; ``calibrate=["start"]`` fits it."""
-        self.start = only_a_clock(calibrate, clock)
+        self.start = clock_of(calibrate, clock)
         self.sensor = checked_sensor(sensor)
         known = dict(sensor.columns(dimension))
         names = list(known) if columns is None else list(columns)
@@ -313,7 +308,7 @@ class Tracks:
         ``times`` (frames,) [s] after the start of the run, NaN for unseen tracers. ``noise``: standard deviation of a
         coordinate [m], if known. ``clock`` [s] is added to the times; ``calibrate=["start"]`` fits it. Raise
         `InputError` if a tracer has no fluid around it."""
-        self.start = only_a_clock(calibrate, clock)
+        self.start = clock_of(calibrate, clock)
         begun, places = as_numbers("first", first), as_numbers("positions", positions)
         tracers, d = begun.shape if begun.ndim == 2 else (0, 0)
         if not tracers or d != simulation.dimension:
