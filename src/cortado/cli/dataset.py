@@ -69,13 +69,11 @@ class Member:
         return True, [str(one.message) for one in caught if issubclass(one.category, CortadoWarning)]
 
 
-def make_dataset(
-    file: Path, runs: int, out: Path, overrides: list[str], device: str, precision: str, where: Where
-) -> str:
+def make_dataset(file: Path, runs: int, out: Path, words: list[str], device: str, precision: str, where: Where) -> str:
     """Compute the missing runs of a new or existing data set, and write its files; return a sentence that names the
     folder. Raise `ComputationError` if the disk is full, or if training, validation or test has no run."""
-    table = _table(file, overrides)
-    of_scene = [one for one in overrides if one not in overrides_of(overrides, ("dataset",))]
+    table = _table(file, words)
+    of_scene = [one for one in words if one not in overrides_of(words, ("dataset",))]
     member = Member(file.absolute(), tuple(of_scene), table, out.absolute(), device, precision)
     least = 1 + (table.valid > 0.0) + (table.test > 0.0)
     if not least <= runs <= MOST_RUNS or not (split := table.split(runs))["train"]:

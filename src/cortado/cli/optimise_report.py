@@ -15,6 +15,7 @@ from cortado.optimisation.solved_task import TaskFigures, component_names, knot_
 from cortado.optimisation.task_files import Setup, Task, task_in_words
 from cortado.pictures.pages import MOST_NUMBERS, Section, written
 from cortado.pictures.particle_view import scene_view
+from cortado.scene.parameter_values import Arrays
 from cortado.scene.scene import scene_in_words
 
 Rows = list[tuple[object, ...]]
@@ -45,19 +46,10 @@ class Verdict:
 
 
 def judge(
-    task: Task,
-    result: Result,
-    estimate: dict[str, np.ndarray] | None = None,
-    noise: float | None = None,
-    first: float | None = None,
+    task: Task, result: Result, estimate: Arrays | None = None, noise: float | None = None, first: float | None = None
 ) -> Verdict:
-    """Judge a result by the task's [optimise.check].
-
-    Args:
-        estimate: the parameters, if the result has only coordinates.
-        noise: the peak signal-to-noise ratio reached [dB].
-        first: the loss at the start, if the history begins with another loss.
-    """
+    """Judge a result by the task's [optimise.check], with the parameters, if the result has only coordinates, the peak
+    signal-to-noise ratio reached [dB], and the ``first`` loss, if the history begins with another one."""
     check, estimate = task.optimise.check, result.parameters if estimate is None else estimate
     first = result.history[0].loss if first is None else first
     reduction = first / result.loss if result.loss > 0.0 else math.inf

@@ -85,9 +85,7 @@ class Window:
     def close(self) -> None:
         self._guarded.close()
 
-    def show(
-        self, positions: Points, colours: Points, out: NDArray[np.bool_], quantities: Mapping[str, Quantity]
-    ) -> None:
+    def show(self, positions: Points, colours: Points, out: NDArray, quantities: Mapping[str, Quantity]) -> None:
         """Replace the drawn particles by those that are ``out`` (n,) of emitters and drains.
 
         Args:

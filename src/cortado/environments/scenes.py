@@ -84,18 +84,16 @@ class EnvState:
         chosen = list(numbers) if isinstance(numbers, Iterable) else [numbers]
         if not chosen or any(not isinstance(b, (int, np.integer)) or not 0 <= b < len(self) for b in chosen):
             raise InputError(f"numbers are {shown(numbers)}, but must be one or more from 0 to {len(self) - 1}.")
+        arrays: Any = {name: getattr(self, name)[chosen] for name in ("step_number", "over", "observations")}
+        for name in ("clocks", "starts", "generators"):
+            arrays[name] = tuple(getattr(self, name)[b] for b in chosen)
         return replace(
             self,
             kind=self.kind.replace(counted(len(self), "scene"), counted(len(chosen), "scene"), 1),
             fields={name: _picked(array, chosen, len(self)) for name, array in self.fields.items()},
-            clocks=tuple(self.clocks[b] for b in chosen),
-            step_number=self.step_number[chosen],
-            starts=tuple(self.starts[b] for b in chosen),
             driven=tuple(one[chosen] for one in self.driven),
             lost=frozenset(k for k, b in enumerate(chosen) if b in self.lost),
-            over=self.over[chosen],
-            observations=self.observations[chosen],
-            generators=tuple(self.generators[b] for b in chosen),
+            **arrays,
         )
 
     def __repr__(self) -> str:

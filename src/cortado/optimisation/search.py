@@ -96,9 +96,7 @@ class ReplayLog:
     Every record is on the disk before `append` returns. The next evaluation overwrites an incomplete last record.
     """
 
-    def __init__(
-        self, folder: str | os.PathLike[str], layout: ParameterLayout, settings: Mapping[str, str], resume: bool
-    ) -> None:
+    def __init__(self, folder: Path | str, layout: ParameterLayout, settings: Mapping[str, str], resume: bool):
         """Open the log of ``folder`` to ``resume`` a search, or begin a new log.
 
         Raise `InputError` if the folder contains evaluations and ``resume`` is false, if ``settings`` differ, or if a

@@ -19,14 +19,13 @@ light of a frame, vary together.
    larger by the factor 1 + 2 / (n (1 - c)) on average.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from cortado.errors import ComputationError
-from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting, weighted
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting, Weights, weighted
 
 LONGEST = 3.0
 """Greatest correlation time, relative to the length of the record."""
@@ -181,7 +180,7 @@ class Certainty:
     parts: tuple[FittedPart, ...]
 
     @classmethod
-    def of(cls, problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> "Certainty":
+    def of(cls, problem: Fitted, at: Linearised, weights: Weights) -> "Certainty":
         """Compute the certainty at a point; raise `ComputationError` if a combination of parameters is undetermined."""
         N = hessian(problem, at, weights)
         N_inverse = inverse(problem, N)
@@ -203,7 +202,7 @@ class Certainty:
         return cls(N, covariance, np.array(freedom), tuple(scores), tuple(parts))
 
 
-def noise_of(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> list[Weighting]:
+def noise_of(problem: Fitted, at: Linearised, weights: Weights) -> list[Weighting]:
     """Return weights from the residuals of a first fit, smaller for correlated numbers."""
     N_inverse = inverse(problem, hessian(problem, at, weights))
     found = []
@@ -219,13 +218,13 @@ def noise_of(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> l
     return found
 
 
-def counted_covariance(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
+def counted_covariance(problem: Fitted, at: Linearised, weights: Weights) -> np.ndarray:
     """Return the covariance (free, free) of the estimate if all measured numbers were independent."""
     alone = [Weighting(spread(r) or weight.scale) for r, weight in zip(at.residuals, weights, strict=True)]
     return inverse(problem, hessian(problem, at, alone))
 
 
-def hessian(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
+def hessian(problem: Fitted, at: Linearised, weights: Weights) -> np.ndarray:
     """Return N = J^T J (free, free) of the weighted Jacobians."""
     flat = (J.reshape(-1, len(at.u)) for J in weighted(problem.parts, weights, at.jacobians))
     return np.asarray(sum(J.T @ J for J in flat))

@@ -21,7 +21,7 @@ from cortado.optimisation.fitting.certainty import (
     spread,
 )
 from cortado.optimisation.fitting.experiment import Experiment
-from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting, weighted
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weights, weighted
 from cortado.optimisation.fitting.observations import CLOCK
 from cortado.scene.parameter_values import Arrays
 
@@ -31,9 +31,7 @@ EXACT = 1e-4
 """Residuals below this part of the largest measured number come from simulated measurements, and cause no doubt."""
 
 
-def doubts_of(
-    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], certainty: Certainty
-) -> tuple[str, ...]:
+def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty: Certainty) -> tuple[str, ...]:
     """Return sentences of doubt about a fit; empty if residuals look like noise and determine the parameters."""
     found, is_exact = list[str](), True
     for part, r, weight in zip(problem.parts, at.residuals, weights, strict=True):
@@ -90,9 +88,7 @@ def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]
     return max(quiet, 0.002 * float(np.nanmax(np.abs(measured)))), moving  # half a step of 8 bits
 
 
-def _halves(
-    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], scores: Sequence[ScoreCovariance]
-) -> list[str]:
+def _halves(problem: LeastSquares, at: Linearised, weights: Weights, scores: Sequence[ScoreCovariance]) -> list[str]:
     """Return sentences about parameters of which the two halves of the frames tell different Gauss-Newton steps."""
     size, steps, variances = len(at.u), [], []
     white, slopes = (weighted(problem.parts, weights, own) for own in (at.residuals, at.jacobians))
@@ -126,11 +122,7 @@ class Explained:
 
 
 def explained(
-    problem: LeastSquares,
-    at: Linearised,
-    weights: Sequence[Weighting],
-    columns: Sequence[np.ndarray],
-    is_doubted: bool = False,
+    problem: LeastSquares, at: Linearised, weights: Weights, columns: Sequence[np.ndarray], is_doubted: bool = False
 ) -> Explained | None:
     """Estimate the sizes of possible causes of residuals by a Gauss-Newton step. ``columns``: derivatives (frames, m,
     causes) of each part's predictions. Return None if the sizes are within the noise, or undetermined.
@@ -164,7 +156,7 @@ def explained(
     return None if share < (0.5 if is_doubted else 0.05) else Explained(sizes, share)
 
 
-def dear_causes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
+def dear_causes(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
     """Return sentences about the fluid's density and the container's slip, from further runs."""
     values, found = problem.coordinates.values(at.u), list[str]()
     with warnings.catch_warnings():
@@ -186,7 +178,7 @@ def dear_causes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighti
     return found
 
 
-def _step(wide: Widened, before: Linearised, weights: Sequence[Weighting]) -> Linearised:
+def _step(wide: Widened, before: Linearised, weights: Weights) -> Linearised:
     N_inverse = inverse(wide, hessian(wide, before, weights))
     white, slopes = (weighted(wide.parts, weights, own) for own in (before.residuals, before.jacobians))
     score: np.ndarray = sum(np.einsum("fmp,fm->p", J, r) for J, r in zip(slopes, white, strict=True))
@@ -198,7 +190,7 @@ def _nothing(problem: LeastSquares, count: int) -> list[np.ndarray]:
     return [np.zeros((*part.observation.measured.shape, count)) for part in problem.parts]
 
 
-def _trends(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
+def _trends(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
     """Return sentences about linear and quadratic trends in parts of at most four numbers per frame."""
     found = []
     for k, part in enumerate(problem.parts):
@@ -219,7 +211,7 @@ def _trends(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting])
     return found
 
 
-def _clocks(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
+def _clocks(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
     found = []
     for k, part in enumerate(problem.parts):
         if CLOCK in part.observation.start:

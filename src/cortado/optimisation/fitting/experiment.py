@@ -72,12 +72,12 @@ class Experiment:
         return f"Experiment({self.simulation!r}, {', '.join(self.observations)})"
 
     @property
-    def start(self) -> dict[str, np.ndarray]:
+    def start(self) -> Arrays:
         """Return first values of the observations' parameters, such as "camera.rotation"."""
         return {f"{name}.{key}": v for name, one in self.observations.items() for key, v in one.start.items()}
 
     @property
-    def unseen(self) -> dict[str, np.ndarray]:
+    def unseen(self) -> Arrays:
         """Return masks by the names of `start`, true for numbers on which no measurement depends."""
         each = self.observations.items()
         return {f"{name}.{key}": mask for name, one in each for key, mask in getattr(one, "unseen", {}).items()}
@@ -103,15 +103,13 @@ class Experiment:
         found.__dict__ |= {**self.__dict__, "observations": FixedDict(again)}
         return found
 
-    def predicted(self, parameters: Values) -> dict[str, np.ndarray]:
+    def predicted(self, parameters: Values) -> Arrays:
         """Return the simulation's predictions for each observation, (frames, m) by name."""
         frames, values = self._frames(parameters), self._shared(parameters)
         wanted = self._wanted(frames)
         return self._read(self._problem(values, wanted).states(values, wanted), frames, parameters)
 
-    def linearised(
-        self, parameters: Values, directions: Sequence[Values]
-    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    def linearised(self, parameters: Values, directions: Sequence[Values]) -> tuple[Arrays, Arrays]:
         """Return predictions (frames, m) and derivatives along directions (frames, m, directions), by forward mode."""
         values, moves = self._shared(parameters), [self._shared(direction) for direction in directions]
         frames = self._frames(parameters)
@@ -183,9 +181,7 @@ class Experiment:
             self._problems[key] = Problem(simulation, steps, own.loss, state=own.state)
         return self._problems[key]
 
-    def _read(
-        self, ends: Mapping[int, Snapshot], frames: Mapping[str, Frames], parameters: Values
-    ) -> dict[str, np.ndarray]:
+    def _read(self, ends: Mapping[int, Snapshot], frames: Mapping[str, Frames], parameters: Values) -> Arrays:
         found = {}
         for name, one in self.observations.items():
             own = self._own(name, parameters)
@@ -201,7 +197,7 @@ class Experiment:
         own = self.start
         return {name: value for name, value in values.items() if name not in own}
 
-    def _own(self, observation: str, values: Values) -> dict[str, np.ndarray]:
+    def _own(self, observation: str, values: Values) -> Arrays:
         return {
             key: np.asarray(values[f"{observation}.{key}"], dtype=np.float64)
             for key in self.observations[observation].start

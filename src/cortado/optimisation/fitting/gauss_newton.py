@@ -15,7 +15,7 @@ import numpy as np
 
 from cortado.errors import DivergedError
 from cortado.optimisation.fitting.certainty import Certainty, spread
-from cortado.optimisation.fitting.least_squares import TINY, LeastSquares, Linearised, TrialPoints, Weighting
+from cortado.optimisation.fitting.least_squares import TINY, LeastSquares, Linearised, TrialPoints, Weights
 
 GREATEST_LOGARITHM = 1.0
 """Greatest change of a logarithm in a step."""
@@ -35,7 +35,7 @@ class Searched:
     converged: bool
 
 
-def least(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], trials: int) -> tuple[Linearised, bool]:
+def least(problem: LeastSquares, at: Linearised, weights: Weights, trials: int) -> tuple[Linearised, bool]:
     """Minimise the sum of squares, first with estimated Jacobians, later with tangents. Return the minimum with its
     tangents and True, or the lowest point and False."""
     for _ in range(4):
@@ -57,12 +57,7 @@ def least(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], t
 
 
 def search(
-    problem: LeastSquares,
-    at: Linearised,
-    weights: Sequence[Weighting],
-    trials: int,
-    enough: float,
-    fixed: Sequence[int] = (),
+    problem: LeastSquares, at: Linearised, weights: Weights, trials: int, enough: float, fixed: Sequence[int] = ()
 ) -> Searched:
     """Lower the sum of squares until a step is predicted to lower it by a fraction of at most ``enough``. The
     coordinates with numbers in ``fixed`` do not change.
@@ -103,7 +98,7 @@ def search(
 
 
 def next_point(
-    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], damping: float = 0.0, fixed: Sequence[int] = ()
+    problem: LeastSquares, at: Linearised, weights: Weights, damping: float = 0.0, fixed: Sequence[int] = ()
 ) -> tuple[np.ndarray, float]:
     """Minimise the linear model's sum of squares within the bounds; return the point (free,) and the decrease."""
     from scipy.optimize import lsq_linear
@@ -124,9 +119,7 @@ def next_point(
     return point, float((q**2).sum() - ((R @ shift + q) ** 2).sum())
 
 
-def over_the_bars(
-    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]
-) -> tuple[Linearised, bool | None]:
+def over_the_bars(problem: LeastSquares, at: Linearised, weights: Weights) -> tuple[Linearised, bool | None]:
     """Return the end of a search with differences over the width of the error bars, and True if they converged; return
     None if the tangents pass the check."""
     axes = _axes(problem, at, weights)
@@ -147,7 +140,7 @@ def over_the_bars(
     return at, False
 
 
-def _axes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
+def _axes(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray:
     """Return independent moves by `REACH` standard errors as columns (free, free), at most as long as a search step."""
     covariance = Certainty.of(problem, at, weights).covariance
     axes = REACH * np.linalg.cholesky(covariance + (1e-12 * np.trace(covariance) + TINY) * np.eye(len(covariance)))
@@ -156,7 +149,7 @@ def _axes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -
     return np.asarray(axes * np.minimum(1.0, GREATEST_LOGARITHM / longest))
 
 
-def _is_straight(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axis: np.ndarray) -> bool:
+def _is_straight(problem: LeastSquares, at: Linearised, weights: Weights, axis: np.ndarray) -> bool:
     """Test if tangents predict the residuals at the end of an axis, on the side away from the start of the search."""
     each = zip(problem.parts, at.jacobians, strict=True)
     if all(np.abs(J @ axis).max() <= 1e-5 * np.nanmax(np.abs(part.observation.measured)) for part, J in each):
@@ -172,7 +165,7 @@ def _is_straight(problem: LeastSquares, at: Linearised, weights: Sequence[Weight
 
 
 def _differences(
-    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axes: np.ndarray
+    problem: LeastSquares, at: Linearised, weights: Weights, axes: np.ndarray
 ) -> tuple[Linearised, list[Linearised]]:
     """Return the point with a Jacobian of differences along the axes, and the points that were run.
 

@@ -16,6 +16,7 @@ from cortado.arrays import as_numbers, require_table
 from cortado.errors import DivergedError, InputError
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.observations import Observation
+from cortado.scene.parameter_values import Arrays
 
 MOST_NUMBERS = 100
 DIFFERENCE = 0.02
@@ -118,16 +119,16 @@ class Coordinates:
         """Return the derivatives (free,) of numbers with respect to their coordinates."""
         return np.where(self.by_logarithm, self.numbers(u), 1.0)
 
-    def values(self, u: np.ndarray) -> dict[str, np.ndarray]:
+    def values(self, u: np.ndarray) -> Arrays:
         whole = self.at_start.copy()
         whole[self.free] = self.numbers(u)
         return self.named(whole)
 
-    def named(self, whole: np.ndarray) -> dict[str, np.ndarray]:
+    def named(self, whole: np.ndarray) -> Arrays:
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)])
         return {n: whole[ends[k] : ends[k + 1]].reshape(self.shapes[k]) for k, n in enumerate(self.names)}
 
-    def directions(self, u: np.ndarray) -> list[dict[str, np.ndarray]]:
+    def directions(self, u: np.ndarray) -> list[Arrays]:
         """Return the derivative of the parameters with respect to each coordinate, without those that are 0."""
         found, slopes = [], self.slopes(u)
         for k, place in enumerate(np.flatnonzero(self.free)):
@@ -136,7 +137,7 @@ class Coordinates:
             found.append({name: value for name, value in self.named(whole).items() if value.any()})
         return found
 
-    def spread(self, free: np.ndarray, otherwise: float) -> dict[str, np.ndarray]:
+    def spread(self, free: np.ndarray, otherwise: float) -> Arrays:
         """Return fitted numbers (free,) as arrays by name, filled with ``otherwise`` for other numbers."""
         whole = np.full(len(self.at_start), otherwise)
         whole[self.free] = free
@@ -188,6 +189,10 @@ class Weighting:
         return whitened(values, times, self.correlation_time) / self.scale
 
 
+Weights = Sequence[Weighting]
+"""A weighting for each part."""
+
+
 @dataclass(frozen=True)
 class Linearised:
     """Residuals and Jacobians of all parts at coordinates u (free,), in the units of the measurements."""
@@ -199,7 +204,7 @@ class Linearised:
     """Jacobian (frames, m, free) of each part."""
 
 
-def weighted(parts: Sequence[Part], weights: Sequence[Weighting], values: Sequence[np.ndarray]) -> list[np.ndarray]:
+def weighted(parts: Sequence[Part], weights: Weights, values: Sequence[np.ndarray]) -> list[np.ndarray]:
     each = zip(parts, weights, values, strict=True)
     return [weight.of(own, part.observation.times) for part, weight, own in each]
 
@@ -266,17 +271,15 @@ class LeastSquares:
                     jacobians.append(jacobian)
         return Linearised(u.copy(), residuals, jacobians)
 
-    def stacked(self, at: Linearised, weights: Sequence[Weighting]) -> tuple[np.ndarray, np.ndarray]:
+    def stacked(self, at: Linearised, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
         """Return the weighted Jacobian (numbers, free) and residuals (numbers,) of all parts."""
         J = [own.reshape(-1, len(at.u)) for own in weighted(self.parts, weights, at.jacobians)]
         return np.concatenate(J), np.concatenate([r.ravel() for r in weighted(self.parts, weights, at.residuals)])
 
-    def sum_of_squares(self, residuals: Sequence[np.ndarray], weights: Sequence[Weighting]) -> float:
+    def sum_of_squares(self, residuals: Sequence[np.ndarray], weights: Weights) -> float:
         return float(sum((r**2).sum() for r in weighted(self.parts, weights, residuals)))
 
-    def _run(
-        self, number: int, values: dict[str, np.ndarray], along: Sequence[dict[str, np.ndarray]]
-    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    def _run(self, number: int, values: Arrays, along: Sequence[Arrays]) -> tuple[Arrays, Arrays]:
         experiment, at = self.experiments[number], self.values_of(number, values)
         self.runs, self.tangents = self.runs + 1, self.tangents + len(along)
         try:
@@ -285,7 +288,7 @@ class LeastSquares:
             self.refused += 1
             raise
 
-    def values_of(self, experiment: int, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def values_of(self, experiment: int, values: Arrays) -> Arrays:
         """Return the values of an experiment's parameters, without those of other experiments' observations."""
         others = {name for one in self.experiments for name in one.start} - set(self.experiments[experiment].start)
         return {name: value for name, value in values.items() if name not in others}
@@ -295,7 +298,7 @@ class LeastSquares:
 
 
 class TrialPoints:
-    def __init__(self, problem: LeastSquares, weights: Sequence[Weighting], at: Linearised):
+    def __init__(self, problem: LeastSquares, weights: Weights, at: Linearised):
         J, r = problem.stacked(at, weights)
         self._metric = np.asarray(np.linalg.qr(J, mode="r"))
         self._scales = [weight.scale for weight in weights]
