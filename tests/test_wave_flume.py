@@ -15,10 +15,10 @@ FLUME = names_of("wave_flume.py")
 OWN = ["--hull", "hull.csv", "--draught", "0.15", "--at", "1", "--centre", "0.12", "--gyration", "0.14"]
 
 
-@pytest.mark.parametrize("period", [0.897, 1.158, 1.5])
-def test_a_steady_flap_makes_the_waves_of_its_transfer_function(period):
-    """A flap with a hinge above the floor (Dean and Dalrymple 1991, section 6.3), far from it."""
-    omega, depth, hinge = 2.0 * np.pi / period, FLUME["DEPTH"], FLUME["HINGE"]
+@pytest.mark.parametrize(("period", "hinge"), [(0.897, 0.1), (1.158, 0.0), (1.5, 0.1)])
+def test_a_steady_flap_makes_the_waves_of_its_transfer_function(period, hinge):
+    """A flap with a hinge at the floor or above it (Dean and Dalrymple 1991, section 6.3), far from it."""
+    omega, depth = 2.0 * np.pi / period, FLUME["DEPTH"]
     k = omega**2 / 9.81
     for _ in range(100):
         k = omega**2 / (9.81 * np.tanh(k * depth))
@@ -27,7 +27,7 @@ def test_a_steady_flap_makes_the_waves_of_its_transfer_function(period):
     wanted = 2.0 * np.sinh(kd) / (0.5 * np.sinh(2.0 * kd) + kd) * lever
     times = np.arange(0.0, 16.0, 0.01)
     stroke = 0.01 * np.minimum(times / 4.0, 1.0) * np.sin(omega * times)
-    found, late = FLUME["theory"](times, stroke, np.array([3.0]))[:, 0], times > 11.0
+    found, late = FLUME["theory"](times, stroke, np.array([3.0]), hinge=hinge)[:, 0], times > 11.0
     assert abs(FLUME["swing"](times[late], found[late], period)) / 0.01 == pytest.approx(wanted, rel=0.01)
     assert FLUME["period"](times, stroke) == pytest.approx(period, abs=0.005)
 
@@ -80,14 +80,21 @@ def test_a_flap_and_a_hull_of_ones_own_need_no_measurements(monkeypatch, own_cas
     said = capsys.readouterr().out
     assert "1 mm and 1 s" in said and "probes left out" in said and "3 m\n" in said
     assert "37.50 kg for each metre" in said and "correlation" not in said
-    assert [line.split()[0] for line in said.splitlines()[-5:]] == ["0.50", "1.60", "sway_m:", "heave_m:", "roll_rad:"]
+    assert [line.split()[0] for line in said.splitlines()[-6:-1]] == [
+        "0.50",
+        "1.60",
+        "sway_m:",
+        "heave_m:",
+        "roll_rad:",
+    ]
     assert "nan" not in said and np.ptp(read_picture("wave_flume.png")) > 0.5
 
 
 @pytest.mark.parametrize(
     ("options", "wanted"),
     [
-        (["hull.csv"], "has no column time_s"),
+        (["hull.csv"], "has the columns x_m, y_m, but must have time_s"),
+        (["--hinge", "1"], "--hinge is 1 m, but must be from 0 to less than 1 m"),
         (["gone.csv"], "gone.csv not found"),
         (["flap.csv", *OWN, "--hull", "crossed.csv"], "no polygon"),
         (["flap.csv", *OWN, "--draught", "0.3"], "would not float"),

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from section import HELD, MEASURED, Rig, Section
+from section import DEPTH, HELD, HINGE, MEASURED, Rig, Section
 
 BEGIN, END, STEP, SHORTEST = 13.0, 22.0, 0.02, 4.0  # when waves are compared [s], samples [s], at least so long [s]
 PROBES = {"probe_1_m": 3.0, "probe_2_m": 4.95, "probe_3_m": 5.2, "probe_4_m": 5.5, "probe_6_m": 8.5}  # [m]
@@ -61,18 +61,26 @@ class Case:
 
 
 def period(times, stroke):
-    """The period [s] at which the record of the flap has most of its amplitude."""
+    """The period [s] with which two harmonics come nearest to the record of the flap, where the first is greatest."""
     late = times >= min(8.0, 0.5 * times[-1])
     tried = np.linspace(0.6, 2.5, 1901)
-    return tried[np.argmax([abs(swing(times[late], stroke[late], one)) for one in tried])]
+    most = tried[np.argmax([abs(swing(times[late], stroke[late], one)) for one in tried])]
+    near = tried[np.abs(tried / most - 1.0) < 0.1]
+    return near[np.argmin([harmonics(times[late], stroke[late], one)[1] for one in near])]
 
 
 def swing(times, values, long):
     """The complex amplitude of a series at a period ``long`` [s], beside its mean and its second harmonic."""
-    turn = 2.0 * np.pi * times / long
-    waves = [np.cos(turn), np.sin(turn), np.cos(2.0 * turn), np.sin(2.0 * turn), np.ones_like(turn)]
-    a, b, *_ = np.linalg.lstsq(np.stack(waves, axis=1), values, rcond=None)[0]
+    (a, b, *_), _ = harmonics(times, values, long)
     return a - 1j * b
+
+
+def harmonics(times, values, long):
+    """The cosine and sine of a period ``long`` [s] and of its half, and the mean; and the squares that are left."""
+    turn = 2.0 * np.pi * times / long
+    waves = np.stack([np.cos(turn), np.sin(turn), np.cos(2.0 * turn), np.sin(2.0 * turn), np.ones_like(turn)], axis=1)
+    found = np.linalg.lstsq(waves, values, rcond=None)[0]
+    return found, ((values - waves @ found) ** 2).sum()
 
 
 def table(path, wanted):
@@ -84,7 +92,7 @@ def table(path, wanted):
     names = found.dtype.names or ()
     for name in wanted:
         if name not in names:
-            raise ValueError(f"{path} has no column {name}; it wants {', '.join(wanted)}.")
+            raise ValueError(f"{path} has the columns {', '.join(names)}, but must have {', '.join(wanted)}.")
         if not np.isfinite(found[name]).all():
             raise ValueError(f"{path} has a line without a number in its column {name}.")
     return {name: found[name] for name in names}
@@ -118,8 +126,11 @@ def read(asked):
         case.end = times[-1]
     if case.end - case.begin < SHORTEST:
         raise ValueError(
-            f"Compared is from --begin, {case.begin:g} s, to {case.end:g} s: it wants {SHORTEST:g} s or more."
+            f"Waves are compared from --begin, {case.begin:g} s, to {case.end:g} s, but must be for {SHORTEST:g} s or "
+            f"more: give --begin {max(case.end - 9.0, 0.5 * case.end):.3g}."
         )
+    if not 0.0 <= asked.hinge < DEPTH:
+        raise ValueError(f"--hinge is {asked.hinge:g} m, but must be from 0 to less than {DEPTH:g} m.")
     return case
 
 
@@ -157,6 +168,7 @@ def parser_of(words):
     default = Path(__file__).parent / "1062.csv"
     parser.add_argument("record", type=Path, nargs="?", default=default, help="a CSV file with time_s and wavemaker_m")
     parser.add_argument("--gain", type=float, default=1.0, help="the flap moves by so many times its record")
+    parser.add_argument("--hinge", type=float, default=HINGE, help="height of the flap's hinge over the floor [m]")
     parser.add_argument("--begin", type=float, default=BEGIN, help="from when on waves are compared [s]")
     parser.add_argument("--end", type=float, default=END, help="until when [s]")
     parser.add_argument("--probes", type=float, nargs="+", help="places of probe_1_m, probe_2_m and so on [m]")

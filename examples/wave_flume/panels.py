@@ -75,7 +75,7 @@ class LinearFlume:
     ``loads`` (n, 3, 4) [N, N m] are those on the section, about its keel, and ``surfaces`` (n, places, 4) [m].
     """
 
-    def __init__(self, places, section=None):
+    def __init__(self, places, section=None, hinge=HINGE):
         self.section, self.places = section, list(places)
         if section:  # waves before and behind it
             near = max(section.place - ASIDE, 0.5 * (section.place + section.left))
@@ -90,7 +90,7 @@ class LinearFlume:
         along = (end - start) / size[:, None]
         normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
         of_q, of_potential = influence(start, along, normal, size, middle)
-        flap = np.where(kinds == "flap", -np.maximum(middle[:, 1] - HINGE, 0.0) / (DEPTH - HINGE), 0.0)
+        flap = np.where(kinds == "flap", -np.maximum(middle[:, 1] - hinge, 0.0) / (DEPTH - hinge), 0.0)
         x, y = (middle - (section.keel if section else 0.0)).T
         modes = np.stack([*normal.T, x * normal[:, 1] - y * normal[:, 0]], axis=1) * (kinds == "hull")[:, None]
         moved, top = np.concatenate([flap[:, None], modes], axis=1), np.flatnonzero(kinds == "top")
@@ -201,7 +201,7 @@ def main():
     except (OSError, ValueError) as wrong:
         parser.error(str(wrong))
     names, times, late = [*case.on_section, *case.probes], case.times, case.late
-    surface, on_section = LinearFlume(case.probes.values(), case.section).answers(case.stroke)
+    surface, on_section = LinearFlume(case.probes.values(), case.section, hinge=asked.hinge).answers(case.stroke)
     found = np.concatenate([on_section, surface] if case.section else [surface], axis=1)
     long = period(times, case.stroke)
     print(f"linear theory, waves of {long:.3f} s; amplitude, measured amplitude, ratio, phase after measured [deg]")

@@ -29,11 +29,9 @@ from section import DEPTH, GAUGE, GRAVITY, HINGE
 import cortado
 from cortado.sensors import SolidLoad, WaveGauge
 
-FOOT, BEACH, NEAR = (
-    0.05,
-    2.3,
-    6.0,
-)  # how far the flap reaches into its sill; the beach; probes of the gain are nearer [m]
+FOOT, BEACH, NEAR = 0.05, 2.3, 6.0  # of the flap in its sill; of the beach; probes of the gain are nearer [m]
+FEW = 20.0  # particles in the draught of a section that moves
+SERIES = "measured", "here", "linear theory"
 
 
 def beach(x, v, t, k, start, length):
@@ -42,14 +40,14 @@ def beach(x, v, t, k, start, length):
     return -k * way * way * v
 
 
-def flume(times, stroke, deep, long, section):
+def flume(times, stroke, deep, long, section, hinge=HINGE):
     """A flume with ``deep`` particles in its depth; ``stroke`` (times,) is that of the flap at the surface [m]."""
-    spacing, angle, arm = DEPTH / deep, -np.arctan2(stroke, DEPTH - HINGE), np.array([-0.1, 0.5 * (1.3 - HINGE - FOOT)])
+    spacing, angle, arm = DEPTH / deep, -np.arctan2(stroke, DEPTH - hinge), np.array([-0.1, 0.5 * (1.3 - hinge - FOOT)])
     cos, sin = np.cos(angle), np.sin(angle)
     turned = np.stack([cos * arm[0] - sin * arm[1], sin * arm[0] + cos * arm[1]], axis=1)
-    flap = {"name": "flap", "shape": "box", "lower": [-0.2, HINGE - FOOT], "upper": [0.0, 1.3], "motion": "path"}
-    sill = {"name": "sill", "shape": "box", "lower": [-0.4, -5.0 * spacing], "upper": [0.0, HINGE]}
-    flap |= {"times": times.tolist(), "positions": ([0.0, HINGE] + turned).tolist(), "rotations": angle.tolist()}
+    flap = {"name": "flap", "shape": "box", "lower": [-0.2, hinge - FOOT], "upper": [0.0, 1.3], "motion": "path"}
+    sill = {"name": "sill", "shape": "box", "lower": [-0.4, -5.0 * spacing], "upper": [0.0, hinge]}
+    flap |= {"times": times.tolist(), "positions": ([0.0, hinge] + turned).tolist(), "rotations": angle.tolist()}
     ship, springs = section.tables() if section else (None, [])
     return cortado.Scene(
         name="wave flume",
@@ -58,19 +56,19 @@ def flume(times, stroke, deep, long, section):
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [long, DEPTH], "phase": "water"}],
         container={"shape": "box", "lower": [-0.8, 0.0], "upper": [long, 2.0]},
-        solid=[sill, flap, *([ship] if section else [])],
+        solid=[*([sill] if hinge else []), flap, *([ship] if section else [])],
         spring=springs,
         solver={"kind": "projection", "time_step": 0.1 * spacing},
     )
 
 
-def simulated(times, stroke, places, asked, section=None, often=None):
+def simulated(times, stroke, places, asked, section=None, often=None, hinge=HINGE):
     """The run of a flume by the stroke of its flap, with gauges at places, and with a frame every ``often`` [s]."""
     step = 0.1 / asked.deep
     force = cortado.forces.Body(beach, k=6.0, start=asked.long - BEACH, length=BEACH)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", cortado.CortadoWarning)  # the limit "solids" is of water that falls: none does
-        scene = flume(times, stroke, asked.deep, asked.long, section)
+        scene = flume(times, stroke, asked.deep, asked.long, section, hinge)
         simulation = cortado.Simulation(scene, device=asked.device, forces=[force])
         sensors = {f"{place:g}": WaveGauge([place, 0.0], radius=2.0 / asked.deep) for place in places}
         sensors |= {"load": SolidLoad("section")} if section and not section.rig else {}
@@ -100,13 +98,13 @@ def surface(run, times, places):
     return np.stack([np.interp(times, gauge.times, gauge["height"]) - DEPTH for gauge in gauges], axis=1)
 
 
-def theory(times, stroke, places, length=40.0, modes=4000):
+def theory(times, stroke, places, length=40.0, modes=4000, hinge=HINGE):
     """The surface (times, places) [m] by linear theory in a long channel, mode by mode: E'' + w^2 E = S stroke''."""
     k = np.arange(modes) * np.pi / length
-    w, y = np.sqrt(GRAVITY * k * np.tanh(k * DEPTH)), np.linspace(HINGE, DEPTH, 1001)
+    w, y = np.sqrt(GRAVITY * k * np.tanh(k * DEPTH)), np.linspace(hinge, DEPTH, 1001)
     profile = np.exp(np.multiply.outer(k, y - DEPTH)) + np.exp(-np.multiply.outer(k, y + DEPTH))
     profile /= (1.0 + np.exp(-2.0 * k * DEPTH))[:, None]
-    source = np.trapezoid((y - HINGE) / (DEPTH - HINGE) * profile, y, axis=1)
+    source = np.trapezoid((y - hinge) / (DEPTH - hinge) * profile, y, axis=1)
     parts = max(round((times[1] - times[0]) / 4e-3), 1)  # so many shorter steps in each
     fine = np.linspace(times[0], times[-1], parts * (len(times) - 1) + 1)
     step, speed = fine[1] - fine[0], np.gradient(np.interp(fine, times, stroke), fine)
@@ -153,12 +151,15 @@ def main():
     asked.end, times, late, places = case.end, case.times, case.late, list(case.probes.values())
     measured, section = case.columns(case.probes), case.section
     often = 0.04 if asked.film or (section and section.rig) else None
-    run = simulated(times, case.stroke, places, asked, section, often)
+    if section and section.rig and section.draught * asked.deep / DEPTH < FEW:
+        many = section.draught * asked.deep / DEPTH
+        print(f"there are {many:.2g} particles in the draught, few for motions: compare them with linear theory")
+    run = simulated(times, case.stroke, places, asked, section, often, asked.hinge)
     here = surface(run, times, places)
     if section:
-        linear, by_theory = LinearFlume(places, section).answers(case.stroke)
+        linear, by_theory = LinearFlume(places, section, hinge=asked.hinge).answers(case.stroke)
     else:
-        linear, by_theory = theory(times, case.stroke, np.array(places)), []
+        linear, by_theory = theory(times, case.stroke, np.array(places), hinge=asked.hinge), []
 
     long, has_measured = period(times, case.stroke), np.isfinite(measured).all()
     other, name = (measured, "measured") if section and has_measured else (linear, "theory")
@@ -187,6 +188,10 @@ def main():
         print(f"{abs(expected):.4g} in linear theory; here / {what} {abs(own / beside):.3f}", end=", ")
         print(f"{np.degrees(np.angle(beside / own)):.0f} degrees after it")
     draw(times, rows, case.end)
+    names = [f"{name}, {what}" for name, each in rows.items() for what, _ in zip(SERIES, each, strict=False)]
+    table = np.stack([times, *(one for each in rows.values() for one in each)], axis=1)
+    np.savetxt("wave_flume.csv", table, "%.6g", ",", header=",".join(["time [s]", *names]), comments="")
+    print("wave_flume.png and wave_flume.csv have these series")
     if asked.film:
         run.film("wave_flume.mp4", device=asked.device, width=1280, height=240, film_frames=150)
     assert not near or same > 0.8, "the waves are not those that were measured"
@@ -205,10 +210,10 @@ def on_section(run, section):
 
 def draw(times, series, end, path="wave_flume.png"):
     """Draw what was measured, what is here, and at probes linear theory, over time: a row each, by its name."""
-    styles = ("measured", "0.65", 3.0, 1), ("here", "tab:blue", 1.2, 3), ("linear theory", "tab:orange", 1.0, 2)
+    styles = list(zip(SERIES, ("0.65", "tab:blue", "tab:orange"), (3.0, 1.2, 1.0), (1, 3, 2), strict=True))
     figure, axes = plt.subplots(len(series), sharex=True, squeeze=False, figsize=(9.0, 1.4 * len(series) + 0.7))
     for row, (name, each) in zip(axes[:, 0], series.items(), strict=True):
-        for one, (label, colour, width, order) in zip(each, styles[: len(each)], strict=True):
+        for one, (label, colour, width, order) in zip(each, styles, strict=False):
             if np.isfinite(one).any():
                 row.plot(
                     times[times <= end], one[times <= end], color=colour, linewidth=width, label=label, zorder=order
