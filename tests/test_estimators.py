@@ -10,8 +10,7 @@ import warp as wp
 from bad_scenes import one_sentence
 from cortado import Problem, Simulation, evaluate, gradients, losses
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError
-from cortado.gradients import AdjointEstimator, Estimate, Filtered
-from cortado.gradients.reverse_mode import EddyViscosity
+from cortado.gradients import AdjointEstimator, AdjointViscosity, Estimate, Filtered
 from reference import complex_step
 from scenes import Squares, Weighed, box, jet, plane, plane_of_three, pour, scene, splash
 from twins import twin
@@ -177,8 +176,8 @@ def filtered(simulation, coefficient, point=None):
     given = {name: random.standard_normal(array.shape) + 1.0 for name, array in arrays.items()}
     bar.set(given)
     before = bar.numpy(simulation.dimension)
-    viscosity = EddyViscosity(solver, coefficient)
-    viscosity(bar, rollout.parameters)
+    viscosity = AdjointViscosity(coefficient, limit=np.inf).derivative(rollout)
+    viscosity.filter(bar)
     strengths = np.empty(simulation.particles)
     strengths[solver.search.order.numpy()[: simulation.particles]] = viscosity.strengths.numpy()
     return before, bar.numpy(simulation.dimension), strengths

@@ -117,29 +117,6 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     return SimpleNamespace(crowd=crowd, strength=strength, sort=sort, viscosity=viscosity, limit=limit, squares=squares)
 
 
-class EddyViscosity:
-    """A filter that blends adjoints of positions and velocities with averages over neighbours."""
-
-    def __init__(self, solver: Solver, coefficient: float):
-        self._solver, self._coefficient = solver, coefficient
-        self._kernels = adjoint_filter_kernels(solver.discretisation)
-        precision, particles, device = solver.discretisation.precision, solver.layout.all_particles, solver.device
-        self._most, self.strengths = (wp.zeros(particles, dtype=precision.real, device=device) for _ in range(2))
-        a, b = (wp.zeros(particles, dtype=precision.vector, device=device) for _ in range(2))
-        self._sorted = {"a_sorted": a, "b_sorted": b}
-
-    def __call__(self, bar: State, parameters: Parameters) -> None:
-        """Filter the adjoint of the state from which the last replayed step starts, and set ``strengths`` of sorted
-        particles."""
-        context, kernels = self._solver.context(parameters), self._kernels
-        fields = {"a": bar.positions, "b": bar.velocities, **self._sorted}
-        flow = {"most": self._most, "strengths": self.strengths}
-        context.launch(kernels.crowd, most=self._most)
-        context.launch(kernels.strength, coefficient=self._coefficient, **flow)
-        context.launch(kernels.sort, **fields)
-        context.launch(kernels.viscosity, **flow, **fields)
-
-
 class AdjointNorms:
     """An observer of a backward pass that computes the norms of adjoints on the device."""
 
@@ -312,20 +289,31 @@ class AdjointViscosity(AdjointEstimator):
 
 
 class _ViscousStep(Filtered):
+    """A backward step after which the viscosity blends adjoints of positions and velocities with averages over
+    neighbours, and limits them; ``strengths`` are s_i of sorted particles."""
+
     only_launches = True
 
     def __init__(self, base: BackwardStep, rollout: Rollout, estimator: AdjointViscosity):
         super().__init__(base)
-        self._viscosity = EddyViscosity(base.solver, float(estimator.coefficient))
         layout, self._parameters = base.solver.layout, rollout.parameters
+        real, vector, device = layout.precision.real, layout.precision.vector, layout.device
+        self._kernels = adjoint_filter_kernels(base.solver.discretisation)
+        self._coefficient = {"coefficient": float(estimator.coefficient)}
         self._limits = {"times": float(estimator.limit), "particles": layout.particles}
-        self._squares = wp.zeros(layout.all_particles, dtype=wp.vec2d, device=layout.device)
-        self._sum, self._sum_of_strengths = layout.sum_of(wp.vec2d), layout.sum_of(layout.precision.real)
+        self._most, self.strengths = (wp.zeros(layout.all_particles, dtype=real, device=device) for _ in range(2))
+        kinds = {"a_sorted": vector, "b_sorted": vector, "squares": wp.vec2d}
+        self._own = {name: wp.zeros(layout.all_particles, dtype=kind, device=device) for name, kind in kinds.items()}
+        self._sum, self._sum_of_strengths = layout.sum_of(wp.vec2d), layout.sum_of(real)
 
     def filter(self, bar: State) -> None:
-        self._viscosity(bar, self._parameters)
-        launch, kernels = self.solver.launch, adjoint_filter_kernels(self.solver.discretisation)
-        squares, fields = self._squares, {"a": bar.positions, "b": bar.velocities}
-        launch(kernels.squares, **fields, found=squares)
-        strengths = self._sum_of_strengths(self._viscosity.strengths)
-        launch(kernels.limit, self._limits, **fields, squares=squares, sums=self._sum(squares), strengths=strengths)
+        context, kernels = self.solver.context(self._parameters), self._kernels
+        fields, flow = {"a": bar.positions, "b": bar.velocities}, {"most": self._most, "strengths": self.strengths}
+        context.launch(kernels.crowd, most=self._most)
+        context.launch(kernels.strength, self._coefficient, flow)
+        context.launch(kernels.sort, fields, self._own)
+        context.launch(kernels.viscosity, flow, fields, self._own)
+        squares = self._own["squares"]
+        self.solver.launch(kernels.squares, **fields, found=squares)
+        sums = {"sums": self._sum(squares), "strengths": self._sum_of_strengths(self.strengths)}
+        self.solver.launch(kernels.limit, self._limits, sums, **fields, squares=squares)
